@@ -1,4 +1,4 @@
-"""Results that several test files read: computed once a session, never changed."""
+"""Fixtures shared by several test files: computed once per session, read-only."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ else:  # the same cases each time, within a minute; `--hypothesis-profile long` 
     settings.register_profile("long", max_examples=2000, deadline=None, database=None)
     settings.load_profile("ci")
 
-os.environ["REOBJ_RAISE"] = "1"  # a fault of the program in a picture fails the test
+os.environ["REOBJ_RAISE"] = "1"  # an internal error while drawing fails the test
 
 
 @pytest.fixture(scope="session")
@@ -46,13 +46,13 @@ def chairs() -> rt.Result:
 
 @pytest.fixture(scope="session")
 def parted() -> rt.Result:
-    """The chairs again, of cameras in two parts; not saved. Copy it before you change it."""
+    """The chairs with a trajectory in two components; not saved. Copy it before you change it."""
     return finished(unlinked())
 
 
 @pytest.fixture(scope="session")
 def parted_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Output folder of the two parts with all its files, as `objects` writes them."""
+    """Output folder of the two components with all its files, as `objects` writes them."""
     top = tmp_path_factory.mktemp("parts")
     (top / "frames").mkdir()
     for i in range(64):

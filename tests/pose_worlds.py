@@ -1,4 +1,4 @@
-"""Worlds for the tests of the pose rooms: videos in memory, camera paths, rendered walls."""
+"""Scenes for the tests of reobj.poses: videos in memory, camera trajectories, rendered walls."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FRAMES = 6
 
 
 class FakeVideo:
-    """Images in memory with the attributes of rt.Video that the pose rooms read."""
+    """Images in memory with the attributes of rt.Video that reobj.poses reads."""
 
     def __init__(self, images, names=(), fps=30.0, files=()):
         self.images, self.names, self.fps = images, list(names), fps
@@ -80,7 +80,7 @@ def supplied(cams, camera=PINHOLE):
 
 
 def textured_room(count, step, turn_deg=0.0, seed=0, size=(480, 360)):
-    """Images of a textured corner (two planes) from a walk or a turn on the spot; true poses."""
+    """Images of a textured corner (two planes) from a walk or a pure rotation; true poses."""
     rng = np.random.default_rng(seed)
     walls = [
         cv2.GaussianBlur(rng.integers(0, 255, (700, 1400, 3), np.uint8), (0, 0), 2)

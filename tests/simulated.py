@@ -1,4 +1,4 @@
-"""Simulated chairs seen by a known camera: tracks and cameras with a truth, for several tests."""
+"""Simulated chairs observed by known cameras: tracks and poses with ground truth."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def fitted(
     config: rt.ObjectsConfig | None = None,
     names: tuple[str, ...] = rt.COCO_NAMES,
 ) -> rt.Result:
-    """The result of tracks whose identities are right: fitted and described, nothing linked."""
+    """Fit and describe tracks with the right identities, without linking."""
     config, fits, views = config or rt.ObjectsConfig(), None, None
     if poses is not None:
         classes = object_classes(tracks)
@@ -80,13 +80,13 @@ def fitted(
 
 
 def with_columns(tracks: rt.Tracks, **columns: object) -> rt.Tracks:
-    """The tracks with other columns; a number counts for all rows."""
+    """The tracks with other columns; a scalar applies to all rows."""
     n = len(tracks)
     arrays = {k: np.full(n, v) if np.isscalar(v) else v for k, v in columns.items()}
     return dataclasses.replace(tracks, **arrays)  # type: ignore[arg-type]
 
 
-BREAK = 40  # first frame of the second part in `two_parts`
+BREAK = 40  # first frame of the second component in `two_parts`
 PARTS = (  # scale, rotation vector, shift: x_in_part = scale * R @ x_in_true + shift
     (0.5, (0.2, 0.1, -0.3), (1.0, 2.0, -1.0)),
     (3.0, (-1.0, 0.7, 0.4), (-5.0, 0.5, 4.0)),
@@ -94,15 +94,15 @@ PARTS = (  # scale, rotation vector, shift: x_in_part = scale * R @ x_in_true + 
 
 
 def into_part(part: int, points: np.ndarray) -> np.ndarray:
-    """Points (N, 3) of the true world in that of a part."""
+    """Transform points (N, 3) from the true world to that of a component."""
     scale, turn, shift = PARTS[part]
     return scale * points @ Rotation.from_rotvec(turn).as_matrix().T + shift
 
 
 def two_parts(frames: int = 64) -> rt.Poses:
-    """A walk around the chairs that breaks at frame 40: two worlds; 38 to 40 have no pose.
+    """A walk around the chairs that breaks at frame 40: two components; 38 to 40 have no pose.
 
-    Every chair's centre is a sparse point that all frames of its part observe.
+    Every chair's centre is a sparse point that all frames of its component observe.
     """
     true = walk(frames, 200.0)
     part = (np.arange(frames) >= BREAK).astype(np.int64)
@@ -125,18 +125,18 @@ def two_parts(frames: int = 64) -> rt.Poses:
 
 
 def tracks_in_two_parts(poses: rt.Poses) -> rt.Tracks:
-    """Boxes of the chairs in `two_parts`: the tracker follows all three over the break."""
+    """Boxes of the chairs in `two_parts`: all three tracks continue over the break."""
     true = dataclasses.replace(walk(len(poses.frame), 200.0), frame=poses.frame)
     return tracks_of(true, 0.5)
 
 
 def unlinked(poses: rt.Poses | None = None, tracks: rt.Tracks | None = None) -> rt.Result:
-    """What the tracker and the reconstruction hand over: by default in two parts."""
+    """Output of tracker and reconstruction, before linking: by default two components."""
     poses = two_parts() if poses is None else poses
     tracks = tracks_in_two_parts(poses) if tracks is None else tracks
     return rt.Result(tracks, rt.COCO_NAMES, VideoInfo("walk.mp4", *SIZE, 30.0), poses=poses)
 
 
 def finished(result: rt.Result, **options: Any) -> rt.Result:
-    """The same result, linked and fitted."""
+    """The same, linked and fitted."""
     return link_and_fit(result, rt.ObjectsConfig(**options))

@@ -47,12 +47,12 @@ def test_every_public_method_has_a_docstring() -> None:
     assert missing == []
 
 
-# ---- The ways to call it ----
+# ---- Ways to call the tracker ----
 
 
 @dataclass
 class Duck:
-    """What counts of supervision's Detections: these arrays, rows by index, a tracker_id."""
+    """The used subset of supervision's Detections: arrays, indexing of rows, a tracker_id."""
 
     xyxy: np.ndarray
     confidence: np.ndarray | None = None
@@ -74,7 +74,7 @@ def short() -> rt.Video:
 def test_all_online_ways_give_the_same_identities(
     short: rt.Video, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Masks steer the appearance, so arrays, which have none, may differ in detail elsewhere."""
+    """On other data, arrays may differ in detail: they carry no masks, which change embeddings."""
     if importlib.util.find_spec("supervision") is None:
         stand_in = ModuleType("supervision")
         stand_in.Detections = Duck  # type: ignore[attr-defined]
@@ -116,7 +116,7 @@ def test_supervision_without_scores_classes_and_masks() -> None:
 
 
 def test_arrays_in_and_out() -> None:
-    """Rows keep the number of their detection, also when the rows before are not tracked."""
+    """Rows keep the index of their detection, also if earlier rows are not tracked."""
     tracker = rt.Tracker(rt.TrackerConfig(n_init=1))
     rows = np.array([[0, 0, 9, 9, 0.05, 1], [10, 10, 50, 90, 0.9, 2]])
     out = tracker.update(rows).to_array()
@@ -157,7 +157,7 @@ def test_track_is_lazy_and_numbers_frames_as_the_source() -> None:
 
 
 def test_track_takes_paths_and_brings_an_embedder(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Recorded detections are asked by the source's frame numbers."""
+    """Recorded detections are looked up by the source's frame numbers."""
     made = []
 
     class Stub:
@@ -181,7 +181,7 @@ def test_track_takes_paths_and_brings_an_embedder(monkeypatch: pytest.MonkeyPatc
 
 
 def test_track_hands_poses_to_the_tracker() -> None:
-    """Those of the frame by its number, with the camera at the size of the frames."""
+    """The pose of the frame number, with the camera at the size of the frames."""
     video = rt.Video(ROOM / "room.mp4", rt.InputConfig(start=2, every=3, stop=9, max_size=320))
     camera = rt.Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
     frame = np.array([2, 8])
@@ -206,7 +206,7 @@ def test_track_hands_poses_to_the_tracker() -> None:
 WITH_EXAMPLE = ("Detections.from_array", "Tracker", "track")  # where users look
 
 
-def test_docstring_examples_of_all_rooms_run() -> None:
+def test_docstring_examples_of_all_modules_run() -> None:
     paths = [ROOT / "reobj_track.py", ROOT / "quadrics.py", *(ROOT / "reobj").rglob("*.py")]
     names = [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in sorted(paths)]
     finder, runner = doctest.DocTestFinder(), doctest.DocTestRunner()

@@ -1,4 +1,4 @@
-"""Pairs of tracks and detections: who gets whom, and which compete."""
+"""Assignment of detections to tracks, and competing pairs."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from scipy.optimize import linear_sum_assignment
 from reobj.tracking.assignment import AMBIGUITY_MARGIN, Pairs, ambiguous_pairs, assign, touching
 
 
-def random_pairs(seed: int, rows: int, columns: int, share: float) -> tuple[np.ndarray, np.ndarray]:
-    """(M, 2) row and column of pairs that are possible, and their costs (M,)."""
+def random_pairs(seed: int, rows: int, columns: int, density: float) -> tuple:
+    """(M, 2) row and column of the allowed pairs, and their costs (M,)."""
     rng = np.random.default_rng(seed)
-    pairs = np.argwhere(rng.random((rows, columns)) < share)
+    pairs = np.argwhere(rng.random((rows, columns)) < density)
     return pairs, rng.random(len(pairs))
 
 
-@pytest.mark.parametrize("share", [0.0, 0.05, 0.3, 1.0])
+@pytest.mark.parametrize("density", [0.0, 0.05, 0.3, 1.0])
 @pytest.mark.parametrize(("rows", "columns"), [(0, 3), (1, 1), (6, 9), (30, 20)])
-def test_as_many_as_possible_then_at_least_cost(rows: int, columns: int, share: float) -> None:
-    """As scipy does on the whole matrix, where what is impossible costs more than all the rest."""
+def test_most_pairs_then_least_cost(rows: int, columns: int, density: float) -> None:
+    """Equals scipy on the full matrix with a prohibitive cost for pairs that are not allowed."""
     for seed in range(10):
-        pairs, cost = random_pairs(seed, rows, columns, share)
+        pairs, cost = random_pairs(seed, rows, columns, density)
         whole = np.full((rows, columns), 1e3)
         whole[tuple(pairs.T)] = cost
         row, column = linear_sum_assignment(whole)
@@ -29,11 +29,11 @@ def test_as_many_as_possible_then_at_least_cost(rows: int, columns: int, share: 
         assert {tuple(p) for p in pairs[assign(*pairs.T, cost)]} == expected
 
 
-@pytest.mark.parametrize("share", [0.0, 0.2, 0.7])
-def test_rivals_cost_little_more_than_the_best_of_track_and_detection(share: float) -> None:
-    """As the same rule over the whole matrix."""
+@pytest.mark.parametrize("density", [0.0, 0.2, 0.7])
+def test_rivals_cost_little_more_than_the_best_of_track_and_detection(density: float) -> None:
+    """Equals the same rule on the full matrix."""
     for seed in range(10):
-        pairs, cost = random_pairs(seed, 8, 7, share)
+        pairs, cost = random_pairs(seed, 8, 7, density)
         rng = np.random.default_rng(seed)
         same, possible = rng.random((2, len(pairs))) < 0.8
         given = Pairs(*pairs.T, cost, cost, cost, same)
@@ -52,8 +52,8 @@ def test_rivals_cost_little_more_than_the_best_of_track_and_detection(share: flo
             np.testing.assert_array_equal(whole_found, expected)
 
 
-def test_detections_touch_a_track_where_its_reach_and_their_box_meet_in_x_and_in_y() -> None:
-    """As pair by pair; in the order of tracks, then of detections."""
+def test_candidate_detections_overlap_the_gate_in_x_and_y() -> None:
+    """Equals a test of each pair; sorted by track, then by detection."""
     rng = np.random.default_rng(0)
     center, reach = rng.uniform(0, 100, (2, 20)), rng.uniform(1, 20, (2, 20))
     corner, size = rng.uniform(0, 100, (30, 2)), rng.uniform(0, 20, (30, 2))

@@ -1,4 +1,4 @@
-"""Which detection is of which solid: evidence, proposals, the association of a whole scene."""
+"""Assignment of detections to 3D objects: evidence, proposals, association of a whole scene."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def chairs() -> Shapes:
 
 
 def detected_in(table: rt.Tracks, poses: rt.Poses) -> PosedDetections:
-    """Rows of frames that all have a pose, in no tracklets."""
+    """Rows in no tracklet, of frames that all have a pose."""
     none = np.full(len(table), -1)
     cams = poses.camera.K @ poses.cam_from_world
     return PosedDetections(
@@ -44,7 +44,7 @@ def shifted(table: rt.Tracks, by: np.ndarray) -> rt.Tracks:
 
 
 def odds_of(table: rt.Tracks, poses: rt.Poses, solid: int = 0) -> float:
-    """Median of the log odds that the boxes of the first chair are of a solid; -inf: of none."""
+    """Median log odds that the boxes of the first chair belong to an object; -inf: to none."""
     own = table[table.detection_index == 0]
     found = gather_evidence(chairs(), detected_in(own, poses))
     odds = np.full(len(own), -np.inf)
@@ -56,7 +56,7 @@ def odds_of(table: rt.Tracks, poses: rt.Poses, solid: int = 0) -> float:
 # ---- Evidence ----
 
 
-def test_a_box_speaks_for_its_solid_and_not_for_the_next_one() -> None:
+def test_a_box_supports_its_object_and_not_the_neighbour() -> None:
     poses = walk(20)
     table = table_of(poses)
     assert odds_of(table, poses) > 8
@@ -67,18 +67,18 @@ def test_a_box_speaks_for_its_solid_and_not_for_the_next_one() -> None:
     ("inside", "outside"),
     [([0.3, 0, 0, 0], [-0.3, 0, 0, 0]), ([0, 0, 0, -0.4], [0, 0, 0, 0.4])],
 )
-def test_a_thing_may_be_half_hidden_but_not_stick_out(
+def test_a_box_may_be_half_occluded_but_not_exceed_the_projection(
     inside: list[float], outside: list[float]
 ) -> None:
     poses = walk(20)
     table = table_of(poses)
-    hidden, larger = (odds_of(shifted(table, np.array(by)), poses) for by in (inside, outside))
-    assert odds_of(table, poses) >= hidden > larger + 1
+    occluded, larger = (odds_of(shifted(table, np.array(by)), poses) for by in (inside, outside))
+    assert odds_of(table, poses) >= occluded > larger + 1
 
 
 @pytest.mark.parametrize("shown", [0.5, 0.3, 0.15])
-def test_of_a_thing_any_part_may_be_hidden(shown: float) -> None:
-    """The upper end of a thing shows: hidden is as likely for each share of its height."""
+def test_the_occluded_fraction_of_the_height_is_uniform(shown: float) -> None:
+    """Only the upper end is visible: each occluded fraction of the height is equally likely."""
     projected, size = np.array([[100.0, 100, 180, 300]]), (640, 480)
     part = projected.copy()
     part[0, 3] = 100 + shown * 200
@@ -87,8 +87,8 @@ def test_of_a_thing_any_part_may_be_hidden(shown: float) -> None:
         for box in (projected, projected - [[0, 0, 0, 100]], part)
     )
     assert whole > half > 2
-    # The hidden edge has one density over the projection, boxes anywhere one that goes with 1 / h;
-    # the upper edge is known to a share of the mean height.
+    # The occluded edge is uniform over the projection, a clutter box has a density prop. to 1 / h;
+    # the sigma of the upper edge is a fraction of the mean height.
     expected = np.log(shown / 0.5) - np.log((1 + shown) / 1.5)
     assert some - half == pytest.approx(expected, abs=0.02)
     beyond = projected.copy()
@@ -97,7 +97,7 @@ def test_of_a_thing_any_part_may_be_hidden(shown: float) -> None:
     assert likelihood._box_log_odds(projected, beyond, size)[0] < 0
 
 
-def test_scores_and_classes_count() -> None:
+def test_scores_and_classes_change_the_odds() -> None:
     poses = walk(20)
     table = table_of(poses)
     weak = dataclasses.replace(table, score=np.full(len(table), 0.2))
@@ -107,17 +107,17 @@ def test_scores_and_classes_count() -> None:
     assert odds_of(table, poses) - 3 < odds_of(named, poses) < odds_of(table, poses)
 
 
-def test_a_solid_is_expected_where_most_of_it_is_in_the_image() -> None:
+def test_a_detection_is_expected_if_most_of_the_object_is_in_the_image() -> None:
     poses = walk(40)
     cams = poses.camera.K @ poses.cam_from_world
     whole = quadrics.solid_boxes(chair_solids(), "box", cams)
     cut = quadrics.clip_boxes(whole, SIZE)
-    share = ((cut[..., 2:] - cut[..., :2]) / (whole[..., 2:] - whole[..., :2])).prod(-1)
+    visible = ((cut[..., 2:] - cut[..., :2]) / (whole[..., 2:] - whole[..., :2])).prod(-1)
     found = gather_evidence(chairs(), detected_in(table_of(poses), poses))
-    np.testing.assert_array_equal(found.expected, np.nan_to_num(share) > EXPECTED)
+    np.testing.assert_array_equal(found.expected, np.nan_to_num(visible) > EXPECTED)
 
 
-def test_many_solids_are_looked_at_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_objects_are_evaluated_in_batches(monkeypatch: pytest.MonkeyPatch) -> None:
     detected = detected_in(table_of(walk(10)), walk(10))
     five = Shapes.concatenate([chairs(), chairs()[[2, 0]]])
     whole = gather_evidence(five, detected)
@@ -141,8 +141,8 @@ def proposed_for(table: rt.Tracks, poses: rt.Poses, floor: quadrics.Floor | None
 
 
 @pytest.mark.parametrize("floor", [None, quadrics.Floor(np.array([0, 0, 1.0]), 0.0, 0.01)])
-def test_one_view_proposes_the_place_among_others(floor: quadrics.Floor | None) -> None:
-    """Of the backrests alone, in three frames without parallax."""
+def test_a_single_view_proposes_the_true_position(floor: quadrics.Floor | None) -> None:
+    """From the backrests alone, in three frames without parallax."""
     poses = walk(120)
     table = table_of(poses)
     table = table[(table.frame >= 60) & (table.frame < 63)]
@@ -157,17 +157,17 @@ def test_one_view_proposes_the_place_among_others(floor: quadrics.Floor | None) 
         np.testing.assert_allclose(centre[rays, 2], half[rays, 2], atol=0.02)  # they stand on it
 
 
-# ---- The whole ----
+# ---- The whole association ----
 
 
 def located(table: rt.Tracks, poses: rt.Poses) -> np.ndarray:
-    """The solid of each row."""
+    """The object of each row."""
     fit, priors = make_fit(rt.ObjectsConfig(), poses, NAMES), quadrics.load_priors()
     return associate_component(table, NAMES, poses, fit, priors).label
 
 
 def test_weak_detections_that_agree_belong_to_the_object() -> None:
-    """Two of three boxes are in no tracklet, of score .2."""
+    """Two of three boxes are in no tracklet and have score .2."""
     poses = walk()
     table = table_of(poses)
     weak = table.frame % 3 != 0
@@ -179,7 +179,7 @@ def test_weak_detections_that_agree_belong_to_the_object() -> None:
 
 @pytest.mark.parametrize("score, found_at_all", [(0.42, True), (0.38, False)])
 def test_good_detections_in_no_tracklet_make_an_object(score: float, found_at_all: bool) -> None:
-    """Photos with wide steps: nothing connects the boxes of a chair but its place."""
+    """Photos with wide baselines: only the 3D position connects the boxes of a chair."""
     poses, solids = walk(12), chair_solids()[[0, 2]]
     solids.half_axes[0] = 0.05  # a cup, which the tracker follows
     table = table_of(poses, solids)
@@ -206,8 +206,8 @@ def test_strong_detections_that_do_not_agree_are_clutter() -> None:
     assert (found[~wild] >= 0).all() and len(np.unique(found[~wild])) == 2
 
 
-def test_where_nothing_agrees_nothing_is_located() -> None:
-    """Boxes at random, of classes without priors, and a table of priors without rows."""
+def test_random_boxes_give_no_objects() -> None:
+    """Random boxes, classes without priors, and an empty table of priors."""
     poses = walk(30)
     table = table_of(poses)
     corner = np.random.default_rng(1).uniform(0, 300, (len(table), 2))
@@ -223,8 +223,8 @@ def test_where_nothing_agrees_nothing_is_located() -> None:
 
 
 @pytest.mark.parametrize(("off_px", "name"), [(3.0, "chair"), (0.0, "couch")])
-def test_a_thing_that_is_detected_twice_is_one_thing(off_px: float, name: str) -> None:
-    """A second tracklet has the first chair too, in every frame: a little off, or misnamed."""
+def test_duplicate_detections_give_one_object(off_px: float, name: str) -> None:
+    """A second tracklet shows the first chair in every frame: slightly off, or of another class."""
     poses = walk()
     table = table_of(poses)
     again = table[table.detection_index == 0]
@@ -240,8 +240,8 @@ def test_a_thing_that_is_detected_twice_is_one_thing(off_px: float, name: str) -
 
 
 @pytest.mark.parametrize("metric", [True, False])
-def test_no_detections_are_fitted_twice_and_the_first_scale_holds(metric: bool) -> None:
-    """The first fit finds the scale; what follows asks for sets of detections not fitted yet."""
+def test_fits_are_not_repeated_and_the_first_scale_is_kept(metric: bool) -> None:
+    """The first fit estimates the scale; later fits use new sets of detections only."""
     poses = dataclasses.replace(walk(), metric=metric)
     table = table_of(poses)
     table = dataclasses.replace(table, tracklet_id=1 + table.detection_index)
@@ -261,15 +261,15 @@ def test_no_detections_are_fitted_twice_and_the_first_scale_holds(metric: bool) 
     (none, first), *others = scales
     assert none is None and all(known == (None if metric else first) for known, _ in others)
     assert all(used == first for _, used in others)
-    places = found.ellipsoids.center_in_world
-    assert len(places) == 4 and np.isnan(places[3]).all()
+    centers = found.ellipsoids.center_in_world
+    assert len(centers) == 4 and np.isnan(centers[3]).all()
     order = np.argsort(
         found.label[[np.flatnonzero(table.detection_index == k)[0] for k in range(3)]]
     )
-    np.testing.assert_allclose(places[:3], chair_solids().center_in_world[order], atol=0.05)
+    np.testing.assert_allclose(centers[:3], chair_solids().center_in_world[order], atol=0.05)
 
 
-def test_twins_that_stand_close_stay_two() -> None:
+def test_adjacent_identical_objects_stay_separate() -> None:
     poses = walk()
     solids = chair_solids()
     solids.center_in_world[1] = solids.center_in_world[0] + [0.35, 0, 0]
@@ -282,7 +282,7 @@ def test_twins_that_stand_close_stay_two() -> None:
 
 
 def association_of(solids: Shapes, poses: rt.Poses) -> tuple[Associator, Association]:
-    """The chairs' detections with solids that are never refitted."""
+    """Association of the chairs' detections with fixed objects."""
     table = table_of(poses)
     detected = detected_in(table, poses)
     made = Associator(
@@ -293,13 +293,13 @@ def association_of(solids: Shapes, poses: rt.Poses) -> tuple[Associator, Associa
     return made, made._assign(solids, np.full(len(table), -1))
 
 
-def test_every_detection_goes_to_its_solid_one_to_one() -> None:
+def test_detections_are_assigned_to_their_objects_one_to_one() -> None:
     _, found = association_of(chairs(), walk(30))
     np.testing.assert_array_equal(found.label, table_of(walk(30)).detection_index)
     assert (found.gains(detected_in(table_of(walk(30)), walk(30))) > 50).all()
 
 
-def test_a_detection_without_any_evidence_loses_its_solid() -> None:
+def test_a_detection_without_evidence_is_unassigned() -> None:
     made, found = association_of(chairs(), walk(30))
     away = dataclasses.replace(
         found.shapes.ellipsoids, center_in_world=found.shapes.ellipsoids.center_in_world + 50.0
@@ -310,7 +310,7 @@ def test_a_detection_without_any_evidence_loses_its_solid() -> None:
     assert len(made._prune(four).shapes) == 3
 
 
-def test_a_double_is_dropped_and_its_detections_return() -> None:
+def test_a_duplicate_object_is_pruned_and_its_detections_reassigned() -> None:
     three = chairs()
     four = Shapes.concatenate([three, three[[0]]])
     made, found = association_of(four, walk(30))
@@ -319,7 +319,7 @@ def test_a_double_is_dropped_and_its_detections_return() -> None:
     assert len(found.shapes) == 3 and (found.label >= 0).all()
 
 
-def test_what_another_solid_explains_does_not_tell_where_a_solid_is() -> None:
+def test_ambiguous_detections_are_excluded_from_refits() -> None:
     made, found = association_of(chairs(), walk(30))
     assert found.unambiguous().all()
     slipped = np.flatnonzero(found.label == 0)[:4]
@@ -336,10 +336,10 @@ def test_what_another_solid_explains_does_not_tell_where_a_solid_is() -> None:
     np.testing.assert_array_equal(label, found.label[rows])
     votes = np.array([[score[(found.label == obj) & (kind.clip(0) == k)].sum() for k in range(4)]
                       for obj in range(2)])  # fmt: skip
-    assert classes.tolist() == [*votes.argmax(1), CHAIR]  # that without detections keeps its own
+    assert classes.tolist() == [*votes.argmax(1), CHAIR]  # without detections: unchanged
 
 
-def test_a_double_is_fitted_to_all_its_detections_as_none_is_clear() -> None:
+def test_a_duplicate_without_unambiguous_detections_is_fitted_to_all() -> None:
     four = Shapes.concatenate([chairs(), chairs()[[0]]])
     _, found = association_of(four, walk(30))
     assert found.unambiguous().all() and len(np.unique(found.label)) >= 3
@@ -347,8 +347,8 @@ def test_a_double_is_fitted_to_all_its_detections_as_none_is_clear() -> None:
 
 
 @pytest.mark.parametrize("first", [0, 3])
-def test_of_two_that_stand_for_one_thing_the_better_placed_one_stays(first: int) -> None:
-    """A solid 12 cm off has half of the chair's detections, and is of a likelier size."""
+def test_of_two_duplicates_the_better_fitting_one_stays(first: int) -> None:
+    """An object 12 cm off has half of the chair's detections and a more probable size."""
     three = chairs()
     off = dataclasses.replace(
         three.ellipsoids, center_in_world=three.ellipsoids.center_in_world + np.array([0.12, 0, 0])
@@ -370,17 +370,17 @@ def test_of_two_that_stand_for_one_thing_the_better_placed_one_stays(first: int)
 @pytest.mark.parametrize(
     ("up", "height", "aside", "one"),
     [
-        (0.0, 1.0, 0.0, True),  # the same again
+        (0.0, 1.0, 0.0, True),  # the same object again
         (-0.4, 0.5, 0.0, True),  # its lower half
         (0.4, 0.5, 0.3, True),  # its upper half, a little aside
         (0.0, 1.0, 1.2, False),  # a neighbour that touches it
         (1.6, 0.6, 0.0, False),  # something on top of it
     ],
 )
-def test_a_part_of_a_thing_is_no_other_thing(
+def test_a_part_of_an_object_is_no_separate_object(
     up: float, height: float, aside: float, one: bool
 ) -> None:
-    """Offsets in half extents; whichever is listed first."""
+    """Offsets in half extents; independent of the order."""
     solid = chairs()[[0]]
     half, axes = solid.ellipsoids.half_axes[0], solid.ellipsoids.world_from_obj[0]
     moved = quadrics.Ellipsoids(
@@ -395,8 +395,8 @@ def test_a_part_of_a_thing_is_no_other_thing(
 
 
 @pytest.mark.parametrize("second", [0.1, 0.5, 0.9])
-def test_two_boxes_of_a_thing_in_every_frame_make_one_solid(second: float) -> None:
-    """Its upper half is boxed too, as often and as surely."""
+def test_two_boxes_of_an_object_per_frame_give_one_object(second: float) -> None:
+    """Its upper half is detected as well, as often and with the same score."""
     poses = walk(40)
     table = table_of(poses)
     half = table[table.detection_index == 0]
@@ -417,8 +417,8 @@ def test_two_boxes_of_a_thing_in_every_frame_make_one_solid(second: float) -> No
     assert sorted(made._select_greedily(made._unassigned(many, 0.0)).tolist()) == [0, 1, 2]
 
 
-def test_the_association_ends_where_it_was_before(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two states that follow each other for ever are looked at once each."""
+def test_the_association_stops_at_a_repeated_state(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two states that alternate forever are evaluated once each."""
     made, found = association_of(chairs(), walk(10))
     states = [np.where(found.label == k, -1, found.label) for k in (0, 1)]
     rounds: list[int] = []
@@ -433,10 +433,10 @@ def test_the_association_ends_where_it_was_before(monkeypatch: pytest.MonkeyPatc
     assert len(rounds) == 3
 
 
-def test_pursuit_takes_in_turn_what_adds_most() -> None:
-    """As when every solid is looked at again in every turn; of equal ones the first.
+def test_greedy_selection_adds_the_largest_marginal_gain() -> None:
+    """Equals re-evaluating every object in every round; ties go to the first.
 
-    By their sizes some are just worth it though they explain nothing, some just not.
+    Some have a size prior just high enough to be selected without detections, some just not.
     """
     three = chairs()
     rng = np.random.default_rng(0)
@@ -463,12 +463,12 @@ def test_pursuit_takes_in_turn_what_adds_most() -> None:
         own = (seen.obj == expected[-1]) & (value > 0)
         np.maximum.at(explained, seen.row[own], value[own])
     assert len(expected) > 1 and made._select_greedily(of).tolist() == expected
-    few = made._unassigned(many, 0.0)  # pairs that speak for none add nothing
+    few = made._unassigned(many, 0.0)  # pairs with negative log odds add nothing
     assert len(few.evidence.row) < len(seen.row) and made._select_greedily(few).tolist() == expected
 
 
-def test_the_gain_of_a_merge_is_that_of_all_rows_of_both() -> None:
-    """By loops: of each object its rows' log odds, and in every frame one hit at its best row."""
+def test_the_gain_of_a_merge_uses_all_rows_of_both() -> None:
+    """Computed by loops: each object's summed log odds, with one hit per frame at its best row."""
     three = chairs()
     made, found = association_of(three, walk(12))
     rng = np.random.default_rng(1)
@@ -494,7 +494,7 @@ def test_the_gain_of_a_merge_is_that_of_all_rows_of_both() -> None:
     np.testing.assert_allclose(made._joint_gains(label, strong, weak, fitted), expected)
 
 
-def test_pursuit_chooses_what_is_there() -> None:
+def test_greedy_selection_finds_the_true_objects() -> None:
     three = chairs()
     away = dataclasses.replace(
         three.ellipsoids,
@@ -505,7 +505,7 @@ def test_pursuit_chooses_what_is_there() -> None:
     assert sorted(made._select_greedily(made._unassigned(many)).tolist()) == [3, 4, 5]
 
 
-def test_missed_frames_speak_against_a_solid(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missed_frames_lower_the_evidence_of_an_object(monkeypatch: pytest.MonkeyPatch) -> None:
     made, found = association_of(chairs(), walk(30))
     gain = found.gains(made.detections)
     monkeypatch.setattr(association, "MISSED", association.MISSED + 1)
@@ -515,8 +515,8 @@ def test_missed_frames_speak_against_a_solid(monkeypatch: pytest.MonkeyPatch) ->
     assert (lost > 10 * (association.MISSED - 1e-9)).all()
 
 
-def test_a_size_is_held_against_its_category_axis_by_axis() -> None:
-    """A chair turned by 90 deg, a pancake of the usual mean size; where no scale is known."""
+def test_a_size_is_compared_with_the_prior_per_axis() -> None:
+    """A chair rotated by 90 deg, a flat one of the usual mean size; without a known scale."""
     priors, names = quadrics.load_priors(), np.array([*NAMES, ""])
     metres = Categories(priors, names, quadrics.Scale(1.0, 0.0, "poses"))
     usual = metres.usual_size(np.array([CHAIR]))[0] / 2
@@ -532,18 +532,18 @@ def test_a_size_is_held_against_its_category_axis_by_axis() -> None:
     assert unknown[3] > -0.5 and unknown[2] < -10
 
 
-def test_confidence_rises_with_score_and_share() -> None:
-    score, share = np.array([-2.0, 0.0, 2.0]), np.array([0.0, 0.5, 1.0])
-    table = existence_probability(score[:, None], share)
+def test_confidence_rises_with_score_and_hit_rate() -> None:
+    score, hit_rate = np.array([-2.0, 0.0, 2.0]), np.array([0.0, 0.5, 1.0])
+    table = existence_probability(score[:, None], hit_rate)
     assert (np.diff(table, axis=0) > 0).all() and (np.diff(table, axis=1) > 0).all()
     assert table[0, 0] < 0.1 and table[2, 2] > 0.9
-    background_seen = existence_probability(score, share, 0.5)
+    background_seen = existence_probability(score, hit_rate, 0.5)
     assert (background_seen < table.diagonal()).all()
-    assert existence_probability(np.zeros(1), np.array([np.nan]))[0] < 0.2  # no solid explains it
+    assert existence_probability(np.zeros(1), np.array([np.nan]))[0] < 0.2  # no object explains it
 
 
-def test_the_best_views_tell_what_a_thing_scores() -> None:
-    """Of 100 views seventy are half hidden, of 200 half; one of ten; the order does not matter."""
+def test_the_score_of_an_object_comes_from_its_best_views() -> None:
+    """Low scores of occluded views: 70 of 100, 100 of 200, 9 of 10; in any order."""
     score = np.r_[np.full(70, 0.2), np.full(30, 0.9), np.full(100, 0.3), np.full(100, 0.8)]
     score = np.r_[score, np.full(9, 0.2), 0.9]
     group = np.repeat([0, 1, 3], [100, 200, 10])
@@ -555,10 +555,10 @@ def test_the_best_views_tell_what_a_thing_scores() -> None:
     np.testing.assert_allclose(np.exp(mixed), (40 * 9 + 10 * 0.25) / 50)  # its best quarter
 
 
-def test_where_no_frame_should_show_a_thing_the_share_is_the_usual_one(
+def test_without_frames_that_should_show_it_the_hit_rate_is_the_prior(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Every view cuts a large table: that it is never missed does not speak against it."""
+    """A large table is truncated in every view: the absence of expected frames is no evidence."""
     monkeypatch.setattr("reobj.objects.likelihood.EXPECTED", 2.0)
     poses, priors = walk(), quadrics.load_priors()
     table = table_of(poses)
@@ -572,11 +572,11 @@ def test_where_no_frame_should_show_a_thing_the_share_is_the_usual_one(
     )
 
 
-# ---- What follows ----
+# ---- After the association ----
 
 
-def test_things_on_the_floor_reach_down_to_it() -> None:
-    """Only the backrests are seen: with a floor their solids are whole, without they are not."""
+def test_floor_standing_objects_extend_to_the_floor() -> None:
+    """Only the backrests are visible: with a floor the shapes are complete, without it not."""
     poses = walk()
     table = table_of(poses)
     table.xyxy[:, 3] = table.xyxy[:, 1] + 0.5 * (table.xyxy[:, 3] - table.xyxy[:, 1])
@@ -592,8 +592,8 @@ def test_things_on_the_floor_reach_down_to_it() -> None:
     assert (cups.center_in_world[:, 2] - cups.half_axes[:, 2] > 0.15).all()  # they may stand high
 
 
-def test_frames_are_filled_by_the_solid() -> None:
-    """While the first chair is missed the view turns: its boxes are those of its projection."""
+def test_missed_frames_are_filled_with_the_projection() -> None:
+    """The view rotates while the first chair is missed: its boxes are those of its projection."""
     poses = walk(60)
     table = table_of(poses)
     seen = (table.detection_index != 0) | (table.frame < 28) | (table.frame >= 33)
@@ -605,8 +605,8 @@ def test_frames_are_filled_by_the_solid() -> None:
     assert set(made.track_id) == {1} and (made.detection_index == -1).all()
 
 
-def test_frames_are_filled_only_from_where_it_was_seen() -> None:
-    """Seen in one frame: filled where the camera is within 10 deg and 1.25 times the distance."""
+def test_frames_are_filled_only_near_observed_viewpoints() -> None:
+    """Detected in one frame: filled if the camera is within 10 deg and 1.25 times the distance."""
     poses = walk(60)
     table = table_of(poses)
     seen = (table.detection_index != 0) | (table.frame == 30)
@@ -620,7 +620,7 @@ def test_frames_are_filled_only_from_where_it_was_seen() -> None:
     filled = fill_from_objects(table[seen], poses, np.array([1, 2, 3]), solids, ["box"] * 3)
     assert filled.frame[filled.score == 0].tolist() == [f for f in np.flatnonzero(near) if f != 30]
     own = table.detection_index[seen] == 0
-    for shift, explained in (([0, 0, 0, -0.4], True), ([0.3, 0, 0.3, 0], False)):  # hidden; beside
+    for shift, explained in (([0, 0, 0, -0.4], True), ([0.3, 0, 0.3, 0], False)):  # occluded; aside
         moved = shifted(table[seen], np.where(own[:, None], shift, 0.0))
         again = fill_from_objects(moved, poses, np.array([1, 2, 3]), solids, ["box"] * 3)
         assert ((again.score == 0).sum() == (filled.score == 0).sum()) == explained

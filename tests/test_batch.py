@@ -31,7 +31,7 @@ def manifest(folder: Path, *options: str) -> Path:
     return folder / "m.csv"
 
 
-def test_manifest_csv_and_jsonl_say_the_same(tmp_path: Path) -> None:
+def test_manifests_in_csv_and_jsonl_are_equal(tmp_path: Path) -> None:
     rows = [
         {"path": "a.mp4", "poses": "sparse", "options": "--classes 'tv,dining table'"},
         {"path": "sub/b.mp4", "out": "x", "poses": "none", "command": "track"},
@@ -79,7 +79,7 @@ def test_bad_manifest(case: str, tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert not (tmp_path / "out").exists()
 
 
-def test_without_ray_it_says_what_to_install(
+def test_without_ray_the_message_names_the_package(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -117,7 +117,7 @@ def test_finished_means_same_files_and_options(tmp_path: Path) -> None:
     assert batch.finished(first) is None and not (tmp_path / "a" / batch.MARKER).exists()
 
 
-def test_the_summary_says_what_the_run_found(tmp_path: Path) -> None:
+def test_the_summary_equals_the_results_of_the_run(tmp_path: Path) -> None:
     """With true cameras of the clip, which are in metres, for 25 of its first 30 frames."""
     lines = (ROOM / "poses.txt").read_text().splitlines(keepends=True)
     (tmp_path / "poses.txt").write_text("".join([x for x in lines if x[0] != "#"][:25]))
@@ -144,8 +144,8 @@ def wait_for(path: Path, process: subprocess.Popen[str]) -> str:
     return path.read_text()
 
 
-def test_a_killed_worker_loses_nothing_and_doubles_nothing(tmp_path: Path) -> None:
-    """Two workers, three videos; the one at work on b is killed; then the batch is run again."""
+def test_a_killed_worker_loses_and_repeats_no_videos(tmp_path: Path) -> None:
+    """Two workers, three videos; the worker of b is killed; then the batch is run again."""
     pytest.importorskip("ray")
     path, results = manifest(tmp_path, *(f"--stop {n}" for n in (15, 25, 12))), tmp_path / "out"
     command = [sys.executable, ROOT / "examples/batch.py", path, "-o", results, "--workers", "2"]

@@ -1,4 +1,4 @@
-"""The camera's motion in the image: against known motions of synthetic images."""
+"""Estimated image motion of the camera, against known motions of synthetic images."""
 
 from __future__ import annotations
 
@@ -47,10 +47,10 @@ def test_a_known_motion_is_recovered(size_hw: tuple[int, int], truth: np.ndarray
 
 
 @pytest.mark.parametrize(("foreign", "computed_here"), [(9, 0), (3, 4)])
-def test_looking_ahead_changes_nothing(
+def test_estimating_ahead_changes_nothing(
     monkeypatch: pytest.MonkeyPatch, foreign: int, computed_here: int
 ) -> None:
-    """The motion is known before it is asked for; after a foreign image it is computed again."""
+    """The motion is computed ahead of its request, and again after an unexpected image."""
     rng, here = np.random.default_rng(2), []
     wide = textured(rng, (240, 500))
     frames = [Frame(i, i / 30, wide[:, 9 * i : 9 * i + 320].copy()) for i in range(6)]
@@ -75,7 +75,7 @@ def test_looking_ahead_changes_nothing(
     np.testing.assert_allclose(motion[:2, 2], [-9, 0], atol=0.3)
 
 
-def test_a_wide_step_needs_no_majority() -> None:
+def test_a_wide_step_needs_no_majority_of_corners() -> None:
     """A quarter of the corners is enough: the rest left the view or changed."""
     rng = np.random.default_rng(5)
     old, new = textured(rng), textured(rng)
@@ -101,10 +101,10 @@ def test_a_step_over_half_the_image() -> None:
 @pytest.mark.parametrize(
     ("shifts", "expected"),
     [((4, 22, 10, 16), 16), ((10, 10, 10, 22), 10)],
-    ids=["a deep scene: as the corners near by", "a thing that moves by itself: as the rest"],
+    ids=["a deep scene: as the corners near by", "a moving object: as the background"],
 )
 def test_parallax_of_a_scene_with_depth(shifts: tuple[int, ...], expected: int) -> None:
-    """Four bands of the image move sideways; where does a point of the last band go?"""
+    """Four bands of the image move sideways; the motion of a point in the last band."""
     image = textured(np.random.default_rng(6))
     motion = CameraMotion()
     motion(image)
@@ -116,7 +116,7 @@ def test_parallax_of_a_scene_with_depth(shifts: tuple[int, ...], expected: int) 
     assert motion.parallax(np.empty((0, 2))).shape == (0, 2)
 
 
-def test_parallax_is_of_the_latest_step_alone() -> None:
+def test_parallax_uses_the_latest_step_only() -> None:
     image = textured(np.random.default_rng(6))
     motion = CameraMotion()
     motion(image)
@@ -130,8 +130,8 @@ def test_parallax_is_of_the_latest_step_alone() -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_where_too_few_points_agree_the_camera_stands_still(seed: int) -> None:
-    """Two pictures of different things have corners, but fewer than 8 move alike by chance."""
+def test_too_few_inliers_give_no_motion(seed: int) -> None:
+    """Two unrelated images have corners, but fewer than 8 inliers by chance."""
     rng = np.random.default_rng(seed)
     motion = CameraMotion()
     motion(textured(rng))
@@ -146,7 +146,7 @@ def test_frames_without_texture_and_of_another_size() -> None:
 
 
 def test_corners_are_of_the_latest_image() -> None:
-    """Where the texture of the left half goes and that of the right half comes."""
+    """The texture of the left half disappears, that of the right half appears."""
     image, motion = textured(np.random.default_rng(2)), CameraMotion()
     for side in (slice(0, 320), slice(320, 640)):
         half = np.full_like(image, 128)
@@ -157,8 +157,8 @@ def test_corners_are_of_the_latest_image() -> None:
         assert len(x) > 20 and x.min() > side.start - 10 and x.max() < side.stop + 10
 
 
-def test_the_state_is_what_arrays_names() -> None:
-    """A second object with the same arrays goes on exactly as the first one."""
+def test_the_state_is_complete_in_arrays() -> None:
+    """A second object with the same arrays continues exactly as the first one."""
     rng = np.random.default_rng(1)
     image = textured(rng)
     first, second = CameraMotion(), CameraMotion()
@@ -166,6 +166,6 @@ def test_the_state_is_what_arrays_names() -> None:
     for name in CameraMotion.ARRAYS:
         setattr(second, name, getattr(first, name))
     moved = np.roll(image, (3, 8), (0, 1))
-    told = first(moved)
-    np.testing.assert_array_equal(told, second(moved))
-    np.testing.assert_allclose(told[:2, 2], [8, 3], atol=0.5)
+    motion = first(moved)
+    np.testing.assert_array_equal(motion, second(moved))
+    np.testing.assert_allclose(motion[:2, 2], [8, 3], atol=0.5)

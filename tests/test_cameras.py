@@ -82,8 +82,8 @@ def test_every_model_of_pycolmap_with_a_focal_length_is_tested():
 
 
 @pytest.mark.parametrize("model", DISTORTED)
-def test_the_parameters_that_k_holds_are_those_of_their_names(model):
-    """The model's own names say which numbers are focal lengths and centre."""
+def test_k_holds_the_named_parameters(model):
+    """The model's parameter names identify focal lengths and principal point."""
     names = camera_parameters(model)
     value = dict(zip(names, DISTORTED[model], strict=True))
     fx, fy = (value["f"],) * 2 if "f" in value else (value["fx"], value["fy"])
@@ -113,8 +113,8 @@ def test_k3_is_undistorted_as_opencv_does(name):
     assert np.nanmax(np.abs(without - camera.undistort(grid))) > 3  # k3 matters at the corners
 
 
-def test_pixels_that_no_pinhole_can_have_are_nan():
-    """Of a fisheye of 180 degrees and more, and outside of what a polynomial can undo."""
+def test_pixels_without_a_pinhole_equivalent_are_nan():
+    """For a fisheye of 180 degrees and more, and outside the invertible range of a polynomial."""
     fisheye = rt.Camera("SIMPLE_FISHEYE", *SIZE, (200.0, 320.0, 240.0))
     found = fisheye.undistort(np.array([[320.0, 240], [0, 240], [0, 0], [320, 0]]))
     assert np.isfinite(found).all(1).tolist() == [True, False, False, True]  # 92, 115, 69 deg
@@ -131,7 +131,7 @@ def test_pixels_that_no_pinhole_can_have_are_nan():
         ("EQUIRECTANGULAR", (640.0, 320.0), "EQUIRECTANGULAR camera has no focal length"),
     ],
 )
-def test_what_is_no_camera_is_refused_by_name(model, params, message):
+def test_invalid_cameras_are_refused_with_their_name(model, params, message):
     with pytest.raises(rt.ReobjError, match=message):
         _ = rt.Camera(model, *SIZE, params).K
 
@@ -194,7 +194,7 @@ def test_quaternions_have_w_first_and_positive():
     assert quat_wxyz_from_matrix(np.empty((0, 3, 3))).shape == (0, 4)
 
 
-def test_rays_point_from_the_camera_to_what_the_box_is_around():
+def test_rays_point_to_the_centre_of_the_object():
     cams, points = some_cameras(), np.array([[0.3, -0.2, 4.0], [-1, 0.5, 5]])
     K = PINHOLE.K
     for cam in cams:
@@ -244,10 +244,10 @@ def lossy(**changes):
     return dataclasses.replace(supplied(cams), frame=frame, **changes)
 
 
-def test_frames_are_found_among_the_poses():
-    place, known = place_of(lossy(), np.array([8, 5, 6, 3, 99, 0]))
+def test_frames_are_looked_up_in_the_poses():
+    row, known = place_of(lossy(), np.array([8, 5, 6, 3, 99, 0]))
     assert known.tolist() == [True, False, False, True, False, False]
-    assert place[known].tolist() == [3, 0]
+    assert row[known].tolist() == [3, 0]
 
 
 @pytest.mark.parametrize("up", [None, [0, 0.6, 0.8]])
@@ -324,7 +324,7 @@ def test_import_loads_no_pycolmap():
     assert subprocess.run([sys.executable, "-c", code], cwd=folder, check=False).returncode == 0
 
 
-def test_pycolmap_leaves_the_signal_that_ends_us():
+def test_pycolmap_keeps_the_termination_signal():
     code = (
         "import signal; from reobj.cameras import import_pycolmap; import_pycolmap();"
         "assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL"

@@ -24,7 +24,7 @@ def box_tracks(cams, noise_px, seed, objects=12):
     xy = np.einsum("ij,ofj->ofi", K, in_cam)
     xy = xy[..., :2] / xy[..., 2:]
     seen = (in_cam[..., 2] > 0.3) & (xy > 0).all(2) & (xy < SIZE).all(2)
-    bias = rng.normal(0, noise_px, (objects, 1, 2))  # boxes are not centred on one point
+    bias = rng.normal(0, noise_px, (objects, 1, 2))  # boxes are not centred on a point
     xy = (
         xy + rng.normal(0, noise_px, xy.shape) + bias * np.linspace(-1, 1, len(cams))[None, :, None]
     )
@@ -69,8 +69,8 @@ def test_quaternions_in_the_other_order_are_named():
         cams = motion(kind)
         given = invert_rigid(cams)
         xyzw = Rotation.from_matrix(given[:, :, :3]).as_quat()
-        for places, named in ((1, "w first given as"), (-1, "w last given as")):
-            given[:, :, :3] = Rotation.from_quat(np.roll(xyzw, places, 1)).as_matrix()
+        for shift, named in ((1, "w first given as"), (-1, "w last given as")):
+            given[:, :, :3] = Rotation.from_quat(np.roll(xyzw, shift, 1)).as_matrix()
             message = check_poses(supplied(invert_rigid(given)), box_tracks(cams, 4, 0))
             assert message is not None and named in message
 
@@ -91,8 +91,8 @@ def test_check_needs_tracks():
     assert check_poses(supplied(motion("orbit")), [(np.array([1, 2]), np.ones((2, 2)))]) is None
 
 
-def test_what_fits_within_a_degree_is_beyond_doubt():
-    """A camera that moves by a centimetre: the other direction fits better, and means nothing."""
+def test_poses_that_fit_within_a_degree_are_accepted():
+    """A camera that moves by 1 cm: the inverse direction fits better by chance."""
     cams = motion("still")
     for seed in range(5):
         assert check_poses(supplied(invert_rigid(cams)), box_tracks(cams, 0, seed)) is None

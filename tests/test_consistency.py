@@ -1,4 +1,4 @@
-"""What a reconstruction is checked against: its focal length, its ties, its neighbours."""
+"""Checks of a reconstruction: focal length, connecting points, neighbouring images."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def cross(t):
 
 
 def poses_of(count, rng):
-    """cam_from_world (count, 3, 4) of a walk to the right past a wall, with a shake of the hand."""
+    """cam_from_world (count, 3, 4) of a walk to the right past a wall, with camera shake."""
     turn = Rotation.from_rotvec(rng.normal(0, 0.03, (count, 3))).as_matrix()
     centre = np.column_stack([0.25 * np.arange(count), rng.normal(0, 0.05, (count, 2))])
     return np.concatenate([turn, -turn @ centre[:, :, None]], 2)
@@ -54,14 +54,14 @@ def test_the_focal_length_is_that_of_the_fundamental_matrices(focal):
     )
 
 
-def test_nearly_half_of_the_pairs_may_be_wrong():
+def test_nearly_half_of_the_pairs_may_be_outliers():
     wrong = np.random.default_rng(3).normal(size=(18, 3, 3)) / [[320, 320, 1]]  # any matrices
     wrong = wrong / np.array([320, 320, 1])[:, None]
     F = np.concatenate([fundamental(0.8, 22), wrong])
     assert focal_from_pairs(pairs_of(F), SIZE) == pytest.approx(0.8, rel=0.02)
 
 
-def test_few_pairs_or_few_matches_tell_no_focal_length():
+def test_few_pairs_or_few_matches_give_no_focal_length():
     F = fundamental(0.8, MIN_FOCAL_PAIRS)
     assert focal_from_pairs(pairs_of(F), SIZE) is not None
     assert focal_from_pairs(pairs_of(F[1:]), SIZE) is None
@@ -71,15 +71,15 @@ def test_few_pairs_or_few_matches_tell_no_focal_length():
     assert focal_from_pairs(pairs_of(F[:0]), SIZE) is None
 
 
-def test_a_focal_length_out_of_the_range_is_not_told():
+def test_a_focal_length_out_of_range_is_not_reported():
     assert focal_from_pairs(pairs_of(fundamental(3.5, 40)), SIZE) is None
 
 
-# ---- Groups that hold together -------------------------------------------------------------------
+# ---- Connected groups of images ------------------------------------------------------------------
 
 
 class Scene:
-    """Images of points of a wall, and the model and the matches that were made of them.
+    """Images of points on a wall, with the model and the matches computed from them.
 
     Attributes:
         seen: (R, N) whether an image observes a point. poses: (R, 3, 4), those of the model.
@@ -100,7 +100,7 @@ class Scene:
         return xy, (at[:, 2] > 0) & ((xy > 0) & (xy < SIZE)).all(1)
 
     def untie(self, first, ties):
-        """Points that images on both sides of `first` see are two points, but for some."""
+        """Split points observed on both sides of `first` into two, except for some."""
         both = np.flatnonzero(self.seen[:first].any(0) & self.seen[first:].any(0))
         cut = both[ties:]
         before = self.seen[:, cut] & (np.arange(len(self.seen)) < first)[:, None]
@@ -131,7 +131,7 @@ class Scene:
         return made
 
     def pairs(self, across=False):
-        """Match neighbours and the next but one; across: also what was untied."""
+        """Match neighbours and next neighbours; across: also the split points."""
         ids, inliers = [], []
         count = len(self.seen)
         for a, b in [(a, a + step) for step in (1, 2) for a in range(count - step)]:
@@ -159,23 +159,23 @@ def test_a_good_model_stays_whole():
 
 
 @pytest.mark.parametrize("ties", [MIN_BRIDGE - 1, 0])
-def test_groups_tied_by_too_few_points_are_taken_apart(ties):
+def test_groups_connected_by_too_few_points_are_separated(ties):
     scene = Scene()
     scene.untie(7, ties)
     assert scene.groups() == numbers((1, 8), (8, 13))
 
 
 @pytest.mark.parametrize("ties, found", [(60, [(1, 8), (8, 13)]), (3000, [(1, 13)])])
-def test_points_that_near_views_do_not_find_again_part_two_groups(ties, found):
-    """Enough points tie them, but of those that both sides should see few or many are found."""
+def test_points_not_redetected_in_nearby_views_separate_groups(ties, found):
+    """Enough points connect them, but few or many of the expected ones are observed by both."""
     scene = Scene(points=10_000)
     scene.untie(7, ties)
     assert scene.groups() == numbers(*found)
 
 
 @pytest.mark.parametrize("back, found", [(1.5, [(1, 13)]), (12.0, [(1, 8), (8, 13)])])
-def test_points_that_only_far_views_share_tie_nothing(back, found):
-    """From 12 m farther off no feature looks as it does from near: such matches are chance."""
+def test_points_common_to_distant_views_only_connect_nothing(back, found):
+    """Features do not match at a distance 12 m larger: such matches are accidental."""
     scene = Scene()
     scene.poses[7:, 2, 3] += back
     scene.xy[7:] = [scene.project(pose)[0] for pose in scene.poses[7:]]
@@ -183,21 +183,21 @@ def test_points_that_only_far_views_share_tie_nothing(back, found):
     assert scene.groups() == numbers(*found)
 
 
-def test_fewer_than_three_images_that_hang_loose_are_in_no_group():
+def test_fewer_than_three_loosely_connected_images_form_no_group():
     scene = Scene()
     scene.untie(10, MIN_BRIDGE - 1)
     assert scene.groups() == numbers((1, 11))
 
 
-def test_neighbours_whose_matches_are_two_points_part_a_sequence():
-    """Two halves tied by 200 points far from the seam: as where a place was taken for its twin."""
+def test_split_points_between_neighbours_separate_a_sequence():
+    """Two halves connected by 200 points far from the seam, as after mixing up look-alikes."""
     scene = Scene(points=10_000)
     scene.untie(6, 200)
     assert scene.groups() == numbers((1, 13))  # nothing was matched, so nothing is missing
     assert scene.groups(across=True) == numbers((1, 7), (7, 13))
 
 
-def test_an_image_tied_to_neither_neighbour_splits_nothing():
+def test_an_image_connected_to_no_neighbour_splits_nothing():
     scene = Scene()
     model, pairs = scene.model(), scene.pairs()
     for k, pair in enumerate(pairs.image_ids.tolist()):
@@ -208,24 +208,24 @@ def test_an_image_tied_to_neither_neighbour_splits_nothing():
 
 
 def keyframes_dropped(scene, model, dropped):
-    """Take images out of a model, as where a mapper could not place them."""
+    """Remove images from a model, as if a mapper could not register them."""
     for image in dropped:
         model.deregister_frame(model.image(image).frame_id)
     return model
 
 
-def test_a_matched_keyframe_that_has_no_place_parts_its_neighbours_unless_they_are_tied():
-    """Images 1-6 and 9-12: what lies between was matched with both and could not be placed."""
+def test_a_matched_but_unregistered_keyframe_separates_unconnected_neighbours():
+    """Images 1-6 and 9-12: those between were matched with both and could not be registered."""
     scene, dropped = Scene(), [7, 8]
     model, pairs = keyframes_dropped(scene, scene.model(), dropped), scene.pairs()
     found = [ids.tolist() for ids in consistent_groups(read_arrays(model), pairs)]
     assert found == numbers((1, 7), (9, 13))  # 6 and 9 were never matched
     near = keyframes_dropped(scene, scene.model(), [7])
     found = [ids.tolist() for ids in consistent_groups(read_arrays(near), pairs)]
-    assert found == [[*range(1, 7), *range(8, 13)]]  # 6 and 8 were, and share points
+    assert found == [[*range(1, 7), *range(8, 13)]]  # 6 and 8 were, with common points
 
 
-def test_keyframes_that_show_nothing_part_nobody():
+def test_unmatched_keyframes_separate_nothing():
     scene = Scene()
     model, pairs = keyframes_dropped(scene, scene.model(), [7]), scene.pairs()
     blurred = (pairs.image_ids == 7).any(1)
@@ -236,8 +236,8 @@ def test_keyframes_that_show_nothing_part_nobody():
 
 
 @pytest.mark.parametrize("step, found", [(0.25, [(1, 17)]), (0.0, [(1, 9), (9, 17)])])
-def test_where_the_camera_only_turned_no_point_ties_two_groups(step, found):
-    """Images 7-10 see the same new points: with a step between them these have a depth."""
+def test_points_seen_under_pure_rotation_connect_no_groups(step, found):
+    """Images 7-10 observe the same new points: with a baseline these get a depth."""
     scene = Scene(count=16, points=4000)
     for image in (7, 8, 9):
         scene.poses[image] = scene.poses[6]
@@ -247,23 +247,23 @@ def test_where_the_camera_only_turned_no_point_ties_two_groups(step, found):
     first[8:], last[:8] = False, False
     one_side = np.arange(4000) % 2 == 0
     seen = np.where(one_side, first, last)
-    turning = np.arange(4000) % 4 == 1  # 1000 points that the four share, and nobody else sees
+    turning = np.arange(4000) % 4 == 1  # 1000 points observed by these four only
     seen[:, turning] = False
     seen[6:10, turning] = True
     scene.seen = seen
     assert scene.groups() == numbers(*found)
 
 
-def test_less_is_explained_where_the_model_turns():
+def test_fewer_matches_are_explained_where_the_model_bends():
     scene = Scene()
     turn = Rotation.from_rotvec([0, 0, 0.4]).as_matrix()
     rotation = scene.truth[6:, :, :3] @ turn.T
     scene.poses = np.concatenate([scene.truth[:6], np.dstack([rotation, scene.truth[6:, :, 3]])])
     pairs = scene.pairs()
     total = np.array([len(match) for match in pairs.inliers])
-    share = count_explained(read_arrays(scene.model()), pairs) / total
+    fraction = count_explained(read_arrays(scene.model()), pairs) / total
     across = (pairs.image_ids <= 6).sum(1) == 1
-    assert (share[across] < 0.5).all() and (share[~across] == 1).all()
+    assert (fraction[across] < 0.5).all() and (fraction[~across] == 1).all()
 
 
 def test_explained_matches_are_counted():

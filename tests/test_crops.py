@@ -50,7 +50,7 @@ def red_on_green() -> tuple[np.ndarray, rt.Detections]:
 # ---- The factory ----
 
 
-def test_what_the_configuration_names_is_made(net: str, tmp_path: Path) -> None:
+def test_the_configured_embedder_is_built(net: str, tmp_path: Path) -> None:
     assert make_embedder("none") is None
     assert type(make_embedder("reobj", threads=1)) is rt.Embedder
     frame, crops = make_embedder(net, threads=1), make_embedder(f"crops:{net}", threads=1)
@@ -65,7 +65,7 @@ def test_what_the_configuration_names_is_made(net: str, tmp_path: Path) -> None:
     assert with_head is not None and with_head.trained
 
 
-def test_crops_alone_are_of_the_backbone_whose_block_comes_along(monkeypatch) -> None:
+def test_crops_use_the_backbone_with_a_bundled_block(monkeypatch) -> None:
     if not BACKBONE_FILES.is_dir():
         pytest.skip("no frozen backbones here")
     monkeypatch.setenv("REOBJ_MODELS", str(BACKBONE_FILES))
@@ -86,7 +86,7 @@ def test_offline_and_unknown_models_are_refused(tmp_path: Path, monkeypatch) -> 
 # ---- Crops ----
 
 
-def test_crops_hold_object_or_surroundings(net: str) -> None:
+def test_crops_contain_object_or_surroundings(net: str) -> None:
     image, found = red_on_green()
     crops = rt.CropEmbedder(net, threads=1)
     pixels, own = crops.cut(image, found, np.arange(1))
@@ -118,7 +118,7 @@ def test_without_a_mask_the_inscribed_ellipse_is_the_object(net: str) -> None:
     ],
 )
 def test_the_window_is_the_largest_box_of_the_layout(net: str, layout, side: int) -> None:
-    """The share of the object says how large the window is."""
+    """The object fraction of the layout determines the size of the window."""
     image, found = red_on_green()
     _, own = rt.CropEmbedder(net, layout=layout, threads=1).cut(image, found, np.arange(1))
     assert own.mean() == pytest.approx((40 / side) ** 2, rel=0.03)
@@ -157,7 +157,7 @@ def test_the_map_at_stride_32_is_taken(tmp_path: Path) -> None:
     assert rt.Embedder(path, threads=1).backbone(np.zeros((64, 64, 3), np.uint8)).shape == (4, 4, 2)
 
 
-def test_embeddings_of_both_crops_apart_or_joined(net: str, tmp_path: Path) -> None:
+def test_embeddings_of_both_crops_separate_or_joined(net: str, tmp_path: Path) -> None:
     """Foreground red, background green; the ConvBlock gets the foreground's channels first."""
     image, found = red_on_green()
     crops = rt.CropEmbedder(net, threads=1)
@@ -175,7 +175,7 @@ def test_embeddings_of_both_crops_apart_or_joined(net: str, tmp_path: Path) -> N
     np.testing.assert_allclose(joint.foreground[0], expected / np.linalg.norm(expected), atol=1e-5)
 
 
-def test_a_conv_block_brings_its_layout_and_must_fit(net: str, tmp_path: Path) -> None:
+def test_a_conv_block_defines_the_layout_and_must_match(net: str, tmp_path: Path) -> None:
     image, found = red_on_green()
     conv_block(tmp_path / "crops_net_head.onnx", side=3, layout={"crop_px": 96, "reach": 0.1})
     beside = rt.CropEmbedder(net, threads=1)
@@ -190,7 +190,7 @@ def test_a_conv_block_brings_its_layout_and_must_fit(net: str, tmp_path: Path) -
         rt.CropEmbedder(net, row, threads=1)(image, found)
 
 
-def test_rows_are_those_that_are_asked_for(net: str) -> None:
+def test_only_requested_rows_are_embedded(net: str) -> None:
     image, found = scene_with_twins()
     crops = rt.CropEmbedder(net, layout=rt.SamplingLayout(crop_px=64), threads=1)
     whole, part = crops(image, found), crops(image, found, np.array([1]))
@@ -198,10 +198,10 @@ def test_rows_are_those_that_are_asked_for(net: str) -> None:
     assert len(crops(image, found, np.zeros(0, np.int64)).foreground) == 0
 
 
-# ---- Our own weights on crops ----
+# ---- The bundled weights on crops ----
 
 
-def test_trained_crops_see_only_their_part() -> None:
+def test_trained_crops_depend_on_their_part_only() -> None:
     """With the shipped model: another wall changes the background's rows alone."""
     _, found = red_on_green()
     walls = np.full((2, 120, 160, 3), 60, np.uint8)
@@ -216,8 +216,8 @@ def test_trained_crops_see_only_their_part() -> None:
 
 
 @pytest.mark.parametrize(("score", "hides"), [(0.9, True), (0.2, False)])
-def test_trained_crops_hide_confident_other_objects(score: float, hides: bool) -> None:
-    """The wider box counts others too, but says that they are others."""
+def test_trained_crops_mask_confident_other_objects(score: float, hides: bool) -> None:
+    """The wider box includes other objects, but marks them as such."""
     image, found = red_on_green()
     masks = np.concatenate([found.masks, np.zeros_like(found.masks)])
     masks[1, :, 105:] = True
@@ -232,7 +232,7 @@ def test_trained_crops_hide_confident_other_objects(score: float, hides: bool) -
     assert same is not hides
 
 
-def test_our_weights_get_black_where_a_part_is_hidden() -> None:
+def test_bundled_weights_get_black_pixels_for_masked_parts() -> None:
     image, found = red_on_green()
     crops = rt.CropEmbedder("reobj", layout=rt.SamplingLayout(crop_px=64), threads=1)
     pixels, own = crops.cut(image, found, np.arange(1))

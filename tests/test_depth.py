@@ -1,4 +1,4 @@
-"""Depth maps: which frame each belongs to, their camera, points, visibility and metric scale."""
+"""Depth maps: assignment to frames, their camera, points, visibility and metric scale."""
 
 from __future__ import annotations
 
@@ -106,8 +106,8 @@ def test_points_lie_on_the_walls_with_colour_and_the_frames_that_see_them(tmp_pa
     assert len(np.unique(voxel, axis=0)) > 0.7 * len(voxel)  # thinned
 
 
-def test_points_seen_by_a_frame_are_those_that_it_really_sees(tmp_path, walk):
-    """Something stands before the wall in two maps; points behind it are not seen from there."""
+def test_occluded_points_are_not_observed(tmp_path, walk):
+    """An object stands in front of the wall in two maps and occludes the points behind it."""
     folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS)
     for name in NUMBERS[4:6]:
         depth = cv2.imread(str(folder / name), cv2.IMREAD_UNCHANGED)
@@ -120,13 +120,13 @@ def test_points_seen_by_a_frame_are_those_that_it_really_sees(tmp_path, walk):
         pose = poses.cam_from_world[row]
         in_cam = poses.points[seen] @ pose[:, :3].T + pose[:, 3]
         x, y = ((in_cam @ CAMERA.K.T)[:, :2] / in_cam[:, 2:]).T
-        hidden = (x > 142) & (x < 178) & (y > 102) & (y < 138) & ~far[seen]
-        assert not hidden.any()
+        occluded = (x > 142) & (x < 178) & (y > 102) & (y < 138) & ~far[seen]
+        assert not occluded.any()
     other = poses.visibility[poses.visibility[:, 0] == 8, 1]
-    assert not far[other].any()  # the rest looks through it: it was dropped, or seen by 4 and 5
+    assert not far[other].any()  # others see through it: it was dropped, or seen by 4 and 5
 
 
-def test_existing_points_stay_and_keep_their_rows(tmp_path, walk):
+def test_existing_points_keep_their_rows(tmp_path, walk):
     own = np.array([[9.0, 9, 9], [8, 8, 8]])
     given = dataclasses.replace(
         metric(walk), points=own, colors=np.array([[1, 2, 3]] * 2, np.uint8),
@@ -138,8 +138,8 @@ def test_existing_points_stay_and_keep_their_rows(tmp_path, walk):
     assert poses.visibility[2:, 1].min() == 2 and len(poses.colors) == len(poses.points)
 
 
-def test_maps_of_another_camera_are_placed_by_its_file(tmp_path, walk):
-    """Other intrinsics, size and place than the colour camera's."""
+def test_maps_of_another_camera_use_its_file(tmp_path, walk):
+    """Intrinsics, size and pose differ from the colour camera's."""
     camera = rt.Camera("PINHOLE", 200, 160, (190.0, 180.0, 104.0, 77.0))
     color_from_depth = np.column_stack([np.eye(3), [0.3, -0.1, 0.05]])
     folder = tmp_path / "d"
@@ -168,7 +168,7 @@ def test_scannets_intrinsics_have_another_pixel_centre(tmp_path, walk):
     assert maps.camera.params == (240, 240, 100, 80)
 
 
-def test_the_lens_of_the_colour_camera_is_taken_out_of_registered_maps(tmp_path):
+def test_registered_maps_are_undistorted(tmp_path):
     camera = rt.Camera("SIMPLE_RADIAL", *SIZE, (250.0, 160.0, 120.0, 0.25))
     poses = metric(supplied(motion("walk", FRAMES), camera))
     folder = write_maps(tmp_path / "d", poses.cam_from_world, NUMBERS, camera=camera)
@@ -178,7 +178,7 @@ def test_the_lens_of_the_colour_camera_is_taken_out_of_registered_maps(tmp_path)
     assert np.percentile(on_walls(add(plain, folder).points), 99) > 0.06
 
 
-def test_large_maps_are_thinned_in_the_right_place(tmp_path, walk):
+def test_subsampled_maps_have_no_pixel_offset(tmp_path, walk):
     """Every 3rd pixel of 960: half a pixel off would show."""
     camera = CAMERA.resized((960, 720))
     folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS, camera=camera)
@@ -196,7 +196,7 @@ def test_large_maps_are_thinned_in_the_right_place(tmp_path, walk):
 
 
 def with_points(poses, unit_m, noise=0.0, seed=0):
-    """The same world without scale, with sparse points of the walls seen by every second frame."""
+    """The same scene without scale, with sparse points on the walls seen by every second frame."""
     rng = np.random.default_rng(seed)
     points, seen = [], []
     for row in range(0, FRAMES, 2):
@@ -227,7 +227,7 @@ def test_a_reconstruction_becomes_metric(tmp_path, walk, unit_m, noise):
     assert np.median(on_walls(poses.points)) < 0.1 and len(poses.points) > 1000
 
 
-def test_the_scale_has_a_sigma_that_holds(tmp_path, walk):
+def test_the_sigma_of_the_scale_is_calibrated(tmp_path, walk):
     folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS)
     maps = find_depth_maps(str(folder), walk, ())
     errors = []
@@ -238,7 +238,7 @@ def test_the_scale_has_a_sigma_that_holds(tmp_path, walk):
     assert (np.abs(errors) < 2).all()
 
 
-def test_every_part_has_its_own_scale(tmp_path, walk):
+def test_every_component_has_its_own_scale(tmp_path, walk):
     folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS)
     one, other = with_points(walk, 0.5), with_points(walk, 4.0)
     part = (np.arange(FRAMES) >= 6).astype(int)
@@ -278,7 +278,7 @@ def test_maps_that_contradict_metric_poses_give_no_points(tmp_path, walk, mistak
     assert len(poses.points) == 0 and "no points from depth" in poses.messages[0]
 
 
-def test_maps_without_depth_are_said(tmp_path, walk):
+def test_maps_without_depth_are_reported(tmp_path, walk):
     folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS)
     for path in folder.glob("*.png"):
         cv2.imwrite(str(path), np.zeros((24, 32), np.uint16))
@@ -286,7 +286,7 @@ def test_maps_without_depth_are_said(tmp_path, walk):
     assert len(poses.points) == 0 and "12 maps show no surface" in poses.messages[0]
 
 
-# ---- Which map belongs to which frame ------------------------------------------------------------
+# ---- Assignment of maps to frames ----------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -300,7 +300,7 @@ def test_maps_without_depth_are_said(tmp_path, walk):
         (["7.png", "3.png"], [], [3, 7]),  # of a video: frame numbers
     ],
 )
-def test_maps_find_their_frames(tmp_path, maps, names, expected):
+def test_maps_are_assigned_to_frames(tmp_path, maps, names, expected):
     count = len(names) or 9
     poses = supplied(motion("walk", count), CAMERA)
     write_maps(tmp_path / "d", poses.cam_from_world[: len(maps)], maps)
@@ -366,7 +366,7 @@ def test_bad_input_gives_one_line(tmp_path, walk, make, text, expected):
         add(metric(walk), f"{tmp_path}/{text}")
 
 
-def test_units_are_those_behind_the_colon(tmp_path, walk):
+def test_units_are_given_after_the_colon(tmp_path, walk):
     folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS, units=5000)
     assert on_walls(add(metric(walk), f"{folder}:5000").points).max() < 0.01
 
@@ -382,7 +382,7 @@ def image_folder(folder):
 
 
 def test_a_reconstruction_and_its_model_become_metric_once(tmp_path, walk, monkeypatch):
-    """The second time all comes from the cache; the model without depth maps stays as it was."""
+    """The second run uses the cache; the model without depth maps is unchanged."""
     pycolmap = pytest.importorskip("pycolmap")
     video, workspace = image_folder(tmp_path / "images"), Workspace(tmp_path / "out")
     folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS)
@@ -410,9 +410,7 @@ def test_a_reconstruction_and_its_model_become_metric_once(tmp_path, walk, monke
     np.testing.assert_allclose(cams, found.cam_from_world, atol=1e-6)
 
 
-def test_supplied_poses_are_triangulated_once_where_they_bring_no_points(
-    tmp_path, walk, monkeypatch
-):
+def test_supplied_poses_without_points_are_triangulated_once(tmp_path, walk, monkeypatch):
     video, workspace = image_folder(tmp_path / "images"), Workspace(tmp_path / "out")
     folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS)
     asked = []

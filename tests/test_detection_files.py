@@ -1,4 +1,4 @@
-"""Recorded detections in MOT, CSV, COCO and npz files, with everything that can be wrong there."""
+"""Recorded detections in MOT, CSV, COCO and npz files, valid and damaged."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_mot_variants(tmp_path: Path, video: rt.Video, text: str, names: tuple[s
          [[1, 2, 3, 4, 5, 6, 1], [2, 2, 3, 4, 5, 6, 0]]),
     ],
 )  # fmt: skip
-def test_mot_rows_as_they_are(tmp_path: Path, text: str, expected: list[list[float]]) -> None:
+def test_unusual_mot_rows(tmp_path: Path, text: str, expected: list[list[float]]) -> None:
     (tmp_path / "a.txt").write_text(text)
     rows = tables.read_mot_rows(tmp_path / "a.txt")
     assert rows.tolist() == expected and rows.shape[1] == (len(expected[0]) if expected else 10)
@@ -164,7 +164,7 @@ def test_coco(tmp_path: Path, video: rt.Video) -> None:
 
 
 def test_coco_ids_are_those_of_the_dataset_beside(tmp_path: Path, video: rt.Video) -> None:
-    """An image_id is no frame number (trap 7 of the formats): the dataset JSON says which it is."""
+    """An image_id is no frame number: the dataset JSON maps it to a file name."""
     images = [{"id": 900 + i, "file_name": f"some/im{19 - i}.png"} for i in range(20)]
     dataset = {"images": images, "categories": [{"id": 7, "name": "wok"}, {"id": 9, "name": "cup"}]}
     (tmp_path / "instances.json").write_text(json.dumps(dataset))
@@ -177,7 +177,7 @@ def test_coco_ids_are_those_of_the_dataset_beside(tmp_path: Path, video: rt.Vide
 
 
 def test_datasets_with_their_own_annotations(tmp_path: Path) -> None:
-    """COCO-VID of a video without file names: `frame_id` says which frame, else the order."""
+    """COCO-VID of a video without file names: the frame is `frame_id`, else the order."""
     writer = cv2.VideoWriter(str(tmp_path / "a.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 25, (64, 48))
     for _ in range(9):
         writer.write(np.zeros((48, 64, 3), np.uint8))
@@ -317,7 +317,7 @@ def test_bad_files_give_one_clear_line(
     assert name in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_class_numbers_are_numbers_of_classes(tmp_path: Path, video: rt.Video) -> None:
+def test_classes_without_names_get_default_names(tmp_path: Path, video: rt.Video) -> None:
     """One name is made for each number up to the largest."""
     line = LINE.strip() + ",{}\n"
     assert len(read(tmp_path, "a.txt", line.format(32767), video).class_names) == 32767
@@ -362,7 +362,7 @@ def test_frames_are_whole_numbers(tmp_path: Path, video: rt.Video, frame: str) -
     ("key", "limit", "size"),
     [("frame", "LINES_MAX", 1), ("class_names", "CLASS_MAX", 1), ("mask_counts", "NPZ_MAX", 4)],
 )
-def test_npz_of_more_than_is_taken(
+def test_an_oversized_npz_is_refused(
     tmp_path: Path,
     video: rt.Video,
     monkeypatch: pytest.MonkeyPatch,
@@ -386,7 +386,7 @@ def test_npz_of_more_than_is_taken(
         rt.read_detections(path, video)
 
 
-def test_zip_that_unpacks_to_too_much(
+def test_a_zip_bomb_is_refused(
     tmp_path: Path, video: rt.Video, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cvat, "XML_MAX", 1 << 20)
@@ -398,7 +398,7 @@ def test_zip_that_unpacks_to_too_much(
             rt.read_tracks(tmp_path / name, video)
 
 
-def test_a_damaged_zip_is_one_line(tmp_path: Path, video: rt.Video) -> None:
+def test_a_damaged_zip_gives_one_line(tmp_path: Path, video: rt.Video) -> None:
     with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as packed:
         packed.writestr("annotations.xml", "<annotations/>" * 99)
     data = bytearray((tmp_path / "a.zip").read_bytes())
@@ -485,10 +485,10 @@ def test_real_mot_files() -> None:
     assert len(found) == 3106 and found.class_names == tuple(f"class {i}" for i in range(1, 6))
 
 
-# ---- Times in place of frame numbers -------------------------------------------------------------
+# ---- Times instead of frame numbers --------------------------------------------------------------
 
 
-def test_a_column_of_times_finds_images_named_by_their_times(tmp_path: Path) -> None:
+def test_a_column_of_times_matches_images_named_by_time(tmp_path: Path) -> None:
     """TUM's own header; the nearest within half a frame, others are dropped and counted."""
     start = 1341847980.722988
     names = [f"{start + i / 30:.6f}.png" for i in range(4)]

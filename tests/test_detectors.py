@@ -28,7 +28,7 @@ needs_shared = pytest.mark.skipif(
 
 onnx = pytest.importorskip("onnx", reason="pip install onnx (extra `dev`)")
 IMAGE = np.zeros((160, 320, 3), np.uint8)  # (H, W, 3)
-BOX = [80.0, 40.0, 160.0, 120.0]  # what every model below finds in it
+BOX = [80.0, 40.0, 160.0, 120.0]  # what every model below detects in it
 # The same in a 64 x 64 input.
 STRETCHED, CORNER, CENTRE = [16, 16, 32, 48], [16, 8, 32, 24], [16, 24, 32, 40]
 LABEL, SCORE = 2, 0.75
@@ -43,7 +43,7 @@ def model(
     names: str = "",
     seen: tuple[str, tuple[int, ...], Any] | None = None,
 ) -> Path:
-    """Write a model that answers the same to every image.
+    """Write a model whose output is the same for every image.
 
     seen: (output, index, weights): to this number the mean of weights * input is added.
     """
@@ -208,7 +208,7 @@ def test_layouts(
 def test_dynamic_input_takes_the_image_shape(
     tmp_path: Path, image_size: tuple[int, int], fed: tuple[int, int]
 ) -> None:
-    """A model that answers with the shape that it is fed: 1, 3, width, height."""
+    """A model that returns the shape of its input: 1, 3, width, height."""
     helper = onnx.helper
     tensors = {"labels": np.int64([[LABEL]]), "scores": np.float32([[SCORE]]),
                "order": np.int64([0, 1, 3, 2]), "box shape": np.int64([1, 1, 4])}  # fmt: skip
@@ -247,7 +247,7 @@ def test_masks_are_exact_to_the_pixel(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.masks[0], expected)
 
 
-def test_prototypes_lie_where_the_image_does(tmp_path: Path) -> None:
+def test_prototypes_are_aligned_with_the_image(tmp_path: Path) -> None:
     """The upper half of the box: input rows up to 32, image rows up to (32 - 16) * 5."""
     outputs = yolo_seg()
     outputs["output1"][0, 1] = np.where(np.arange(16) < 8, 1, -1)[:, None]
@@ -267,7 +267,7 @@ def test_an_input_need_not_be_square(tmp_path: Path) -> None:
 
 
 def test_the_size_of_the_image_is_width_and_height(tmp_path: Path) -> None:
-    """As DEIM wants it beside the image; a model that answers with a box of that size."""
+    """DEIM takes it as a second input; the model returns a box of that size."""
     helper = onnx.helper
     tensors = {"labels": np.int64([[LABEL]]), "scores": np.float32([[SCORE]]),
                "zeros": np.float32([[0, 0]]), "box shape": np.int64([1, 1, 4])}  # fmt: skip
@@ -288,7 +288,7 @@ def test_the_size_of_the_image_is_width_and_height(tmp_path: Path) -> None:
     assert rt.OnnxDetector(save_model(graph, tmp_path))(IMAGE).xyxy.tolist() == [[0, 0, 320, 160]]
 
 
-def test_background_is_no_class(tmp_path: Path) -> None:
+def test_background_is_not_a_class(tmp_path: Path) -> None:
     """Label 0 of a model that counts its classes from 1."""
     outputs = ssd()
     outputs["scores"] = [[SCORE, 0.9]]
@@ -320,7 +320,7 @@ def test_channels_and_scaling(
     tmp_path: Path, layout: str, outputs: dict[str, Any], at: Any, options: dict[str, Any],
     order: str, mean: Any, std: Any,
 ) -> None:  # fmt: skip
-    """A model whose score tells the three channels apart: its base + (x + 2 y + 4 z) / 3."""
+    """A model whose score depends on the channel order: its base + (x + 2 y + 4 z) / 3."""
     weights = np.reshape([1, 2, 4], (3, 1, 1))
     path = model(tmp_path, outputs, seen=(*at, weights), **options)
     detector = rt.OnnxDetector(path)
@@ -340,17 +340,17 @@ def test_channels_and_scaling(
     ],
 )
 @pytest.mark.parametrize("portrait", [False, True])
-def test_borders(
+def test_the_letterbox_border_is_grey(
     tmp_path: Path, outputs: dict[str, Any], at: Any, unit: float, where: slice, portrait: bool
 ) -> None:
-    """The image is where its boxes are mapped from; grey of 114 around it."""
+    """The position of the image matches the mapping of boxes; the border is grey, 114."""
     inside = np.zeros((3, 64, 64))
     inside[:, where] = 1
     image = np.full_like(IMAGE, 200)
     if portrait:
         inside, image = inside.transpose(0, 2, 1), image.transpose(1, 0, 2)
-    for share, value in ((inside, 200), (1 - inside, 114)):
-        path = model(tmp_path, outputs, seen=(*at, share))
+    for fraction, value in ((inside, 200), (1 - inside, 114)):
+        path = model(tmp_path, outputs, seen=(*at, fraction))
         expected = SCORE + value * unit / 2  # half of the input
         assert rt.OnnxDetector(path)(image).score[0] == pytest.approx(expected, rel=1e-3)
 
@@ -457,10 +457,10 @@ def spoilt(**change: Any) -> dict[str, Any]:
         ({"logits": np.zeros((1, 1000))}, True, "known layouts"),
     ],
 )
-def test_a_known_model_that_is_not_what_it_was_is_refused(
+def test_a_modified_known_model_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, outputs: Any, sizes: bool, fault: str
 ) -> None:
-    """One line that names the small detector; by its path it is taken as it is."""
+    """One line that names the small detector; given by path, the file is used unverified."""
     path = model(tmp_path, outputs, sizes=sizes)
     known(monkeypatch, path, "DEIM")
     if not fault:
@@ -497,7 +497,7 @@ def reference_nms(xyxy: Any, label: Any, max_iou: float) -> list[int]:
     return kept
 
 
-def test_nms_against_the_slow_way() -> None:
+def test_nms_equals_the_loop() -> None:
     rng = np.random.default_rng(3)
     corner = rng.random((200, 2)) * 60
     xyxy, label = (
@@ -510,7 +510,7 @@ def test_nms_against_the_slow_way() -> None:
 
 
 @pytest.mark.parametrize(("limit", "kept"), [(0.49, [0]), (0.5, [0, 1]), (0.51, [0, 1])])
-def test_nms_leaves_the_overlap_that_is_allowed(limit: float, kept: list[int]) -> None:
+def test_nms_keeps_boxes_at_the_overlap_limit(limit: float, kept: list[int]) -> None:
     xyxy = np.array([[0.0, 0, 10, 10], [0, 0, 10, 5]])  # overlap 1/2
     assert detectors.nms(xyxy, np.zeros(2, np.int64), limit).tolist() == kept
     assert detectors.nms(xyxy, np.array([0, 1]), limit).tolist() == [0, 1]  # of two classes
@@ -575,7 +575,7 @@ def test_damaged_cache_files_are_detected_again(tmp_path: Path, caplog: Any) -> 
     assert len(caplog.records) == 1  # said once, not in every later run
 
 
-def test_what_was_put_last_counts(tmp_path: Path) -> None:
+def test_the_last_entry_of_a_frame_is_used(tmp_path: Path) -> None:
     cache = DetectionCache(tmp_path, (32, 24))
     cache.put(1, some(2))
     cache.flush()
@@ -585,9 +585,7 @@ def test_what_was_put_last_counts(tmp_path: Path) -> None:
     assert_same(DetectionCache(tmp_path, (32, 24)).get(1), some(3))
 
 
-def test_detections_that_were_changed_in_the_cache_are_not_believed(
-    tmp_path: Path, caplog: Any
-) -> None:
+def test_modified_cached_detections_are_rejected(tmp_path: Path, caplog: Any) -> None:
     """A whole npz file of the right shapes, with other scores than were written."""
     cache = DetectionCache(tmp_path, (32, 24))
     cache.put(1, some(1))
@@ -600,14 +598,14 @@ def test_detections_that_were_changed_in_the_cache_are_not_believed(
     assert "its frames are detected again" in caplog.text
 
 
-def test_a_cache_of_another_working_size_is_none(tmp_path: Path) -> None:
+def test_a_cache_of_another_working_size_is_ignored(tmp_path: Path) -> None:
     cache = DetectionCache(tmp_path, (32, 24))
     cache.put(2, some(2))
     cache.flush()
     assert DetectionCache(tmp_path, (64, 48)).get(2) is None
 
 
-def test_frames_without_detections_are_remembered(tmp_path: Path) -> None:
+def test_frames_without_detections_are_cached(tmp_path: Path) -> None:
     cache = DetectionCache(tmp_path, (32, 24))
     cache.put(7, rt.Detections.empty())
     cache.flush()
@@ -635,7 +633,7 @@ def frame(index: int = 0, image: Image = IMAGE) -> rt.Frame:
         ),
     ],
 )
-def test_a_function_is_a_source(found: Any) -> None:
+def test_a_function_is_a_source_of_detections(found: Any) -> None:
     images = []
     source = as_source(lambda image: images.append(image) or found)
     made = source(frame(4))
@@ -685,7 +683,7 @@ def test_a_wrong_answer_names_the_frame() -> None:
 
 
 @pytest.mark.parametrize("other", ["det.txt", None, 3])
-def test_what_is_no_detector_is_refused(other: Any) -> None:
+def test_invalid_detectors_are_refused(other: Any) -> None:
     with pytest.raises(rt.ReobjError, match="is no detector: expected a function"):
         as_source(other)
 
@@ -699,7 +697,7 @@ def clip(tmp_path: Path) -> rt.Video:
     return rt.Video(tmp_path / "im", rt.InputConfig(every=2, max_size=32))
 
 
-def test_a_file_is_asked_by_frame_number(clip: rt.Video, tmp_path: Path) -> None:
+def test_a_file_is_indexed_by_frame_number(clip: rt.Video, tmp_path: Path) -> None:
     path = tmp_path / "det.txt"
     path.write_text("".join(f"{i + 1},-1,{10 + i},20,30,10,.9\n" for i in range(7)))
     source = open_detections(clip, rt.DetectConfig(), path)
@@ -752,10 +750,10 @@ def test_a_function_gets_its_class_names_from_the_options(clip: rt.Video, tmp_pa
     assert source(frame()).class_id.tolist() == [1]
 
 
-def test_a_model_is_a_source(
+def test_a_model_is_a_source_of_detections(
     clip: rt.Video, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Named by the options, run with the threads asked for, kept on disk under a key."""
+    """Named by the options, run with the configured threads, cached on disk under a key."""
     threads, make = [], detectors.onnx_session
     monkeypatch.setattr(
         detectors,
@@ -819,7 +817,7 @@ def test_no_detections_named_and_no_network(
 
 
 class Counting:
-    """A slow detector: counts the frames that it is asked for."""
+    """A slow detector that counts its calls."""
 
     def __init__(self, key: str = "key", slow: bool = True) -> None:
         self.asked: list[int] = []
@@ -830,7 +828,7 @@ class Counting:
         return some(frame.index)
 
 
-def test_a_slow_source_is_asked_once(tmp_path: Path) -> None:
+def test_a_slow_source_is_called_once_per_frame(tmp_path: Path) -> None:
     counting = Counting()
     first = counting.source.cached(tmp_path, (32, 24))
     for index in (1, 2, 3, 2):
@@ -845,7 +843,7 @@ def test_a_slow_source_is_asked_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("options", [{"key": ""}, {"slow": False}])
-def test_what_may_not_or_need_not_be_cached(tmp_path: Path, options: dict[str, Any]) -> None:
+def test_sources_that_are_not_cached(tmp_path: Path, options: dict[str, Any]) -> None:
     counting = Counting(**options)
     source = counting.source.cached(tmp_path / "cache", (32, 24))
     for _ in range(2):
@@ -854,8 +852,8 @@ def test_what_may_not_or_need_not_be_cached(tmp_path: Path, options: dict[str, A
     assert counting.asked == [1, 1] and not (tmp_path / "cache").exists()
 
 
-def test_flush_never_hides_an_error(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """It stands in a `finally`: what it cannot write is a warning, and the first error is kept."""
+def test_flush_never_replaces_an_error(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """It is called in a `finally`: a failed write is a warning, and the first error is kept."""
     (tmp_path / "cache").write_text("a file where the folder should be")
     source = Counting().source.cached(tmp_path / "cache", (32, 24))
     with pytest.raises(KeyboardInterrupt):
@@ -920,7 +918,7 @@ def test_real_weights_agree_with_yolov8s(
 
 @needs_shared
 @pytest.mark.parametrize("name", ["mobilenetv2_feat", "squeezenet1.1", "osnet_x0_25_msmt17"])
-def test_real_networks_that_are_no_detectors(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_real_networks_that_are_not_detectors(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("REOBJ_MODELS", str(SHARED / "models"))
     with pytest.raises(rt.ReobjError, match="no known object detector"):
         rt.OnnxDetector(name)

@@ -38,7 +38,7 @@ def true_poses() -> np.ndarray:
     return poses
 
 
-# ---- What the reader of a tutorial has lying there ----
+# ---- The files of a reader of the tutorials ----
 
 
 def nothing(_: Path) -> None:
@@ -65,12 +65,12 @@ AR_FRAMES = 60
 
 def arkit(folder: Path) -> None:
     """A recording, boxes for it, and the log of an app: world_from_camera in OpenGL axes."""
-    film = cv2.VideoWriter(
+    video = cv2.VideoWriter(
         str(folder / "recording.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 12, (640, 480)
     )
     for frame in rt.Video(ROOM / "room.mp4", rt.InputConfig(stop=AR_FRAMES)):
-        film.write(frame.image)
-    film.release()
+        video.write(frame.image)
+    video.release()
     with np.load(ROOM / "detections.npz") as file:
         rows = file["frame"] < AR_FRAMES
         given = {k: file[k][rows] for k in ("frame", "xyxy", "score", "class_id")}
@@ -106,7 +106,7 @@ def check_scannet(folder: Path) -> None:
 
 
 def check_ar(folder: Path) -> None:
-    """The poses came through the phone's axes: the camera's own path is the true one."""
+    """The poses are converted from the phone's axes: the trajectory is the true one."""
     rows, true = np.loadtxt(folder / "poses.txt"), true_poses()[:AR_FRAMES]
     np.testing.assert_allclose(rows[:, 1:4], true[:, :3, 3], atol=1e-6)
     again = np.loadtxt(folder / "out/poses.txt")
@@ -144,7 +144,7 @@ def blocks(page: Path) -> list[tuple[str, str]]:
 
 
 def need(page: str) -> None:
-    """Skip where this machine lacks what the page says it needs."""
+    """Skip if a requirement of the page is not installed."""
     if page == "scannet_scene":
         try:
             rt.model_path("fast", offline=True)
@@ -155,7 +155,7 @@ def need(page: str) -> None:
         pytest.importorskip("onnx")
 
 
-def test_every_tutorial_is_executed() -> None:
+def test_every_tutorial_is_tested() -> None:
     pages = {path.stem for path in TUTORIALS.glob("*.md")} - {"README"}
     assert pages == set(PAGES)
     listed = re.findall(r"\]\((\w+)\.md\)", (TUTORIALS / "README.md").read_text())
@@ -197,7 +197,7 @@ PAGES_OF_TEXT = [
 
 
 @pytest.mark.parametrize("page", PAGES_OF_TEXT, ids=lambda p: p.relative_to(ROOT).as_posix())
-def test_links_lead_somewhere(page: Path) -> None:
+def test_links_have_targets(page: Path) -> None:
     targets = re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text())
     local = [t for t in targets if "://" not in t]
     assert [t for t in local if not (page.parent / t).exists()] == []

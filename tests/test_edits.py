@@ -1,4 +1,4 @@
-"""Corrections by hand: the file, what it makes of tracks, and `objects OUT --edits`."""
+"""Manual corrections: the file, its effect on tracks, and `objects OUT --edits`."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def table() -> rt.Tracks:
 
 
 def ref(obj: int, frame: int, named: int | None = None) -> dict[str, Any]:
-    """What the page writes: a box, rounded; the id that the object has there."""
+    """A reference as the viewer writes it: a rounded box and the id of the object."""
     x = 20.04 * obj + frame
     return {"id": named or obj, "frame": frame, "box": [x, x, x + 18, x + 18]}
 
@@ -73,11 +73,11 @@ DELETE = {"do": "delete", "object": ref(2, 7)}
         ((), ALL),
         ((DELETE,), {1: {10}, 3: {30, 31, 32}}),
         ((SPLIT,), {1: {10}, 2: {20, 21}, 3: {30}, 4: {31, 32}}),
-        # the page's second edit names what the first one made
+        # the second edit of the viewer names the result of the first
         ((SPLIT, {"do": "merge", "object": ref(3, 6, 4), "with": ref(2, 6)}),
          {1: {10}, 2: {20, 21, 31, 32} - {21}, 3: {30}}),
-        ((SPLIT, SPLIT), {1: {10}, 2: {20, 21}, 3: {30}, 4: {31, 32}}),  # it is apart already
-        ((MERGE, MERGE), {1: {30, 31, 32}, 2: {20, 21}}),  # and this is one already
+        ((SPLIT, SPLIT), {1: {10}, 2: {20, 21}, 3: {30}, 4: {31, 32}}),  # separate already
+        ((MERGE, MERGE), {1: {30, 31, 32}, 2: {20, 21}}),  # and merged already
         ((MERGE, {**SPLIT, "object": ref(1, 3)}), {1: {10, 30}, 2: {20, 21}, 3: {31, 32}}),
         ((DELETE, SPLIT), {1: {10}, 3: {30}, 4: {31, 32}}),
     ],
@@ -85,7 +85,7 @@ DELETE = {"do": "delete", "object": ref(2, 7)}
 def test_identities_after_edits(
     tmp_path: Path, edits: tuple[dict[str, Any], ...], left: dict[int, set[int]]
 ) -> None:
-    """Of two boxes in one frame the better scored one stays: those of higher numbers here."""
+    """Of two boxes in one frame the one with the higher score stays: here the higher id."""
     made = applied(tmp_path, *edits)
     assert members(made) == left
     frames = made.tracks[made.keep]
@@ -93,20 +93,20 @@ def test_identities_after_edits(
     assert len(pairs) == len(set(pairs))
 
 
-def test_a_merge_says_that_both_were_seen_at_once(tmp_path: Path) -> None:
+def test_a_merge_of_simultaneous_objects_is_reported(tmp_path: Path) -> None:
     made = applied(tmp_path, MERGE)
     assert "merged object 1 has two boxes in 10 frames" in made.messages[0]
     assert "1 correction by hand applied" in made.messages[1] and made.confirmed == {1}
 
 
-def test_a_new_class_joins_the_names(tmp_path: Path) -> None:
+def test_a_new_class_is_added_to_the_names(tmp_path: Path) -> None:
     made = applied(tmp_path, RENAME, {"do": "rename", "object": ref(1, 3), "class": "cup"})
     assert made.class_names == ("chair", "cup", "mug") and made.confirmed == {1, 2}
     for obj, class_id in ((1, 1), (2, 2), (3, 0)):
         assert set(made.tracks.class_id[made.tracks.track_id == obj]) == {class_id}
 
 
-def test_of_equal_boxes_that_of_the_number_counts(tmp_path: Path) -> None:
+def test_among_equal_boxes_the_id_decides(tmp_path: Path) -> None:
     tracks = table()
     tracks = with_columns(tracks, xyxy=np.tile([10.0, 10, 50, 50], (len(tracks), 1)))
     for number in (1, 2, 3):
@@ -123,7 +123,7 @@ def test_of_equal_boxes_that_of_the_number_counts(tmp_path: Path) -> None:
         ({**MERGE, "with": ref(1, 30)}, "edit 1 (merge 3 with 1)"),
     ],
 )
-def test_what_is_not_found_is_said(tmp_path: Path, edit: dict[str, Any], said: str) -> None:
+def test_unmatched_edits_are_reported(tmp_path: Path, edit: dict[str, Any], said: str) -> None:
     with pytest.raises(rt.ReobjError) as error:
         applied(tmp_path, edit)
     assert said in str(error.value) and "anew in scene.html" in str(error.value)
@@ -189,7 +189,7 @@ def state(out: Path) -> dict[str, bytes]:
     return {str(p.relative_to(out)): p.read_bytes() for p in out.rglob("*") if p.is_file()}
 
 
-def test_edits_stay_with_the_folder(folder: Path, tmp_path: Path, capsys: Any) -> None:
+def test_edits_are_stored_in_the_folder(folder: Path, tmp_path: Path, capsys: Any) -> None:
     """A merge over the break of the cameras, a new name, a deletion; later fits keep them."""
     before = rt.Result.load(folder)
     path = write(
@@ -217,7 +217,7 @@ def test_edits_stay_with_the_folder(folder: Path, tmp_path: Path, capsys: Any) -
     assert not (folder / "edits.json").exists()
 
 
-def test_the_same_edits_make_the_same_files(folder: Path, tmp_path: Path) -> None:
+def test_the_same_edits_give_the_same_files(folder: Path, tmp_path: Path) -> None:
     edit = {"do": "delete", "object": box_of(folder, 6)}
     path = write(tmp_path / "e.json", edit)
     made = []
@@ -242,7 +242,7 @@ def test_bad_edits_write_nothing(folder: Path, tmp_path: Path, capsys: Any, bad:
     assert state(folder) == before
 
 
-def test_edits_that_fit_no_more_are_left_out_with_a_warning(folder: Path, capsys: Any) -> None:
+def test_edits_that_no_longer_match_are_ignored_with_a_warning(folder: Path, capsys: Any) -> None:
     lost = {"do": "delete", "object": {"id": 1, "frame": 3, "box": [0, 0, 5, 5]}}
     write(folder / "edits.json", lost)
     assert rt.main(["objects", str(folder)]) == 0
@@ -269,7 +269,7 @@ def test_given_identities_replace_edits(folder: Path, tmp_path: Path, capsys: An
     assert len(rt.Result.load(folder).objects) == 4
 
 
-def test_another_video_takes_no_edits_along(folder: Path, tmp_path: Path) -> None:
+def test_another_video_discards_the_edits(folder: Path, tmp_path: Path) -> None:
     write(folder / "edits.json")
     (tmp_path / "frames").mkdir()
     cv2.imwrite(str(tmp_path / "frames/0.png"), np.zeros((48, 64, 3), np.uint8))
@@ -278,7 +278,7 @@ def test_another_video_takes_no_edits_along(folder: Path, tmp_path: Path) -> Non
 
 
 def test_embeddings_follow_their_rows(tmp_path: Path) -> None:
-    """Of a deleted object they are gone; the others lie at their rows."""
+    """Those of a deleted object are removed; the others stay aligned with their rows."""
     poses = walk()
     tracks = tracks_of(poses)
     result = unlinked(poses, tracks)
@@ -296,12 +296,12 @@ def test_embeddings_follow_their_rows(tmp_path: Path) -> None:
     np.testing.assert_array_equal(result.tracks.xyxy[result.embedding_row], tracks.xyxy[rows[kept]])
 
 
-def test_solids_of_merged_objects_hide_nothing(
+def test_shapes_of_merged_objects_occlude_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What stood where one of two merged objects was is not the solid of both; others keep theirs.
+    """The shapes of the two merged objects are not that of their union; other objects keep theirs.
 
-    (Splits likewise: neither piece is the solid that was fitted to both.)
+    (Splits likewise: the shape fitted to both is that of neither piece.)
     """
     poses = walk()
     tracks = tracks_of(poses)

@@ -1,6 +1,4 @@
-"""Embeddings of detections from one feature map a frame: tiny networks, and the weights that come
-along.
-"""
+"""Embeddings of detections from one feature map per frame: tiny networks and the bundled weights."""
 
 from __future__ import annotations
 
@@ -33,7 +31,7 @@ def boxes(*xyxy: tuple[float, ...], masks: np.ndarray | None = None) -> rt.Detec
     return rt.Detections(np.array(xyxy, float), np.full(n, 0.9), np.zeros(n, np.int64), masks)
 
 
-def scene_with_twins() -> tuple[np.ndarray, rt.Detections]:
+def scene_with_identical_objects() -> tuple[np.ndarray, rt.Detections]:
     """Two identical patches on different backgrounds."""
     rng = np.random.default_rng(13)
     image = cv2.GaussianBlur(rng.integers(0, 256, (240, 480, 3), dtype=np.uint8), (0, 0), 8)
@@ -75,8 +73,8 @@ def mean_backbone(path: Path, channels: int = 4, stride: int = 32) -> Path:
 
 
 def sum_head(path: Path, **facts) -> Path:
-    """A head of two rows: of all numbers of the cells of either part (cells * (C + 2) of 4
-    channels), times the weights 1, 2 and 1, 3; unit length is not asked of it.
+    """A head with two outputs per part: weighted sums (1, 2 and 1, 3) of all values of the cells
+    (cells * (C + 2) of 4 channels); not normalised.
     """
     nodes, weights = [], {}
     for name, out, cells, second in (("fg", "foreground", 4, 2), ("bg", "background", 16, 3)):
@@ -112,7 +110,7 @@ def test_a_foreign_backbone_gets_rgb_normalised_as_imagenet(net: str) -> None:
 
 
 def test_a_network_of_our_own_gets_bgr_bytes() -> None:
-    """Its metadata say that it takes channels last; swapping red and blue changes the map."""
+    """Its metadata declare channels-last input; swapping red and blue changes the map."""
     image = np.zeros((1, 64, 64, 3), np.uint8)
     image[..., 0] = 250
     backbone = rt.Embedder("reobj", threads=1).backbone
@@ -152,7 +150,7 @@ def test_real_backbones_are_found_by_their_file_names(monkeypatch: pytest.Monkey
     if not BACKBONE_FILES.is_dir():
         pytest.skip("no frozen backbones here")
     monkeypatch.setenv("REOBJ_MODELS", str(BACKBONE_FILES))
-    image, found = scene_with_twins()
+    image, found = scene_with_identical_objects()
     for name, widths in (("mobilenetv2_feat", (128, 256)), ("squeezenet1.1", None)):
         embedder = rt.Embedder(name, threads=1, offline=True)
         assert embedder.frozen and embedder.trained == (widths is not None)
@@ -167,7 +165,7 @@ def test_real_backbones_are_found_by_their_file_names(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("name", ["mobilenetv2_feat", "crops:mobilenetv2_feat"])
-def test_heads_of_mobilenetv2_come_along(name: str) -> None:
+def test_heads_of_mobilenetv2_are_bundled(name: str) -> None:
     path = trained_head(name)
     assert path is not None and path.parent == own_models()
     facts = onnx_metadata(onnx_session(path, 1))
@@ -190,7 +188,7 @@ def test_a_head_is_found_beside_its_backbone_or_given(net: str, tmp_path: Path) 
 
 
 def test_a_head_gets_the_cells_of_its_part(net: str, tmp_path: Path) -> None:
-    """Foreground cells of a grey box on black give another row than its background."""
+    """Foreground cells of a grey box on black give a different embedding than the background."""
     sum_head(tmp_path / "net_head.onnx", layout={"neighbours": 0.0})
     embedder, image = rt.Embedder(net, threads=1), np.zeros((256, 256, 3), np.uint8)
     image[64:192, 64:192] = 200
@@ -206,8 +204,8 @@ def test_a_head_gets_the_cells_of_its_part(net: str, tmp_path: Path) -> None:
 # ---- Embedder ----
 
 
-def test_foreground_is_of_the_object_and_background_of_the_rest(net: str) -> None:
-    """A red object on blue, and without a head the signed roots of the cells."""
+def test_foreground_shows_the_object_and_background_the_rest(net: str) -> None:
+    """A red object on blue; without a head, rows are the signed square roots of the cells."""
     image = np.full((512, 512, 3), (250, 0, 0), np.uint8)
     image[128:384, 128:384] = (0, 0, 250)
     mask = np.zeros((1, 512, 512), bool)
@@ -229,28 +227,28 @@ def test_foreground_is_of_the_object_and_background_of_the_rest(net: str) -> Non
 
 
 def test_without_a_head_cells_with_few_samples_weigh_less(net: str) -> None:
-    """By the root of the share: at the corners of the box little of a cell is in the ellipse."""
+    """By the square root of the fraction of the cell in the ellipse, small at box corners."""
     image = np.full((512, 512, 3), 250, np.uint8)
     layout = rt.SamplingLayout(size_px=512, foreground_cells=4)
     embedder, found = rt.Embedder(net, layout=layout, threads=1), boxes((128, 128, 384, 384))
     fore, _ = embedder.cells(image, found, np.arange(1))
-    share = fore[0, :, 4]
-    assert share.max() == 1 and share[0] < 0.5
+    weight = fore[0, :, 4]
+    assert weight.max() == 1 and weight[0] < 0.5
     look = embedder(image, found).foreground.reshape(16, 4)
-    np.testing.assert_allclose(look[:, 0] / look[5, 0], np.sqrt(share), atol=1e-5)
+    np.testing.assert_allclose(look[:, 0] / look[5, 0], np.sqrt(weight), atol=1e-5)
 
 
 def test_without_a_head_each_box_of_the_background_counts_the_same(net: str) -> None:
     layout = rt.SamplingLayout(surround_scale=1.5, surround_cells=5)
-    image, found = scene_with_twins()
+    image, found = scene_with_identical_objects()
     background = rt.Embedder(net, layout=layout, threads=1)(image, found).background
     assert background.shape == (2, (16 + 25) * 4)
     np.testing.assert_allclose(np.linalg.norm(background[:, :64], axis=1), 0.5**0.5, rtol=1e-5)
 
 
 def test_a_mask_decides_what_is_foreground(net: str) -> None:
-    """With a mask of the left half, a change of the right half of the box is none."""
-    image, plain = scene_with_twins()
+    """With a mask of the left half, changing the right half of the box has no effect."""
+    image, plain = scene_with_identical_objects()
     masks = np.zeros((2, *image.shape[:2]), bool)
     masks[0, 90:150, 90:120] = masks[1, 90:150, 330:360] = True
     masked = boxes(*plain.xyxy, masks=masks)
@@ -268,7 +266,7 @@ def test_a_mask_decides_what_is_foreground(net: str) -> None:
     "box", [(-50, -50, 20, 20), (470, 230, 600, 400), (10, 10, 10.5, 10.5), (900, 900, 950, 950)]
 )
 def test_boxes_at_and_over_the_border(box: tuple[float, ...], net: str) -> None:
-    image, _ = scene_with_twins()
+    image, _ = scene_with_identical_objects()
     for embedder in (rt.Embedder(net, threads=1), rt.Embedder("reobj", threads=1)):
         found = embedder(image, boxes(box))
         assert np.isfinite(found.foreground).all() and np.isfinite(found.background).all()
@@ -276,12 +274,12 @@ def test_boxes_at_and_over_the_border(box: tuple[float, ...], net: str) -> None:
 
 @pytest.mark.parametrize("trained", [True, False])
 def test_some_rows_are_embedded_as_all_rows(trained: bool, net: str, monkeypatch) -> None:
-    """In whatever order they are asked for, also by and by; the map is made once a frame."""
+    """In any order of requests; the map is computed once per frame."""
     model, computed, plain = "reobj" if trained else net, [], Backbone.__call__
     monkeypatch.setattr(
         Backbone, "__call__", lambda self, frame: (computed.append(1), plain(self, frame))[1]
     )
-    image, detections = scene_with_twins()
+    image, detections = scene_with_identical_objects()
     embedder = rt.Embedder(model, threads=1)
     whole, part = embedder(image, detections), embedder(image, detections, np.array([1]))
     np.testing.assert_allclose(whole.foreground[1:], part.foreground, atol=1e-5)
@@ -302,7 +300,7 @@ def test_some_rows_are_embedded_as_all_rows(trained: bool, net: str, monkeypatch
 
 
 def test_no_foreground_is_computed_twice(monkeypatch) -> None:
-    """The first request computes those of the neighbours too."""
+    """The first request also computes the neighbours' foreground."""
     computed, plain = [], rt.Embedder.cells
 
     def counted(self, frame, detections, fore_rows, back_rows):
@@ -310,7 +308,7 @@ def test_no_foreground_is_computed_twice(monkeypatch) -> None:
         return plain(self, frame, detections, fore_rows, back_rows)
 
     monkeypatch.setattr(rt.Embedder, "cells", counted)
-    image, two = scene_with_twins()
+    image, two = scene_with_identical_objects()
     three = rt.Detections(two.xyxy[[0, 1, 1]], np.array([0.9, 0.9, 0.2]), np.zeros(3, np.int64))
     embedder = rt.Embedder("reobj", threads=1)
     for row in (1, 0, 2):
@@ -318,8 +316,8 @@ def test_no_foreground_is_computed_twice(monkeypatch) -> None:
     assert computed == [([0, 1], [1]), ([], [0]), ([2], [2])]
 
 
-def test_weak_detections_hide_no_background_and_are_no_neighbours() -> None:
-    image, _ = scene_with_twins()
+def test_weak_detections_mask_no_background_and_are_no_neighbours() -> None:
+    image, _ = scene_with_identical_objects()
     two = boxes((90, 90, 150, 150), (155, 90, 215, 150))
     weak = rt.Detections(two.xyxy, np.array([0.9, 0.29]), two.class_id)
     alone, with_weak, both = (
@@ -328,14 +326,14 @@ def test_weak_detections_hide_no_background_and_are_no_neighbours() -> None:
     )
     np.testing.assert_allclose(with_weak, alone, atol=1e-6)
     assert not alone[:, 128:].any() and both[:, 128:].any()
-    assert np.abs(both[:, :128] / 0.8**0.5 - alone[:, :128]).max() > 0.01  # hidden background
+    assert np.abs(both[:, :128] / 0.8**0.5 - alone[:, :128]).max() > 0.01  # masked background
 
 
 # ---- Neighbours ----
 
 
-def test_neighbour_embedding_is_of_the_near_and_confident_others() -> None:
-    """The near one of two others counts more, unsure ones and oneself do not; alone: nothing."""
+def test_neighbour_embedding_averages_near_confident_objects() -> None:
+    """The nearer of two weighs more; unconfident ones and the object itself are excluded."""
     xyxy = np.array([(0, 0, 40, 40), (50, 0, 90, 40), (300, 0, 340, 40), (0, 0, 40, 40)], float)
     confident, look = np.array([True, True, True, False]), np.eye(4)
     around = neighbour_embedding(xyxy, look, confident, np.arange(4))
@@ -343,46 +341,46 @@ def test_neighbour_embedding_is_of_the_near_and_confident_others() -> None:
     np.testing.assert_allclose(around[0, 1:3], weights / np.linalg.norm(weights))
     np.testing.assert_allclose(np.linalg.norm(around, axis=1), 1)
     assert around[0, 1] > 0.99 > around[2, 1] > around[2, 0] > 0 and not around[:, 3].any()
-    assert not around.diagonal().any() and around[3, 0] > around[3, 1]  # the unsure one has some
+    assert not around.diagonal().any() and around[3, 0] > around[3, 1]  # not confident
     larger = neighbour_embedding(3 * xyxy + 7, look, confident, np.arange(4))
     np.testing.assert_allclose(around, larger)
     unlike = np.array(
         [(0, 0, 40, 10), (30, 0, 110, 80), (60, 0, 70, 10)], float
     )  # sizes 20, 80, 10
     found = neighbour_embedding(unlike, np.eye(3), np.ones(3, bool), np.arange(1))[0]
-    weights = np.exp(-np.array([np.hypot(50, 35), 45]) / 20)  # over the size of its own
+    weights = np.exp(-np.array([np.hypot(50, 35), 45]) / 20)  # over its own size
     np.testing.assert_allclose(found[1:], weights / np.linalg.norm(weights))
     assert not neighbour_embedding(xyxy[:1], look[:1], confident[:1], np.arange(1)).any()
     some = neighbour_embedding(xyxy, look, confident, np.array([2, 3]))
     np.testing.assert_allclose(around[2:], some)
 
 
-def test_neighbours_tell_places_apart_that_look_the_same() -> None:
-    """Twins on a plain wall; a red and a green thing stand near, but out of their background."""
+def test_neighbours_separate_identical_objects() -> None:
+    """Identical objects on a plain wall; a red and a green object are nearby."""
     image, grey = np.full((480, 640, 3), 160, np.uint8), (40, 40, 40)
-    things = {20: grey, 440: grey, 200: (0, 0, 220), 620: (0, 220, 0)}
-    for x, colour in things.items():
+    colours = {20: grey, 440: grey, 200: (0, 0, 220), 620: (0, 220, 0)}
+    for x, colour in colours.items():
         image[220:260, x - 20 : x + 20] = colour
-    found = boxes(*[(x - 20, 220, x + 20, 260) for x in things])
-    plain, told = (
-        rt.Embedder("reobj", layout=rt.SamplingLayout(neighbours=share), threads=1)(image, found)
-        for share in (0.0, 0.2)
+    found = boxes(*[(x - 20, 220, x + 20, 260) for x in colours])
+    plain, extended = (
+        rt.Embedder("reobj", layout=rt.SamplingLayout(neighbours=weight), threads=1)(image, found)
+        for weight in (0.0, 0.2)
     )
-    assert (plain.background.shape[1], told.background.shape[1]) == (128, 256)
-    np.testing.assert_allclose(np.linalg.norm(told.background, axis=1), 1, atol=1e-5)
-    np.testing.assert_allclose(told.background[:, :128], 0.8**0.5 * plain.background, atol=1e-5)
+    assert (plain.background.shape[1], extended.background.shape[1]) == (128, 256)
+    np.testing.assert_allclose(np.linalg.norm(extended.background, axis=1), 1, atol=1e-5)
+    np.testing.assert_allclose(extended.background[:, :128], 0.8**0.5 * plain.background, atol=1e-5)
     around = neighbour_embedding(found.xyxy, plain.foreground, np.ones(4, bool), np.arange(4))
-    np.testing.assert_allclose(told.background[:, 128:], 0.2**0.5 * around, atol=1e-5)
-    cosine = [(b[0] @ b[1]).item() for b in (told.background, plain.background)]
+    np.testing.assert_allclose(extended.background[:, 128:], 0.2**0.5 * around, atol=1e-5)
+    cosine = [(b[0] @ b[1]).item() for b in (extended.background, plain.background)]
     assert cosine[0] < cosine[1] - 0.02
     alone = rt.Embedder("reobj", threads=1)(image, found[:1]).background
     assert not alone[:, 128:].any() and np.linalg.norm(alone) == pytest.approx(1, abs=1e-5)
 
 
-# ---- The weights that come along ----
+# ---- The bundled weights ----
 
 
-def test_own_weights_are_found_without_a_download(tmp_path, monkeypatch) -> None:
+def test_bundled_weights_need_no_download(tmp_path, monkeypatch) -> None:
     monkeypatch.setenv("REOBJ_MODELS", str(tmp_path))
     path = rt.model_path("reobj", offline=True)
     assert path.parent == own_models()
@@ -391,8 +389,8 @@ def test_own_weights_are_found_without_a_download(tmp_path, monkeypatch) -> None
     assert state["reobj"] == "verified"
 
 
-def test_own_weights_tell_twins_apart_and_know_an_object_again() -> None:
-    image, detections = scene_with_twins()
+def test_bundled_weights_reidentify_identical_objects() -> None:
+    image, detections = scene_with_identical_objects()
     moved = np.roll(image, (5, 9), (0, 1)).astype(int) + 12
     later = boxes((99, 95, 159, 155), (339, 95, 399, 155))
     embedder, looks = rt.Embedder("reobj", threads=1), []
@@ -405,9 +403,9 @@ def test_own_weights_tell_twins_apart_and_know_an_object_again() -> None:
     assert cosine.diagonal().min() > cosine[~np.eye(2, dtype=bool)].max() + 0.2
 
 
-def test_own_foreground_sees_no_context() -> None:
-    """Everything from 10 pixels (of 320) around the object on is changed: its background alone
-    notices.
+def test_bundled_foreground_ignores_the_context() -> None:
+    """Changing all pixels 10 px (of 320) away from the object affects its background
+    embedding only.
     """
     noise = np.random.default_rng(0).integers(0, 255, (240, 320, 3)).astype(np.uint8)
     image, mask = cv2.GaussianBlur(noise, (0, 0), 3), np.zeros((1, 240, 320), bool)
@@ -422,7 +420,7 @@ def test_own_foreground_sees_no_context() -> None:
     assert (one.background * two.background).sum() < 0.95
 
 
-def test_own_weights_say_how_they_were_trained() -> None:
+def test_bundled_weights_document_their_training() -> None:
     facts = onnx_metadata(onnx_session(rt.model_path("reobj"), 1))
     assert {"layout", "multiple", "head", "trained"} <= set(facts)
     assert {"steps", "seed", "minutes", "rooms"} <= set(facts["trained"])
@@ -433,7 +431,7 @@ def test_own_weights_say_how_they_were_trained() -> None:
 # ---- Embeddings on request ----
 
 
-def test_fused_rows_weigh_the_cosines_of_the_parts() -> None:
+def test_cosines_of_fused_rows_are_weighted_means() -> None:
     rng = np.random.default_rng(2)
     given = rt.Embeddings(rng.normal(size=(4, 6)), rng.normal(size=(4, 3)))
     lazy = LazyEmbeddings(given, None, None, boxes(*[(0, 0, 9, 9)] * 4), 0.7)
@@ -458,7 +456,7 @@ def test_fused_rows_without_a_background_are_the_foreground(weight: float) -> No
     np.testing.assert_allclose(lazy.get(np.arange(1)), [[0.6, 0.8]], atol=1e-6)
 
 
-def test_only_rows_that_are_asked_for_are_computed() -> None:
+def test_only_requested_rows_are_computed() -> None:
     asked = []
 
     def embedder(frame, detections, rows):
@@ -476,7 +474,7 @@ def test_only_rows_that_are_asked_for_are_computed() -> None:
     assert not LazyEmbeddings(None, None, np.zeros((9, 9, 3), np.uint8), found, 0.5).available
 
 
-def test_embeddings_as_they_come() -> None:
+def test_accepted_embeddings() -> None:
     assert as_embeddings(None, 3) is None
     both = rt.Embeddings(np.ones((2, 4)), np.ones((2, 1)))
     assert as_embeddings(both, 2) is both
@@ -502,6 +500,6 @@ def test_embeddings_as_they_come() -> None:
         ([["a"], ["b"]], 0, "no array of numbers"),
     ],
 )
-def test_embeddings_that_do_not_fit_are_refused(given: Any, width: int, message: str) -> None:
+def test_invalid_embeddings_are_refused(given: Any, width: int, message: str) -> None:
     with pytest.raises(rt.ReobjError, match=message):
         as_embeddings(given, 2, width)

@@ -58,7 +58,7 @@ def test_the_sparse_model_holds_the_keyframes(walk):
 
 
 def seen_job(monkeypatch, video, folder, **changes):
-    """What `estimate_poses` hands to the reconstruction."""
+    """Input of the reconstruction from `estimate_poses`."""
     seen = {}
 
     def record(images, ids, frames, names, boxes, size, **options):
@@ -73,7 +73,7 @@ def seen_job(monkeypatch, video, folder, **changes):
     return seen
 
 
-def test_options_arrive_at_the_reconstruction(walk, tmp_path, monkeypatch):
+def test_options_reach_the_reconstruction(walk, tmp_path, monkeypatch):
     video = walk[0]
     seen = seen_job(monkeypatch, video, tmp_path)
     assert seen["images"][0].shape == (240, 320, 3) and seen["size"] == (320, 240)
@@ -94,7 +94,7 @@ def test_options_arrive_at_the_reconstruction(walk, tmp_path, monkeypatch):
 
 @pytest.fixture
 def reconstructed(walk, monkeypatch):
-    """The keyframes' reconstruction is that of `walk` and takes no time."""
+    """Replaces the reconstruction of the keyframes by that of `walk`."""
 
     def copy(*args, work_dir, **options):
         shutil.copytree(walk[2] / "sparse", work_dir / "sparse", dirs_exist_ok=True)
@@ -124,7 +124,7 @@ def test_the_seed_reaches_pnp(reconstructed, tmp_path, monkeypatch):
 def test_gaps_are_filled_up_to_max_gap(reconstructed, tmp_path, monkeypatch, max_gap, filled):
     """Where the error is small enough; frames without a camera are named."""
     monkeypatch.setattr("reobj.poses.estimate.MAX_GAP", max_gap)
-    monkeypatch.setattr("reobj.poses.localize.PNP_ERROR_PX", 1000.0)  # the hand shakes
+    monkeypatch.setattr("reobj.poses.localize.PNP_ERROR_PX", 1000.0)  # camera shake
     video, _, _, poses = reconstructed
     video = FakeVideo(video.images, [f"{k:03d}.jpg" for k in range(30)])
     cams, status = poses.cam_from_world.copy(), poses.status.copy()
@@ -151,7 +151,7 @@ def test_gaps_are_filled_up_to_max_gap(reconstructed, tmp_path, monkeypatch, max
         (textured_room(1, 0)[0] * 45, "only 2 different views"),  # still
     ],
 )
-def test_failures_are_no_crash_and_say_what_helps(tmp_path, images, message):
+def test_failures_are_reported_with_a_remedy(tmp_path, images, message):
     poses = rt.estimate_poses(FakeVideo(images), config(), tmp_path)
     assert not poses.known.any() and poses.source == "none" and set(poses.status) == {"none"}
     assert len(poses.frame) == len(images) and poses.cam_from_world.shape == (len(images), 3, 4)
@@ -176,7 +176,7 @@ def test_empty_video_and_live_camera_are_refused(tmp_path):
     [
         ([[0, 10, 20, 30, 40, 50]], []),  # nothing broke
         ([[0, 10, 20], [30, 40, 50]], [*range(11, 40)]),  # the step between, and one on each side
-        ([[0, 10, 20, 40, 50]], [*range(11, 50)]),  # a keyframe in no part
+        ([[0, 10, 20, 40, 50]], [*range(11, 50)]),  # a keyframe in no component
         ([[10, 20, 30, 40, 50]], [*range(1, 20)]),  # the first
         ([[0, 10, 20, 30, 40]], [*range(31, 50)]),  # the last
     ],
@@ -189,14 +189,14 @@ def test_more_keyframes_around_breaks(parts, rows, monkeypatch):
     assert rows_around_breaks(keys, parts) == [row for row in rows if row % 10 == 5]
 
 
-def test_neighbouring_rows_leave_no_room_for_keyframes():
+def test_no_keyframes_between_adjacent_rows():
     parts = [np.array([0, 1, 2]), np.array([3, 4])]
     assert rows_around_breaks([0, 1, 2, 3, 4], parts) == []
     assert rows_around_breaks([0, 1, 2, 5, 6], [np.array([0, 1, 2]), np.array([5, 6])]) == [3, 4]
 
 
-def test_where_it_broke_it_is_done_again_with_more_keyframes(walk, tmp_path, monkeypatch):
-    """Once, with those of before among them; ids tell the frames."""
+def test_a_broken_reconstruction_is_repeated_with_more_keyframes(walk, tmp_path, monkeypatch):
+    """Once, including the earlier keyframes; ids are frame numbers."""
     calls = []
 
     def broken(images, ids, names, *args, work_dir, **options):
@@ -224,7 +224,7 @@ def test_where_it_broke_it_is_done_again_with_more_keyframes(walk, tmp_path, mon
     assert poses.part_count == 2 and poses.known[walk[3].status == "keyframe"].all()
     assert (np.diff(poses.part) >= 0).all() or set(poses.part) == {0, 1}
     assert poses.visibility[:, 1].max() < len(poses.points)
-    seen = poses.part[poses.visibility[:, 0]]  # (M,) rows of points of part 0 come first
+    seen = poses.part[poses.visibility[:, 0]]  # (M,) rows of points of component 0 come first
     assert poses.visibility[seen == 0, 1].max() < poses.visibility[seen == 1, 1].min()
     assert "broke between frames 22 and 23" in poses.messages[0]
 
@@ -243,7 +243,7 @@ def photo_with_exif(path, image, focal_35mm):
 
 
 @pytest.mark.parametrize("focal_35mm", [48, 0])
-def test_the_exif_focal_length_is_the_guess_before_the_usual_one(tmp_path, monkeypatch, focal_35mm):
+def test_the_exif_focal_length_replaces_the_default_guess(tmp_path, monkeypatch, focal_35mm):
     """COLMAP: 48 mm of a film whose diagonal is 43.27 mm."""
     images = textured_room(3, 0.5)[0]
     (tmp_path / "photos").mkdir()

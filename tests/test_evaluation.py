@@ -119,7 +119,7 @@ def score(gt: Path, found: Path) -> dict[str, float]:
     return rt.evaluate(found, gt)["tracks"]["all"]
 
 
-# ---- Against others ----
+# ---- Against other implementations ----
 
 
 @pytest.mark.parametrize("seed", STORED)
@@ -175,8 +175,8 @@ def test_equals_published_scores(name: str, published: dict[str, float]) -> None
         pytest.skip(f"{folder} is not there (py-motmetrics' example, not redistributed)")
     mine = score(folder / "gt.txt", folder / "test.txt")
     for key, value in published.items():
-        share = 1 if key in ("IDSW", "Frag") else 100
-        assert round(share * mine[key], 1) == pytest.approx(value, abs=0.051), key
+        scale = 1 if key in ("IDSW", "Frag") else 100
+        assert round(scale * mine[key], 1) == pytest.approx(value, abs=0.051), key
 
 
 # ---- By hand ----
@@ -187,7 +187,7 @@ def boxes(*rows: tuple[float, ...]) -> LabelledBoxes:
     return labelled(np.array([[f, i, x, 0, 10, 10, 1] for f, i, x in rows], float))
 
 
-def test_a_switch_halves_the_identity() -> None:
+def test_a_switch_halves_idf1() -> None:
     truth = boxes(*((f, 1, 0) for f in range(4)))
     found = boxes((0, 5, 0), (1, 5, 0), (2, 6, 0), (3, 6, 0))
     mine = score_tracks(truth, found)
@@ -196,7 +196,7 @@ def test_a_switch_halves_the_identity() -> None:
 
 
 def test_returns_keep_their_identity_or_not() -> None:
-    """Object 1 is away for 40 frames twice: first recognised, then taken for a newcomer."""
+    """Object 1 is absent for 40 frames twice: first re-identified, then given a new identity."""
     truth = boxes(*((f, 1, 0) for f in (0, 1, 42, 43, 84, 85)), (0, 2, 50))
     found = boxes(*((f, 5 if f < 84 else 6, 0) for f in (0, 1, 42, 43, 84, 85)), (0, 7, 50))
     assert visits(truth).tolist() == [0, 0, 1, 1, 2, 2, 0]
@@ -209,8 +209,8 @@ def test_returns_keep_their_identity_or_not() -> None:
     [
         ([[1, 0], [0, 1], [0.9, 0.1]], [1]),  # like its own first view
         ([[1, 0], [0, 1], [0.1, 0.9]], [2]),  # like the other object
-        ([[1, 0], [np.nan, np.nan], [0.1, 0.9]], [1]),  # the other one has none
-        ([[np.nan, np.nan], [0, 1], [0.1, 0.9]], []),  # its own first view has none: no query
+        ([[1, 0], [np.nan, np.nan], [0.1, 0.9]], [1]),  # the other one has no embedding
+        ([[np.nan, np.nan], [0, 1], [0.1, 0.9]], []),  # no embedding of its own: no query
     ],
 )
 def test_rank_of_a_return(embedding: list[list[float]], ranks: list[int]) -> None:
@@ -250,22 +250,22 @@ def truth_of(path: Path, result: rt.Result) -> Path:
     return write(path, rows)
 
 
-def test_the_report_has_no_class_of_zeros() -> None:
-    """What was not found at all is named in one line; a class with any score keeps its own."""
+def test_the_report_omits_classes_without_detections() -> None:
+    """Undetected classes are listed in one line; a class with any score keeps its own."""
     zero = dict.fromkeys("HOTA DetA AssA IDF1 IDP IDR MOTA IDSW Frag ids_per_object".split(), 0.0)
     some = zero | {"HOTA": 0.4, "IDF1": 0.5, "IDP": 0.5, "IDR": 0.5, "IDSW": 3}
-    names = {f"thing {i}": zero for i in range(20)}
+    names = {f"object {i}": zero for i in range(20)}
     tracks = {"all": some, "chair": some, "clock": zero, **names}
     lines = score_report({"tracks": tracks, "ranks": {}}).splitlines()
     assert [line.split()[0] for line in lines[1:3]] == ["all", "chair"]
     assert lines[1].split()[1:] == [f"{v}.00" for v in (40, 0, 0, 50, 50, 50, 0, 3, 0, 0)]
-    assert lines[3].startswith("nothing found of: clock, thing 0,")
+    assert lines[3].startswith("nothing found of: clock, object 0,")
     assert not any(line.startswith("clock") for line in lines) and max(map(len, lines)) <= 100
     nothing = score_report({"tracks": {"all": zero}, "ranks": {}}).splitlines()
     assert nothing[1].startswith("all ")
 
 
-def test_eval_ranks_the_embeddings_that_the_folder_holds(tmp_path: Path) -> None:
+def test_eval_ranks_the_embeddings_of_the_folder(tmp_path: Path) -> None:
     """Two cups, one comes back twice: once like itself, once like the other (Rank-1 .5)."""
     result = cups([0, 0, 40, 80], [1, 2, 1, 1])
     fused = np.array([[1, 1, 0], [1, 0, 1], [1, 0.9, 0.1], [1, 0.1, 0.9]], np.float16)
@@ -275,8 +275,8 @@ def test_eval_ranks_the_embeddings_that_the_folder_holds(tmp_path: Path) -> None
     tracked_folder(tmp_path / "out", result)
     gt = truth_of(tmp_path / "gt.txt", result)
     scores = rt.evaluate(str(tmp_path / "out"), str(gt))
-    share = {"queries": 2, "rank1": 0.5, "rank5": 1.0, "rank20": 1.0, "rank50": 1.0}
-    assert scores["ranks"] == share and scores["tracks"]["all"]["HOTA"] == 1
+    expected = {"queries": 2, "rank1": 0.5, "rank5": 1.0, "rank20": 1.0, "rank50": 1.0}
+    assert scores["ranks"] == expected and scores["tracks"]["all"]["HOTA"] == 1
     assert "2 queries: Rank-1 0.500, Rank-5 1.000" in score_report(scores)
 
 
@@ -294,7 +294,7 @@ def test_rows_without_an_embedding_are_no_queries(tmp_path: Path) -> None:
 
 
 def test_objects_of_other_classes_are_not_in_the_gallery() -> None:
-    """A cup looks just as the chair that comes back, which has changed."""
+    """A cup looks like the returning chair, whose own appearance has changed."""
     truth = boxes((0, 1, 0), (0, 2, 50), (0, 3, 90), (50, 1, 0))
     embedding = np.array([[0.8, 0.6], [1, 0], [0, 1], [1, 0]])
     for names, rank in ((["chair", "cup", "chair", "chair"], 1), (["chair"] * 4, 2)):
@@ -358,7 +358,7 @@ def test_zero_marked_truth_is_left_out(tmp_path: Path) -> None:
 
 
 def test_results_on_ignored_truth_are_dropped() -> None:
-    """The better overlap decides whose a box is; one on nothing stays."""
+    """A box is matched by the larger overlap; a box without overlap is kept."""
     truth = boxes((0, 1, 0), (0, 2, 4), (0, 3, 90))
     role = np.array([Role.SCORED, Role.IGNORED, Role.ABSENT])
     truth = LabelledBoxes(truth.frame, truth.identity, truth.xyxy, truth.name, role)
@@ -380,15 +380,15 @@ def test_identities_are_mapped_one_to_one_by_common_frames() -> None:
 
 
 @pytest.mark.parametrize(
-    ("shift", "share"),  # of 19 thresholds; IoU of two squares of side 10 shifted by s px is
+    ("shift", "expected"),  # of 19 thresholds; IoU of two squares of side 10 shifted by s px is
     [(0, 1), (2, 13 / 19), (5, 6 / 19), (6, 5 / 19), (9, 1 / 19)],  # (10 - s) / (10 + s)
 )
-def test_hota_counts_the_thresholds_that_the_overlap_passes(shift: float, share: float) -> None:
+def test_hota_counts_the_thresholds_that_the_overlap_passes(shift: float, expected: float) -> None:
     truth, found = boxes((0, 1, 0), (1, 1, 0)), boxes((0, 5, shift), (1, 5, shift))
     mine = score_tracks(truth, found)
     hit = np.mean([(10 - shift) / (10 + shift) >= k * 0.05 - 1e-9 for k in range(1, 20)])
-    assert hit == pytest.approx(share)
-    assert mine["HOTA"] == pytest.approx(share) and mine["AssA"] == pytest.approx(share)
+    assert hit == pytest.approx(expected)
+    assert mine["HOTA"] == pytest.approx(expected) and mine["AssA"] == pytest.approx(expected)
 
 
 def test_hota_prefers_the_identity_that_fits_the_whole_object() -> None:
@@ -396,8 +396,8 @@ def test_hota_prefers_the_identity_that_fits_the_whole_object() -> None:
     truth = boxes(*((f, 1, 0) for f in range(10)))
     found = boxes(*((f, 5, -2) for f in range(6)), *((f, 6, 2) for f in range(5)),
                   *((f, 5, 500) for f in range(10, 104)))  # fmt: skip
-    share = (5 * 5 / 10 + 1 / 109) / 6  # of 6 true positives, 5 are identity 6's
-    assert score_tracks(truth, found)["AssA"] == pytest.approx(13 / 19 * share)
+    expected = (5 * 5 / 10 + 1 / 109) / 6  # of 6 true positives, 5 are identity 6's
+    assert score_tracks(truth, found)["AssA"] == pytest.approx(13 / 19 * expected)
 
 
 def test_mota_counts_misses_false_boxes_and_switches() -> None:
@@ -425,12 +425,12 @@ def test_a_gap_is_a_fragment() -> None:
     assert one["Frag"] == 0  # an object that is never found has none
 
 
-def test_the_map_of_identities_names_those_that_none_is_found_for() -> None:
+def test_the_map_of_identities_contains_missed_objects() -> None:
     truth = boxes((0, 1, 0), (0, 2, 60), (1, 1, 0))
     assert identity_map(truth, boxes((0, 7, 0))) == {1: 7, 2: None}
 
 
-def test_a_return_is_kept_if_any_visit_before_had_its_identity() -> None:
+def test_a_return_is_kept_if_any_earlier_visit_had_its_identity() -> None:
     """Visits of object 1: identities 5, 6, 5 (kept), 7 (lost), 6 (kept)."""
     names, starts = (5, 6, 5, 7, 6), (0, 50, 100, 150, 200)
     frames = [(s + k, n) for s, n in zip(starts, names, strict=True) for k in range(3)]
@@ -440,8 +440,8 @@ def test_a_return_is_kept_if_any_visit_before_had_its_identity() -> None:
 
 
 @pytest.mark.parametrize(("frames_of_5", "kept"), [(1, 0), (2, 1)])
-def test_the_main_identity_of_a_visit_counts(frames_of_5: int, kept: float) -> None:
-    """Away for long, then three frames under the old identity 5 or a new one."""
+def test_the_main_identity_of_a_visit_is_scored(frames_of_5: int, kept: float) -> None:
+    """Long absent, then three frames under the old identity 5 or a new one."""
     names = [5, 5, *[5] * frames_of_5, *[9] * (3 - frames_of_5)]
     frames = (0, 1, 50, 51, 52)
     truth = boxes(*((f, 1, 0) for f in frames))
@@ -456,7 +456,7 @@ def test_a_visit_ends_after_thirty_frames() -> None:
     assert visits(unordered).tolist() == [1, 0, 0, 1]
 
 
-def test_nothing_found_and_nothing_true() -> None:
+def test_empty_results_and_empty_truth() -> None:
     some, none = boxes((0, 1, 0), (1, 1, 0)), labelled(np.empty((0, 7)))
     assert score_tracks(some, none)["HOTA"] == 0
     assert score_tracks(none, some)["precision"] == 0
@@ -471,7 +471,7 @@ def test_classes_never_match_each_other() -> None:
     assert score_tracks(chair, any_class)["recall"] == 1
 
 
-def test_mot17_distractors_swallow_what_they_match(tmp_path: Path) -> None:
+def test_mot17_boxes_on_distractors_are_ignored(tmp_path: Path) -> None:
     """Class 8 is a distractor, class 3 (car) is not: a box on the car is false."""
     (tmp_path / "seqinfo.ini").touch()
     (tmp_path / "gt").mkdir()
@@ -485,7 +485,7 @@ def test_mot17_distractors_swallow_what_they_match(tmp_path: Path) -> None:
 
 
 def test_barely_visible_truth_and_that_of_other_classes_are_ignored(tmp_path: Path) -> None:
-    """Two chairs, one of them hidden, and a cup are found by a file without classes."""
+    """Two chairs, one of them occluded, and a cup, evaluated by a file without classes."""
     truth = (1, 0, 56, 0.9), (2, 50, 56, 0.1), (3, 90, 41, 0.9)  # id, x, class, visibility
     gt = np.array([[1, i, x, 0, 10, 10, 1, kind, seen] for i, x, kind, seen in truth])
     pr = np.array([[1, i, x, 0, 10, 10, 1, -1, -1, -1] for i, x, *_ in truth])
@@ -520,7 +520,7 @@ def test_command_line_prints_a_table_and_refuses_other_files(
 
 # ---- Objects in 3D ----
 
-TURN = Rotation.from_rotvec([0.3, -0.5, 0.8]).as_matrix()  # ours from the true world
+TURN = Rotation.from_rotvec([0.3, -0.5, 0.8]).as_matrix()  # estimated from true world
 SHIFT = np.array([1.0, 2.0, 3.0])
 TRUE = {"id": 4, "center": [0.5, 0.2, 1.0], "half_axes": [0.2, 0.3, 0.4],
         "world_from_obj": Rotation.from_rotvec([0, 0, 0.7]).as_matrix().tolist()}  # fmt: skip
@@ -549,11 +549,11 @@ def half_sized(tmp_path: Path, source: str = "pycolmap") -> tuple[rt.Result, Pat
     return result, tmp_path / "gt_objects.json", tmp_path / "poses_c2w.txt"
 
 
-def test_solids_are_compared_in_the_true_world(tmp_path: Path) -> None:
-    """Our world is half as large and turned: after the alignment by cameras nothing is wrong."""
+def test_shapes_are_compared_in_the_true_world(tmp_path: Path) -> None:
+    """The estimated world is scaled and rotated: all errors are 0 after alignment by cameras."""
     found = score_objects(*half_sized(tmp_path), {4: 9, 5: 7})
     assert found["o3d_found"] == pytest.approx(1, abs=5e-3)
-    assert found["o3d_all"] == pytest.approx(0.5, abs=5e-3)  # the second true object has no solid
+    assert found["o3d_all"] == pytest.approx(0.5, abs=5e-3)  # the second true object has no shape
     assert found["center_error_median"] == pytest.approx(0, abs=1e-9)
     assert found["size_error_median"] == pytest.approx(0, abs=1e-9)
     assert found["scale_error"] == pytest.approx(0.1)
@@ -564,7 +564,7 @@ def test_solids_are_compared_in_the_true_world(tmp_path: Path) -> None:
 
 
 def test_errors_are_in_units_of_the_truth(tmp_path: Path) -> None:
-    """Half a unit off in ours is one in the truth; twice the volume is 26 % in size."""
+    """An offset of half an estimated unit is one true unit; twice the volume is 26 % in size."""
     result, *files = half_sized(tmp_path)
     off = TURN @ np.array([0.5, 0, 0])
     (o,) = result.objects
@@ -577,11 +577,11 @@ def test_errors_are_in_units_of_the_truth(tmp_path: Path) -> None:
 
 
 def test_sides_within_two_sigma_along_the_true_axes(tmp_path: Path) -> None:
-    """The own axes have another order; the sigma is that of the log."""
+    """The estimated axes have another order; the sigma is that of the log."""
     result, *files = half_sized(tmp_path)
     assert score_objects(result, *files, {4: 9})["sizes_inside"] is None  # no covariance
     (o,) = result.objects
-    axes = np.roll(np.eye(3), 1, 0)  # own x is the true y ...
+    axes = np.roll(np.eye(3), 1, 0)  # estimated x is the true y ...
     turn = Rotation.from_quat(np.roll(o.quat_wxyz, -1)).as_matrix() @ axes
     cov = np.diag(np.repeat([1.0, 0.1, 1.0], 3) ** 2)
     half = np.roll(o.half_axes, -1) * np.exp([0.19, 0.21, 0.0])
@@ -593,7 +593,7 @@ def test_sides_within_two_sigma_along_the_true_axes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("pairs", [{4: None}, {4: 8}, {}])
-def test_objects_that_the_identities_do_not_say_are_not_found(
+def test_objects_without_matched_identities_are_not_found(
     tmp_path: Path, pairs: dict[int, int | None]
 ) -> None:
     assert score_objects(*half_sized(tmp_path), pairs)["found"] == 0
@@ -619,14 +619,14 @@ def test_true_cameras_may_be_tum_rows(tmp_path: Path) -> None:
     result, solids, path = half_sized(tmp_path)
     c2w = np.loadtxt(path).reshape(-1, 4, 4)
     rows = np.c_[np.arange(12) / 10 + 0.01, c2w[:, :3, 3], np.tile([0, 0, 0, 1], (12, 1))]
-    rows[3, 0], rows[3, 1] = 0.345, 99  # between two frames: of none
+    rows[3, 0], rows[3, 1] = 0.345, 99  # between two frames: unassigned
     np.savetxt(tmp_path / "tum.txt", rows[::-1])
     found = score_objects(result, solids, tmp_path / "tum.txt", {4: 9})
     assert found["center_error_median"] == pytest.approx(0, abs=1e-9)
 
 
 def straight(tmp_path: Path, form: str, turned: np.ndarray) -> float:
-    """Centre error of a chair 3 m beside a straight path of .4 m, own centres 4 mm off.
+    """Centre error of a chair 3 m beside a straight path of .4 m, estimated centres 4 mm off.
 
     form: of the true poses; turned: (3, 3) true_cam_from_cam of their axes.
     """
@@ -659,8 +659,8 @@ def straight(tmp_path: Path, form: str, turned: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("form", ["tum", "matrix"])
-def test_a_short_path_is_aligned_by_its_directions_of_view(tmp_path: Path, form: str) -> None:
-    """Of centres alone the world turns about a straight path; axes of another kind are left out."""
+def test_a_short_path_is_aligned_by_viewing_directions(tmp_path: Path, form: str) -> None:
+    """Centres alone leave the roll about a straight path free; other camera axes are ignored."""
     assert straight(tmp_path, form, np.eye(3)) < 0.01
     for turned in ([np.pi, 0, 0], [0, np.pi / 2, 0]):  # OpenGL's axes; x ahead
         axes = Rotation.from_rotvec(turned).as_matrix()
@@ -691,7 +691,7 @@ def test_true_solids_are_finite_numbers(tmp_path: Path, number: str) -> None:
 
 
 def test_true_classes_of_any_number_are_read(tmp_path: Path) -> None:
-    """Also those that no table has; without a warning of numpy's."""
+    """Also unknown ones; without a NumPy warning."""
     path = write(tmp_path / "gt.txt", np.array([[1, 1, 5, 5, 20, 20, 1, 1e30, 1]]))
     found = read_truth(path, ["chair"], 0.0)
     assert len(found) == 1 and found.name[0] not in ("", "chair")

@@ -1,4 +1,4 @@
-"""Exports: each is read back, by our reader, by the format's own, or as its reader does it."""
+"""Exports: each is read back by this package, by the format's own reader, or like it."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def mot(path: Path) -> np.ndarray:
 
 
 def detected(out: Path) -> np.ndarray:
-    """Rows of tracks.txt that have a detection; what fills a gap has score 0."""
+    """Rows of tracks.txt that have a detection; filled gaps have score 0."""
     rows = mot(out / "tracks.txt")
     return rows[rows[:, 6] > 0]
 
@@ -80,7 +80,7 @@ def test_coco_vid_holds_every_row(room: Path, tmp_path: Path) -> None:
 def test_a_filled_gap_may_lie_in_a_frame_that_was_not_read(
     chairs: rt.Result, tmp_path: Path
 ) -> None:
-    """The poses have the frames that could be read; frame 5 could not, but has boxes."""
+    """Poses exist for the decoded frames only; frame 5 was not decoded, but has boxes."""
     poses = chairs.poses
     cut = {k: np.delete(getattr(poses, k), 5, 0) for k in ("frame", "time_s", "cam_from_world",
                                                            "status")}  # fmt: skip
@@ -116,11 +116,11 @@ def test_coco_vid_as_detections_and_as_tracks(room: Path, tmp_path: Path) -> Non
     )
 
 
-# ---- CVAT: identities corrected by hand ----
+# ---- CVAT: manually corrected identities ----
 
 
-def test_cvat_has_what_its_importer_reads(room: Path, tmp_path: Path) -> None:
-    """The attributes that cvat.py's loader asks for; only keyframes count; visits are closed."""
+def test_cvat_has_the_attributes_of_its_importer(room: Path, tmp_path: Path) -> None:
+    """The attributes that cvat.py's loader reads; only keyframes; visits are closed."""
     path = tmp_path / "a.xml"
     rt.export(room, "cvat", path)
     root, rows = ET.parse(path).getroot(), mot(room / "tracks.txt")
@@ -155,7 +155,7 @@ def test_cvat_unchanged_gives_the_same_objects(room: Path, tmp_path: Path) -> No
     kept = [i for i, o in before.items() if o["status"] == after[i]["status"] == "ok"]
     gap = [np.subtract(before[i]["center"], after[i]["center"]) for i in kept]
     gap = np.sort(np.linalg.norm(gap, axis=1))  # m; all scores are 1 here, and a first fit and not
-    # the association tells which points are on what: one may have others
+    # the association decides which points lie on which object: they may differ
     assert len(kept) >= 6 and gap[-2] < 0.05 and gap[-1] < 0.2
 
 
@@ -177,19 +177,19 @@ def edited(room: Path, path: Path) -> tuple[int, int]:
 
 
 @pytest.mark.parametrize("kind", ["xml", "zip"])
-def test_corrected_identities_are_taken(room: Path, tmp_path: Path, kind: str) -> None:
-    """`objects OUT --tracks`: what the user says stands, whatever the linker would think."""
+def test_corrected_identities_are_used(room: Path, tmp_path: Path, kind: str) -> None:
+    """`objects OUT --tracks`: corrected identities override the linker."""
     out, path = tmp_path / "out", tmp_path / "corrected.xml"
     shutil.copytree(room, out)
     a, b = edited(out, path)
-    if kind == "zip":  # what CVAT's download is
+    if kind == "zip":  # as downloaded from CVAT
         with zipfile.ZipFile(tmp_path / "task.zip", "w") as archive:
             archive.write(path, "annotations.xml")
         path = tmp_path / "task.zip"
     rows = detected(out)
     moved = np.flatnonzero(rows[:, 1] == b)[4:]
     rows[moved, 1] = a
-    for _ in range(2):  # and it stands when the objects are fitted again without --tracks
+    for _ in range(2):  # and they are kept when the objects are fitted again without --tracks
         assert cli("objects", out, *(("--tracks", path) if path else ()), *NO_PICTURES) == 0
         found = detected(out)
         assert sorted(map(tuple, found[:, :2])) == sorted(map(tuple, rows[:, :2]))
@@ -211,7 +211,7 @@ def test_corrected_mot_keeps_the_classes(room: Path, tmp_path: Path) -> None:
     assert [(o["id"] + 100, o["class"]) for o in before] == [(o["id"], o["class"]) for o in after]
     status = [(o["status"], a["status"]) for o, a in zip(before, after, strict=True)]
     # Some are at a limit: boxes in the file are rounded, and a first fit and not the association
-    # tells which edges are hidden, and which points are on what.
+    # decides which edges are occluded, and which points lie on which object.
     changed = [x for x in status if x[0] != x[1]]
     assert len(changed) <= len(before) // 5
     assert all(set(x) == {"ok", "prior_dominated"} for x in changed)
@@ -292,7 +292,7 @@ def test_csv_runs_no_formula(tmp_path: Path, chairs: rt.Result, name: str, cell:
 
 
 def test_nerfstudio_of_a_video(room: Path, tmp_path: Path) -> None:
-    """Our own reader, which is tested with nerfstudio's files, finds cameras and images again."""
+    """Cameras and images are read back by this package, which is tested with nerfstudio's files."""
     path = rt.export(room, "nerfstudio", tmp_path / "nerf/transforms.json")
     data = json.loads(path.read_text())
     assert len(data["frames"]) == 40
@@ -309,7 +309,7 @@ def test_nerfstudio_of_a_video(room: Path, tmp_path: Path) -> None:
 
 
 def test_nerfstudio_of_a_folder_copies_nothing(tmp_path: Path) -> None:
-    """Images stay where they are; sparse points come along; frames without a pose do not."""
+    """Images are not copied; sparse points are exported, frames without a pose are not."""
     (tmp_path / "frames").mkdir()
     for i in range(40):
         cv2.imwrite(str(tmp_path / f"frames/{i:03d}.png"), np.zeros((480, 640, 3), np.uint8))
@@ -348,7 +348,7 @@ def test_nerfstudio_of_a_folder_copies_nothing(tmp_path: Path) -> None:
          {"k1": 0.1, "p2": 0.4}, True),
     ],
 )  # fmt: skip
-def test_nerfstudio_knows_the_lens(
+def test_nerfstudio_has_the_distortion(
     tmp_path: Path, camera: tuple, terms: dict, said: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "f").mkdir()
@@ -373,19 +373,19 @@ def test_nerfstudio_knows_the_lens(
 # ---- PLY ----
 
 
-def test_ply_holds_the_solids(room: Path, tmp_path: Path) -> None:
-    """Closed, outwards, in place: each one's volume and corners are those of its shape."""
+def test_ply_has_the_3d_shapes(room: Path, tmp_path: Path) -> None:
+    """Closed meshes with outward normals; volume and corners are those of the shape."""
     trimesh = pytest.importorskip("trimesh", reason="pip install trimesh (dev extra)")
     mesh = trimesh.load(rt.export(room, "ply", tmp_path / "a.ply"))
     assert mesh.is_watertight and mesh.is_winding_consistent
     result = rt.Result.load(room)
     parts = {tuple(p.visual.vertex_colors[0][:3]): p for p in mesh.split(only_watertight=True)}
-    share = {"box": 8.0, "cylinder": 2 * np.pi, "ellipsoid": 4 / 3 * np.pi}
+    unit_volume = {"box": 8.0, "cylinder": 2 * np.pi, "ellipsoid": 4 / 3 * np.pi}
     assert {o.support for o in result.located} >= {"box", "cylinder"}
     assert len(parts) == len(result.located) > 5
     for o in result.located:
         part = parts[object_color(o.id)[::-1]]
-        volume = share[o.support] * o.half_axes.prod()
+        volume = unit_volume[o.support] * o.half_axes.prod()
         assert part.volume == pytest.approx(volume, rel=0.03)  # a polyhedron inside the surface
         np.testing.assert_allclose(part.bounds.mean(0), o.center, atol=1e-4)
         w, x, y, z = o.quat_wxyz
@@ -410,7 +410,7 @@ def test_same_folder_same_bytes(room: Path, tmp_path: Path, to: str) -> None:
 
 
 def test_track_only_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Without cameras: the 2D formats work, the 3D ones say what is missing."""
+    """Without cameras: the 2D formats work, the 3D ones report the missing cameras."""
     args = ("--detections", ROOM / "detections.npz", "--stop", 20, "-o", tmp_path / "out")
     assert cli("track", ROOM / "room.mp4", *args, *NO_PICTURES) == 0
     for to in ("coco-vid", "cvat"):
@@ -427,7 +427,7 @@ def test_track_only_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
 def test_a_video_without_objects(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], recwarn: pytest.WarningsRecorder
 ) -> None:
-    """Empty files of the right form, and no complaint."""
+    """Empty valid files, and no warning."""
     (tmp_path / "det.csv").write_text("frame,x1,y1,x2,y2,score,class\n")
     out = tmp_path / "out"
     args = ("--detections", tmp_path / "det.csv", "-o", out, "--stop", 3)
@@ -441,7 +441,7 @@ def test_a_video_without_objects(
     assert not list(ET.parse(out / "cvat.xml").getroot().iter("track"))
 
 
-def test_the_video_may_be_gone(room: Path, tmp_path: Path) -> None:
+def test_the_video_may_be_deleted(room: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     shutil.copytree(room, out)
     source = json.loads((out / "cache/source.json").read_text())
@@ -462,7 +462,7 @@ def test_export_of_no_output_folder(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 
 def located(out: Path) -> tuple[dict[str, object], list[dict[str, object]]]:
-    """The world of an output folder, and its objects with a solid."""
+    """The world of an output folder, and its located objects."""
     data = json.loads((out / "objects.json").read_text())
     return data["world"], [o for o in data["objects"] if o["status"] != "rejected"]
 
@@ -484,7 +484,7 @@ def in_glb(result: rt.Result, path: Path) -> dict[str, tuple[np.ndarray, object]
 
 
 def test_glb_stands_upright_in_metres(chairs: rt.Result, tmp_path: Path) -> None:
-    """Our world is tilted and its unit is half a metre: in the file y is up, chairs .82 m high."""
+    """The world is tilted and its unit is half a metre: in the file y is up, chairs .82 m high."""
     tilt = Rotation.from_euler("xyz", [40, 70, -20], degrees=True).as_matrix()
     ellipsoids = chairs.ellipsoids()
     objects = [
@@ -510,7 +510,7 @@ def test_glb_stands_upright_in_metres(chairs: rt.Result, tmp_path: Path) -> None
 
 
 def test_glb_in_trimesh(room: Path, tmp_path: Path) -> None:
-    """Every ellipsoid is a named node in its place and colour, with the facts of its object."""
+    """Every ellipsoid is a named node with its position, colour and metadata."""
     nodes = nodes_of(rt.export(room, "glb", tmp_path / "a.glb"))
     world, kept = located(room)
     up, scale = np.array(world["up_in_world"]), world["scale"]["metres_per_unit"]
@@ -540,7 +540,7 @@ def test_glb_in_trimesh(room: Path, tmp_path: Path) -> None:
 
 
 def test_glb_shows_points_and_the_path_of_the_cameras(chairs: rt.Result, tmp_path: Path) -> None:
-    """z is up in the walk: the file has x, z, -y, or that turned around y."""
+    """z is up in the walk: the file has x, z, -y, or that rotated about y."""
     points = np.random.default_rng(0).uniform(-1, 1, (50, 3))
     colors = np.tile(np.array([[200, 30, 10]], np.uint8), (50, 1))
     poses = dataclasses.replace(chairs.poses, points=points, colors=colors)
@@ -552,7 +552,7 @@ def test_glb_shows_points_and_the_path_of_the_cameras(chairs: rt.Result, tmp_pat
     np.testing.assert_allclose(np.linalg.norm(path[:, [0, 2]], axis=1), 3.5, atol=1e-4)
 
 
-def test_glb_without_scale_or_up_says_so(
+def test_glb_reports_a_missing_scale_or_up(
     chairs: rt.Result, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     scale = chairs.world.scale._replace(value=7.0, source="none")
@@ -604,7 +604,7 @@ def test_rrd_in_rerun(room: Path, tmp_path: Path) -> None:
 
 
 def test_images_in_rerun_are_small_and_boxes_fit_them(chairs: rt.Result, tmp_path: Path) -> None:
-    """A video of 1920 px: image, lens and boxes all shrink to a third."""
+    """A video of 1920 px: image, camera and boxes are all scaled to a third."""
     pytest.importorskip("rerun", reason="pip install .[viewer]")
     large = rt.Camera("PINHOLE", 1920, 1440, tuple(3 * p for p in chairs.poses.camera.params))
     tracks = dataclasses.replace(chairs.tracks, xyxy=3 * chairs.tracks.xyxy)
@@ -628,7 +628,7 @@ def test_images_in_rerun_are_small_and_boxes_fit_them(chairs: rt.Result, tmp_pat
     np.testing.assert_allclose(first["Boxes2D:centers"], centers, atol=0.01)
 
 
-def test_an_image_that_is_missing_is_missing_in_rerun(chairs: rt.Result, tmp_path: Path) -> None:
+def test_missing_images_are_missing_in_rerun(chairs: rt.Result, tmp_path: Path) -> None:
     """Frame 1 cannot be read, frame 3 was never read: each image stands at its own frame."""
     pytest.importorskip("rerun", reason="pip install .[viewer]")
     (tmp_path / "f").mkdir()
@@ -652,7 +652,7 @@ def test_an_image_that_is_missing_is_missing_in_rerun(chairs: rt.Result, tmp_pat
 
 
 def test_tracks_of_no_object_are_not_exported(chairs: rt.Result, tmp_path: Path) -> None:
-    """Rows added to tracks.txt by hand: of which class they are is not known."""
+    """Rows added to tracks.txt by hand have no class."""
     chairs.save(tmp_path)
     with (tmp_path / "tracks.txt").open("a") as file:
         file.write("1,9,10,10,20,20,0.9,-1,-1,-1\n")
@@ -661,7 +661,7 @@ def test_tracks_of_no_object_are_not_exported(chairs: rt.Result, tmp_path: Path)
     assert not (tmp_path / "cvat.xml").exists()
 
 
-def test_the_viewer_follows_the_tracking(tmp_path: Path) -> None:
+def test_the_live_viewer_follows_the_tracking(tmp_path: Path) -> None:
     """Frame by frame, as they are tracked: image, boxes with names, and a known camera."""
     pytest.importorskip("rerun", reason="pip install .[viewer]")
     config = rt.InputConfig(stop=4, max_size=320)
@@ -671,7 +671,7 @@ def test_the_viewer_follows_the_tracking(tmp_path: Path) -> None:
     poses, seen = walk(40), []
     for frame, tracks in viewer.follow(steps, rt.COCO_NAMES, video, poses):
         seen.append((frame.index, len(tracks)))
-        assert tracks.xyxy.max(initial=0) < 200  # handed on as they were
+        assert tracks.xyxy.max(initial=0) < 200  # passed on unchanged
     viewer.close()
     found = in_rrd(path)
     assert (
@@ -687,7 +687,7 @@ def test_the_viewer_follows_the_tracking(tmp_path: Path) -> None:
 def test_show_reaches_the_viewer(
     room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The flag: followed while tracking, then the result; what comes from the cache is read."""
+    """The flag --show: live while tracking, then the result; cached tracks are read."""
     pytest.importorskip("rerun", reason="pip install .[viewer]")
     path = tmp_path / "live.rrd"
     viewer = partial(Viewer, start=lambda rec: rec.save(path))

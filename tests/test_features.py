@@ -27,7 +27,7 @@ def brute_force(a, b):
 
 @pytest.mark.parametrize("noise", [0.02, 0.06, 0.12])
 def test_matches_are_those_of_a_loop(noise):
-    """Some rows are common, some of these twice, the rest foreign."""
+    """Some rows are common, some of these duplicated, the rest unrelated."""
     rng = np.random.default_rng(0)
     a = unit(rng.uniform(0, 1, (200, 16)) ** 3)
     common = a[rng.permutation(200)[:120]]
@@ -38,7 +38,7 @@ def test_matches_are_those_of_a_loop(noise):
     assert 10 < len(found) < 121
 
 
-def test_the_same_the_other_way_round():
+def test_matching_is_symmetric():
     rng = np.random.default_rng(1)
     a = unit(rng.uniform(0, 1, (80, 16)))
     b = unit(np.abs(a[::2] + rng.normal(0, 0.05, (40, 16))))
@@ -47,6 +47,6 @@ def test_the_same_the_other_way_round():
 
 
 @pytest.mark.parametrize("sizes", [(0, 9), (9, 0), (1, 9), (9, 1)])
-def test_with_no_second_best_nothing_matches(sizes):
+def test_without_a_second_best_nothing_matches(sizes):
     a, b = (unit(np.ones((n, 16))) for n in sizes)
     assert _matches(a, b).shape == (0, 2)

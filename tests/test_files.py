@@ -1,4 +1,4 @@
-"""Files that are whole or not at all, JSON and npz, progress, and text for messages."""
+"""Atomic files, JSON and npz, progress, and text for messages."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ import pytest
 import reobj_track as rt
 from reobj import files
 
-# ---- Whole files ---------------------------------------------------------------------------------
+# ---- Atomic files --------------------------------------------------------------------------------
 
 
 def test_a_file_appears_when_it_is_complete(tmp_path: Path) -> None:
@@ -38,7 +38,7 @@ def test_a_file_appears_when_it_is_complete(tmp_path: Path) -> None:
     assert path.read_text() == "new" and list(path.parent.iterdir()) == [path]
 
 
-def test_a_file_is_on_the_disk_before_it_has_its_name(
+def test_a_file_is_synced_before_it_is_renamed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     done: list[str] = []
@@ -51,7 +51,7 @@ def test_a_file_is_on_the_disk_before_it_has_its_name(
 
 
 @pytest.mark.parametrize("error", [OSError, KeyboardInterrupt])
-def test_an_error_leaves_what_was_there(tmp_path: Path, error: type[BaseException]) -> None:
+def test_an_error_keeps_the_old_file(tmp_path: Path, error: type[BaseException]) -> None:
     path = tmp_path / "a.txt"
     path.write_text("old")
     with pytest.raises(error), files.atomic(path) as part:
@@ -60,7 +60,7 @@ def test_an_error_leaves_what_was_there(tmp_path: Path, error: type[BaseExceptio
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
 
 
-def test_a_part_of_a_killed_run_is_no_obstacle(tmp_path: Path) -> None:
+def test_a_temporary_file_of_a_killed_run_is_replaced(tmp_path: Path) -> None:
     with files.atomic(tmp_path / "a.txt") as part:
         part.touch()
     (tmp_path / "a.txt").rename(part)
@@ -93,7 +93,7 @@ def test_json_names_the_line(tmp_path: Path) -> None:
         files.load_json(path)
 
 
-def test_text_without_end_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_endless_text_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(files, "TEXT_MAX", 3 << 20)
     with pytest.raises(rt.ReobjError, match=r"/dev/zero: more than 3 MB of text"):
         files.read_text(Path("/dev/zero"))
@@ -115,7 +115,7 @@ def test_text_without_end_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyP
         ("TEXT_MAX", 9, "a\n" * 5, "a.txt: more than 0 MB of text"),
     ],
 )
-def test_tables_have_an_end(
+def test_tables_have_a_size_limit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, most: int, text: str, what: str
 ) -> None:
     path = tmp_path / "a.txt"
@@ -126,7 +126,7 @@ def test_tables_have_an_end(
         files.read_lines(path)
 
 
-def test_the_lines_of_a_file_are_those_of_its_text(tmp_path: Path) -> None:
+def test_lines_equal_those_of_the_whole_text(tmp_path: Path) -> None:
     path = tmp_path / "a.txt"
     path.write_bytes(b"\xef\xbb\xbfa\r\nb\rc\n\nd")
     assert files.read_lines(path) == ["a\n", "b\n", "c\n", "\n", "d"]
@@ -138,7 +138,7 @@ def test_the_lines_of_a_file_are_those_of_its_text(tmp_path: Path) -> None:
 def test_json_is_refused_before_it_takes_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str
 ) -> None:
-    """What is taken is less than what was reckoned, which is what is refused."""
+    """The memory used is less than the estimate, and the estimate is what is limited."""
     path, taken = tmp_path / "a.json", 64 * (text.count(",") + text.count("["))
     taken += 200 * text.count("{")
     path.write_text(text)
@@ -150,8 +150,8 @@ def test_json_is_refused_before_it_takes_memory(
 
 
 @pytest.mark.parametrize("item", ["[],", "{},", '{"a":1},', "1.5,", '"ab",', "[1.5,2.5,3.5],"])
-def test_json_takes_no_more_than_was_reckoned(tmp_path: Path, item: str) -> None:
-    """By what Python has allocated; 2 MB of text of the worst kinds."""
+def test_json_uses_no_more_memory_than_estimated(tmp_path: Path, item: str) -> None:
+    """Measured by Python's allocations; 2 MB of worst-case text."""
     path, text = tmp_path / "a.json", "[" + item * (2_000_000 // len(item)) + "0]"
     path.write_text(text)
     reckoned = files.json_memory(text)
@@ -165,7 +165,7 @@ def test_json_takes_no_more_than_was_reckoned(tmp_path: Path, item: str) -> None
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, '{"a": ' * 100_000])
-def test_json_that_no_one_writes(tmp_path: Path, text: str) -> None:
+def test_unusual_json(tmp_path: Path, text: str) -> None:
     (tmp_path / "a.json").write_text(text)
     with pytest.raises(rt.ReobjError, match=r"a\.json: invalid JSON"):
         files.load_json(tmp_path / "a.json")
@@ -198,8 +198,8 @@ def test_damaged_npz(tmp_path: Path) -> None:
             files.load_npz(path)
 
 
-def test_npz_that_unpacks_to_too_much(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Refused by its table of contents: nothing is unpacked."""
+def test_an_npz_bomb_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Refused by its directory: nothing is decompressed."""
     files.save_npz(tmp_path / "a.npz", {"a": np.zeros(3 << 20, np.uint8)})
     assert (tmp_path / "a.npz").stat().st_size < 9000
     monkeypatch.setattr(files, "NPZ_MAX", 2 << 20)
@@ -208,7 +208,7 @@ def test_npz_that_unpacks_to_too_much(tmp_path: Path, monkeypatch: pytest.Monkey
         files.load_npz(tmp_path / "a.npz")
 
 
-def test_a_sealed_npz_is_as_it_was_written(tmp_path: Path) -> None:
+def test_a_checksummed_npz_is_verified(tmp_path: Path) -> None:
     path, arrays = tmp_path / "a.npz", {"a": np.arange(6), "b": np.float32([[1, 2]])}
     files.save_npz(path, arrays, version=2)
     found, metadata = files.load_npz(path, sealed=True)
@@ -221,7 +221,7 @@ def test_a_sealed_npz_is_as_it_was_written(tmp_path: Path) -> None:
         "metadata": np.array(str(stored["metadata"]).replace('"version": 2', '"version": 3')),
     }.items():
         np.savez(path, **(stored | {name: other}))
-        files.load_npz(path)  # of other tools: not sealed
+        files.load_npz(path)  # of other tools: no checksum
         with pytest.raises(rt.ReobjError, match="the content does not match its digest"):
             files.load_npz(path, sealed=True)
     np.savez(path, **arrays)
@@ -229,7 +229,7 @@ def test_a_sealed_npz_is_as_it_was_written(tmp_path: Path) -> None:
         files.load_npz(path, sealed=True)
 
 
-def test_a_damaged_cache_file_is_said_and_removed(tmp_path: Path, caplog: Any) -> None:
+def test_a_damaged_cache_file_is_reported_and_removed(tmp_path: Path, caplog: Any) -> None:
     path = tmp_path / "a.json"
     assert files.load_cached(path, files.load_json) is None and not caplog.records
     path.write_text("[1]")
@@ -241,7 +241,7 @@ def test_a_damaged_cache_file_is_said_and_removed(tmp_path: Path, caplog: Any) -
     assert record.message.endswith("; it is removed and computed again")
 
 
-def test_full_disk_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_gives_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*args: Any, **kwargs: Any) -> None:
         raise OSError(28, "No space left on device")
 
@@ -251,8 +251,8 @@ def test_full_disk_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert not list(tmp_path.iterdir())
 
 
-def test_other_errors_pass(tmp_path: Path) -> None:
-    """Such as that of a file elsewhere, which the block reads."""
+def test_other_errors_are_not_caught(tmp_path: Path) -> None:
+    """Such as an error of another file read within the block."""
     elsewhere = OSError(errno.EACCES, "Permission denied", "/elsewhere/input.txt")
     for error in (elsewhere, OSError(errno.ENOENT, "No such file"), OSError("unknown")):
         with pytest.raises(OSError) as raised, files.atomic(tmp_path / "a.txt"):
@@ -268,9 +268,7 @@ def test_other_errors_pass(tmp_path: Path) -> None:
         (OSError("1024 requested and 16 written"), "make room on this disk"),  # NumPy
     ],
 )
-def test_errors_of_the_disk_say_where_and_what_to_do(
-    tmp_path: Path, error: OSError, text: str
-) -> None:
+def test_disk_errors_name_the_path_and_a_remedy(tmp_path: Path, error: OSError, text: str) -> None:
     with pytest.raises(rt.ReobjError, match=text), files.atomic(tmp_path / "a.txt") as part:
         part.write_text("half")
         raise error
@@ -281,7 +279,7 @@ def test_errors_of_the_disk_say_where_and_what_to_do(
 
 
 def test_staged_files_appear_together(tmp_path: Path) -> None:
-    """Files of folders too; what was not made anew stays, and what a kill left behind goes."""
+    """Also in folders; other files are kept, leftovers of a killed run are deleted."""
     (tmp_path / "a.txt").write_text("old")
     (tmp_path / "notes.txt").write_text("mine")
     (tmp_path / files.PART_RESULTS).mkdir()
@@ -297,7 +295,7 @@ def test_staged_files_appear_together(tmp_path: Path) -> None:
 
 def test_a_full_disk_keeps_all_old_files(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text("old")
-    where = rf"{tmp_path.name}/b\.txt: cannot be written"  # not the folder that is gone again
+    where = rf"{tmp_path.name}/b\.txt: cannot be written"  # not the folder that is deleted again
     with pytest.raises(rt.ReobjError, match=where), files.staged(tmp_path) as new:
         (new / "a.txt").write_text("new")
         with files.atomic(new / "b.txt"):
@@ -305,7 +303,7 @@ def test_a_full_disk_keeps_all_old_files(tmp_path: Path) -> None:
     assert [p.read_text() for p in tmp_path.iterdir()] == ["old"]
 
 
-def test_a_lock_is_held_by_one(tmp_path: Path) -> None:
+def test_a_lock_has_one_holder(tmp_path: Path) -> None:
     with files.locked(tmp_path / "lock"):
         began = time.monotonic()
         with pytest.raises(files.LockedError), files.locked(tmp_path / "lock", 0.2):
@@ -316,7 +314,7 @@ def test_a_lock_is_held_by_one(tmp_path: Path) -> None:
 
 
 class Windows:
-    """What its module msvcrt does: a byte that one open file has locked is refused to others."""
+    """Emulates msvcrt: a byte locked by one open file is refused to others."""
 
     LK_NBLCK = 2
 
@@ -332,7 +330,7 @@ class Windows:
 
 
 def test_a_lock_on_windows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same file, as it is there: without fcntl, with msvcrt."""
+    """The same module without fcntl, with msvcrt."""
     windows = Windows()
     monkeypatch.setattr(sys, "platform", "win32")
     monkeypatch.setitem(sys.modules, "msvcrt", windows)
@@ -351,8 +349,8 @@ def test_a_lock_on_windows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         pass
 
 
-def test_without_locks_there_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Some network drives: better two runs than none."""
+def test_missing_locks_are_accepted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Such as some network drives: two concurrent runs are better than none."""
 
     def no_locks(_: int) -> None:
         raise OSError(errno.ENOLCK, "No locks available")
@@ -382,7 +380,7 @@ def last_line(screen: Terminal) -> str:
     return screen.getvalue().split("\r")[-1]
 
 
-def test_progress_tells_share_rate_and_time_left(
+def test_progress_shows_percentage_rate_and_remaining_time(
     clock: list[float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     screen = Terminal()
@@ -391,10 +389,10 @@ def test_progress_tells_share_rate_and_time_left(
     clock[0] += 4
     progress.step(20)  # 5 a second, 180 left: 36 s
     clock[0] += 0.01
-    progress.step()  # too soon for an eye
+    progress.step()  # too soon to be visible
     assert screen.getvalue() == "\rtrack     20/200  10 %, 36 s left, 5.0/s\x1b[K"
     clock[0] += 5.99
-    progress.step(9)  # the rate is that of the last seconds: what is slow now is seen now
+    progress.step(9)  # the rate is that of the last seconds
     assert last_line(screen) == "track     30/200  15 %, 102 s left, 1.7/s\x1b[K"
     assert progress.close() == pytest.approx(10)
     assert last_line(screen) == "track     30/30 100 %, 10.0 s, 3.0/s\x1b[K\n"
@@ -403,7 +401,7 @@ def test_progress_tells_share_rate_and_time_left(
 def test_the_first_step_has_no_rate_of_millions(
     clock: list[float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What comes from a cache in no time: the line says how many, and no rate."""
+    """Instantly cached results: the line shows the count and no rate."""
     screen = Terminal()
     monkeypatch.setattr("sys.stderr", screen)
     with files.Progress("track", 240) as progress:
@@ -417,7 +415,7 @@ def test_the_first_step_has_no_rate_of_millions(
 def test_a_stage_ends_at_100_percent_only_when_it_is_complete(
     clock: list[float], monkeypatch: pytest.MonkeyPatch, total: int
 ) -> None:
-    """Videos say their length wrong; 100 % is never shown before the end."""
+    """Videos may announce a wrong length; 100 % is never shown before the end."""
     screen = Terminal()
     monkeypatch.setattr("sys.stderr", screen)
     with files.Progress("track", total) as progress:
@@ -433,7 +431,7 @@ def test_a_stage_ends_at_100_percent_only_when_it_is_complete(
     assert last_line(screen) == f"track     8/{total}, 4.0 s, not finished, 2.0/s\x1b[K\n"
 
 
-def test_a_stage_without_steps_is_shown_while_it_lasts(
+def test_a_stage_without_steps_is_shown_while_it_runs(
     clock: list[float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     screen = Terminal()
@@ -481,7 +479,7 @@ def test_long_lines_are_wrapped() -> None:
     ("word", "expected"),
     [("chiar", "; did you mean chair?"), ("zebra", ""), ("chair", "; did you mean chair?")],
 )
-def test_a_wrong_word_gets_the_likest_one(word: str, expected: str) -> None:
+def test_a_misspelt_word_gets_the_closest_suggestion(word: str, expected: str) -> None:
     assert files.did_you_mean(word, ("cup", "chair", "bowl")) == expected
 
 

@@ -1,4 +1,4 @@
-"""The film: it plays in a browser, whichever encoder is here; it is whole or not there at all."""
+"""The overlay video: browser playback with either encoder; complete or absent."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def encoder(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def pictures(count: int = FRAMES) -> list[np.ndarray]:
-    """A red ground on which a square moves."""
+    """A square moving on a red background."""
     made = [np.full((SIZE[1], SIZE[0], 3), (20, 20, 200), np.uint8) for _ in range(count)]
     for i, image in enumerate(made):
         image[100:140, 8 * i : 8 * i + 40] = (200, 200, 20)
@@ -59,11 +59,11 @@ def pictures(count: int = FRAMES) -> list[np.ndarray]:
 
 
 def written(path: Path, images: list[np.ndarray]) -> Path:
-    film = FilmWriter(path, FPS, SIZE)
+    writer = FilmWriter(path, FPS, SIZE)
     for image in images:
-        film.write(image)
-    film.close(True)
-    return film.path
+        writer.write(image)
+    writer.close(True)
+    return writer.path
 
 
 def test_the_suffix_is_that_of_the_format(tmp_path: Path, encoder: str) -> None:
@@ -81,7 +81,7 @@ def test_the_suffix_is_that_of_the_format(tmp_path: Path, encoder: str) -> None:
 
 
 class Listener(http.server.BaseHTTPRequestHandler):
-    """Keeps what a page says by asking for a path."""
+    """Collects the messages of a page, sent as requested paths."""
 
     said: queue.Queue[str]
 
@@ -94,7 +94,7 @@ class Listener(http.server.BaseHTTPRequestHandler):
 
 
 def test_a_browser_plays_it(tmp_path: Path, encoder: str) -> None:
-    """From the disk, as a user opens it: decoded, of the right length, and time goes on."""
+    """Opened from disk: it is decoded, has the right length and plays."""
     if CHROMIUM is None:
         pytest.skip("no chromium here: apt-get install chromium")
     path = written(tmp_path / "overlay.mp4", pictures())
@@ -119,7 +119,7 @@ def test_a_browser_plays_it(tmp_path: Path, encoder: str) -> None:
     np.testing.assert_allclose(rgba[:3], [200, 20, 20], atol=12)
 
 
-def test_pictures_come_back_in_order(tmp_path: Path, encoder: str) -> None:
+def test_frames_are_decoded_in_order(tmp_path: Path, encoder: str) -> None:
     images = pictures()
     capture = cv2.VideoCapture(str(written(tmp_path / "a.mp4", images)))
     assert capture.get(cv2.CAP_PROP_FPS) == pytest.approx(FPS)
@@ -128,8 +128,8 @@ def test_pictures_come_back_in_order(tmp_path: Path, encoder: str) -> None:
     assert not capture.read()[0]
 
 
-def test_same_pictures_same_bytes(tmp_path: Path, encoder: str) -> None:
-    """Wherever they lie in memory, and however often: noise that moves, as x264 had it wrong."""
+def test_same_images_give_the_same_bytes(tmp_path: Path, encoder: str) -> None:
+    """Independent of memory layout and repetition: moving noise, for which x264 failed."""
     rng = np.random.default_rng(0)
     wide = cv2.GaussianBlur(rng.integers(0, 256, (SIZE[1], 400, 3), np.uint8), (0, 0), 2)
     made = set()
@@ -143,11 +143,11 @@ def test_same_pictures_same_bytes(tmp_path: Path, encoder: str) -> None:
 
 @pytest.mark.parametrize("fps", [30000 / 1001, 12.0, 1.0])
 def test_frame_rates_are_kept(tmp_path: Path, encoder: str, fps: float) -> None:
-    film = FilmWriter(tmp_path / "a.mp4", fps, SIZE)
+    writer = FilmWriter(tmp_path / "a.mp4", fps, SIZE)
     for image in pictures(4):
-        film.write(image)
-    film.close(True)
-    found = cv2.VideoCapture(str(film.path))
+        writer.write(image)
+    writer.close(True)
+    found = cv2.VideoCapture(str(writer.path))
     every = 2 if encoder == "vp8" and fps > 15 else 1  # the slow encoder takes every second one
     assert found.get(cv2.CAP_PROP_FRAME_COUNT) == 4 / every
     rel = 1e-5 if encoder == "vp8" else 1e-6  # whole ns
@@ -156,53 +156,53 @@ def test_frame_rates_are_kept(tmp_path: Path, encoder: str, fps: float) -> None:
         last_s = found.get(cv2.CAP_PROP_POS_MSEC) / 1000
     assert last_s == pytest.approx((4 / every - 1) * every / fps, rel=rel)
     if encoder == "vp8":
-        assert b"00:00:%012.9f" % (4 / fps) in film.path.read_bytes()  # FFmpeg's tag DURATION
+        assert b"00:00:%012.9f" % (4 / fps) in writer.path.read_bytes()  # FFmpeg's tag DURATION
 
 
 @pytest.mark.parametrize("size", [(321, 241), (1601, 901), (3840, 2160), (64, 48)])
-def test_sides_are_even_and_no_longer_than_plays(
+def test_sides_are_even_and_within_the_decoder_limit(
     tmp_path: Path, encoder: str, size: tuple[int, int]
 ) -> None:
-    film = FilmWriter(tmp_path / "a.mp4", FPS, size)
-    film.close(False)
+    writer = FilmWriter(tmp_path / "a.mp4", FPS, size)
+    writer.close(False)
     limit = {"h264": 1280, "vp8": 480}[encoder]
-    assert film.size[0] % 2 == film.size[1] % 2 == 0
-    assert min(limit, size[0]) - 2 < film.size[0] <= min(limit, size[0])
-    assert film.size[0] / film.size[1] == pytest.approx(size[0] / size[1], rel=0.01)
+    assert writer.size[0] % 2 == writer.size[1] % 2 == 0
+    assert min(limit, size[0]) - 2 < writer.size[0] <= min(limit, size[0])
+    assert writer.size[0] / writer.size[1] == pytest.approx(size[0] / size[1], rel=0.01)
 
 
-def test_a_film_that_is_not_complete_is_not_kept(tmp_path: Path, encoder: str) -> None:
-    film = FilmWriter(tmp_path / "o.mp4", FPS, SIZE)
-    film.path.write_text("of an earlier run")
-    film.write(pictures(1)[0])
-    assert film.path.read_text() == "of an earlier run"  # until the new one is complete
-    film.close(False)
-    assert film.path.read_text() == "of an earlier run"
-    assert list(tmp_path.iterdir()) == [film.path]
+def test_an_incomplete_video_is_not_kept(tmp_path: Path, encoder: str) -> None:
+    writer = FilmWriter(tmp_path / "o.mp4", FPS, SIZE)
+    writer.path.write_text("of an earlier run")
+    writer.write(pictures(1)[0])
+    assert writer.path.read_text() == "of an earlier run"  # until the new one is complete
+    writer.close(False)
+    assert writer.path.read_text() == "of an earlier run"
+    assert list(tmp_path.iterdir()) == [writer.path]
 
 
-def test_a_film_that_lost_frames_is_an_error(tmp_path: Path, encoder: str) -> None:
-    film = FilmWriter(tmp_path / "o.mp4", FPS, SIZE)
-    film.write(pictures(1)[0])
-    film.count += 1  # as a full disk does: OpenCV says nothing
+def test_lost_frames_are_an_error(tmp_path: Path, encoder: str) -> None:
+    writer = FilmWriter(tmp_path / "o.mp4", FPS, SIZE)
+    writer.write(pictures(1)[0])
+    writer.count += 1  # as on a full disk: OpenCV reports nothing
     with pytest.raises(OSError, match="disk full"):
-        film.close(True)
+        writer.close(True)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_full_disk_is_said(tmp_path: Path, encoder: str) -> None:
-    """A real limit on the size of files: PyAV raises, OpenCV says nothing."""
+def test_a_full_disk_is_reported(tmp_path: Path, encoder: str) -> None:
+    """A real limit on the file size: PyAV raises, OpenCV reports nothing."""
     code = (
         "import resource, sys; import numpy as np; from pathlib import Path\n"
         "if sys.argv[1] == 'vp8': sys.modules['av'] = None\n"
         "from reobj.results.film import FilmWriter\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (9000, 9000))\n"
-        "film, rng = FilmWriter(Path('o.mp4'), 15, (320, 240)), np.random.default_rng(0)\n"
+        "writer, rng = FilmWriter(Path('o.mp4'), 15, (320, 240)), np.random.default_rng(0)\n"
         "try:\n"
-        "    for _ in range(40): film.write(rng.integers(0, 255, (240, 320, 3), np.uint8))\n"
-        "    film.close(True)\n"
+        "    for _ in range(40): writer.write(rng.integers(0, 255, (240, 320, 3), np.uint8))\n"
+        "    writer.close(True)\n"
         "except OSError as error:\n"
-        "    film.close(False)\n"
+        "    writer.close(False)\n"
         "    print(error)\n"
     )
     env = os.environ | {"PYTHONPATH": str(ROOT)}
@@ -213,15 +213,15 @@ def test_a_full_disk_is_said(tmp_path: Path, encoder: str) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_film_that_cannot_be_written_is_an_error(tmp_path: Path, encoder: str) -> None:
+def test_a_video_that_cannot_be_written_is_an_error(tmp_path: Path, encoder: str) -> None:
     with pytest.raises(OSError, match=r"overlay.*: the overlay cannot be written"):
         FilmWriter(tmp_path / "nowhere" / "overlay.mp4", FPS, SIZE)
 
 
-def test_nothing_is_said_on_the_terminal(
+def test_encoders_print_nothing(
     tmp_path: Path, encoder: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """FFmpeg's C code prints a remark on the four letters of VP8."""
+    """FFmpeg's C code prints a remark on the codec tag of VP8."""
     written(tmp_path / "a.mp4", pictures(3))
     print("still there", file=sys.stderr)
     assert capfd.readouterr() == ("", "still there\n")

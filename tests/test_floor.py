@@ -1,4 +1,4 @@
-"""The floor of synthetic rooms: where it is, how sure that is, and where there is none."""
+"""The floor of synthetic rooms: its position and sigma, and rooms without one."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ def room(seed=0, on_floor=400, noise=0.01, wrong=0.01, table=True, half=3.0):
                     np.column_stack([half + 0 * along, along]))  # fmt: skip
     wall = np.column_stack([wall * np.where(side < 2, 1, -1)[:, None], up])
     top = np.column_stack([rng.uniform([-0.8, -0.5], [0.8, 0.5], (900, 2)), np.full(900, 0.74)])
-    things = rng.uniform([-2, -2, 0], [2, 2, 1], (300, 3))
+    clutter = rng.uniform([-2, -2, 0], [2, 2, 1], (300, 3))
     stray = rng.uniform([-half, -half, -2], [half, half, 0], (int(wrong * 2000), 3))
-    parts = [floor, wall, things, stray] + [top] * table
+    parts = [floor, wall, clutter, stray] + [top] * table
     points = np.concatenate([part for part in parts if len(part)])
     return points + rng.normal(0, noise, points.shape)
 
@@ -49,7 +49,7 @@ def tilted(deg, axis=0):
 @pytest.mark.parametrize(("noise", "on_floor"), [(0.003, 400), (0.02, 400), (0.02, 120)])
 @pytest.mark.parametrize("tilt_deg", [0, 3])
 def test_the_floor_is_found_within_its_sigma(noise, on_floor, tilt_deg):
-    """Not the table's top, which has more points; gravity is a few degrees off."""
+    """Not the table top, which has more points; gravity is a few degrees off."""
     errors = []
     for seed in range(4):
         points = room(seed, on_floor, noise)
@@ -65,12 +65,12 @@ def test_the_floor_is_found_within_its_sigma(noise, on_floor, tilt_deg):
     assert np.mean(np.abs(errors) < 2) >= 0.85
 
 
-def test_more_noise_makes_it_less_sure():
+def test_more_noise_increases_the_sigma():
     quiet, loud = (find_floor(room(0, 150, n), UP, cameras(), 1.0)[0] for n in (0.003, 0.03))
     assert quiet is not None and loud is not None and quiet.sigma < loud.sigma
 
 
-def test_any_unit_and_any_axes_will_do():
+def test_unit_and_axes_of_the_world_do_not_matter():
     turn = Rotation.from_euler("zyx", [30, 100, -20], degrees=True)
     points, centres = room(), cameras()
     plain, _ = find_floor(points, UP, centres, 1.0)
@@ -92,7 +92,7 @@ def test_texture_does_not_outvote_area():
 
 
 def table_top(size=0.7):
-    """A table's top with things on it, and nothing else."""
+    """A table top with objects on it, and nothing else."""
     rng = np.random.default_rng(0)
     top = np.column_stack([rng.uniform(-size, size, (900, 2)), rng.normal(0, 0.002, 900)])
     return np.concatenate([top, rng.uniform([-0.3, -0.3, 0], [0.3, 0.3, 0.3], (400, 3))])
@@ -117,13 +117,13 @@ TABLE = np.array([0, 0, 0.74])
         (np.random.default_rng(0).normal(0, 2, (3000, 3)), cameras(), 1.0, "plane"),
     ],
 )
-def test_where_there_is_no_floor_none_is_found(points, centres, metres, reason):
+def test_scenes_without_a_floor(points, centres, metres, reason):
     floor, why = find_floor(points, UP, centres, metres)
     assert floor is None
     assert any(part in why for part in reason.split("|")), why
 
 
-def test_a_table_is_not_the_floor_where_the_floor_is_seen_below():
+def test_a_table_top_is_not_the_floor_if_the_floor_is_visible():
     """The cameras are near the table; a strip of floor beside it is enough."""
     rng = np.random.default_rng(0)
     strip = np.column_stack([rng.uniform([-2, 0.8], [2, 2], (250, 2)), rng.normal(0, 0.005, 250)])
@@ -133,7 +133,7 @@ def test_a_table_is_not_the_floor_where_the_floor_is_seen_below():
     assert abs(floor.normal @ [0, 1.4, 0] - floor.offset) < 0.02
 
 
-# ---- Of poses, and in a result -------------------------------------------------------------------
+# ---- From poses, and in a result -----------------------------------------------------------------
 
 
 def poses_in_room(**changes):
@@ -164,7 +164,7 @@ def test_points_that_only_two_frames_observed_do_not_count():
 
 
 def poses_in_two_parts():
-    """The same room again in the world of frames 15-29, 5 m higher."""
+    """The same room again in the component of frames 15-29, 5 m higher."""
     poses = poses_in_room(part=np.repeat([0, 1], 15))
     count = len(poses.points)
     cams = poses.cam_from_world.copy()
@@ -177,15 +177,15 @@ def poses_in_two_parts():
     )  # fmt: skip
 
 
-def test_the_floor_is_that_of_the_largest_part():
+def test_the_floor_is_that_of_the_largest_component():
     floor, _ = floor_of(poses_in_two_parts(), UP, 1.0)
     assert floor is not None and abs(floor.middle[2]) < 0.03
 
 
-def test_every_part_of_a_world_has_a_floor_of_its_own():
+def test_every_component_has_its_own_floor():
     scale = quadrics.Scale(1.0, 0.05, "priors")
-    told = SimpleNamespace(scale=scale, up=UP, up_source="cameras")  # all that is asked of a fit
-    world = describe_world(poses_in_two_parts(), [told, told], [])
+    fit = SimpleNamespace(scale=scale, up=UP, up_source="cameras")  # the used attributes of a fit
+    world = describe_world(poses_in_two_parts(), [fit, fit], [])
     for part, height in zip(world.parts, (0, 5 * HIGHER @ UP), strict=True):
         assert part.floor is not None and part.floor_reason == ""
         assert abs(part.floor.middle @ UP - height) < 0.03
@@ -193,14 +193,14 @@ def test_every_part_of_a_world_has_a_floor_of_its_own():
     back = rt.World.from_json(json.loads(json.dumps(world.to_json())))
     assert back.to_json() == world.to_json()
     np.testing.assert_array_equal(back.parts[1].floor.middle, world.parts[1].floor.middle)
-    assert describe_world(poses_in_two_parts(), [told, None], []).parts[1].floor is None
+    assert describe_world(poses_in_two_parts(), [fit, None], []).parts[1].floor is None
 
 
 def test_without_gravity_there_is_no_floor():
     assert floor_of(poses_in_room(), None, 1.0) == (None, "gravity is unknown")
 
 
-def test_the_world_of_a_result_has_it_and_reads_it_back():
+def test_the_floor_is_saved_and_loaded():
     world = describe_world(poses_in_room(), [None], [])
     back = rt.World.from_json(world.to_json())
     assert world.floor is not None and back.floor is not None and back.floor_reason == ""
@@ -214,7 +214,7 @@ def test_the_world_of_a_result_has_it_and_reads_it_back():
     assert rt.World.from_json(entry).floor is None
 
 
-def test_the_world_of_a_result_says_why_there_is_none():
+def test_the_reason_for_a_missing_floor_is_saved():
     world = describe_world(poses_in_room(metric=False), [None], [])
     assert world.floor is None and "scale is unknown" in world.floor_reason
     assert "0 points" in describe_world(walk(4), [None], []).floor_reason

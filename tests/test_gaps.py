@@ -22,7 +22,7 @@ def moving(frames: np.ndarray, start: tuple[float, ...], step: tuple[float, ...]
 
 
 def table(frames: np.ndarray, xyxy: np.ndarray, identity: int = 1) -> rt.Tracks:
-    """One identity, a tracklet of 20 frames each, one detection a frame."""
+    """One identity, tracklets of 20 frames, one detection per frame."""
     one = np.ones(len(frames), np.int64)
     tracklet = 10 * identity + frames // 20
     return rt.Tracks(
@@ -41,7 +41,7 @@ BOXES = moving(ALL, (100, 200, 60, 90), (4, -1, 0.5, 0.8))
 
 
 @pytest.mark.parametrize("every", [1, 2, 7])
-def test_a_gap_is_filled_with_what_was_there(every: int) -> None:
+def test_gaps_are_filled_with_the_true_boxes(every: int) -> None:
     """Exact boxes of constant velocity: the filled ones are the true ones, whatever the stride."""
     seen = np.delete(ALL, [17, 18, 19])
     filled = fill_gaps(table(every * seen, BOXES[seen]), SIZE, 3)
@@ -54,11 +54,11 @@ def test_a_gap_is_filled_with_what_was_there(every: int) -> None:
     assert (filled.score[~new] == 0.9).all()
     before = np.flatnonzero(new)[0] - 1
     assert (filled.tracklet_id[new] == filled.tracklet_id[before]).all()
-    np.testing.assert_array_equal(filled.xyxy[~new], BOXES[seen])  # what was seen stays
+    np.testing.assert_array_equal(filled.xyxy[~new], BOXES[seen])  # detections are unchanged
 
 
-def test_noise_is_smoothed_better_than_by_a_line_between_both_ends() -> None:
-    """Box after box with 3 px of noise, gaps of 4: nearer to the truth, over 60 tracks."""
+def test_smoothing_is_more_accurate_than_linear_interpolation() -> None:
+    """Boxes with 3 px of noise, gaps of 4 frames, 60 tracks."""
     rng, error = np.random.default_rng(0), {"rts": [], "line": []}
     for _ in range(60):
         seen = np.delete(ALL, [18, 19, 20, 21])
@@ -66,14 +66,14 @@ def test_noise_is_smoothed_better_than_by_a_line_between_both_ends() -> None:
         filled = fill_gaps(table(seen, noisy), SIZE, 5)
         truth = BOXES[18:22]
         error["rts"].append(filled.xyxy[filled.score == 0] - truth)
-        share = np.arange(1, 5)[:, None] / 5
-        error["line"].append((1 - share) * noisy[17] + share * noisy[18] - truth)
+        weight = np.arange(1, 5)[:, None] / 5
+        error["line"].append((1 - weight) * noisy[17] + weight * noisy[18] - truth)
     rms = {name: np.sqrt(np.mean(np.square(values))) for name, values in error.items()}
     assert rms["rts"] < 0.9 * rms["line"] < 3
 
 
 def test_smoother_equals_filterpy() -> None:
-    """Its own batch filter and RTS smoother, with the noise of the tracker over the mean side."""
+    """filterpy's batch filter and RTS smoother, with the noise of the tracker per mean side."""
     rng = np.random.default_rng(1)
     at = np.array([0, 1, 2, 5, 6, 9])
     xyxy = BOXES[at] + rng.normal(0, 3, (6, 4))
@@ -97,14 +97,14 @@ def test_smoother_equals_filterpy() -> None:
 
 @pytest.mark.parametrize("every", [1, 3])
 @pytest.mark.parametrize(("max_gap", "filled"), [(0, 0), (3, 0), (4, 4), (5, 4)])
-def test_only_gaps_of_so_many_frames(every: int, max_gap: int, filled: int) -> None:
+def test_only_gaps_up_to_the_limit_are_filled(every: int, max_gap: int, filled: int) -> None:
     seen = np.delete(ALL, [10, 11, 12, 13])
     found = fill_gaps(table(every * seen, BOXES[seen]), SIZE, max_gap)
     assert (found.score == 0).sum() == filled
 
 
 @pytest.mark.parametrize(("jump", "filled"), [(38, True), (52, False)])
-def test_what_moved_far_in_the_gap_is_not_guessed(jump: float, filled: bool) -> None:
+def test_gaps_with_a_large_motion_are_not_filled(jump: float, filled: bool) -> None:
     """Boxes of 80 px, that overlap after the gap by .36 and by .21."""
     boxes = moving(ALL, (100, 200, 80, 80), (0, 0, 0, 0))
     boxes[20:, [0, 2]] += jump
@@ -113,7 +113,7 @@ def test_what_moved_far_in_the_gap_is_not_guessed(jump: float, filled: bool) -> 
 
 
 def test_gaps_belong_to_one_identity() -> None:
-    """One is gone for good, another begins in its place; a third has no gap. Rows stay ordered."""
+    """One track ends, another starts at its position; a third has no gap. Rows stay ordered."""
     still = moving(ALL, (100, 200, 60, 90), (0, 0, 0, 0))
     other = moving(ALL, (400, 200, 60, 90), (0, 0, 0, 0))
     whole = joined(
@@ -128,7 +128,7 @@ def test_gaps_belong_to_one_identity() -> None:
 
 
 def test_boxes_stay_in_the_image() -> None:
-    """It leaves half the image and comes back: the guess ends at the border."""
+    """It leaves the image by half and comes back: the filled boxes end at the border."""
     boxes = moving(ALL, (640, 30, 100, 90), (0, 0, 0, 0))
     seen = np.delete(ALL, [15, 16])
     filled = fill_gaps(table(seen, boxes[seen]), SIZE, 5)
@@ -142,8 +142,8 @@ def test_nothing_to_fill() -> None:
     assert len(fill_gaps(one, SIZE, 5)) == 1
 
 
-def test_filled_rows_shape_no_ellipsoid_and_no_place() -> None:
-    """Their score is 0: what fits and links by views leaves them out, at any min_score above."""
+def test_filled_rows_affect_no_ellipsoid_and_no_position() -> None:
+    """Their score is 0: fitting and linking exclude them for any min_score above."""
     seen = np.delete(ALL, [17, 18, 19])
     filled = fill_gaps(table(seen, BOXES[seen]), SIZE, 5)
     camera = rt.Camera("PINHOLE", *SIZE, (500.0, 500.0, 320.0, 240.0))

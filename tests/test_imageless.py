@@ -1,4 +1,4 @@
-"""Runs from detections and poses alone: frames without images, and what is not possible."""
+"""Runs from detections and poses alone: frames without images, and refused options."""
 
 from __future__ import annotations
 
@@ -100,13 +100,13 @@ def assert_both_chairs(result: rt.Result) -> None:
 
 
 def assert_chairs_in_place(result: rt.Result) -> None:
-    """Without images and poses the camera's turn is unknown, and tracks may break."""
+    """Without images and poses the camera rotation is unknown, and tracks may break."""
     found = np.array([o.center for o in result.located])
     distance = np.linalg.norm(found[:, None] - CENTRES, axis=2).min(0)
     assert distance.max() < 0.02
 
 
-def test_all_files_are_written_but_those_with_pictures(tmp_path: Path) -> None:
+def test_all_files_without_images_are_written(tmp_path: Path) -> None:
     result = run(tmp_path, as_csv(tmp_path), as_tum(tmp_path), LINE)
     assert_both_chairs(result)
     assert result.world.scale.source == "poses" and result.world.units == "m"
@@ -174,7 +174,7 @@ def test_poses_of_some_images_keep_the_numbers_in_their_names(tmp_path: Path) ->
 
 
 def test_a_column_of_times_meets_poses_of_a_higher_rate(tmp_path: Path) -> None:
-    """As TUM's recordings have it: detections at 30 Hz, motion capture at another rate."""
+    """As in TUM's recordings: detections at 30 Hz, motion capture at another rate."""
     times = [f"{1341847980.722988 + i / 30:.6f}" for i in range(FRAMES)]
     path = as_csv(tmp_path, "timestamp", times)
     mocap = as_tum(tmp_path, np.array(times, float))
@@ -207,7 +207,7 @@ def test_our_own_poses_with_a_gap_keep_their_frames(tmp_path: Path) -> None:
     assert result.poses.frame[~result.poses.known].tolist() == [5, 6, 7]
 
 
-def test_the_size_is_that_of_the_detections_where_they_say_it(tmp_path: Path) -> None:
+def test_the_image_size_comes_from_the_detections(tmp_path: Path) -> None:
     assert_both_chairs(run(tmp_path, as_npz(tmp_path), as_tum(tmp_path), "300,300,160,120"))
 
 
@@ -225,7 +225,7 @@ def test_the_size_is_that_of_the_detections_where_they_say_it(tmp_path: Path) ->
         ("late", "tum", LINE, "frame 99, but .*groundtruth.txt has 24 poses"),
     ],
 )
-def test_what_is_not_possible_is_said_in_one_line(
+def test_impossible_combinations_give_one_line(
     tmp_path: Path, detections: object, poses: str, camera: str, message: str
 ) -> None:
     if detections in ("csv", "late"):
@@ -248,7 +248,7 @@ def test_what_is_not_possible_is_said_in_one_line(
         (True, {"mode": "none", "metric": True}, "--poses is none"),
     ],
 )
-def test_options_of_cameras_or_images_that_are_not_there_are_refused(
+def test_options_of_missing_cameras_or_images_are_refused(
     tmp_path: Path, video: bool, options: dict[str, object], message: str
 ) -> None:
     given = {"mode": str(as_tum(tmp_path)), "camera": LINE} | options

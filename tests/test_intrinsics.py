@@ -1,4 +1,4 @@
-"""What --camera takes: numbers, COLMAP's lines, matrices, JSON files of many tools."""
+"""Inputs of --camera: numbers, COLMAP's lines, matrices, JSON files of many tools."""
 
 from __future__ import annotations
 
@@ -174,13 +174,13 @@ def test_a_wrong_file_is_refused_in_one_line(tmp_path, name, content, message):
     assert str(refused.value).startswith(f"--camera {path}: ") and "\n" not in str(refused.value)
 
 
-def test_a_camera_says_its_own_size_where_nothing_else_does():
+def test_a_camera_file_defines_the_size_if_nothing_else_does():
     assert stated_camera("PINHOLE 640 480 500 510 320 240", None) == PINHOLE
     with pytest.raises(rt.ReobjError, match="no image size"):
         stated_camera("500,510,320,240", None)
 
 
-def test_a_line_reads_back_with_all_digits():
+def test_a_line_is_read_back_with_all_digits():
     camera = rt.Camera("OPENCV", *SIZE, (500.123456789012, 510, 320, 240, 1e-17, 0, 0, 0.1 + 0.2))
     assert parse_camera(camera_line(camera), SIZE) == camera
 
@@ -189,8 +189,8 @@ def test_the_example_rooms_camera_is_read():
     assert parse_camera(str(ROOM / "camera.txt"), SIZE).K[0, 0] == 492.756788421
 
 
-def test_another_content_of_the_file_is_another_reconstruction(tmp_path, monkeypatch):
-    """The cache knows the camera that a file holds, not its name."""
+def test_a_changed_camera_file_gives_another_reconstruction(tmp_path, monkeypatch):
+    """The cache key contains the camera in the file, not the file's name."""
     path, cameras = tmp_path / "camera.txt", []
 
     def found(video, config, work, **_):

@@ -1,4 +1,4 @@
-"""Keyframes: how many, which, the sharpest; points that are followed or dropped."""
+"""Keyframes: number, selection, sharpness; points that are tracked or dropped."""
 
 from __future__ import annotations
 
@@ -54,8 +54,8 @@ def test_a_still_camera_has_no_more_than_first_and_last():
 
 
 @pytest.mark.parametrize("level", [0, 255])
-def test_a_picture_without_texture_is_no_keyframe_and_hides_no_motion(walk, level):
-    """Before, between and after; what was followed goes on behind it."""
+def test_a_textureless_image_is_no_keyframe(walk, level):
+    """Before, between and after; point tracks continue after it."""
     blank = np.full_like(walk[0], level)
     assert rows([blank] * 30) == []
     assert rows([blank] * 10 + walk[:3])[0] == 10
@@ -65,11 +65,11 @@ def test_a_picture_without_texture_is_no_keyframe_and_hides_no_motion(walk, leve
     assert np.diff(chosen).max() <= np.diff(rows(walk)).max() + 3
 
 
-def test_after_a_cut_a_keyframe(walk):
+def test_a_cut_gives_a_keyframe(walk):
     assert 5 in rows([*walk[:5], *walk[40:45]])  # a cut: the corners are lost
 
 
-def test_slow_motion_makes_a_keyframe_after_two_seconds():
+def test_slow_motion_gives_a_keyframe_after_two_seconds():
     """7 % of the width in 130 frames: never as much flow as a keyframe needs."""
     images, _ = textured_room(130, 0.0035, size=(240, 180))
     chosen = rows(images, max_flow=0.5)
@@ -89,8 +89,8 @@ def test_images_are_resized_and_read_again_when_memory_is_short(walk, cache_mb):
     assert (again[0] is frames[0].gray) == (cache_mb == 1000)
 
 
-def test_points_are_followed_and_those_that_do_not_come_back_are_dropped():
-    """The left half moves by 3 and -2 px, the right half becomes another picture."""
+def test_points_that_fail_the_backward_check_are_dropped():
+    """The left half moves by 3 and -2 px, the right half becomes another image."""
     rng = np.random.default_rng(0)
     old, other = (
         cv2.GaussianBlur(rng.integers(0, 255, (240, 320), np.uint8), (0, 0), 2) for _ in range(2)

@@ -1,4 +1,4 @@
-"""From tracklets to objects: joins and splits by appearance and by place in 3D."""
+"""Linking of tracklets to objects: joins and splits by appearance and by 3D position."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def chair_solids() -> quadrics.Ellipsoids:
 def table_of(poses: rt.Poses, solids: quadrics.Ellipsoids | None = None) -> rt.Tracks:
     """Noisy boxes of the solids (the chairs), one tracklet each; rows ordered by frame.
 
-    `detection_index` tells which solid a row shows.
+    `detection_index` is the object of a row.
     """
     solids = solids or chair_solids()
     boxes = quadrics.solid_boxes(solids, "box", poses.camera.K @ poses.cam_from_world)  # (F, O, 4)
@@ -53,10 +53,10 @@ def table_of(poses: rt.Poses, solids: quadrics.Ellipsoids | None = None) -> rt.T
     return rt.Tracks(frame, obj + 1, obj + 1, xyxy, score, np.full(n, CHAIR), obj)
 
 
-def views_of(table: rt.Tracks, chair: np.ndarray, twins: float) -> np.ndarray:
+def views_of(table: rt.Tracks, chair: np.ndarray, cosine: float) -> np.ndarray:
     """Noisy embeddings (N, 12) of the true chairs (N,), with this cosine between chairs 0 and 1."""
     own = np.eye(3, 12)
-    own[1] = twins * own[0] + np.sqrt(1 - twins**2) * own[1]
+    own[1] = cosine * own[0] + np.sqrt(1 - cosine**2) * own[1]
     rows = own[chair] + np.random.default_rng(1).normal(0, 0.03, (len(table), 12))
     return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True))
 
@@ -91,16 +91,16 @@ def kinds(events: list[rt.LinkEvent], kept: bool = True) -> set[str]:
 
 
 def objects_of(table: rt.Tracks, truth: np.ndarray) -> list[list[int]]:
-    """The true things in each object, by identity."""
+    """The true objects in each estimated object, by identity."""
     return [np.unique(truth[table.track_id == i]).tolist() for i in np.unique(table.track_id)]
 
 
-# ---- By place ----
+# ---- By 3D position ----
 
 
 def test_a_chair_that_came_back_under_a_new_identity_is_joined() -> None:
-    """Each chair's track is cut in two with a gap; the halves are found again, the twins stay
-    apart.
+    """Each chair's track is cut in two with a gap; the halves are joined, identical chairs stay
+    separate.
     """
     poses = walk()
     table = table_of(poses)
@@ -113,8 +113,8 @@ def test_a_chair_that_came_back_under_a_new_identity_is_joined() -> None:
     assert all(e.place_iou is not None and e.place_iou > 0.5 for e in events)
 
 
-def test_a_wrong_return_is_split_by_its_place() -> None:
-    """The tracker took the third chair for the first one that came back: two places."""
+def test_a_wrong_return_is_split_by_its_position() -> None:
+    """The tracker re-identified the third chair as the first one: two positions."""
     poses = walk()
     table, chair = table_of(poses), table_of(poses).detection_index
     table = table[((chair == 0) & (table.frame < 50)) | ((chair == 2) & (table.frame > 70))]
@@ -125,7 +125,7 @@ def test_a_wrong_return_is_split_by_its_place() -> None:
 
 
 def test_a_right_return_is_not_split() -> None:
-    """The same chair from two sides: the joint solid explains both visits."""
+    """The same chair from two sides: the joint shape explains both visits."""
     poses = walk()
     table = table_of(poses)
     table = table[(table.detection_index == 0) & ((table.frame < 50) | (table.frame > 70))]
@@ -133,8 +133,8 @@ def test_a_right_return_is_not_split() -> None:
     assert objects_of(found, table.detection_index) == [[0]] and events == []
 
 
-def test_boxes_that_no_solid_explains_are_not_split_off() -> None:
-    """The return has boxes at random: a solid of its own would be no better than the joint one."""
+def test_boxes_that_fit_no_shape_are_not_split_off() -> None:
+    """The return has random boxes: a separate shape would fit no better than the joint one."""
     poses = walk()
     table = table_of(poses)
     late = table.frame >= 100
@@ -149,8 +149,8 @@ def test_boxes_that_no_solid_explains_are_not_split_off() -> None:
 
 
 def test_a_poor_fit_alone_splits_nothing() -> None:
-    """A thing on a chair went by the chair's identity: two solids would be better, but they are
-    in one place.
+    """An object on a chair has the chair's identity: two shapes would fit better, but their
+    positions coincide.
     """
     table, poses = stacked()
     one = np.ones(len(table), np.int64)
@@ -159,8 +159,8 @@ def test_a_poor_fit_alone_splits_nothing() -> None:
 
 
 @pytest.mark.parametrize("slips", [[60], [40, 80], []])
-def test_a_tracklet_that_slipped_is_cut_by_place(slips: list[int]) -> None:
-    """The tracker goes on with another chair without missing a frame; else nothing is cut."""
+def test_a_tracklet_with_an_identity_switch_is_cut_by_position(slips: list[int]) -> None:
+    """The tracklet switches to another chair without a missed frame; nothing else is cut."""
     poses = walk()
     table = table_of(poses)
     table = table[table.detection_index == np.searchsorted(slips, table.frame, "right")]
@@ -174,7 +174,7 @@ def test_a_tracklet_that_slipped_is_cut_by_place(slips: list[int]) -> None:
 
 @pytest.mark.parametrize(("gap", "cut"), [(7, True), (4, False)])
 def test_a_tracklet_may_be_another_object_after_a_gap(gap: int, cut: bool) -> None:
-    """For its last five frames, too few to be found by their place, it is on another chair."""
+    """Its last five frames, too few to be localised, show another chair."""
     poses = walk()
     table, last = table_of(poses), 70 + gap
     first = (table.detection_index == 0) & (table.frame < 70)
@@ -186,8 +186,8 @@ def test_a_tracklet_may_be_another_object_after_a_gap(gap: int, cut: bool) -> No
 
 
 def test_objects_seen_together_are_never_joined() -> None:
-    """Two tracks of one chair in the same frames (a double detection) stay two: the evidence says
-    so. By place and by appearance.
+    """Two tracks of one chair in the same frames (duplicate detections) stay separate by the
+    evidence of position and of appearance.
     """
     poses = walk()
     table = table_of(poses)
@@ -201,9 +201,9 @@ def test_objects_seen_together_are_never_joined() -> None:
         assert np.unique(found.track_id).tolist() == [1, 2] and kinds(events) == set()
 
 
-@pytest.mark.parametrize("every", [10**6, 3])  # n-th late box is still called a chair
-def test_what_is_called_something_else_in_the_same_place_is_the_same(every: int) -> None:
-    """Late boxes are called cups, but they are where the chair is and as large."""
+@pytest.mark.parametrize("every", [10**6, 3])  # n-th late box still has the class chair
+def test_another_class_at_the_same_position_is_the_same_object(every: int) -> None:
+    """Late boxes have the class cup, but position and size of the chair."""
     poses = walk()
     table = table_of(poses)
     table = table[(table.detection_index == 0) & ((table.frame < 50) | (table.frame > 70))]
@@ -215,7 +215,7 @@ def test_what_is_called_something_else_in_the_same_place_is_the_same(every: int)
 
 
 def stacked() -> tuple[rt.Tracks, rt.Poses]:
-    """A chair for 95 frames, then what stands on it, of its class and half its height."""
+    """A chair for 95 frames, then an object on it, of its class and half its height."""
     poses = walk()
     solids = quadrics.Ellipsoids(
         np.array([[0, 0, 0.41], [0, 0, 0.65]]),
@@ -226,10 +226,10 @@ def stacked() -> tuple[rt.Tracks, rt.Poses]:
     return table[table.detection_index == (table.frame >= 95)], poses
 
 
-def test_what_moves_stays_as_the_tracker_has_it() -> None:
-    """The same rows as chairs are joined by place and by appearance; as persons they are not.
+def test_moving_classes_keep_the_identities_of_the_tracker() -> None:
+    """The same rows as chairs are joined by position and by appearance; as persons they are not.
 
-    Nor is what does not move joined with what does.
+    Static and moving classes are not joined either.
     """
     poses = walk()
     table = table_of(poses)
@@ -243,7 +243,7 @@ def test_what_moves_stays_as_the_tracker_has_it() -> None:
             assert len(np.unique(found.track_id)) == objects
 
 
-def test_what_moves_is_not_taken_for_what_has_its_number() -> None:
+def test_moving_objects_do_not_take_identities_of_equal_number() -> None:
     """Two chairs that move, and later a person that looks like the first: its tracklet has the
     number of the identity of that chair, and its class is number 0.
     """
@@ -259,8 +259,8 @@ def test_what_moves_is_not_taken_for_what_has_its_number() -> None:
     assert objects_of(found, piece) == [[0], [1], [2]]
 
 
-def test_labels_decide_and_spread_in_their_fragments() -> None:
-    """As row by row: rows of fragments that may have a gap, labelled at random.
+def test_labels_are_propagated_within_fragments() -> None:
+    """Equals a loop over rows: fragments with gaps, random labels.
 
     Changes of less than three rows are not reported.
     """
@@ -290,7 +290,7 @@ def test_labels_decide_and_spread_in_their_fragments() -> None:
     expected = [100 + ids[r] if expected[r] < 0 else expected[r] for r in range(n)]
     pairs = set(zip(found.track_id.tolist(), expected, strict=True))
     assert len(pairs) == len(set(expected)) == len(set(found.track_id.tolist())) > 5
-    told = []
+    changes = []
     for change, whole, part in (("join", expected, ids), ("split", ids, expected)):
         for group in sorted(set(whole)):
             rows = [r for r in range(n) if whole[r] == group]
@@ -300,12 +300,12 @@ def test_labels_decide_and_spread_in_their_fragments() -> None:
                 of = tuple(
                     sorted({int(piece[r]) + 1 for r in (rows if change == "join" else some)})
                 )
-                told.append(
+                changes.append(
                     (change, group, len(some), of, float(np.median(ious)) if ious else None)
                 )
-    long = [t for t in told if t[2] >= 3]
+    long = [t for t in changes if t[2] >= 3]
     later = [t for before, t in zip([("", 0), *long], long, strict=False) if t[:2] == before[:2]]
-    assert {t[0] for t in later} == {"join", "split"} and {t[2] for t in told} > {2, 3}
+    assert {t[0] for t in later} == {"join", "split"} and {t[2] for t in changes} > {2, 3}
     assert [(e.kind, e.tracklets, e.place_iou) for e in events] == [(t[0], *t[3:]) for t in later]
     assert {e.appearance_log_odds for e in events} == {-9.0}
 
@@ -314,29 +314,29 @@ def test_labels_decide_and_spread_in_their_fragments() -> None:
 
 
 @pytest.mark.parametrize(
-    ("tracker", "twins", "objects", "expected"),
+    ("tracker", "cosine", "objects", "expected"),
     [
         ([1, 2, 3, 4, 5, 6], 0.5, 3, {"join"}),  # all came back under new identities
-        ([1, 2, 3, 2, 1, 3], 0.5, 3, {"join", "split"}),  # two were taken for each other
-        ([1, 2, 3, 1, 2, 3], 0.5, 3, set()),  # right already
-        ([1, 2, 3, 4, 5, 3], 0.999, 5, set()),  # twins that nothing tells apart stay apart
+        ([1, 2, 3, 2, 1, 3], 0.5, 3, {"join", "split"}),  # two were swapped
+        ([1, 2, 3, 1, 2, 3], 0.5, 3, set()),  # already right
+        ([1, 2, 3, 4, 5, 3], 0.999, 5, set()),  # indistinguishable instances stay separate
     ],
 )
 def test_appearance_alone_decides_without_poses(
-    tracker: list[int], twins: float, objects: int, expected: set[str]
+    tracker: list[int], cosine: float, objects: int, expected: set[str]
 ) -> None:
-    """Three chairs, each seen before frame 40 and after frame 80; what the tracker made of them."""
+    """Three chairs, each seen before frame 40 and after frame 80; identities of the tracker."""
     table = table_of(walk())
     table = table[(table.frame < 40) | (table.frame >= 80)]
     chair = table.detection_index
     piece = chair + 3 * (table.frame >= 80)
     ids = np.array(tracker)[piece]
     table = dataclasses.replace(table, track_id=ids, tracklet_id=piece + 1)
-    found, events = linked(table, None, views_of(table, chair, twins))
+    found, events = linked(table, None, views_of(table, chair, cosine))
     assert len(np.unique(found.track_id)) == objects
     assert kinds(events) == expected
     assert all(e.place_iou is None and e.kept for e in events)
-    assert all(len(things) == 1 for things in objects_of(found, chair))
+    assert all(len(true) == 1 for true in objects_of(found, chair))
 
 
 # Frames of tracklets 0, 1, 2: all apart, or two of them at once; then also where.
@@ -346,8 +346,8 @@ APART, LAST_TWO, FIRST_LAST = ((0, 40, 80), (0, 40, 40), (0, 40, 0))
 @pytest.mark.parametrize(
     ("first", "cosine", "beside", "group"),
     [
-        (APART, {(0, 1): 0.99}, 200, [1, 1, 2]),  # alike
-        (APART, {(0, 1): 0.4}, 200, [1, 2, 3]),  # rather another object
+        (APART, {(0, 1): 0.99}, 200, [1, 1, 2]),  # similar
+        (APART, {(0, 1): 0.4}, 200, [1, 2, 3]),  # rather dissimilar
         ((0, 0, 80), {(0, 1): 0.99}, 200, [1, 2, 3]),  # seen together
         (APART, {(0, 1): 0.99, (1, 2): 0.99, (0, 2): 0.98}, 200, [1, 1, 1]),
         (APART, {(0, 1): 0.93, (1, 2): 0.9, (0, 2): 0.7}, 200, [1, 1, 1]),  # through a third
@@ -360,7 +360,7 @@ APART, LAST_TWO, FIRST_LAST = ((0, 40, 80), (0, 40, 40), (0, 40, 0))
 def test_the_most_similar_are_joined_first_against_their_rivals(
     first: tuple[int, ...], cosine: dict[tuple[int, int], float], beside: int, group: list[int]
 ) -> None:
-    """Three tracklets of ten frames; those at once stand so many pixels from each other."""
+    """Three tracklets of ten frames; simultaneous ones are this many pixels apart."""
     gram = np.eye(3)
     for (i, j), value in cosine.items():
         gram[i, j] = gram[j, i] = value
@@ -378,9 +378,9 @@ def test_the_most_similar_are_joined_first_against_their_rivals(
     assert names == group
 
 
-def test_views_from_another_side_say_less() -> None:
+def test_appearance_weighs_less_across_viewpoints() -> None:
     """The first and the last views of the chairs, on an arc of 120 degrees around them: with
-    cameras the evidence of every join by appearance is weaker.
+    poses the evidence of every join by appearance is weaker.
     """
     poses = walk()
     table = table_of(poses)
@@ -396,8 +396,8 @@ def test_views_from_another_side_say_less() -> None:
     assert (np.array(odds[1]) < 0.7 * np.array(odds[0])).all()
 
 
-def test_a_misnamed_piece_does_not_ban_the_return_of_its_tracklet() -> None:
-    """A gap within the second tracklet of a chair, before it the detector says cup."""
+def test_a_misclassified_fragment_does_not_prevent_a_join() -> None:
+    """A gap within the second tracklet of a chair, before which the detected class is cup."""
     table = table_of(walk())
     table = table[(table.detection_index == 0) & ((table.frame < 40) | (table.frame >= 80))]
     late = (table.frame >= 80).astype(np.int64)
@@ -412,11 +412,11 @@ def test_a_misnamed_piece_does_not_ban_the_return_of_its_tracklet() -> None:
     ("common", "kinds", "objects"),
     [(0.0, [CHAIR] * 3, 3), (0.9, [CHAIR] * 3, 6), (0.0, [CHAIR, CUP, PERSON], 6)],
 )
-def test_what_similarity_means_is_learnt_from_the_video(
+def test_similarity_is_calibrated_on_the_video(
     common: float, kinds: list[int], objects: int
 ) -> None:
-    """The returns are .8 alike: enough where the chairs side by side are not alike at all, too
-    little where these are .7 alike, or of several classes: then nothing is learnt from them.
+    """The returns have a cosine of .8: enough if simultaneous chairs are dissimilar, too little if
+    their cosine is .7 or they have different classes, which do not calibrate.
     """
     table = table_of(walk())
     table = table[(table.frame < 40) | (table.frame >= 80)]
@@ -425,17 +425,17 @@ def test_what_similarity_means_is_learnt_from_the_video(
     kind = np.array(kinds)[chair]
     table = dataclasses.replace(table, track_id=ids, tracklet_id=ids, class_id=kind)
     own = np.sqrt(common) * np.eye(1, 40) + np.sqrt(1 - common) * np.eye(3, 40, 1)[chair]
-    visit = np.eye(6, 40, 10)[ids - 1]  # what changed until the return
+    visit = np.eye(6, 40, 10)[ids - 1]  # change until the return
     views = np.sqrt(0.8) * own + np.sqrt(0.2) * visit
     views += np.random.default_rng(2).normal(0, 0.03, views.shape)
     found, _ = linked(table, None, views / np.linalg.norm(views, axis=1, keepdims=True))
     assert len(np.unique(found.track_id)) == objects
 
 
-def test_views_of_a_tracklet_tell_how_much_one_object_varies() -> None:
+def test_tracklets_calibrate_the_variation_of_one_object() -> None:
     """Appearance turns by .9 degrees a frame: within a tracklet as much as until the return.
 
-    (Views of the same moment would tell nothing: they are all alike.)
+    (Views of the same moment would be uninformative: they are nearly identical.)
     """
     table = table_of(walk())
     table = table[(table.frame < 40) | (table.frame >= 80)]

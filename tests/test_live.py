@@ -14,16 +14,16 @@ from reobj.sources.tables import read_mot_rows
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 
 
-def test_objects_stand_where_they_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_objects_have_true_positions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """60 frames of the example clip: the ellipsoids' centres are those of the true objects."""
     assert live_ar.main(["-o", str(tmp_path), "--frames", "60", "--embed", "none"]) == 0
     objects = json.loads((tmp_path / "live_objects.json").read_text())
     truth = json.loads((EXAMPLES / "room" / "gt_objects.json").read_text())["objects"]
-    places = np.array([t["center"] for t in truth])
+    centers = np.array([t["center"] for t in truth])
     miss = [
         min(
             np.linalg.norm(np.array(o["center_in_world"]) - p)
-            for p, t in zip(places, truth, strict=True)
+            for p, t in zip(centers, truth, strict=True)
             if t["class"] == o["category"]
         )
         for o in objects
@@ -34,7 +34,7 @@ def test_objects_stand_where_they_are(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "ms" in capsys.readouterr().out
 
 
-def test_a_session_goes_on_from_its_state(tmp_path: Path) -> None:
+def test_a_session_continues_from_its_saved_state(tmp_path: Path) -> None:
     """The second session sees the same frames again: the same objects, no new identities."""
     state = ["--state", str(tmp_path / "state.npz"), "--frames", "40"]
     found = []

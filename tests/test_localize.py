@@ -1,4 +1,4 @@
-"""Frames between keyframes: PnP, followed points, jumps, gaps, against exactly drawn worlds."""
+"""Frames between keyframes: PnP, tracked points, jumps, gaps, on exactly rendered scenes."""
 
 from __future__ import annotations
 
@@ -68,13 +68,13 @@ def test_the_seed_decides_the_samples():
     assert any((other != first).any() for other in others)
 
 
-# ---- Frames between keyframes of a known model ---------------------------------------------------
+# ---- Frames between keyframes of a given model ---------------------------------------------------
 
 WORLD = DotWorld()
 
 
 def true_model(cams, key_rows, native=1):
-    """What a perfect reconstruction of the keyframes holds, pixels `native` times as fine."""
+    """A perfect reconstruction of the keyframes, with pixels `native` times as fine."""
     obs = []
     for image, row in enumerate(key_rows):
         xy, seen = WORLD.project(cams[row])
@@ -105,8 +105,8 @@ def locate(cams, key_rows, images=None, native=1, seed=0, left_out=()):
 
 
 @pytest.mark.parametrize("native", [1, 2])
-def test_frames_between_before_and_behind_keyframes_are_located(native):
-    """Half a pixel would turn the cameras by .07 deg: the centre of a pixel is where it should."""
+def test_frames_between_before_and_after_keyframes_are_located(native):
+    """An offset of half a pixel would rotate the cameras by .07 deg: pixel centres are right."""
     cams = sideways(14)
     found, status = locate(cams, [2, 7, 11], native=native)
     expected = ["keyframe" if i in (2, 7, 11) else "pnp" for i in range(14)]
@@ -115,7 +115,7 @@ def test_frames_between_before_and_behind_keyframes_are_located(native):
     assert np.linalg.norm(centres(found) - centres(cams), axis=1).max() < 0.004
 
 
-def test_frames_are_not_located_past_a_keyframe_that_mapping_took_out():
+def test_frames_are_not_located_beyond_an_unregistered_keyframe():
     """Frames 4 and 8 were keyframes, and the model does not hold them."""
     _, status = locate(sideways(12), [1, 10], left_out=[4, 8])
     near = ["pnp", "keyframe", "pnp", "pnp", *["none"] * 5, "pnp", "keyframe", "pnp"]
@@ -134,7 +134,7 @@ def test_frames_without_the_points_are_lost():
 
 @pytest.mark.parametrize("aside, status", [(0.0, "pnp"), (0.03, "pnp"), (0.3, "none")])
 def test_a_frame_far_from_both_neighbours_is_refused(aside, status):
-    """Steps are 2 cm: drawn 3 cm aside a frame is a shake of the hand, drawn 30 cm a jump."""
+    """Steps are 2 cm: an offset of 3 cm is camera shake, one of 30 cm a jump."""
     cams = sideways(11)
     moved = cams.copy()
     moved[5, :, 3] -= cams[5, :, :3] @ [0, aside, 0]
@@ -145,8 +145,8 @@ def test_a_frame_far_from_both_neighbours_is_refused(aside, status):
         np.testing.assert_allclose(centres(found[5]), centres(moved[5]), atol=0.004)
 
 
-def test_where_a_camera_turns_back_is_no_jump():
-    """The neighbours of the farthest frame are at one place; it is a usual step away."""
+def test_a_reversal_of_the_camera_is_no_jump():
+    """The neighbours of the farthest frame progress a position; it is a usual step away."""
     cams = sideways(6, step=0.04)
     there_and_back = cams[[0, 1, 2, 3, 2, 1, 0]]
     _, status = locate(there_and_back, [0, 6])
@@ -201,21 +201,21 @@ def test_a_gap_is_filled_by_time():
 
 def turned(cams, row, degrees):
     """The camera turns by so much in the frames from `row` to `row` + 5, and goes on as before."""
-    share = np.clip((np.arange(len(cams)) - row) / 5, 0, 1)[:, None]
-    turn = Rotation.from_rotvec(np.radians(degrees) * share * [0, 1, 0]).as_matrix()
+    progress = np.clip((np.arange(len(cams)) - row) / 5, 0, 1)[:, None]
+    turn = Rotation.from_rotvec(np.radians(degrees) * progress * [0, 1, 0]).as_matrix()
     rotation = turn @ cams[:, :, :3]
     return np.concatenate([rotation, -rotation @ centres(cams)[:, :, None]], 2)
 
 
 def test_a_turn_in_the_gap_is_not_filled():
-    """Even motion on both sides, and other than the one between: a blurred corner."""
+    """Even motion on both sides, different from that in the gap: a blurred corner."""
     gap = [16, 17, 18, 19]
     assert (filled(turned(sideways(40), 15, 0.3), gap)[1][gap] == "interpolated").all()
     assert (filled(turned(sideways(40), 15, 20.0), gap)[1][gap] == "none").all()
 
 
-def test_no_gap_of_a_shaking_camera_or_between_photos_is_filled():
-    """Before the gap or after it, interpolation would be wrong where the pose is known."""
+def test_gaps_of_a_shaking_camera_or_between_photos_are_not_filled():
+    """Before or after the gap, interpolation would differ from the known poses."""
     rng = np.random.default_rng(0)
     for first, last in ((0, 14), (20, 40)):
         shaken = sideways(40)
@@ -230,7 +230,7 @@ def test_no_gap_of_a_shaking_camera_or_between_photos_is_filled():
     assert filled(photos, [16])[1][16] == "none"
 
 
-def test_with_few_frames_beside_it_nothing_is_known_of_a_gap():
+def test_a_gap_with_few_neighbouring_frames_is_not_filled():
     assert filled(sideways(40), [2])[1][2] == "none"
     assert filled(sideways(40), [3])[1][3] == "interpolated"
     assert filled(sideways(40), [36])[1][36] == "interpolated"

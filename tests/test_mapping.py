@@ -1,4 +1,4 @@
-"""Reconstruction of keyframes: accuracy, refusals, the child process, a killed run."""
+"""Reconstruction of keyframes: accuracy, refusals, the child process, interrupted runs."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def truth_of(model, poses):
     return poses[[int(name[:3]) for name in model.names]]
 
 
-# ---- What comes out ------------------------------------------------------------------------------
+# ---- Reconstruction ------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +120,7 @@ GUESS, MATCHES = Focal(0.8, FocalSource.GUESS), Focal(0.8, FocalSource.MATCHES)
 
 @pytest.fixture
 def search(monkeypatch):
-    """A search among 30 keyframes whose mappers' components are set by the test: `search.made`."""
+    """A model search over 30 keyframes with mapper outputs set by the test: `search.made`."""
     pairs = MatchedPairs(
         np.array([[1, 2]]), [np.zeros((1000, 2))], dict.fromkeys(range(1, 31)), np.ones((1, 3, 3))
     )
@@ -147,8 +147,8 @@ def component(first=1, last=30, calibrated=True, sigma=0.0005, problem="", focal
     return Component("model", arrays, source, *measures, problem, arrays.ids)
 
 
-def test_a_focal_length_that_nothing_determines_is_kept_and_reported(search):
-    """No mapper's model determines it: the guess is kept, and the user is warned."""
+def test_an_undetermined_focal_length_is_kept_and_reported(search):
+    """No mapper's model determines it: the guess is kept with a warning."""
     search.made = [component(calibrated=False)]
     _, (message,) = search.run()
     assert message.startswith("frames 10-300 do not determine the focal length")
@@ -156,7 +156,7 @@ def test_a_focal_length_that_nothing_determines_is_kept_and_reported(search):
     assert search.ran == [("incremental", False), ("incremental", True)]
 
 
-def test_a_component_that_is_refused_is_reported_with_the_reason(search, monkeypatch):
+def test_a_refused_component_is_reported_with_the_reason(search, monkeypatch):
     monkeypatch.setattr(mapping, "confirmed", lambda components, others, source: components)
     still = component(16, 27, problem="the camera hardly moved")
     search.made = [component(1, 15), still, component(28, 30)]
@@ -166,8 +166,8 @@ def test_a_component_that_is_refused_is_reported_with_the_reason(search, monkeyp
     assert messages == ["frames 160-270 have no poses: the camera hardly moved"]
 
 
-def test_a_whole_global_model_needs_no_other_to_confirm_it(search, monkeypatch):
-    """Of hololens_kitchen the incremental mapper found pieces, the global one all of it."""
+def test_a_complete_global_model_needs_no_confirmation(search, monkeypatch):
+    """As on hololens_kitchen: the incremental mapper gives pieces, the global one all images."""
     pieces = [component(1, 15), component(16, 30, sigma=0.003)]
     made = {"incremental": pieces, "global": [component()]}
     monkeypatch.setattr(search, "_components", lambda mapper, keep_intrinsics: made[mapper])
@@ -181,9 +181,7 @@ def test_a_whole_global_model_needs_no_other_to_confirm_it(search, monkeypatch):
 @pytest.mark.parametrize(
     "focal, sigma, count", [(0.82, 0.0011, 1), (0.9, 0.0011, 2), (0.9, 9e-4, 1)]
 )
-def test_weaker_geometry_needs_the_matches_or_another_mapper(
-    search, monkeypatch, focal, sigma, count
-):
+def test_weak_geometry_needs_matches_or_another_mapper(search, monkeypatch, focal, sigma, count):
     """The matches determine the focal length without any model."""
     monkeypatch.setattr(mapping, "confirmed", lambda components, others, source: components)
     search.made = [component(sigma=sigma, focal=focal)]
@@ -192,10 +190,8 @@ def test_weaker_geometry_needs_the_matches_or_another_mapper(
     assert len(search.ran) == count
 
 
-def test_the_second_mapper_is_not_believed_for_the_focal_length_that_it_was_held_to(
-    search, monkeypatch
-):
-    """The first differed from that of the matches: one of the two is wrong."""
+def test_a_second_mapper_with_a_fixed_focal_length_does_not_confirm_it(search, monkeypatch):
+    """The first model and the matches give different focal lengths: one is wrong."""
     first, second = component(sigma=0.0011, focal=0.9), component(sigma=0.00102)
     made = {"incremental": [first], "global": [second]}
     asked = []
@@ -206,8 +202,8 @@ def test_the_second_mapper_is_not_believed_for_the_focal_length_that_it_was_held
     assert asked == [made["incremental"], made["global"]]
 
 
-def test_a_zoom_in_a_component_that_is_refused_anyway_takes_no_images(search, monkeypatch):
-    """Its points have too little parallax; it is checked where no other component is sound."""
+def test_a_zoom_in_a_refused_component_removes_no_images(search, monkeypatch):
+    """Its points have too little parallax; it is checked only if no other component is sound."""
     asked = []
     monkeypatch.setattr(mapping, "confirmed", lambda components, others, source: components)
     monkeypatch.setattr(mapping, "constant_focal", lambda a: (asked.append(a) or np.empty(0), []))
@@ -230,8 +226,8 @@ def test_a_focal_length_that_keeps_changing_is_refused(search, monkeypatch):
     assert len(search.ran) == 3
 
 
-def test_of_a_zoom_the_images_left_determine_the_focal_length(search, monkeypatch):
-    """Matches of images of two focal lengths give one between them."""
+def test_after_a_zoom_the_kept_images_determine_the_focal_length(search, monkeypatch):
+    """Matches between images of two focal lengths give an intermediate one."""
     ids = np.column_stack([np.arange(1, 21), np.arange(2, 22)])[np.arange(40) % 20]
     matches = [np.zeros((50, 2), np.int64)] * 40
     keypoints = dict.fromkeys(range(1, 31))
@@ -248,10 +244,10 @@ def test_of_a_zoom_the_images_left_determine_the_focal_length(search, monkeypatc
 @pytest.mark.parametrize(
     "focal, calibrated, kept", [(0.8, True, True), (1.1, True, False), (0.8, False, False)]
 )
-def test_of_two_focal_lengths_that_of_the_given_camera_is_right(
+def test_a_zoom_with_a_given_camera_keeps_its_focal_length(
     search, monkeypatch, focal, calibrated, kept
 ):
-    """The images of a zoom are left out; those that stay may be the zoomed ones."""
+    """Images of one focal length are dropped; the kept ones may be the zoomed ones."""
     found = iter([(np.array([22, 23]), [(21, 22, 1.4)]), (np.empty(0), [])])
     arrays = SimpleNamespace(focal_over_size=focal)
     freed = SimpleNamespace(arrays=arrays, calibrated=calibrated)
@@ -273,7 +269,7 @@ def test_a_given_camera_is_kept(walk, tmp_path):
     assert model.obs_xy.max() > 340  # native pixels
 
 
-def test_boxes_of_moving_things_hold_no_features(walk, tmp_path):
+def test_boxes_of_moving_objects_have_no_features(walk, tmp_path):
     """The left quarter, given in pixels of frames twice as large."""
     images = walk[0]
     boxes = [np.array([[0, 0, 160.0, 480]])] * len(images)
@@ -281,9 +277,9 @@ def test_boxes_of_moving_things_hold_no_features(walk, tmp_path):
     assert len(model.obs_xy) > 300 and model.obs_xy[:, 0].min() > 150
 
 
-def test_features_lie_where_the_dots_are(tmp_path):
-    """Dots at exactly known places. OpenCV's SIFT is off by a quarter of a pixel (it halves the
-    coordinates of an image that it has doubled); COLMAP's half pixel is another matter.
+def test_features_lie_on_the_dots(tmp_path):
+    """Dots at known positions. OpenCV's SIFT is off by a quarter of a pixel (it halves the
+    coordinates of an upsampled image); COLMAP's half pixel is a separate convention.
     """
     world = DotWorld(count=700)
     cams = arc(8, 0.1)
@@ -316,7 +312,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_has_no_depth_is_refused_and_the_message_says_what_helps(tmp_path, name):
+def test_scenes_without_depth_are_refused_with_a_remedy(tmp_path, name):
     images, message = REFUSED[name]
     messages, model = run(tmp_path, images())
     assert model is None and len(messages) == 1 and "--poses" in messages[0]
@@ -333,8 +329,8 @@ def test_images_that_do_not_connect_are_refused(walk, tmp_path):
 # ---- The child process ---------------------------------------------------------------------------
 
 
-def test_the_child_is_found_from_anywhere(walk, tmp_path, monkeypatch):
-    """Other working directory with modules of the same names, and a PYTHONPATH of the user's."""
+def test_the_child_starts_from_any_folder(walk, tmp_path, monkeypatch):
+    """From a working directory with modules of the same names, and with a user's PYTHONPATH."""
     for name in ("reobj", "numpy", "pycolmap"):
         (tmp_path / "here" / name).mkdir(parents=True)
         (tmp_path / "here" / name / "__init__.py").write_text("raise SystemExit(3)")
@@ -347,7 +343,7 @@ def test_the_child_is_found_from_anywhere(walk, tmp_path, monkeypatch):
 
 
 def test_the_users_pythonpath_reaches_the_child(walk, tmp_path, monkeypatch):
-    """Where pycolmap lies in it, it must."""
+    """It may contain pycolmap."""
     note = tmp_path / "note"
     (tmp_path / "sitecustomize.py").write_text(f"open({str(note)!r}, 'w').write('was here')")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
@@ -356,7 +352,7 @@ def test_the_users_pythonpath_reaches_the_child(walk, tmp_path, monkeypatch):
 
 
 def test_packages_are_imported_while_the_child_maps(tmp_path, monkeypatch):
-    """Not before: until then the child needs all cores. What is not installed is passed over."""
+    """Not earlier: before mapping the child uses all cores. Missing packages are skipped."""
     stages, imported = [], []
 
     def import_module(name):
@@ -386,8 +382,8 @@ def test_an_aborted_child_is_reported(walk, tmp_path, monkeypatch):
     assert model is None and "signal 6" in messages[0] and "pycolmap.log" in messages[0]
 
 
-def test_a_killed_run_goes_on_where_it_stopped(walk, tmp_path):
-    """The second run takes features and matches from the first and ends with the same bytes."""
+def test_a_killed_run_resumes(walk, tmp_path):
+    """The second run reuses features and matches of the first and gives the same bytes."""
     images, _, folder, *_ = walk
     started: list[str] = []
     again = ["features", "match", "mapping", "mapping", "features"]
@@ -409,8 +405,8 @@ def test_a_killed_run_goes_on_where_it_stopped(walk, tmp_path):
         run(tmp_path, images, seed=1, progress=note)
 
 
-def test_with_more_keyframes_only_what_is_new_is_done(walk, tmp_path):
-    """Every second view first, then all: 4 more images, 28 pairs less the 6 that are known."""
+def test_with_more_keyframes_only_new_work_is_done(walk, tmp_path):
+    """Every second view first, then all: 4 more images, and 28 pairs minus the 6 cached ones."""
     totals: list[tuple[str, int]] = []
 
     def note(stage, total):
@@ -427,7 +423,7 @@ def test_with_more_keyframes_only_what_is_new_is_done(walk, tmp_path):
 
 
 def test_two_rooms_come_as_two_components(tmp_path):
-    """The larger one is the first; one camera, the better one, took both."""
+    """The larger one comes first; the better of two cameras is used for both."""
     one, truth = textured_room(12, 0.45, -3, size=(320, 240))
     other, _ = textured_room(10, 0.45, -3, seed=5, size=(320, 240))
     messages, models = models_of(tmp_path, other + one)
@@ -460,7 +456,7 @@ with Child("sleeper", Path("work/mapping"), Path("work/log")) as child:
 @pytest.mark.parametrize("ending", [signal.SIGKILL, signal.SIGTERM])
 @pytest.mark.parametrize("platform", ["linux", "other"])
 def test_the_child_ends_with_its_parent(tmp_path, ending, platform):
-    """Also in the middle of a job; the next one waits until nobody works in the folder."""
+    """Also during a job; the next process waits until the folder is unlocked."""
     code = SLEEPER.replace("import sys, time", f"import sys, time; sys.platform = {platform!r}")
     (tmp_path / "sleeper.py").write_text(code)
     root = str(Path(rt.__file__).parent)
@@ -480,7 +476,7 @@ def test_the_child_ends_with_its_parent(tmp_path, ending, platform):
         pass
 
 
-def test_a_damaged_job_file_begins_anew(walk, tmp_path, caplog):
+def test_a_damaged_job_file_restarts_the_job(walk, tmp_path, caplog):
     shutil.copytree(walk[2], tmp_path / "out")
     (tmp_path / "out/mapping/job.json").write_text('{"camera"')
     again = run(tmp_path / "out", walk[0])

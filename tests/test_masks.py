@@ -73,7 +73,7 @@ def test_polygons_beyond_any_image_are_refused(x: float) -> None:
         masks.polygon_runs([[1, 2, 3, 4, 5, 6], [x, 2, 3, 4, 5, 6]], (20, 10))
 
 
-def test_polygons_lie_where_their_corners_are() -> None:
+def test_polygons_have_no_pixel_offset() -> None:
     """Centre and area of an ellipse; half a pixel of shift would be three times the tolerance."""
     angle = np.linspace(0, 2 * np.pi, 200, endpoint=False)
     ring = np.stack([60.3 + 30 * np.cos(angle), 50.7 + 25 * np.sin(angle)], 1)

@@ -1,4 +1,4 @@
-"""Which frame a supplied pose belongs to: numbers, times, what lies between two times."""
+"""Assignment of supplied poses to frames: by number, by time, by interpolation."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def rows_of(found: list[FrameAssignment]) -> dict[str, tuple[list[int], int]]:
 
 
 def test_poses_between_two_times_are_interpolated() -> None:
-    """A steady turn about z and a steady move: a quarter of the way is a quarter of both."""
+    """Constant angular and linear velocity: a quarter of the time is a quarter of both."""
     angle = np.array([0.0, 0.4, 0.8, 1.2])
     world_from_cam = np.concatenate(
         [
@@ -51,7 +51,7 @@ def test_poses_between_two_times_are_interpolated() -> None:
     np.testing.assert_allclose(turn, np.outer([0.1, 0.6], [0, 0, 1]), atol=1e-5)
 
 
-def test_a_pose_that_is_not_known_interpolates_nothing() -> None:
+def test_unknown_poses_are_not_interpolated() -> None:
     poses = np.tile(np.eye(3, 4), (3, 1, 1))
     poses[1, 0, 3] = np.nan
     _, at = interpolated(poses, np.array([0.0, 0.1, 0.2]), np.array([0.05, 0.15]))
@@ -79,7 +79,7 @@ def test_of_fast_frames_a_time_matches_within_half_a_frame() -> None:
     assert rows_by_time(np.array([0.004, 0.036, 0.06]), frame, frame / 100).tolist() == [0, -1, 2]
 
 
-def test_a_video_has_as_many_frames_as_were_decoded_if_all_were() -> None:
+def test_a_fully_decoded_video_has_its_decoded_frame_count() -> None:
     for config, names, count in (
         (None, (), 9), (InputConfig(), (), 9), (InputConfig(every=2), (), 30),
         (InputConfig(stop=9), (), 30), (InputConfig(), ("a.png",) * 30, 30),
@@ -88,7 +88,7 @@ def test_a_video_has_as_many_frames_as_were_decoded_if_all_were() -> None:
         assert source_of(video, np.arange(9), np.arange(9) / 10).count == count
 
 
-def test_numbers_beside_images_that_count_from_elsewhere() -> None:
+def test_numbers_with_an_offset_from_the_images() -> None:
     seen = source([0, 1, 2], [0, 0.1, 0.2], 3)
     from_1 = _by_image_numbers(np.array([1, 2, 3]), np.array([0, 1, 2]), seen, "numbers")
     assert rows_of(from_1)["number1"] == ([0, 1, 2], 0)

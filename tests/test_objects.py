@@ -1,4 +1,4 @@
-"""From views to solids, and what is said of them: simulated chairs, and fits made by hand."""
+"""Object fitting and description: simulated chairs, and fits with values set by hand."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ def options(**changes: object) -> rt.ObjectsConfig:
     return dataclasses.replace(rt.ObjectsConfig(), **changes)  # type: ignore[arg-type]
 
 
-# ---- Where objects are, against the truth ----
+# ---- Positions, against ground truth ----
 
 
-def test_objects_come_out_where_they_are(chairs: rt.Result) -> None:
+def test_objects_have_their_true_positions(chairs: rt.Result) -> None:
     for found, center in zip(chairs.objects, chair_solids().center_in_world, strict=True):
         assert (found.status, found.class_name, found.support) == ("ok", "chair", "box")
         np.testing.assert_allclose(found.center, center, atol=0.03)
@@ -37,7 +37,7 @@ def test_objects_come_out_where_they_are(chairs: rt.Result) -> None:
         assert np.radians(90) < angle < np.radians(150)  # an arc of 120 degrees around the middle
 
 
-def test_without_poses_objects_are_the_tracks() -> None:
+def test_without_poses_objects_equal_the_tracks() -> None:
     tracks = tracks_of(walk(8))
     tracks = with_columns(tracks, tracklet_id=tracks.track_id + 10 * (tracks.frame > 4))
     result = fitted(tracks, None)
@@ -83,7 +83,7 @@ def test_classes_that_move_get_no_ellipsoid(moving: str, status: str) -> None:
 
 
 @pytest.mark.parametrize(("min_views", "rejected"), [(4, False), (5, True)])
-def test_min_views_is_the_number_that_is_needed(min_views: int, rejected: bool) -> None:
+def test_min_views_is_the_number_required(min_views: int, rejected: bool) -> None:
     poses = walk(40)
     tracks = tracks_of(poses)
     tracks = tracks[np.isin(tracks.frame, [0, 13, 26, 39])]
@@ -94,7 +94,7 @@ def test_min_views_is_the_number_that_is_needed(min_views: int, rejected: bool) 
 
 @pytest.mark.parametrize(("score", "views"), [(0.0, 10), (0.25, 40)])
 def test_filled_gaps_do_not_shape_the_ellipsoid(score: float, views: int) -> None:
-    """Three of four boxes are twice as high: of score 0 they are filled in, and no views."""
+    """Three of four boxes are twice as high: with score 0 they are filled gaps and no views."""
     poses = walk(40)
     tracks = tracks_of(poses)
     weak = tracks.frame % 4 != 0
@@ -115,22 +115,22 @@ def classes_of(labels: list[int], score: float = 0.8, others: int = 0) -> dict[s
     return describe_objects(tracks, rt.COCO_NAMES, None, None, rt.ObjectsConfig())[0].classes
 
 
-def test_an_object_says_its_two_likeliest_classes() -> None:
+def test_an_object_lists_its_two_most_probable_classes() -> None:
     chair, couch, bench = 56, 57, 13
     torn = classes_of([chair] * 11 + [couch] * 9 + [bench])
     assert list(torn) == ["chair", "couch"] and 0.5 < torn["chair"] < 0.75
-    assert sum(torn.values()) < 1  # the bench has a little
-    sure = classes_of([chair] * 60 + [couch] * 20)
-    assert sure["chair"] > 0.95 > torn["chair"]
+    assert sum(torn.values()) < 1  # the bench has a small probability
+    clear = classes_of([chair] * 60 + [couch] * 20)
+    assert clear["chair"] > 0.95 > torn["chair"]
     weak = classes_of([chair] * 60 + [couch] * 20, score=0.1)
-    assert sure["chair"] > weak["chair"] > weak["couch"]
+    assert clear["chair"] > weak["chair"] > weak["couch"]
     assert classes_of([chair]) == {"chair": 1.0}  # no other class in the video
     once = classes_of([chair], others=9)
-    assert list(once) == ["chair"] and 0.1 < once["chair"] < 0.3  # one box says little
+    assert list(once) == ["chair"] and 0.1 < once["chair"] < 0.3  # one box is weak evidence
 
 
 def test_known_size_sets_the_scale() -> None:
-    """A world of half the size and without metric poses: the chairs' .82 m say so."""
+    """A world of half the size and without metric poses: scaled by the chairs' .82 m."""
     poses = walk()
     tracks = tracks_of(poses)
     poses = dataclasses.replace(poses, metric=False)
@@ -144,8 +144,8 @@ def test_known_size_sets_the_scale() -> None:
         np.testing.assert_allclose(np.sort(found.size_m), [0.56, 0.6, 0.82], rtol=0.1)
 
 
-def test_priors_support_and_up_are_obeyed(tmp_path: Path) -> None:
-    """What the config names is what the fit gets: other priors, another solid, another up."""
+def test_priors_support_and_up_reach_the_fit(tmp_path: Path) -> None:
+    """The fit uses the configured priors, shape and up direction."""
     poses = dataclasses.replace(walk(20), up_in_world=None)
     tracks = tracks_of(poses)
     tilted = np.array([0, 0.1, 1]) / np.hypot(0.1, 1)
@@ -161,7 +161,7 @@ def test_priors_support_and_up_are_obeyed(tmp_path: Path) -> None:
     few = tracks[tracks.frame < 3]  # hardly any parallax: the prior decides the depth
     sizes = [fitted(few, poses, options(priors=p, support="box")).objects[0].size_rel_sigma.max()
              for p in ("", str(tmp_path / "priors.json"))]  # fmt: skip
-    assert sizes[1] > 1.2 * sizes[0]  # an unknown category says less of the size
+    assert sizes[1] > 1.2 * sizes[0]  # an unknown category constrains the size less
 
 
 @pytest.mark.parametrize("text", ["north", "0,0,0", "1,2", "1,2,nan", "1,2,3,4"])
@@ -190,13 +190,13 @@ def test_known_sizes(text: str, sizes: dict[str, tuple[str, float]]) -> None:
 @pytest.mark.parametrize(
     "text", ["door", "door=tall", "door=2furlongs", "=2m", "door=1.2.3m", "door=.m", "door=0m"]
 )
-def test_known_size_that_cannot_be_read(text: str) -> None:
+def test_invalid_known_sizes(text: str) -> None:
     with pytest.raises(rt.ReobjError, match="--known-size"):
         parse_known_size(text)
 
 
-def test_fitter_names_classes_beyond_the_names() -> None:
-    """A class without a name has no category, and is no error."""
+def test_the_fitter_accepts_classes_without_a_name() -> None:
+    """A class without a name has no category and raises no error."""
     poses = walk(10)
     tracks = with_columns(tracks_of(poses), class_id=7)
     views = gather_views(tracks, poses, tracks.track_id - 1, 3, 0.3)
@@ -206,13 +206,13 @@ def test_fitter_names_classes_beyond_the_names() -> None:
     }
 
 
-# ---- What is said of a fit, made by hand ----
+# ---- Description of a fit set by hand ----
 
 TURN = Rotation.from_euler("zyx", [70, 20, -40], degrees=True)
 
 
 def a_fit(count: int = 4, **changes: object) -> tuple[quadrics.ObjectFits, Views]:
-    """One object fitted in `count` frames of a camera that stands still, and its exact boxes."""
+    """One object fitted in `count` frames of a static camera, and its exact boxes."""
     half = np.array([[0.2, 0.3, 0.4]])
     solids = quadrics.Ellipsoids(np.array([[0.1, -0.2, 5.0]]), half, TURN.as_matrix()[None])
     img_from_world = np.tile(walk(1).camera.K @ np.eye(3, 4), (count, 1, 1))
@@ -241,7 +241,7 @@ def described(
     return found
 
 
-def test_sizes_are_in_metres_and_know_the_error_of_the_scale() -> None:
+def test_sizes_are_in_metres_and_include_the_sigma_of_the_scale() -> None:
     found = described()
     np.testing.assert_allclose(found.size, [0.4, 0.6, 0.8])
     np.testing.assert_allclose(found.size_m, [1.0, 1.5, 2.0])  # 2.5 m a unit
@@ -271,15 +271,15 @@ def test_evidence_of_a_fit() -> None:
     assert found.score == 0.6 and found.class_name == "lamp" and found.reason == ""
 
 
-def test_numbers_that_are_unknown_are_none() -> None:
-    """JSON knows no NaN."""
+def test_unknown_numbers_are_none() -> None:
+    """JSON has no NaN."""
     found = described(parallax_deg=np.array([np.nan]))
     assert found.parallax_deg is None
     json.dumps(found.to_json(), allow_nan=False)
 
 
 @pytest.mark.parametrize("status", ["ok", "prior_dominated", "rejected"])
-def test_only_rejected_objects_have_no_solid(status: str) -> None:
+def test_only_rejected_objects_have_no_shape(status: str) -> None:
     found = described(status=np.array([status]), reason=["so it is"])
     assert (found.status, found.reason) == (status, "so it is")
     assert found.located == (status != "rejected") == (found.center is not None)
@@ -324,7 +324,7 @@ def test_world_of_a_fit() -> None:
     [(True, True, [0, 0, 1], "objects"), (False, True, [1, 0, 0], "poses"),
      (False, False, None, "none")],
 )  # fmt: skip
-def test_up_is_the_fits_or_the_poses(
+def test_up_comes_from_the_fit_or_the_poses(
     fit_knows: bool, poses_know: bool, up: list[float] | None, source: str
 ) -> None:
     poses = dataclasses.replace(walk(3), up_in_world=np.array([1.0, 0, 0]) if poses_know else None)

@@ -30,11 +30,11 @@ def scene(counter: np.ndarray) -> tuple[quadrics.Ellipsoids, Views]:
 
 
 def cut_below(views: Views) -> None:
-    """Cut the boxes of the first solid where those of the second begin."""
+    """Truncate the boxes of the first object at those of the second."""
     views.boxes[:, 0, 3] = views.boxes[:, 1, 1]
 
 
-def test_the_edge_at_a_counter_is_hidden_and_no_other() -> None:
+def test_only_the_edge_at_the_counter_is_occluded() -> None:
     solids, views = scene(np.array([1.5, 0.1, 0.3]))
     cut_below(views)
     found = occluded_edges(views, solids)
@@ -43,7 +43,7 @@ def test_the_edge_at_a_counter_is_hidden_and_no_other() -> None:
     np.testing.assert_array_equal(found, expected)
 
 
-def test_what_is_farther_away_hides_nothing() -> None:
+def test_farther_objects_occlude_nothing() -> None:
     solids, views = scene(np.array([1.5, 0.1, 0.15]))
     solids.center_in_world[1, 1] = 0.4
     views.boxes[:] = quadrics.solid_boxes(solids, "box", views.img_from_world)
@@ -53,21 +53,21 @@ def test_what_is_farther_away_hides_nothing() -> None:
     assert occluded_edges(views, solids)[:, 0, LOWER].all()
 
 
-def test_what_covers_the_whole_box_hides_no_edge() -> None:
-    """The chair is seen although a solid is in the way: that is no wall."""
+def test_an_object_covering_the_whole_box_occludes_no_edge() -> None:
+    """The chair is detected although an object covers it: that object is not opaque."""
     solids, views = scene(np.array([1.5, 0.1, 0.9]))
     assert not occluded_edges(views, solids).any()
 
 
-def test_an_unknown_solid_hides_nothing() -> None:
+def test_an_unknown_object_occludes_nothing() -> None:
     solids, views = scene(np.array([1.5, 0.1, 0.3]))
     cut_below(views)
     solids.center_in_world[1] = solids.half_axes[1] = np.nan
     assert not occluded_edges(views, solids).any()
 
 
-def test_no_edge_is_hidden_below_the_image() -> None:
-    """The box ends where the image does, and so does the solid's."""
+def test_no_edge_is_occluded_below_the_image() -> None:
+    """The box ends at the image border, and so does the projection."""
     solids, views = scene(np.array([0.2, 0.2, 0.4]))
     solids.center_in_world[1, :2] = [1.5, 0]
     whole = quadrics.solid_boxes(solids, "box", views.img_from_world)
@@ -77,23 +77,23 @@ def test_no_edge_is_hidden_below_the_image() -> None:
 
 
 @pytest.mark.parametrize("edge", [UPPER, LOWER])
-def test_behind_a_hidden_edge_the_fit_goes_on(edge: int) -> None:
-    """A third of each box is hidden; how tall a chair usually is tells the rest."""
+def test_the_fit_extends_behind_an_occluded_edge(edge: int) -> None:
+    """A third of each box is occluded; the size prior of chairs gives the rest."""
     poses = walk()
     table = table_of(poses)
     side = 0.35 * (table.xyxy[:, 3] - table.xyxy[:, 1])
     table.xyxy[:, edge] += side if edge == UPPER else -side
     views = gather_views(table, poses, table.detection_index, 3, 0.0)
-    hidden = np.zeros(views.boxes.shape, bool)
-    hidden[..., edge] = True
+    occluded = np.zeros(views.boxes.shape, bool)
+    occluded[..., edge] = True
     fit = make_fit(rt.ObjectsConfig(), poses, NAMES)
     cut, whole = (
-        fit(dataclasses.replace(views, occluded=mask), [CHAIR] * 3) for mask in (None, hidden)
+        fit(dataclasses.replace(views, occluded=mask), [CHAIR] * 3) for mask in (None, occluded)
     )
     true = 2 * chair_solids().half_axes[:, 2]
     assert (cut.size[:, 2] < 0.8 * true).all()
     np.testing.assert_allclose(whole.size[:, 2], true, rtol=0.15)
-    assert (whole.cov[:, 5, 5] > 1.5 * cut.cov[:, 5, 5]).all()  # and it is said
+    assert (whole.cov[:, 5, 5] > 1.5 * cut.cov[:, 5, 5]).all()  # and it is reported
 
 
 def seen_along(distance: float, beside: float = 0.0, count: int = 40) -> np.ndarray:
@@ -105,7 +105,7 @@ def seen_along(distance: float, beside: float = 0.0, count: int = 40) -> np.ndar
 
 
 def through(points: np.ndarray) -> float:
-    """How much is seen through a chair by five cameras, all of which observe all points."""
+    """See-through ratio of a chair for five cameras, all of which observe all points."""
     solids, _ = scene(np.array([0.2, 0.2, 0.4]))
     every = np.indices((5, len(points))).reshape(2, -1).T
     poses = dataclasses.replace(walk(5, arc_deg=8.0), points=points, visibility=every)
@@ -114,13 +114,13 @@ def through(points: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("distance, seen", [(1.4, True), (1.0, False), (0.9, False), (0.6, False)])
-def test_points_behind_a_solid_tell_that_it_is_not_there(distance: float, seen: bool) -> None:
-    """Those on it and before it do not."""
+def test_points_behind_an_object_are_evidence_against_it(distance: float, seen: bool) -> None:
+    """Points on it and in front of it are not."""
     assert through(seen_along(distance)) == pytest.approx(np.log(210 / 10) if seen else 0)
 
 
-def test_what_is_seen_on_a_solid_or_beside_it_speaks_for_it() -> None:
-    """Things have holes: twice as much may be seen through them."""
+def test_points_on_or_beside_an_object_support_it() -> None:
+    """Objects have holes: twice as many points may be seen through them."""
     behind, on_it = seen_along(1.4), seen_along(1.0)
     assert through(np.concatenate([behind, on_it[:10]])) == pytest.approx(np.log(210 / 110))
     assert through(np.concatenate([behind, on_it[:20]])) == 0
@@ -128,5 +128,5 @@ def test_what_is_seen_on_a_solid_or_beside_it_speaks_for_it() -> None:
     assert through(np.empty((0, 3))) == 0
 
 
-def test_of_very_many_points_some_are_enough() -> None:
+def test_many_points_are_subsampled() -> None:
     assert np.log(5 * 200 / 10) < through(seen_along(1.4, count=5000)) < np.log(5 * 501 / 10)

@@ -1,4 +1,4 @@
-"""Options: how many, how they are set, and that every one is obeyed where it is read.
+"""Options: their list, how they are set, and the effect of each one.
 
 `SHOWN` has one check for each option: it sets the option and sees the effect. A new option without
 a check fails here.
@@ -51,10 +51,10 @@ CAMERA_TEXT = "300,300,160,120"
 CAMERA = rt.Camera("PINHOLE", 320, 240, (300.0, 300.0, 160.0, 120.0))
 
 
-# ---- How many, and their list ----
+# ---- The list of options ----
 
 
-def test_the_list_of_options_has_them_all(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_list_of_options_is_complete(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as done:
         rt.main(["--options"])
     lines = capsys.readouterr().out.splitlines()
@@ -64,8 +64,8 @@ def test_the_list_of_options_has_them_all(capsys: pytest.CaptureFixture[str]) ->
     assert named == list(every_option(rt.Config()))
 
 
-def test_every_option_says_what_it_does() -> None:
-    """In words, with its default; and no two flags are the same."""
+def test_every_option_is_documented() -> None:
+    """With text and default; flags are unique."""
     options = every_option(rt.Config())
     assert all(len(f.metadata["help"].split()) >= 2 for f in options.values())
     flags = [f.metadata["flag"] for f in options.values() if f.metadata["flag"]]
@@ -110,7 +110,7 @@ def test_set_changes_one_option(name: str, seen: list[rt.Config]) -> None:
 
 
 def test_flags_set_their_options(seen: list[rt.Config]) -> None:
-    """Every flag of `run`, all at once; `track` knows none of cameras and objects."""
+    """Every flag of `run`, all at once; `track` has no flags of cameras and objects."""
     flags = {n: f for n, f in every_option(rt.Config()).items() if f.metadata["flag"]}
     words, wanted = [], {}
     for name, f in flags.items():
@@ -127,7 +127,7 @@ def test_flags_set_their_options(seen: list[rt.Config]) -> None:
     ("text", "value"),
     [("true", True), ("On", True), ("1", True), ("no", False), ("off", False), ("FALSE", False)],
 )
-def test_switches_take_words(text: str, value: bool, seen: list[rt.Config]) -> None:
+def test_switches_accept_words(text: str, value: bool, seen: list[rt.Config]) -> None:
     assert rt.main(["run", "a.mp4", "-o", "out", "--set", f"output.scene={text}"]) == 0
     assert seen[0].output.scene is value
 
@@ -137,7 +137,7 @@ def test_switches_take_words(text: str, value: bool, seen: list[rt.Config]) -> N
     [
         ("tracker.coast_frame=3", "no such option; did you mean tracker.coast_frames?"),
         ("traker.n_init=3", "no such option; did you mean tracker.n_init?"),
-        ("hgh=.3", "did you mean tracker.high_score?"),  # a word of the field is enough
+        ("hgh=.3", "did you mean tracker.high_score?"),  # a part of the name is enough
         ("coast=3", "did you mean tracker.coast_frames?"),
         ("fps_max=3", "no such option; did you mean"),
         ("quite.else=3", "no such option; did you mean"),
@@ -150,7 +150,7 @@ def test_switches_take_words(text: str, value: bool, seen: list[rt.Config]) -> N
         ("tracker.n_init", "expected =INT, found None"),
     ],
 )
-def test_a_wrong_set_is_one_line(
+def test_an_invalid_set_gives_one_line(
     item: str, expected: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert rt.main(["run", "a.mp4", "-o", "out", "--set", item]) == 2
@@ -171,7 +171,7 @@ def test_a_file_keeps_every_option(tmp_path: Path) -> None:
     assert tomllib.loads((tmp_path / "a.toml").read_text())["tracker"]["n_init"] == 6
 
 
-def test_a_file_holds_what_differs_only(tmp_path: Path) -> None:
+def test_a_file_holds_changed_values_only(tmp_path: Path) -> None:
     path = tmp_path / "a.toml"
     write_config(rt.Config(), path)
     assert tomllib.loads(path.read_text()) == {}
@@ -202,7 +202,7 @@ def test_any_text_survives_a_file(tmp_path: Path, text: str) -> None:
         ("[output]\noverlay = 'solid'", r"output\.overlay=solid: expected"),
     ],
 )
-def test_a_wrong_file_is_one_line(
+def test_an_invalid_file_gives_one_line(
     tmp_path: Path, text: str, expected: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "a.toml"
@@ -217,7 +217,7 @@ def test_a_wrong_file_is_one_line(
 
 
 def test_flags_override_the_file(tmp_path: Path, seen: list[rt.Config]) -> None:
-    """And --set overrides flags; --save-config keeps what came out."""
+    """And --set overrides flags; --save-config saves the result."""
     path, kept = tmp_path / "a.toml", tmp_path / "b.toml"
     path.write_text("threads = 2\n[input]\nevery = 5\nstart = 7\n[tracker]\nhigh_score = 1\n")
     words = ["--every", "3", "--set", "input.start=8", "--save-config", str(kept)]
@@ -228,7 +228,7 @@ def test_flags_override_the_file(tmp_path: Path, seen: list[rt.Config]) -> None:
     assert read_config(rt.Config(), kept) == config
 
 
-# ---- Every one is obeyed ----
+# ---- Effect of every option ----
 
 
 class Lab:
@@ -253,7 +253,7 @@ class Lab:
         return [frame.index for frame in rt.Video(folder, self.config(value).input)]
 
     def refit(self, value: Any, **others: Any) -> rt.Result:
-        """Link, fit and write again what the room's folder holds."""
+        """Link, fit and write the room's folder again."""
         config = self.config(value, output__overlay="none", output__scene=False)
         for name, other in others.items():
             config = with_option(config, name.replace("__", "."), other)
@@ -262,7 +262,7 @@ class Lab:
         return rt.refit(out, config)
 
     def caught(self, module: Any, function: str, parameter: str) -> list[Any]:
-        """Values that reach a parameter of a function, which is called all the same."""
+        """Record the values passed for a parameter of a function, which is still called."""
         real, values = getattr(module, function), []
         signature = inspect.signature(real)
 
@@ -303,12 +303,12 @@ def rows(*boxes: tuple[float, ...]) -> rt.Detections:
     return rt.Detections.from_array(table)
 
 
-def test_every_option_is_shown_to_be_obeyed() -> None:
+def test_every_option_has_an_effect_check() -> None:
     assert set(SHOWN) == set(every_option(rt.Config()))
 
 
 @pytest.mark.parametrize("name", every_option(rt.Config()))
-def test_option_is_obeyed(
+def test_option_has_its_effect(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: Path
 ) -> None:
     SHOWN[name](Lab(name, tmp_path, monkeypatch, room))
@@ -396,7 +396,7 @@ class Session:
 
 
 def by_network(lab: Lab, value: Any) -> tuple[rt.Detections, tuple[str, ...]]:
-    """What an ONNX detector finds with the option set, in 64 px of grey."""
+    """Detections of an ONNX detector with the option set, in a grey image of 64 px."""
     lab.patch.setattr(detectors, "onnx_session", Session)
     model = lab.path / "model.onnx"
     model.touch()
@@ -405,7 +405,7 @@ def by_network(lab: Lab, value: Any) -> tuple[rt.Detections, tuple[str, ...]]:
 
 
 def by_file(lab: Lab, value: Any) -> tuple[rt.Detections, tuple[str, ...]]:
-    """What recorded detections hold for frame 0 with the option set: two chairs and a mouse."""
+    """Recorded detections of frame 0 with the option set: two chairs and a mouse."""
     table = lab.path / "det.csv"
     table.write_text("frame,x1,y1,x2,y2,score,class\n" + "".join(
         f"0,{x - w / 2},{y - h / 2},{x + w / 2},{y + h / 2},{score},{('mouse', 'chair')[kind]}\n"
@@ -436,7 +436,7 @@ def _(lab: Lab) -> None:
 
 @shows("detect.tiles")
 def _(lab: Lab) -> None:
-    """The same box in every tile, at four places; those of the whole image and of one coincide."""
+    """The same box in every tile, at four positions; that of the whole image equals one of them."""
     boxes = ((32, 32, 20, 20, 0.9, 1),)
     lab.patch.setattr(Session, "BOXES", boxes)
     assert [len(by_network(lab, value)[0]) for value in ("", "2x1", "2x2")] == [1, 3, 5]
@@ -467,7 +467,7 @@ def _(lab: Lab) -> None:
 
 @shows("detect.first_frame")
 def _(lab: Lab) -> None:
-    """A frame 1 of two is the second one as CSV counts, the first where the user says so."""
+    """Frame 1 of two is the second one in CSV by default, the first with the option."""
     (lab.path / "det.csv").write_text("frame,x1,y1,x2,y2\n1,1,2,30,40\n")
     video = rt.Video(images(lab.path / "images", 3))
     for value, frame in (("", 1), ("0", 1), ("1", 0)):
@@ -487,11 +487,11 @@ def _(lab: Lab) -> None:
     assert [len(by_file(lab, value)[0]) for value in (3, 9, 0)] == [3, 9, 10]  # 0: all of a file
 
 
-# ---- embed, threads, device, offline: what reaches the networks of a run ----
+# ---- embed, threads, device, offline: settings of the networks of a run ----
 
 
 def run_on_nothing(lab: Lab, value: Any) -> None:
-    """Track six images in which nothing is found."""
+    """Track six images without detections."""
     folder, out = lab.path / "images", lab.path / "out"
     config = lab.config(value, output__overlay="none", output__scene=False)
     rt.run(images(folder, 6), out, config, detections=lambda image: [], in_3d=False)
@@ -507,7 +507,7 @@ def _(lab: Lab) -> None:
 
 @shows("embed.head")
 def _(lab: Lab) -> None:
-    """Another head of the network; one that is not there is refused by its name."""
+    """Another head of the network; a missing one is refused by its name."""
     heads = lab.caught(rt, "make_embedder", "head")
     with pytest.raises(rt.ReobjError, match=r"no-such-head\.onnx"):
         run_on_nothing_with_backbone(lab)
@@ -515,7 +515,7 @@ def _(lab: Lab) -> None:
 
 
 def run_on_nothing_with_backbone(lab: Lab) -> None:
-    """The network of our weights by its file, without the metadata that names its head."""
+    """The bundled network by its file, without the metadata that names its head."""
     lab.patch.setattr("reobj.appearance.embedding.onnx_metadata", lambda session: {})
     config = lab.config("no-such-head.onnx", embed__model=str(own_models() / "reobj.onnx"))
     rt.run(images(lab.path / "images", 2), lab.path / "out", config, detections=lambda image: [],
@@ -535,7 +535,7 @@ def _(lab: Lab) -> None:
 
 @shows("device")
 def _(lab: Lab) -> None:
-    """Where detector and embedder run; one that is not here is refused."""
+    """The device of detector and embedder; an unavailable one is refused."""
     detector = lab.caught(rt, "open_detections", "device")
     embedder = lab.caught(rt, "make_embedder", "device")
     with pytest.raises(rt.ReobjError, match="--device no-such-device: unknown"):
@@ -578,7 +578,7 @@ NOTHING = rt.Detections.empty()
 
 @shows("tracker.high_score")
 def _(lab: Lab) -> None:
-    """Of a fair box on the track and a clear one aside the first to be matched goes on."""
+    """Of a medium box on the track and a strong one beside it, the one matched first is used."""
     fair, clear = (*BOX, 0.5), (*ASIDE, 0.9)
     found = {v: track(lab.tracker(v), *[rows(BOX)] * 4, rows(fair, clear)) for v in (0.4, 0.6)}
     index = {v: t.detection_index[t.track_id == 1].tolist() for v, t in found.items()}
@@ -646,7 +646,7 @@ def _(lab: Lab) -> None:
 
 @shows("tracker.appearance_weight")
 def _(lab: Lab) -> None:
-    """Two swap places, by their looks: who believes the places alone does not notice."""
+    """Two objects swap positions according to their appearance, unnoticed by motion alone."""
     views = np.eye(2, 8)
     for value, ids in ((0.0, [1, 2]), (0.8, [2, 1])):
         tracker = lab.tracker(value)
@@ -657,7 +657,7 @@ def _(lab: Lab) -> None:
 
 @shows("tracker.foreground_weight")
 def _(lab: Lab) -> None:
-    """Share of the foreground in a fused row, and in what two rows have in common."""
+    """Weight of the foreground in a fused row, and in the cosine of two rows."""
     for value in (0.2, 0.9):
         tracker = lab.tracker(value)
         both = rt.Embeddings(np.eye(2, 3), np.ones((2, 1)))
@@ -682,7 +682,7 @@ def _(lab: Lab) -> None:
 
 @shows("tracker.return_probability")
 def _(lab: Lab) -> None:
-    """A return that is rather alike: enough for one who asks for little."""
+    """A return with a medium similarity: enough for a low threshold."""
     for value, identity in ((0.05, 1), (0.95, 2)):
         tracker = lab.tracker(value)
         track(tracker, *[rows(BOX)] * 12, embeddings=np.eye(1, 8))
@@ -693,7 +693,7 @@ def _(lab: Lab) -> None:
 
 @shows("tracker.camera_motion")
 def _(lab: Lab) -> None:
-    """The image moves 40 px to the right; the track goes with it, or stays."""
+    """The image moves 40 px to the right; the track follows it, or stays."""
     image = cv2.imread(str(images(lab.path / "images", 1) / "0000.jpg"))
     for value, shift in ((True, 40), (False, 0)):
         tracker = lab.tracker(value)
@@ -794,13 +794,13 @@ def _(lab: Lab) -> None:
 
 
 def write_model(poses: rt.Poses, lab: Lab) -> rt.Poses:
-    """Stand for a reconstruction, with its COLMAP model."""
+    """Replaces a reconstruction, with its COLMAP model."""
     write_colmap(lab.path / "out" / "cache" / "sfm" / "sparse", poses, [str(i) for i in range(4)])
     return poses
 
 
 def reconstructed(lab: Lab, value: Any) -> rt.Poses:
-    """Poses of 9 frames of which a model holds frames 0, 4 and 8; what is between has no points."""
+    """Poses of 9 frames; the model contains frames 0, 4 and 8, the others have no points."""
     folder = lab.path / "images"
     video = rt.Video(folder if folder.exists() else images(folder, 9))
     keys = np.array([0, 4, 8])
@@ -873,7 +873,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Output folder of a run: two chairs in 24 frames with poses.
 
     The first is missed in frames 9 to 11; the second is away in frames 12 to 17, and comes back
-    under another identity with faint boxes.
+    under another identity with low scores.
     """
     base = tmp_path_factory.mktemp("room")
     poses = arc(24)
@@ -968,7 +968,7 @@ def _(lab: Lab) -> None:
 
 @shows("output.overlay")
 def _(lab: Lab) -> None:
-    """No film; one with edges of solids, and one with ellipses and trails besides boxes."""
+    """No overlay; one with edges of the 3D shapes, and one with boxes, ellipses and trails."""
     sizes = {}
     for value in ("none", "solids", "ellipses,trails"):
         config = lab.config(value, output__scene=False)
@@ -989,7 +989,7 @@ def _(lab: Lab) -> None:
 
 @shows("output.doubtful")
 def _(lab: Lab) -> None:
-    """Nothing is likelier than 1.1: all are in the file and the page; in the film if asked for."""
+    """All are below a confidence of 1.1: in the file and the viewer; in the overlay on request."""
     for value, count in ((False, 0), (True, 2)):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(reobj.objects.confidence, "LOW_CONFIDENCE", 1.1)
@@ -999,16 +999,16 @@ def _(lab: Lab) -> None:
         result, out, video, *_, doubtful = shown.call_args[0]
         assert len(result.objects) == 2 and doubtful == value
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(scene, "Overlay", film := Mock())
+            patch.setattr(scene, "Overlay", drawn := Mock())
             patch.setattr(scene, "write_scene", page := Mock())
             scene.write_pictures(result, out, video, doubtful=doubtful)
-        assert len(film.call_args[0][0].objects) == count and page.call_args[0][-1] == value
+        assert len(drawn.call_args[0][0].objects) == count and page.call_args[0][-1] == value
 
 
 @shows("output.fill_gaps")
 def _(lab: Lab) -> None:
-    """Three frames in which the first chair was missed; the second was away for six, of which four
-    are from about where it was seen: both are located.
+    """The first chair is missed in three frames; the second is absent in six, of which four are
+    near viewpoints that observed it: both are located.
     """
     for value, count in ((0, 0), (1, 7)):
         result = lab.refit(value)

@@ -1,4 +1,4 @@
-"""What is drawn over the video: in the right place, at the right scale, of the right objects."""
+"""The overlay video: position, scale and identity of everything drawn."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_labels_stay_in_the_image(corner: tuple[float, float]) -> None:
     assert x2 - x1 > 80 and x1 >= 0 and x2 <= 200 and y1 <= 4
 
 
-def test_identities_have_colours_of_their_own() -> None:
+def test_identities_have_distinct_colours() -> None:
     assert len({object_color(i) for i in range(1, 40)}) == 39
 
 
@@ -113,14 +113,14 @@ def test_an_ellipse_is_the_outline_of_the_surface() -> None:
         np.full((3, 3), np.nan),
     ],
 )
-def test_what_is_no_ellipse_is_not_drawn(dual_c: np.ndarray) -> None:
+def test_other_conics_are_not_drawn(dual_c: np.ndarray) -> None:
     assert ellipse_of_dual_conic(dual_c) is None
     image = grey()
     draw_ellipses(image, dual_c[None], *ALL)
     assert (image == 127).all()
 
 
-def test_ellipses_are_drawn_in_place_if_wanted() -> None:
+def test_ellipses_are_drawn_if_enabled() -> None:
     near, pixels = projected((0.2, 0.1, 4.0), (0.2, 0.3, 0.4))
     dual_c, ids = np.concatenate([near, near]), [1, 2]
     image = grey()
@@ -134,13 +134,13 @@ def test_ellipses_are_drawn_in_place_if_wanted() -> None:
     assert 1.7 * thin < wide < 2.1 * thin  # of an object with a box
 
 
-def test_huge_ellipses_are_left_out() -> None:
+def test_huge_ellipses_are_not_drawn() -> None:
     """An object beside the camera: the outline would run through the whole picture."""
     image = grey()
     huge, _ = projected((0.67, 0.0, 0.74), (0.545, 0.545, 0.545))
     assert max(ellipse_of_dual_conic(huge[0])[1]) > 4 * 200
     draw_ellipses(image, np.diag([0.7, 0.7, 1]) @ huge @ np.diag([0.7, 0.7, 1]), *ALL)
-    assert (image != 127).any()  # a smaller one is seen
+    assert (image != 127).any()  # a smaller one is drawn
     image = grey()
     draw_ellipses(image, huge, *ALL)
     assert (image == 127).all()
@@ -162,7 +162,7 @@ STILL = np.eye(3, 4)
 
 @pytest.mark.parametrize("kind", ["box", "cylinder"])
 @pytest.mark.parametrize("turn", [TILTED, np.eye(3), TILTED.T])
-def test_edges_reach_as_far_as_the_solid(kind: str, turn: np.ndarray) -> None:
+def test_edges_span_the_projection_of_the_object(kind: str, turn: np.ndarray) -> None:
     frames, bounds = one_solid(kind, (0.2, 0.1, 4.0), (0.2, 0.5, 0.9), turn)
     ends, _, _ = frames.segments(STILL)
     pixels = image_points(PINHOLE, ends).reshape(-1, 2)
@@ -179,18 +179,18 @@ def test_edges_reach_as_far_as_the_solid(kind: str, turn: np.ndarray) -> None:
         ((0.0, 0.0, 0.1), np.eye(3), 0),  # from within
     ],
 )
-def test_a_box_hides_its_own_edges(center: tuple[float, ...], turn: np.ndarray, shown: int) -> None:
+def test_a_box_occludes_back_edges(center: tuple[float, ...], turn: np.ndarray, shown: int) -> None:
     frames, _ = one_solid("box", center, (0.5, 0.5, 0.5), turn)
     ends, edge, front = frames.segments(STILL)
     assert front.sum() == shown
     if shown == 9:  # the three others meet in the farthest corner
-        hidden = np.round(ends[~front], 6).reshape(-1, 3)
+        occluded = np.round(ends[~front], 6).reshape(-1, 3)
         corner = np.array(center) + 0.5
-        assert len(edge) == 12 and (np.abs(hidden - corner).max(1) < 1e-6).sum() == 3
+        assert len(edge) == 12 and (np.abs(occluded - corner).max(1) < 1e-6).sum() == 3
 
 
-def test_a_cylinder_has_two_sides_and_half_a_hidden_rim() -> None:
-    """Upright before a camera that looks down on it (y is down): the bottom rim goes behind."""
+def test_a_cylinder_has_two_sides_and_half_an_occluded_rim() -> None:
+    """Upright in front of a camera that looks down (y is down): half the bottom rim is occluded."""
     upright = Rotation.from_euler("x", 90, degrees=True).as_matrix()
     frames, _ = one_solid("cylinder", (0.0, 1.0, 4.0), (0.5, 0.5, 0.6), upright)
     ends, edge, front = frames.segments(STILL)
@@ -204,7 +204,7 @@ def test_a_cylinder_has_two_sides_and_half_a_hidden_rim() -> None:
 
 
 def test_edges_beside_the_camera_are_cut() -> None:
-    """A long box that the camera stands in front of: what is behind is cut off, on the edges."""
+    """A long box beside the camera: edges are clipped behind the camera."""
     frames, _ = one_solid("box", (1.0, 0.0, 0.0), (0.5, 0.5, 6.0), np.eye(3))
     ends, edge, _ = frames.segments(STILL)
     assert (ends[:, :, 2] > 0.29).all() and len(edge) == 8
@@ -215,15 +215,15 @@ def test_edges_beside_the_camera_are_cut() -> None:
     assert len(behind.segments(STILL)[0]) == 0
 
 
-def test_solids_without_edges_have_none() -> None:
+def test_ellipsoids_have_no_edges() -> None:
     solids = chair_solids()
     frames = wireframes(solids, ["ellipsoid", "box", None])
     assert set(frames.solid) == {1} and len(frames.edges) == 12
     assert len(wireframes(solids, [None] * 3).segments(STILL)[0]) == 0
 
 
-def test_the_lens_bends_what_is_projected() -> None:
-    """As OpenCV's own projection does."""
+def test_projections_are_distorted() -> None:
+    """Equals OpenCV's projection."""
     lens = rt.Camera("OPENCV", 200, 120, (300.0, 300.0, 100.0, 60.0, -0.3, 0.1, 0.001, -0.002))
     points = np.random.default_rng(0).uniform([-1, -0.6, 3], [1, 0.6, 5], (40, 3))
     expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), lens.K,
@@ -240,23 +240,23 @@ def drawn(frames, seen: set[int], wanted: bool = True, camera: rt.Camera = PINHO
     return image
 
 
-def test_edges_are_drawn_in_place_if_wanted() -> None:
+def test_edges_are_drawn_if_enabled() -> None:
     frames, bounds = one_solid("box", (0.2, 0.1, 4.0), (0.2, 0.3, 0.4))
     image = drawn(frames, {1})
     np.testing.assert_allclose(drawn_in(image, object_color(1), 60), bounds, atol=2)
     dim = np.array(object_color(1)) * 0.6
-    assert (np.abs(image.astype(float) - dim).max(2) < 12).any()  # hidden edges
+    assert (np.abs(image.astype(float) - dim).max(2) < 12).any()  # occluded edges
     unseen = drawn(frames, set())
     assert (image != 127).any(2).sum() > 1.5 * (unseen != 127).any(2).sum()
     assert not (np.abs(unseen.astype(float) - dim).max(2) < 12).any()
     assert (drawn(frames, {1}, wanted=False) == 127).all()
 
 
-def test_edges_are_bent_by_the_lens() -> None:
-    """The middle of a long edge is where the lens has it, not between its ends."""
+def test_edges_are_distorted() -> None:
+    """The middle of a long edge is distorted, not interpolated between its ends."""
     lens = rt.Camera("OPENCV", 200, 120, (300.0, 300.0, 100.0, 60.0, -0.9, 0.0, 0.0, 0.0))
-    half, place = np.array([[1.2, 0.7, 0.2]]), np.array([[0, 0, 4.0]])
-    frames = wireframes(quadrics.Ellipsoids(place, half, np.eye(3)[None]), ["box"])
+    half, center = np.array([[1.2, 0.7, 0.2]]), np.array([[0, 0, 4.0]])
+    frames = wireframes(quadrics.Ellipsoids(center, half, np.eye(3)[None]), ["box"])
     image = drawn(frames, {1}, camera=lens)
     ends = image_points(lens, np.array([[-1.2, 0.7, 3.8], [1.2, 0.7, 3.8]]))
     x, y = np.round(image_points(lens, np.array([[0, 0.7, 3.8]]))[0] - 0.5).astype(int)
@@ -266,9 +266,9 @@ def test_edges_are_bent_by_the_lens() -> None:
 
 
 def test_nearer_solids_are_drawn_over_farther_ones() -> None:
-    places, half = np.array([[0, 0, 3.0], [0, 0, 6.0]]), np.full((2, 3), 0.3)
+    centers, half = np.array([[0, 0, 3.0], [0, 0, 6.0]]), np.full((2, 3), 0.3)
     for order in ([0, 1], [1, 0]):
-        solids = quadrics.Ellipsoids(places[order], half * places[order][:, 2:] / 3,
+        solids = quadrics.Ellipsoids(centers[order], half * centers[order][:, 2:] / 3,
                                      np.tile(np.eye(3), (2, 1, 1)))  # fmt: skip
         image = drawn(wireframes(solids, ["box", "box"]), {1, 2})
         near = 1 + order.index(0)
@@ -277,7 +277,7 @@ def test_nearer_solids_are_drawn_over_farther_ones() -> None:
         assert (np.abs(found - object_color(near)).max(1) < 60).any()
 
 
-def test_huge_solids_are_left_out() -> None:
+def test_huge_objects_are_not_drawn() -> None:
     frames, _ = one_solid("box", (0.6, 0.0, 0.3), (0.5, 0.5, 0.5), np.eye(3))
     assert (drawn(frames, {1}) == 127).all()
 
@@ -286,7 +286,7 @@ def test_huge_solids_are_left_out() -> None:
 
 
 def test_labels_never_cover_each_other() -> None:
-    """Random crowds: every label lies inside the image and beside all others."""
+    """Random boxes: every label lies inside the image and overlaps no other."""
     rng = np.random.default_rng(3)
     for count in (2, 12, 60):
         boxes = rng.integers(-20, 300, (count, 2))
@@ -301,7 +301,7 @@ def test_labels_never_cover_each_other() -> None:
         assert overlap.max() == 0 and len(shown) >= min(count, 8)
 
 
-def test_a_label_stays_at_its_place_while_it_is_free() -> None:
+def test_a_label_keeps_its_position_while_it_is_free() -> None:
     sizes, boxes = np.array([[60, 17]] * 2), np.array([[50, 50, 90, 90]] * 2)
     places: dict[int, int] = {}
     first = place_labels([1, 2], sizes, boxes, (320, 240), places)
@@ -310,7 +310,7 @@ def test_a_label_stays_at_its_place_while_it_is_free() -> None:
     assert place_labels([3], sizes[:1], boxes[:1], (320, 240), {})[0] == first[0]
 
 
-def test_what_fills_a_gap_is_dashed() -> None:
+def test_filled_gaps_are_dashed() -> None:
     row = one_row((40, 30, 160, 110))
     edges = []
     for score in (0.9, 0.0):
@@ -326,14 +326,14 @@ def test_what_fills_a_gap_is_dashed() -> None:
         ("solids", {"boxes", "solids"}),
         ("Ellipses, trails", {"boxes", "ellipses", "trails"}),
         ("boxes", {"boxes"}),
-        ("on", {"boxes", "solids"}),  # as before it was a choice
+        ("on", {"boxes", "solids"}),  # the default layers
         ("True", {"boxes", "solids"}),
         ("none", set()),
         ("0", set()),
         (False, set()),
     ],
 )
-def test_layers_of_the_film(text: str, layers: set[str]) -> None:
+def test_layers_of_the_overlay(text: str, layers: set[str]) -> None:
     assert film_layers(text) == layers
 
 
@@ -345,10 +345,10 @@ def test_unknown_layers_are_refused(text: str) -> None:
         rt.OutputConfig(overlay=text)
 
 
-# ---- The film ----
+# ---- The overlay video ----
 
 
-def film(path: Path) -> tuple[list[np.ndarray], float]:
+def decoded(path: Path) -> tuple[list[np.ndarray], float]:
     capture = cv2.VideoCapture(str(path))
     fps, pictures = capture.get(cv2.CAP_PROP_FPS), []
     while (read := capture.read())[0]:
@@ -366,18 +366,18 @@ def frames(folder: Path, count: int, size: tuple[int, int]) -> Path:
 def overlay_of(
     result: rt.Result, video: rt.Video, path: Path, layers: str = "solids"
 ) -> tuple[list[np.ndarray], float]:
-    """Pictures of the film without its legend, and its rate."""
+    """Frames of the overlay without its legend, and its rate."""
     overlay = Overlay(result, path, video, layers)
     overlay.legend = []
     for frame in video:
         overlay.take(frame)
     overlay.close(True)
-    return film(overlay.path)
+    return decoded(overlay.path)
 
 
 @pytest.mark.parametrize("size", [(1601, 901), (321, 241)])
-def test_large_videos_are_shrunk_and_boxes_with_them(tmp_path: Path, size: tuple[int, int]) -> None:
-    """Also when the frames are read smaller than they are; the sides are even."""
+def test_large_videos_are_downscaled_with_boxes(tmp_path: Path, size: tuple[int, int]) -> None:
+    """Also if the working size is smaller than the frames; the sides are even."""
     box = tuple(np.array([0.2, 0.4, 0.6, 0.8]) * [*size, *size])
     tracks = one_row(box, frame=1)
     video = rt.Video(frames(tmp_path / "f", 2, size), rt.InputConfig(max_size=300))
@@ -403,15 +403,15 @@ def test_every_other_frame_plays_at_half_the_rate(tmp_path: Path) -> None:
 def solid_pixels(
     result: rt.Result, folder: Path, count: int, layers: str = "solids"
 ) -> tuple[list[np.ndarray], rt.Result]:
-    """Pictures with the solids alone: the boxes are taken away, the labels with them."""
+    """Frames with the 3D shapes alone: boxes and labels are removed."""
     bare = dataclasses.replace(result, tracks=rt.Tracks.empty())
     video = rt.Video(frames(folder / "f", count, SIZE))
     return overlay_of(bare, video, folder / "o.mp4", layers)[0], bare
 
 
 @pytest.mark.parametrize("layers", ["solids", "ellipses"])
-def test_solids_lie_where_the_objects_are(chairs: rt.Result, tmp_path: Path, layers: str) -> None:
-    """The first object is rejected: the others keep their own places and colours."""
+def test_shapes_are_drawn_at_the_objects(chairs: rt.Result, tmp_path: Path, layers: str) -> None:
+    """The first object is rejected: the others keep their positions and colours."""
     result = dataclasses.replace(chairs)
     result = dataclasses.replace(
         result,
@@ -430,13 +430,13 @@ def test_solids_lie_where_the_objects_are(chairs: rt.Result, tmp_path: Path, lay
         y, x = np.nonzero(changed)
         expected = [*boxes[1:, :2].min(0), *boxes[1:, 2:].max(0)]
         np.testing.assert_allclose([x.min(), y.min(), x.max(), y.max()], expected, atol=10)
-        assert boxes[0, 0] < expected[0] - 30  # the rejected one would show
+        assert boxes[0, 0] < expected[0] - 30  # the rejected one would be visible
         for number in (2, 3):
             hue = picture[changed].astype(int) - object_color(number)
             assert (np.abs(hue).max(1) < 75).any(), number
 
 
-def test_ellipses_of_large_videos_are_shrunk(chairs: rt.Result, tmp_path: Path) -> None:
+def test_ellipses_of_large_videos_are_downscaled(chairs: rt.Result, tmp_path: Path) -> None:
     """The same walk with a camera of three times the pixels; the overlay has twice as many."""
     small = walk(1).camera
     large = rt.Camera("PINHOLE", 1920, 1440, tuple(3 * p for p in small.params))
@@ -453,7 +453,7 @@ def test_ellipses_of_large_videos_are_shrunk(chairs: rt.Result, tmp_path: Path) 
     np.testing.assert_allclose(bounds, [*expected[:, :2].min(0), *expected[:, 2:].max(0)], atol=4)
 
 
-def test_priors_are_drawn_only_while_the_object_is_seen(chairs: rt.Result, tmp_path: Path) -> None:
+def test_priors_are_drawn_only_with_a_detection(chairs: rt.Result, tmp_path: Path) -> None:
     result = dataclasses.replace(chairs)
     result = dataclasses.replace(
         result, objects=[dataclasses.replace(o, status="prior_dominated") for o in chairs.objects]
@@ -470,7 +470,7 @@ def test_priors_are_drawn_only_while_the_object_is_seen(chairs: rt.Result, tmp_p
     assert np.abs(inside - 127).max() > 60  # the ellipse lies in its box
 
 
-def test_a_loaded_result_is_drawn_as_well(chairs: rt.Result, tmp_path: Path) -> None:
+def test_a_loaded_result_is_drawn_identically(chairs: rt.Result, tmp_path: Path) -> None:
     dataclasses.replace(chairs).save(tmp_path / "out")
     pictures, _ = solid_pixels(rt.Result.load(tmp_path / "out"), tmp_path, 1)
     assert np.abs(pictures[0].astype(int) - 127).max() > 60
@@ -512,14 +512,14 @@ def test_the_legend_is_shown_first(chairs: rt.Result, tmp_path: Path) -> None:
     for frame in video:
         overlay.take(frame)
     overlay.close(True)
-    pictures, _ = film(overlay.path)
+    pictures, _ = decoded(overlay.path)
     panel = [picture[-60:-10, 8:20].astype(int).mean() < 90 for picture in pictures]
     shown = int(2 * rate)  # 2 s
     assert panel == [True] * shown + [False] * (12 - shown) and shown >= rate
 
 
-def test_the_legend_tells_what_is_there(chairs: rt.Result, tmp_path: Path) -> None:
-    """And nothing that is not: no gaps, no 3D, no trails."""
+def test_the_legend_lists_the_drawn_elements(chairs: rt.Result, tmp_path: Path) -> None:
+    """And no others: no gaps, no 3D, no trails."""
     video = rt.Video(frames(tmp_path / "f", 1, SIZE))
 
     def kinds(result: rt.Result, layers: str) -> list[str]:
@@ -542,12 +542,12 @@ def test_the_legend_tells_what_is_there(chairs: rt.Result, tmp_path: Path) -> No
     assert (image[110:190, 10:40].max(2) > 150).any()
 
 
-# ---- Where exactly ----
+# ---- Exact positions ----
 
 
 @pytest.mark.parametrize("kind", ["box", "cylinder"])
-def test_edges_lie_on_the_two_faces_that_meet_there(kind: str) -> None:
-    """And the middle of the solid is inside of all faces."""
+def test_edges_lie_on_two_adjacent_faces(kind: str) -> None:
+    """And the centre is inside of all faces."""
     center = (0.2, 0.1, 4.0)
     frames, _ = one_solid(kind, center, (0.2, 0.5, 0.9))
     ends = frames.points[frames.edges]  # (E, 2, 3)
@@ -571,11 +571,11 @@ def test_lines_are_centred_on_the_edges(scale: float) -> None:
     left, right = (scale * (100 + 300 * (0.1 + side * 0.3) / 3.5) for side in (-1, 1))
     top, bottom = (scale * (60 + 300 * (-0.05 + side * 0.2) / 3.5) for side in (-1, 1))
     row, column = round(scale * (60 - 300 * 0.05 / 3.5)), round(scale * (100 + 300 * 0.1 / 3.5))
-    for values, places in ((weight[row], (left, right)), (weight[:, column], (top, bottom))):
-        middle = len(values[values > 0]) and round(sum(places) / 2)
-        for part, place in ((slice(None, middle), places[0]), (slice(middle, None), places[1])):
+    for values, edges in ((weight[row], (left, right)), (weight[:, column], (top, bottom))):
+        middle = len(values[values > 0]) and round(sum(edges) / 2)
+        for part, edge in ((slice(None, middle), edges[0]), (slice(middle, None), edges[1])):
             at = np.arange(len(values))[part] + 0.5
-            assert (at @ values[part]) / values[part].sum() == pytest.approx(place, abs=0.1)
+            assert (at @ values[part]) / values[part].sum() == pytest.approx(edge, abs=0.1)
 
 
 def test_no_edge_in_view_draws_nothing() -> None:
@@ -594,7 +594,7 @@ def test_no_edge_in_view_draws_nothing() -> None:
 
 
 def test_thin_lines_are_thinner() -> None:
-    """In the legend, and of a box whose solid is drawn too."""
+    """In the legend, and for boxes of objects with a drawn 3D shape."""
 
     def ink(image: np.ndarray) -> int:
         return int((np.abs(image.astype(int) - object_color(1)).max(2) < 90).sum())

@@ -1,4 +1,4 @@
-"""Cameras in two parts that do not connect: each is a world of its own, in every file."""
+"""A trajectory in two unconnected components: each has its own frame, in every file."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ NAMES = rt.COCO_NAMES
 # ---- Linked and fitted ----
 
 
-def test_every_part_has_its_own_identities(parted: rt.Result) -> None:
-    """The tracker followed the chairs over the break; nothing is known of where they went."""
+def test_every_component_has_its_own_identities(parted: rt.Result) -> None:
+    """Tracks continue over the break, but their positions after it are unrelated."""
     assert [(o.id, o.part) for o in parted.objects] == [
         (1, 0), (2, 0), (3, 0), (4, 1), (5, 1), (6, 1),
     ]  # fmt: skip
@@ -62,7 +62,7 @@ def test_every_part_has_its_own_identities(parted: rt.Result) -> None:
     assert len({t for o in parted.objects for t in o.tracklet_ids}) == 6
 
 
-def test_every_part_has_its_own_frame_and_scale(parted: rt.Result) -> None:
+def test_every_component_has_its_own_frame_and_scale(parted: rt.Result) -> None:
     for part, (scale, *_) in enumerate(PARTS):
         own = [o for o in parted.objects if o.part == part]
         centers = np.array([o.center for o in own])
@@ -71,7 +71,7 @@ def test_every_part_has_its_own_frame_and_scale(parted: rt.Result) -> None:
         np.testing.assert_allclose([o.size_m[2] for o in own], 0.82, rtol=0.2)
 
 
-def test_a_part_comes_out_as_if_it_were_a_video_of_its_own(parted: rt.Result) -> None:
+def test_a_component_equals_the_result_of_a_separate_video(parted: rt.Result) -> None:
     for part in (0, 1):
         poses = parted.poses.of_part(part)
         tracks = tracks_in_two_parts(parted.poses)
@@ -87,7 +87,7 @@ def test_a_part_comes_out_as_if_it_were_a_video_of_its_own(parted: rt.Result) ->
         assert facts == parted.world.to_json()["parts"][part]
 
 
-def test_the_world_describes_its_parts(parted: rt.Result) -> None:
+def test_the_world_describes_its_components(parted: rt.Result) -> None:
     world = parted.world
     assert [(p.spans, p.frames, p.registered_frames) for p in world.parts] == [
         ([[0, 39]], 40, 38), ([[40, 63]], 24, 23),
@@ -97,7 +97,7 @@ def test_the_world_describes_its_parts(parted: rt.Result) -> None:
         np.testing.assert_allclose(part.scale.value, 1 / scale, rtol=0.2)
         up = into_part(PARTS.index((scale, turn, _)), np.array([[0, 0, 1.0], [0, 0, 0]]))
         np.testing.assert_allclose(part.up_in_world, (up[0] - up[1]) / scale, atol=0.03)
-    largest = world.parts[0]  # the fields that there were before there were parts
+    largest = world.parts[0]  # the fields that predate components
     assert world.registered_frames == 38 and world.frames == 64
     assert world.scale == largest.scale and world.up_source == largest.up_source
     np.testing.assert_array_equal(world.up_in_world, largest.up_in_world)
@@ -123,7 +123,7 @@ def test_fits_are_in_the_order_of_the_objects(parted: rt.Result) -> None:
     assert len(of_second.poses.frame) == of_second.world.frames == 24
 
 
-def test_one_part_is_the_result_itself() -> None:
+def test_a_single_component_is_the_result_itself() -> None:
     poses = two_parts().of_part(0)
     result = finished(unlinked(poses, tracks_in_two_parts(two_parts())[: 3 * BREAK]))
     assert result.of_part(0) is result and result.parts() == [result]
@@ -131,13 +131,13 @@ def test_one_part_is_the_result_itself() -> None:
     assert {o.part for o in result.objects} == {0} and len(result.world.parts) == 1
 
 
-def test_without_linking_too_identities_end_with_their_part() -> None:
+def test_identities_end_with_their_component_without_linking() -> None:
     result = finished(unlinked(), link=False)
     assert [(o.id, o.part) for o in result.objects] == [(i + 1, i // 3) for i in range(6)]
 
 
-def test_what_comes_into_view_while_the_cameras_are_lost_is_of_the_next_part() -> None:
-    """Frames 38 to 40 have no pose; the third chair is seen from frame 39 on, of part 0."""
+def test_a_track_that_starts_in_the_break_belongs_to_the_next_component() -> None:
+    """Frames 38 to 40 have no pose; the third chair is detected from frame 39 on."""
     given = unlinked()
     third = given.tracks.detection_index == 2
     given = dataclasses.replace(
@@ -148,10 +148,10 @@ def test_what_comes_into_view_while_the_cameras_are_lost_is_of_the_next_part() -
     assert sorted(o.visits[0][0] for o in objects) == [0, 0, BREAK - 1, BREAK, BREAK]
 
 
-def test_embeddings_stay_with_their_rows(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The linker of each part gets those of its own frames, numbered by its own rows."""
+def test_embeddings_stay_aligned_with_their_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The linker of each component gets the embeddings of its frames, indexed by its rows."""
     given = unlinked()
-    row = np.arange(0, len(given.tracks), 7)  # of the tracks that were embedded
+    row = np.arange(0, len(given.tracks), 7)  # of the embedded tracks
     frame = given.tracks.frame[row]
     given = dataclasses.replace(
         given,
@@ -173,7 +173,7 @@ def test_embeddings_stay_with_their_rows(monkeypatch: pytest.MonkeyPatch) -> Non
 
 @pytest.mark.parametrize("every", [1, 8])
 def test_a_tracklet_is_once_in_a_frame(every: int) -> None:
-    """It slips from the first chair to the second; what they lose there is in no tracklet."""
+    """It switches from the first chair to the second; duplicate rows lose their tracklet."""
     poses = walk(60)
     poses = dataclasses.replace(poses, frame=poses.frame * every)
     table, chair = tracks_of(poses), tracks_of(poses).detection_index
@@ -188,11 +188,11 @@ def test_a_tracklet_is_once_in_a_frame(every: int) -> None:
     owner = [np.unique(tracks.track_id[tracks.detection_index == k]) for k in range(3)]
     assert [len(ids) for ids in owner] == [1, 1, 1] and len(tracks) == len(table)
     again = tracks.tracklet_id[(tracks.detection_index == 0) & (tracks.frame >= 30 * every)]
-    assert len(np.unique(again)) == 1  # pieced together although nothing tracked it
+    assert len(np.unique(again)) == 1  # joined although it was not tracked
 
 
-def test_two_solids_do_not_share_a_tracklet_that_slipped() -> None:
-    """It shows one in frame 0 and the other in frame 1; in frame 2 neither is in a tracklet."""
+def test_a_switched_tracklet_belongs_to_one_object() -> None:
+    """It shows one object in frame 0 and the other in frame 1; in frame 2 both have none."""
     none, chair = np.zeros((4, 4)), np.full(4, CHAIR)
     tracklet = np.array([1, 1, 0, 0])
     table = rt.Tracks(np.array([0, 1, 2, 2]), tracklet, tracklet, none, none[0], chair, chair)
@@ -200,39 +200,39 @@ def test_two_solids_do_not_share_a_tracklet_that_slipped() -> None:
     assert found.tolist() == [1, 1, 1, 2]
 
 
-def test_what_is_seen_without_cameras_alone_is_not_doubted() -> None:
-    """The third chair shows only after frame 40, whose cameras are not known: no word about it."""
+def test_objects_without_poses_have_no_confidence() -> None:
+    """The third chair is detected only after frame 40, in frames without poses."""
     poses = walk(60)
     poses.cam_from_world[40:] = np.nan
     poses = dataclasses.replace(poses, status=np.where(np.arange(60) < 40, poses.status, "missing"))
     table = tracks_of(poses)
     third = table.detection_index == 2
     found = finished(unlinked(poses, table[~third | (table.frame >= 40)])).objects
-    sure = {o.class_name: [x.confidence for x in found] for o in found}["chair"]
-    assert len(sure) == 3 and sure.count(None) == 1
+    confidences = {o.class_name: [x.confidence for x in found] for o in found}["chair"]
+    assert len(confidences) == 3 and confidences.count(None) == 1
     (alone,) = (o for o in found if o.confidence is None)
     assert alone.status == "rejected" and "camera" in alone.reason
 
 
-def test_the_last_fit_knows_hidden_edges(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The lower third of every chair is hidden, and something says so."""
+def test_the_last_fit_uses_occluded_edges(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The lower third of every chair is occluded and marked as such."""
     given = unlinked(walk(), tracks_of(walk()))
     box = given.tracks.xyxy
     box[:, 3] -= 0.35 * (box[:, 3] - box[:, 1])
     heights = []
-    for hidden in ([False] * 4, [False, False, False, True]):
+    for occluded in ([False] * 4, [False, False, False, True]):
         monkeypatch.setattr(
             reobj.objects.fit,
             "occluded_edges",
-            lambda v, e, own=hidden: np.broadcast_to(own, v.boxes.shape),
+            lambda v, e, own=occluded: np.broadcast_to(own, v.boxes.shape),
         )
         found = finished(dataclasses.replace(given), link=False).objects
         heights.append([o.size[2] for o in found if o.size is not None])
     assert len(heights[1]) == 3 and (np.array(heights[1]) > 1.2 * np.array(heights[0])).all()
 
 
-def test_the_last_fit_knows_the_points_on_each_thing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ten points on the second chair, which all frames observe; no other fit has any."""
+def test_the_last_fit_uses_the_points_on_each_object(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ten points on the second chair, observed by all frames; no other fit has points."""
     points = chair_solids().center_in_world[1] + np.linspace(-0.1, 0.1, 10)[:, None]
     every = np.indices((40, 10)).reshape(2, -1).T
     poses = dataclasses.replace(
@@ -248,10 +248,10 @@ def test_the_last_fit_knows_the_points_on_each_thing(monkeypatch: pytest.MonkeyP
     np.testing.assert_array_equal(found[np.argsort(found[:, 2])], points)
 
 
-def test_the_last_fit_begins_with_the_places_of_the_association(
+def test_the_last_fit_starts_from_the_association(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """What hides is known from there; where nothing is associated a first fit tells."""
+    """Occluders come from the association; without one, from a first fit."""
     for link in (True, False):
         seen = Mock(wraps=reobj.objects.fit.occluded_edges)
         monkeypatch.setattr(reobj.objects.fit, "occluded_edges", seen)
@@ -261,15 +261,15 @@ def test_the_last_fit_begins_with_the_places_of_the_association(
         (_, ellipsoids), _ = seen.call_args
         center = [o.center for o in result.objects]
         np.testing.assert_allclose(ellipsoids.center_in_world, center, atol=0.05)
-        hidden = [call.kwargs["hidden"] is not None for call in calls.call_args_list]
-        assert hidden[-1] and not any(hidden[:-1])
-        assert link or len(hidden) == 2
+        occluded = [call.kwargs["hidden"] is not None for call in calls.call_args_list]
+        assert occluded[-1] and not any(occluded[:-1])
+        assert link or len(occluded) == 2
         monkeypatch.undo()
 
 
 @pytest.mark.parametrize("given", [True, False])
-def test_the_last_fit_stands_on_the_floor(given: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Gravity is that of the floor, unless the poses know it."""
+def test_the_last_fit_uses_the_floor(given: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gravity is that of the floor, unless the poses define it."""
     normal = np.array([0.0, np.sin(0.05), np.cos(0.05)])
     floor = quadrics.Floor(normal, 0.0, 0.01)
     monkeypatch.setattr(reobj.objects.fit, "find_floor", lambda poses, fits: floor)
@@ -280,8 +280,8 @@ def test_the_last_fit_stands_on_the_floor(given: bool, monkeypatch: pytest.Monke
     np.testing.assert_allclose(world.up_in_world, up, atol=1e-5)
 
 
-def test_identities_of_the_user_may_span_parts() -> None:
-    """They stay as they are; the solid lies in the part that has most of the boxes."""
+def test_identities_of_the_user_may_span_components() -> None:
+    """They are unchanged; the shape belongs to the component with most of the boxes."""
     poses = two_parts()
     tracks = tracks_in_two_parts(poses)
     tracks = tracks[(tracks.detection_index < 2) | (tracks.frame >= BREAK - 10)]  # chair 3: late
@@ -295,13 +295,14 @@ def test_identities_of_the_user_may_span_parts() -> None:
     ]  # fmt: skip
     assert [o.frames_seen for o in result.objects] == [64, 34, 64]
     assert [o.views for o in result.objects] == [38, 23, 38]
-    places = [into_part(0, CENTERS[1:2])[0], into_part(1, CENTERS[2:])[0], into_part(0, CENTERS)[0]]
-    np.testing.assert_allclose([o.center for o in result.objects], places, atol=0.06)
-    np.testing.assert_allclose(result.ellipsoids().center_in_world, places, atol=0.06)
+    at = (0, CENTERS[1:2]), (1, CENTERS[2:]), (0, CENTERS)
+    centers = [into_part(*a)[0] for a in at]
+    np.testing.assert_allclose([o.center for o in result.objects], centers, atol=0.06)
+    np.testing.assert_allclose(result.ellipsoids().center_in_world, centers, atol=0.06)
     np.testing.assert_array_equal(result.tracks.track_id, given.tracks.track_id)
 
 
-def test_a_part_with_too_few_cameras_rejects_its_own_objects_only() -> None:
+def test_a_component_with_too_few_cameras_rejects_its_objects_only() -> None:
     poses = two_parts()
     lost = poses.cam_from_world.copy()
     lost[BREAK + 3 :] = np.nan  # two cameras are left: 41 and 42
@@ -313,7 +314,7 @@ def test_a_part_with_too_few_cameras_rejects_its_own_objects_only() -> None:
 
 
 @pytest.mark.parametrize("empty", [0, 1])
-def test_a_part_without_objects(empty: int, tmp_path: Path) -> None:
+def test_a_component_without_objects(empty: int, tmp_path: Path) -> None:
     poses = two_parts()
     tracks = tracks_in_two_parts(poses)
     result = finished(unlinked(poses, tracks[poses.part_of(tracks.frame) != empty]))
@@ -333,14 +334,14 @@ def test_no_object_at_all(tmp_path: Path) -> None:
     assert len(rt.Result.load(tmp_path).world.parts) == 2
 
 
-def test_up_is_a_direction_of_the_largest_part() -> None:
+def test_the_up_option_applies_to_the_largest_component() -> None:
     up = into_part(0, np.array([[0, 0, 1.0], [0, 0, 0]]))
     text = ",".join(map(str, up[0] - up[1]))
     parts = finished(unlinked(), up=text).world.parts
     assert [p.up_source == "given" for p in parts] == [True, False]
 
 
-def test_boxes_that_no_fit_can_use_do_not_choose_the_part() -> None:
+def test_unusable_boxes_do_not_decide_the_component() -> None:
     tracks = tracks_in_two_parts(two_parts())
     weak = (tracks.detection_index == 0) & (tracks.frame < BREAK)
     given = unlinked(tracks=with_columns(tracks, score=np.where(weak, 0.01, 0.9)))
@@ -352,7 +353,7 @@ def test_boxes_that_no_fit_can_use_do_not_choose_the_part() -> None:
     ]
 
 
-def test_up_of_the_poses_is_that_of_the_largest_part() -> None:
+def test_up_of_the_poses_is_that_of_the_largest_component() -> None:
     up = into_part(0, np.array([[0, 0, 1.0], [0, 0, 0]]))
     poses = dataclasses.replace(two_parts(), up_in_world=(up[0] - up[1]) / PARTS[0][0])
     parts = finished(unlinked(poses)).world.parts
@@ -361,7 +362,7 @@ def test_up_of_the_poses_is_that_of_the_largest_part() -> None:
     np.testing.assert_allclose(parts[1].up_in_world, (true[0] - true[1]) / PARTS[1][0], atol=0.03)
 
 
-def test_the_message_says_what_it_means_and_what_helps() -> None:
+def test_the_message_explains_the_break_and_a_remedy() -> None:
     (text,) = components_message(two_parts())
     for words in ("2 components", "component 0: frames 0-39", "component 1: frames 40-63",
                   "own frame and scale", "listed twice", "more overlap", "--poses",
@@ -369,8 +370,8 @@ def test_the_message_says_what_it_means_and_what_helps() -> None:
         assert words in text
 
 
-def test_identities_joined_by_hand_are_kept(parted_folder: Path, tmp_path: Path) -> None:
-    """Object 4 is object 1 behind the break: merged in tracks.txt, given back."""
+def test_manually_merged_identities_are_kept(parted_folder: Path, tmp_path: Path) -> None:
+    """Object 4 is object 1 after the break: merged in tracks.txt and supplied again."""
     out = tmp_path / "out"
     shutil.copytree(parted_folder, out)
     rows = np.loadtxt(out / "tracks.txt", delimiter=",")
@@ -387,7 +388,7 @@ def test_identities_joined_by_hand_are_kept(parted_folder: Path, tmp_path: Path)
 # ---- Files ----
 
 
-def test_each_part_has_files_of_its_own(parted_folder: Path) -> None:
+def test_each_component_has_its_own_files(parted_folder: Path) -> None:
     poses = two_parts()
     for part, name in enumerate(("poses.txt", "poses_part1.txt")):
         own = poses.of_part(part)
@@ -402,9 +403,7 @@ def test_each_part_has_files_of_its_own(parted_folder: Path) -> None:
         np.testing.assert_allclose(mesh.vertices.mean(0), middle, atol=0.02 * PARTS[part][0])
 
 
-def test_parts_come_back_when_loaded(
-    parted_folder: Path, parted: rt.Result, tmp_path: Path
-) -> None:
+def test_components_are_loaded(parted_folder: Path, parted: rt.Result, tmp_path: Path) -> None:
     found = rt.Result.load(parted_folder)
     assert found.world.to_json() == parted.world.to_json()
     assert [o.to_json() for o in found.objects] == [o.to_json() for o in parted.objects]
@@ -426,7 +425,7 @@ def test_objects_json_is_as_its_schema_says(parted_folder: Path, tmp_path: Path)
     assert "objects[0].part" in faults and "world.parts[1]" in faults
 
 
-def test_parts_are_those_of_the_cameras(parted_folder: Path, tmp_path: Path) -> None:
+def test_components_are_those_of_the_cameras(parted_folder: Path, tmp_path: Path) -> None:
     shutil.copytree(parted_folder, tmp_path / "out")
     data = json.loads((parted_folder / "objects.json").read_text())
     data["world"]["parts"].append(data["world"]["parts"][0])
@@ -435,7 +434,7 @@ def test_parts_are_those_of_the_cameras(parted_folder: Path, tmp_path: Path) -> 
         rt.Result.load(tmp_path / "out")
 
 
-def test_an_objects_json_without_parts_loads(chairs: rt.Result, tmp_path: Path) -> None:
+def test_an_objects_json_without_components_loads(chairs: rt.Result, tmp_path: Path) -> None:
     dataclasses.replace(chairs).save(tmp_path)
     data = json.loads((tmp_path / "objects.json").read_text())
     del data["world"]["parts"]
@@ -448,7 +447,7 @@ def test_an_objects_json_without_parts_loads(chairs: rt.Result, tmp_path: Path) 
     assert "component" not in found.summary() and "scale: 1.0" in found.summary()
 
 
-def test_files_of_parts_of_an_earlier_run_go(parted: rt.Result, tmp_path: Path) -> None:
+def test_component_files_of_an_earlier_run_are_deleted(parted: rt.Result, tmp_path: Path) -> None:
     dataclasses.replace(parted).save(tmp_path)
     names = ("poses_part1.txt", "objects_part1.ply")
     assert all((tmp_path / name).exists() for name in names)
@@ -461,10 +460,10 @@ def test_files_of_parts_of_an_earlier_run_go(parted: rt.Result, tmp_path: Path) 
     assert left == {"tracks.txt", "objects.json", "poses.txt", "objects.ply", "poses_partial.txt"}
 
 
-def test_run_writes_what_a_broken_reconstruction_gives(
+def test_run_writes_a_reconstruction_in_components(
     parted_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """From the pose stage on: models, files, cache; a later run in one piece leaves no part."""
+    """From the pose stage on: models, files, cache; a later unbroken run deletes them."""
     found, calls = two_parts(), list[int]()
 
     def estimate(video: Any, config: rt.PosesConfig, work_dir: Path, **_: Any) -> rt.Poses:
@@ -498,7 +497,7 @@ def test_run_writes_what_a_broken_reconstruction_gives(
     assert (tmp_path / "out/sparse").is_dir() and calls == [0, 1]
 
 
-def test_poses_command_writes_a_file_for_each_part(
+def test_poses_command_writes_a_file_for_each_component(
     parted_folder: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -524,14 +523,14 @@ def test_the_summary_has_a_line_for_each_component(parted: rt.Result) -> None:
     assert not [line for line in lines if line.startswith("scale")]
 
 
-def test_a_part_without_scale_is_not_said_to_be_in_metres(parted: rt.Result) -> None:
+def test_a_component_without_scale_is_not_reported_in_metres(parted: rt.Result) -> None:
     unscaled = [dataclasses.replace(o, size_m=None) if o.part else o for o in parted.objects]
     lines = dataclasses.replace(parted, objects=unscaled).summary().splitlines()
     assert "m  " in lines[0]
     assert ["units" in line for line in lines[1:7]] == [False] * 3 + [True] * 3
 
 
-# ---- Pictures ----
+# ---- Overlay and viewer ----
 
 
 def ellipse_box(dual_c: np.ndarray) -> np.ndarray:
@@ -541,16 +540,16 @@ def ellipse_box(dual_c: np.ndarray) -> np.ndarray:
     return np.concatenate([c[:2, 2] - half, c[:2, 2] + half])
 
 
-def test_the_overlay_draws_each_part_in_its_own_frames(parted: rt.Result, tmp_path: Path) -> None:
+def test_the_overlay_draws_each_component_in_its_frames(parted: rt.Result, tmp_path: Path) -> None:
     class Facts:
         config, fps, size = rt.InputConfig(), 30.0, SIZE
 
     video: Any = Facts()
-    film = Overlay(parted, tmp_path / "a.mp4", video, "ellipses")
-    film.close(False)
-    assert sorted(film.outlines) == [f for f in range(64) if f not in (38, 39, 40)]
+    overlay = Overlay(parted, tmp_path / "a.mp4", video, "ellipses")
+    overlay.close(False)
+    assert sorted(overlay.outlines) == [f for f in range(64) if f not in (38, 39, 40)]
     for frame in (0, 20, 37, 41, 63):
-        ids, dual_c, visible = film.outlines[frame]
+        ids, dual_c, visible = overlay.outlines[frame]
         assert Overlay(parted, tmp_path / "b.mp4", video).cameras[frame][1] == ids
         assert ids == ([1, 2, 3] if frame < BREAK else [4, 5, 6]) and visible.all()
         boxes = np.array([ellipse_box(c) for c in dual_c])
@@ -558,7 +557,7 @@ def test_the_overlay_draws_each_part_in_its_own_frames(parted: rt.Result, tmp_pa
         np.testing.assert_allclose(boxes, seen, atol=0.2 * (seen[:, 3] - seen[:, 1]).max())
 
 
-def test_the_page_holds_every_part(parted_folder: Path) -> None:
+def test_the_viewer_contains_every_component(parted_folder: Path) -> None:
     text = (parted_folder / "scene.html").read_text()
     data = json.loads(text.split('id="data">')[1].split("</script>")[0])
     assert data["steps"]["part"] == [0] * 40 + [1] * 24
@@ -577,7 +576,7 @@ def test_the_page_holds_every_part(parted_folder: Path) -> None:
     assert all(len(o["crops"]) >= 3 for o in data["objects"])
 
 
-def test_the_page_has_the_floor_of_every_part(parted: rt.Result, tmp_path: Path) -> None:
+def test_the_viewer_has_the_floor_of_every_component(parted: rt.Result, tmp_path: Path) -> None:
     floor = Floor(np.array([0, 0, 1.0]), -0.25, np.zeros(3), 0.01, 0.3, 200)
     first, second = (dataclasses.replace(p, floor=None) for p in parted.world.parts)
     parts = (first, dataclasses.replace(second, floor=floor))
@@ -602,7 +601,7 @@ def exported(folder: Path, to: str, path: Path, caplog: pytest.LogCaptureFixture
     return caplog.text
 
 
-def test_exports_in_3d_hold_the_largest_part(
+def test_3d_exports_contain_the_largest_component(
     parted_folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     trimesh = pytest.importorskip("trimesh", reason="pip install trimesh (dev extra)")
@@ -616,7 +615,7 @@ def test_exports_in_3d_hold_the_largest_part(
     assert (tmp_path / "a.rrd").stat().st_size > 1000
 
 
-def test_exports_in_2d_say_the_part(
+def test_2d_exports_name_the_component(
     parted_folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     text = exported(parted_folder, "coco-vid", tmp_path / "a.json", caplog)
@@ -647,10 +646,8 @@ def true_eyes() -> np.ndarray:
     return invert_rigid(walk(64, 200.0).cam_from_world)[:, :, 3]
 
 
-def test_each_part_is_scored_after_an_alignment_of_its_own(
-    parted: rt.Result, tmp_path: Path
-) -> None:
-    pairs: dict[int, int | None] = {1: 1, 2: 5, 3: 6}  # one of the first part, two of the second
+def test_each_component_is_aligned_and_scored_separately(parted: rt.Result, tmp_path: Path) -> None:
+    pairs: dict[int, int | None] = {1: 1, 2: 5, 3: 6}  # one of component 0, two of component 1
     found = score_objects(parted, *truth(tmp_path), pairs)
     assert (found["true"], found["found"]) == (3, 3)
     assert found["o3d_all"] > 0.9 and found["center_error_median"] < 0.02
@@ -661,7 +658,7 @@ def test_each_part_is_scored_after_an_alignment_of_its_own(
     np.testing.assert_allclose(errors, np.abs(np.array(scales) - 1), atol=5e-3)
 
 
-def test_a_part_without_true_cameras_is_not_found(
+def test_a_component_without_true_cameras_is_not_found(
     parted: rt.Result, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     found = score_objects(parted, *truth(tmp_path, BREAK), {1: 1, 2: 5, 3: 6})
@@ -671,7 +668,7 @@ def test_a_part_without_true_cameras_is_not_found(
         score_objects(parted, *truth(tmp_path, 2), {1: 1})
 
 
-def test_eval_reports_both_parts(parted_folder: Path, tmp_path: Path) -> None:
+def test_eval_reports_both_components(parted_folder: Path, tmp_path: Path) -> None:
     tracks = tracks_in_two_parts(two_parts())
     ltwh = np.column_stack([tracks.xyxy[:, :2], tracks.xyxy[:, 2:] - tracks.xyxy[:, :2]])
     rows = np.column_stack([tracks.frame + 1, tracks.track_id, ltwh, np.ones(len(tracks)),
@@ -683,7 +680,7 @@ def test_eval_reports_both_parts(parted_folder: Path, tmp_path: Path) -> None:
     assert scores["tracks"]["all"]["ids_per_object"] == 2
 
 
-def test_what_is_seen_through_is_less_likely_there() -> None:
+def test_objects_that_are_seen_through_are_less_probable() -> None:
     """Every camera observes points behind the first chair, on rays through its middle."""
     plain = finished(unlinked(walk(), tracks_of(walk()))).objects
     poses, chair = walk(), np.array(plain[0].center)

@@ -49,135 +49,135 @@ def ball(
     return quadrics.Ellipsoids(np.array([[x, 0.1, z]]), np.array([half_axes]), np.eye(3)[None])
 
 
-def outline(thing: quadrics.Ellipsoids, view: np.ndarray) -> np.ndarray:
+def outline(ellipsoid: quadrics.Ellipsoids, view: np.ndarray) -> np.ndarray:
     """Box (4,) of the image of points sampled on the surface."""
     rng = np.random.default_rng(0)
     sphere = unit(rng, 20000, 3)
-    points = thing.center_in_world[0] + sphere * thing.half_axes[0]
+    points = ellipsoid.center_in_world[0] + sphere * ellipsoid.half_axes[0]
     seen = np.c_[points, np.ones(len(points))] @ view.T
     xy = seen[:, :2] / seen[:, 2:]
     return np.concatenate([xy.min(0), xy.max(0)])
 
 
 def mapped(
-    things: list[quadrics.Ellipsoids], views: list[np.ndarray], step: int = 5
+    objects: list[quadrics.Ellipsoids], views: list[np.ndarray], step: int = 5
 ) -> EllipsoidMap:
-    places, identity = EllipsoidMap(), np.arange(len(things))
+    ellipsoids, identity = EllipsoidMap(), np.arange(len(objects))
     for i, view in enumerate(views):
-        places.add(step * i, identity, np.stack([outline(t, view) for t in things]), view)
-    places.refit(SIZE)
-    return places
+        ellipsoids.add(step * i, identity, np.stack([outline(t, view) for t in objects]), view)
+    ellipsoids.refit(SIZE)
+    return ellipsoids
 
 
 WALK = [view_at(x) for x in np.linspace(-1.1, 1.1, 12)]
 
 
-def test_places_are_found_and_projected() -> None:
-    """In a view that was not used the boxes are those of the things themselves."""
-    things = [ball(-0.5), ball(0.6, (0.3, 0.2, 0.25))]
-    places = mapped(things, WALK)
-    assert places.known[:3].tolist() == [True, True, False]
-    found = places.project(view_at(0.3, 8), SIZE, 0.5)
-    for box, thing in zip(found[:2], things, strict=True):
-        x1, y1, x2, y2 = outline(thing, view_at(0.3, 8))
+def test_ellipsoids_are_estimated_and_projected() -> None:
+    """In a view that was not used the boxes are the true projections."""
+    objects = [ball(-0.5), ball(0.6, (0.3, 0.2, 0.25))]
+    ellipsoids = mapped(objects, WALK)
+    assert ellipsoids.known[:3].tolist() == [True, True, False]
+    projected = ellipsoids.project(view_at(0.3, 8), SIZE, 0.5)
+    for box, ellipsoid in zip(projected[:2], objects, strict=True):
+        x1, y1, x2, y2 = outline(ellipsoid, view_at(0.3, 8))
         np.testing.assert_allclose(box, [(x1 + x2) / 2, (y1 + y2) / 2, x2 - x1, y2 - y1], atol=3)
     assert np.isnan(found[2:]).all()
 
 
-def test_places_out_of_view_are_not_projected() -> None:
-    """Half out to the left: its part in the image, if as much as asked for; behind: nothing."""
-    places = mapped([ball(0)], WALK)
+def test_ellipsoids_out_of_view_are_not_projected() -> None:
+    """Half outside to the left: clipped, if enough of it is inside; behind the camera: none."""
+    ellipsoids = mapped([ball(0)], WALK)
     x1, y1, x2, y2 = outline(ball(0), view_at(0, 33.5))
     assert x1 < -10 and x2 > 20
     inside = x2 / (x2 - x1)
-    found = places.project(view_at(0, 33.5), SIZE, inside - 0.1)[0]
+    found = ellipsoids.project(view_at(0, 33.5), SIZE, inside - 0.1)[0]
     np.testing.assert_allclose(found, [x2 / 2, (y1 + y2) / 2, x2, y2 - y1], atol=4)
-    assert np.isnan(places.project(view_at(0, 33.5), SIZE, inside + 0.1)[0]).all()
+    assert np.isnan(ellipsoids.project(view_at(0, 33.5), SIZE, inside + 0.1)[0]).all()
     for turn in (90, 180):
-        assert np.isnan(places.project(view_at(0, turn), SIZE, 0.0)[0]).all()
+        assert np.isnan(ellipsoids.project(view_at(0, turn), SIZE, 0.0)[0]).all()
 
 
 @pytest.mark.parametrize(("length", "known"), [(0.2, True), (4.0, False)])
-def test_a_needle_is_no_place(length: float, known: bool) -> None:
-    """Half-seen things give ellipsoids that reach beyond the camera: they tell nothing."""
+def test_elongated_ellipsoids_are_rejected(length: float, known: bool) -> None:
+    """Truncated objects give ellipsoids that extend beyond the camera and are uninformative."""
     assert bool(mapped([ball(0, (length, 0.1, 0.1))], WALK).known[0]) is known
 
 
 @pytest.mark.parametrize(("walked", "known"), [(0.0, False), (0.05, False), (0.4, True)])
-def test_without_parallax_there_is_no_place(walked: float, known: bool) -> None:
+def test_without_parallax_there_is_no_ellipsoid(walked: float, known: bool) -> None:
     """A ball at 4 m and a camera that turns, and walks 0, 0.7 or 5.7 degrees of parallax."""
     xs = np.linspace(-walked / 2, walked / 2, 12)
     views = [view_at(x, turn) for x, turn in zip(xs, np.linspace(-10, 10, 12), strict=True)]
     assert bool(mapped([ball(0)], views).known[0]) is known
 
 
-def test_boxes_at_random_give_no_place() -> None:
-    places, rng = EllipsoidMap(), np.random.default_rng(3)
+def test_random_boxes_give_no_ellipsoid() -> None:
+    ellipsoids, rng = EllipsoidMap(), np.random.default_rng(3)
     for i, view in enumerate(WALK):
         corner, side = rng.uniform(0, 400, 2), rng.uniform(10, 80, 2)
-        places.add(5 * i, one(), np.concatenate([corner, corner + side])[None], view)
-        places.refit(SIZE)
-    assert not places.known[0]
+        ellipsoids.add(5 * i, one(), np.concatenate([corner, corner + side])[None], view)
+        ellipsoids.refit(SIZE)
+    assert not ellipsoids.known[0]
 
 
-def test_a_few_wrong_views_do_not_move_a_place() -> None:
-    places = mapped([ball(0)], WALK)
-    before = places.ends[0].mean(0)
+def test_outlier_views_do_not_move_an_ellipsoid() -> None:
+    ellipsoids = mapped([ball(0)], WALK)
+    before = ellipsoids.ends[0].mean(0)
     for i, wrong in enumerate(([0.0, 0, 20, 20], [600.0, 400, 640, 480])):
-        places.add(100 + i, one(), np.array([wrong]), view_at(0.1))
-    places.fresh[0] = 10
-    assert places.refit(SIZE)
-    assert np.linalg.norm(places.ends[0].mean(0) - before) < 0.05
+        ellipsoids.add(100 + i, one(), np.array([wrong]), view_at(0.1))
+    ellipsoids.fresh[0] = 10
+    assert ellipsoids.refit(SIZE)
+    assert np.linalg.norm(ellipsoids.ends[0].mean(0) - before) < 0.05
 
 
-def test_a_fit_waits_for_new_views() -> None:
-    """Three views at least, and more than a quarter of them new."""
-    places = EllipsoidMap()
-    told = []
+def test_refits_require_new_views() -> None:
+    """At least three views, and more than a quarter of them new."""
+    ellipsoids = EllipsoidMap()
+    refitted = []
     for i, view in enumerate(WALK):
-        places.add(5 * i, one(), outline(ball(0), view)[None], view)
-        told.append(places.refit(SIZE))
-    assert np.flatnonzero(told).tolist() == [2, 4, 6, 9]  # with 3, 5, 7 and 10 views
+        ellipsoids.add(5 * i, one(), outline(ball(0), view)[None], view)
+        refitted.append(ellipsoids.refit(SIZE))
+    assert np.flatnonzero(refitted).tolist() == [2, 4, 6, 9]  # with 3, 5, 7 and 10 views
     assert not EllipsoidMap().refit(SIZE)
 
 
-def test_views_are_few_and_spread_over_all_directions() -> None:
+def test_kept_views_are_bounded_and_cover_all_directions() -> None:
     """A thousand frames around a ball, then a hundred from one spot, which add nothing."""
-    places, angles = EllipsoidMap(), np.radians(np.linspace(0, 120, 1000))
+    ellipsoids, angles = EllipsoidMap(), np.radians(np.linspace(0, 120, 1000))
     for frame in range(1100):
         a = angles[min(frame, 999)]
         eye, turn = np.array([-4 * np.sin(a), 0, 4 - 4 * np.cos(a)]), np.eye(3)
         turn[[0, 0, 2, 2], [0, 2, 0, 2]] = np.cos(a), -np.sin(a), np.sin(a), np.cos(a)
         view = CAMERA.K @ np.c_[turn, -turn @ eye]
-        places.add(frame, one(), np.array([[300.0, 220, 340, 260]]), view)
-    held = places.frame[0] >= 0
-    frames = np.sort(places.frame[0][held])
+        ellipsoids.add(frame, one(), np.array([[300.0, 220, 340, 260]]), view)
+    held = ellipsoids.frame[0] >= 0
+    frames = np.sort(ellipsoids.frame[0][held])
     assert 8 <= len(frames) <= 16 and frames[0] == 0 and 850 < frames[-1] < 1000
     assert np.diff(frames).max() < 200
 
 
-def test_a_view_from_the_same_direction_is_no_new_one() -> None:
-    """A camera at rest that turns; at 1 degree of parallax the second view."""
-    places = EllipsoidMap()
+def test_a_view_without_parallax_is_not_kept() -> None:
+    """A camera that rotates only; at 1 degree of parallax the second view is kept."""
+    ellipsoids = EllipsoidMap()
     for frame, (x, turn) in enumerate([(0, 0), (0, 3), (0, -3), (0.06, 0), (0.08, 0), (0.1, 0)]):
-        places.add(frame, one(), outline(ball(0), view_at(x, turn))[None], view_at(x, turn))
-    assert sorted(f for f in places.frame[0].tolist() if f >= 0) == [0, 4]
+        ellipsoids.add(frame, one(), outline(ball(0), view_at(x, turn))[None], view_at(x, turn))
+    assert sorted(f for f in ellipsoids.frame[0].tolist() if f >= 0) == [0, 4]
 
 
 @pytest.mark.parametrize("scale", [1e-3, 0.1, 7.3, 1e3])
-def test_the_unit_of_the_world_makes_no_difference(scale: float) -> None:
-    things = [ball(-0.5), ball(0.6, (0.3, 0.2, 0.25))]
-    places, own = EllipsoidMap(), mapped(things, WALK)
+def test_the_unit_of_the_world_does_not_matter(scale: float) -> None:
+    objects = [ball(-0.5), ball(0.6, (0.3, 0.2, 0.25))]
+    ellipsoids, own = EllipsoidMap(), mapped(objects, WALK)
     for i, view in enumerate(WALK):
         scaled = np.c_[view[:, :3], scale * view[:, 3]]
-        places.add(5 * i, np.arange(2), np.stack([outline(t, view) for t in things]), scaled)
-    places.refit(SIZE)
-    assert places.known[:2].all()
-    np.testing.assert_allclose(places.ends[:2] / scale, own.ends[:2], rtol=1e-4, atol=1e-5)
+        ellipsoids.add(5 * i, np.arange(2), np.stack([outline(t, view) for t in objects]), scaled)
+    ellipsoids.refit(SIZE)
+    assert ellipsoids.known[:2].all()
+    np.testing.assert_allclose(ellipsoids.ends[:2] / scale, own.ends[:2], rtol=1e-4, atol=1e-5)
 
 
-def test_rough_sizes_are_those_of_the_things() -> None:
-    """Chairs of .6 to .8 m; without parallax, or unseen, nothing is said."""
+def test_rough_sizes_are_near_the_true_ones() -> None:
+    """Chairs of .6 to .8 m; NaN without parallax or detections."""
     poses = walk(8)
     cams = WIDE.K @ poses.cam_from_world
     boxes = quadrics.solid_boxes(chair_solids(), "box", cams)  # (F, 3, 4)
@@ -191,17 +191,17 @@ def test_rough_sizes_are_those_of_the_things() -> None:
     assert np.linalg.norm(error, axis=1).max() < 0.1
 
 
-# ---- Spans of viewing rays ----
+# ---- Depth intervals ----
 
 EYE = np.c_[np.eye(3), [0, 0, 0]]
 
 
-def test_the_points_in_a_box_tell_how_far_away_its_thing_is() -> None:
-    """A ball of 20 cm at 4 m before a wall at 6 m; a box without points is as far as the image."""
+def test_points_in_a_box_give_its_depth_interval() -> None:
+    """A ball of 20 cm at 4 m in front of a wall at 6 m; a box without points uses all points."""
     rng = np.random.default_rng(0)
     on_ball = np.array([0.5, 0, 4.0]) + 0.2 * unit(rng, 60, 3)
     wall = np.c_[rng.uniform(-3, 3, (300, 2)), np.full(300, 6.0)]
-    wall = wall[np.abs(wall[:, 0] / 6 + 0.3) > 0.1]  # a bare place
+    wall = wall[np.abs(wall[:, 0] / 6 + 0.3) > 0.1]  # a region without points
     boxes = np.array([[352.5, 210, 412.5, 270], [150, 220, 190, 260.0]])
     ends, size = depth_intervals(boxes, np.concatenate([on_ball, wall]), EYE, CAMERA.K)
     assert 3.7 < ends[0, 0, 2] < 4.0 < ends[0, 1, 2] < 4.6 and 5 < ends[1].mean(0)[2] < 7
@@ -220,21 +220,21 @@ def test_the_points_in_a_box_tell_how_far_away_its_thing_is() -> None:
     assert np.isnan(project_depth_intervals(ends, size, CAMERA.K, behind)).all()
 
 
-def test_an_uncertain_place_overlaps_within_its_reach() -> None:
+def test_an_uncertain_box_overlaps_within_its_uncertainty() -> None:
     box = np.array([[100.0, 100, 40, 20], [300, 100, 40, 20]])
     seen = np.array([[160.0, 100, 40, 20], [100, 160, 40, 20]])
     columns = box.T[..., None], seen.T[:, None]
-    iou, share = iou_within_uncertainty(columns[0], np.zeros((2, 1, 1)), columns[1])
+    iou, inside = iou_within_uncertainty(columns[0], np.zeros((2, 1, 1)), columns[1])
     boxes = xyxy_from_cxcywh(box), xyxy_from_cxcywh(seen)
     np.testing.assert_allclose(iou, box_iou(*boxes), atol=1e-9)
-    assert share.ravel().tolist() == [1, 1]
-    reach = np.array([[60.0, 20], [0, 0]])[..., None]
-    iou, share = iou_within_uncertainty(columns[0], reach, columns[1])
+    assert inside.ravel().tolist() == [1, 1]
+    uncertainty = np.array([[60.0, 20], [0, 0]])[..., None]
+    iou, inside = iou_within_uncertainty(columns[0], uncertainty, columns[1])
     np.testing.assert_allclose(iou, [[1, 0], [0, 0]], atol=1e-9)  # to the side, not below
-    np.testing.assert_allclose(share.ravel(), [0.25, 0.5])
+    np.testing.assert_allclose(inside.ravel(), [0.25, 0.5])
 
 
-def test_a_frame_sees_the_points_of_its_neighbours_of_the_same_part() -> None:
+def test_a_frame_has_the_points_of_neighbours_in_its_component() -> None:
     poses = walk(6)
     seen = np.array([[0, 0], [0, 1], [3, 1], [3, 2], [5, 3]])
     points, part = np.arange(12.0).reshape(4, 3), np.array([0, 0, 0, 0, 1, 1])

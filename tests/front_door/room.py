@@ -1,7 +1,7 @@
-"""The example clip, and whether an output folder is right about it.
+"""The example clip, and the comparison of an output folder with its ground truth.
 
-Everything goes in as a user brings it, and what comes out is compared with the truth by
-benchmarks/truth.py, which uses the public files only.
+Inputs are the files of a user; results are compared with the ground truth by
+benchmarks/truth.py, which reads the public files only.
 """
 
 from __future__ import annotations
@@ -79,11 +79,11 @@ def true_cameras(frames: range) -> scores.Array:
     return np.concatenate([turn, -turn @ rows[:, 1:4, None]], 2)
 
 
-def film_frames(out: Path) -> int:
-    """Count the frames of the film in OUT that can be decoded."""
+def overlay_frames(out: Path) -> int:
+    """Count the decodable frames of the overlay video in OUT."""
     (path,) = out.glob("overlay.*")
-    film, count = cv2.VideoCapture(str(path)), 0
-    while film.read()[0]:
+    video, count = cv2.VideoCapture(str(path)), 0
+    while video.read()[0]:
         count += 1
     return count
 
@@ -96,15 +96,15 @@ def assert_right(
     own_cameras: bool = False,
     centre_m: float = 0.03,
     size: float = 0.1,
-    share: float = 0.9,
+    hit_rate: float = 0.9,
     warning: str = "",
 ) -> None:
     """Compare an output folder with the truth of the clip.
 
     Args:
         frames: that were read. centre_m, size: bounds of the median errors of centres, and of the
-            sizes (relative). share: of the true objects, that must have a solid in reach; 0: no
-            solids are expected. warning: beginning of the only one that is expected.
+            sizes (relative). hit_rate: minimum fraction of the true objects that are
+            located; 0: no 3D shapes are expected. warning: start of the only expected warning.
     """
     output = scores.Output.read(out)
     said = output.data["warnings"]
@@ -113,7 +113,7 @@ def assert_right(
     found = scores.score_2d(true_boxes().of_frames(frames), output)
     assert found.idf1 >= idf1, found
     assert found.found >= found.true - 1 and found.false <= 1, found
-    if not share:
+    if not hit_rate:
         return
     assert sorted(output.centres) == list(frames)
     cameras = scores.score_cameras(output, dict(enumerate(true_centres())), own_cameras)
@@ -122,7 +122,7 @@ def assert_right(
     seen = set(true_boxes().of_frames(frames).identity.tolist())
     true = [o for o in true_objects() if o["id"] in seen]
     solids = scores.score_solids(true, output, cameras.truth_from_ours)
-    assert solids.found >= share * len(true), solids
+    assert solids.found >= hit_rate * len(true), solids
     assert solids.centre_m <= centre_m and solids.size <= size, solids
 
 
@@ -135,8 +135,8 @@ def idf1_of_rows(rows: np.ndarray, names: dict[int, str], frames: range) -> floa
 
 def assert_example_right(out: Path) -> None:
     """Compare the output folder of README's first command with the truth."""
-    assert_right(out, range(240), own_cameras=True, idf1=0.98, centre_m=0.04, share=0.94)
-    assert film_frames(out) == 240
+    assert_right(out, range(240), own_cameras=True, idf1=0.98, centre_m=0.04, hit_rate=0.94)
+    assert overlay_frames(out) == 240
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""benchmarks/: floors fail where a figure is worse, and changes of the core are real changes."""
+"""benchmarks/: floors fail if a figure is worse; mutations change the compiled code."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ def test_a_worse_figure_misses_its_floor(key: str) -> None:
     assert key in text or "exit code 1" in text
 
 
-def test_no_figure_and_no_floors_are_faults() -> None:
+def test_missing_figures_and_missing_floors_are_errors() -> None:
     floors = recordings.floors_of(FIGURES)
     without = {k: v for k, v in FIGURES.items() if k != "off"}
     assert len(recordings.missed(without, floors)) == 1
     assert len(recordings.missed(FIGURES, None)) == 1
 
 
-def test_every_command_has_a_name_of_its_own() -> None:
+def test_command_names_are_unique() -> None:
     names = [case.name for case in recordings.CASES + recordings.LONG]
     assert len(set(names)) == len(names)
     if recordings.FLOORS.exists():
@@ -67,7 +67,7 @@ def test_identities_and_lists_by_hand(tmp_path: Path) -> None:
     assert scores.score_2d(truth, output([], {})) == scores.Found(0, 0, 2, 0)
 
 
-def test_areas_and_what_need_not_be_found(tmp_path: Path) -> None:
+def test_annotated_areas_and_optional_objects(tmp_path: Path) -> None:
     path = tmp_path / "gt.txt"
     rows = [f"{f + 1},{i},{100 * i},0,40,40,1,-1,1" for f in range(4) for i in (1, 2, 3)]
     path.write_text("\n".join(rows))
@@ -109,7 +109,7 @@ def test_cameras_and_solids_by_hand() -> None:
     assert late is not None and late.median > 0.3
 
 
-def test_changes_are_real_and_can_be_compiled(tmp_path: Path) -> None:
+def test_mutations_change_the_code_and_compile(tmp_path: Path) -> None:
     code = '''"""Doc."""
 
 

@@ -1,4 +1,4 @@
-"""`poses` on small rendered walks in which some pictures cannot be located."""
+"""`poses` on small rendered walks in which some images cannot be registered."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ COUNT = 30
 
 @pytest.fixture(scope="module")
 def walk():
-    """A walk in even steps with a hand that shakes by 5 of 320 pixels; true poses."""
+    """Images of a walk in equal steps with camera shake of 5 px at 320 px; true poses."""
     return textured_room(COUNT, 0.12, -0.8, size=(320, 240))
 
 
 def cameras(folder: Path, images, capsys, caplog) -> tuple[rt.Poses, str]:
-    """Write images, run `poses` on them; the poses and everything that was printed."""
+    """Write images, run `poses` on them; return the poses and the printed text."""
     (folder / "in").mkdir()
     for k, image in enumerate(images):
         cv2.imwrite(str(folder / "in" / f"{k:03d}.png"), image)
@@ -39,10 +39,10 @@ def other_scene(k: int) -> np.ndarray:
     return textured_room(1, 0, seed=7 + k % 2, size=(320, 240))[0][0]
 
 
-def test_some_pictures_without_the_scene_cost_no_camera_of_the_others(
+def test_unrelated_images_do_not_affect_the_other_poses(
     walk, tmp_path, monkeypatch, capsys, caplog
 ):
-    """Black ones and some of another scene: as with them deleted; they have none, and are named."""
+    """Black images and images of another scene: the others get the poses they get without these."""
     monkeypatch.setattr("reobj.poses.estimate.MIN_KEYFRAMES", 12)  # fewer than pictures: by flow
     images, truth = walk
     lost = [*range(5, 10), *range(18, 23)]
@@ -56,7 +56,7 @@ def test_some_pictures_without_the_scene_cost_no_camera_of_the_others(
 
 
 def test_only_gaps_with_a_small_error_are_interpolated(walk, tmp_path, monkeypatch, capsys, caplog):
-    """The shaking hand is off by 2 px in one lost frame, and by 8 px in five; both are said."""
+    """Camera shake gives an error of 2 px over one lost frame and 8 px over five; both reported."""
     monkeypatch.setattr("reobj.poses.estimate.MIN_KEYFRAMES", 12)
     images, truth = walk
     lost = [7, *range(15, 20)]
@@ -75,7 +75,7 @@ def test_images_without_texture_are_reported(tmp_path, capsys, caplog):
     assert "cameras: 0 of 45 frames" in text and "no image has texture" in text
 
 
-def test_a_turn_on_the_spot_is_refused_with_what_was_measured(tmp_path, capsys, caplog):
+def test_a_pure_rotation_is_refused_with_the_measured_values(tmp_path, capsys, caplog):
     images = textured_room(8, 0, 4, size=(320, 240))[0]
     poses, text = cameras(tmp_path, images, capsys, caplog)
     assert not poses.known.any() and "explained by a plane or a pure rotation" in text

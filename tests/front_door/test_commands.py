@@ -1,6 +1,6 @@
 """Every command, solver, exporter and format of poses, as a user calls them, against the truth.
 
-The completion of a shell is asked in tests/test_run.py.
+Shell completion is tested in tests/test_run.py.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from front_door.room import (
     assert_example_right,
     assert_right,
     cli,
-    film_frames,
     idf1_of_rows,
     info,
+    overlay_frames,
     true_boxes,
     true_cameras,
     true_centres,
@@ -79,10 +79,10 @@ def test_run_with_supplied_cameras(room: Path) -> None:
 def test_track(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     assert cli("track", ROOM / "room.mp4", "-o", out, *DETECTIONS, *FEW) == 0
-    assert_right(out, share=0, idf1=0.94)
-    assert film_frames(out) == 40
-    said = capsys.readouterr()
-    assert said.err.strip() == "" and "distinct objects:" in said.out
+    assert_right(out, hit_rate=0, idf1=0.94)
+    assert overlay_frames(out) == 40
+    printed_by = capsys.readouterr()
+    assert printed_by.err.strip() == "" and "distinct objects:" in printed_by.out
 
 
 def test_run_without_images(tmp_path: Path) -> None:
@@ -98,8 +98,8 @@ PICTURES = range(0, 60, 10)  # frames of the clip that are the images 0000.jpg .
 def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Six images of the clip, a quarter of its size."""
     folder = tmp_path_factory.mktemp("pictures")
-    film = rt.Video(ROOM / "room.mp4", rt.InputConfig(every=10, stop=60))
-    for i, frame in enumerate(film):
+    video = rt.Video(ROOM / "room.mp4", rt.InputConfig(every=10, stop=60))
+    for i, frame in enumerate(video):
         cv2.imwrite(str(folder / f"{i:04d}.jpg"), cv2.resize(frame.image, (160, 120)))
     return folder
 
@@ -108,7 +108,7 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_poses_in_every_format(
     pictures: Path, tmp_path: Path, write: Callable[[Path, np.ndarray], Path]
 ) -> None:
-    """The cameras of every image come out where the file has them."""
+    """Camera centres equal those of the file."""
     path, out = write(tmp_path, true_cameras(PICTURES)), tmp_path / "out"
     camera = ",".join(str(float(v) / 4) for v in CAMERA.split(","))
     assert cli("poses", pictures, "-o", out, "--poses", path, "--camera", camera) == 0
@@ -123,18 +123,18 @@ def test_poses_in_every_format(
 
 
 @pytest.mark.parametrize(
-    ("solver", "centre_m", "size", "share"),
+    ("solver", "centre_m", "size", "rate"),
     [("solids", 0.03, 0.1, 0.9), ("lfd", 0.05, 0.25, 0.5), ("sfmo", 0, 0, 0),
      ("psfmo", 0.06, 0.2, 0.9)],
 )  # fmt: skip
-def test_every_solver(out: Path, solver: str, centre_m: float, size: float, share: float) -> None:
-    """SfMO, of affine cameras, has no metric meaning in a walk: files and film only."""
+def test_every_solver(out: Path, solver: str, centre_m: float, size: float, rate: float) -> None:
+    """SfMO assumes affine cameras, so its sizes are not checked here: files and overlay only."""
     pictures = ("--set", "output.overlay=solids", "--set", "output.scene=1")
     assert cli("objects", out, "--solver", solver, *pictures) == 0
     warning = "" if solver == "solids" else f"objects.solver={solver}: "
-    assert_right(out, centre_m=centre_m, size=size, share=share, warning=warning)
+    assert_right(out, centre_m=centre_m, size=size, hit_rate=rate, warning=warning)
     assert sum(o["status"] == "ok" for o in info(out)["objects"]) >= 3
-    assert film_frames(out) == 40 and (out / "scene.html").stat().st_size > 1e6
+    assert overlay_frames(out) == 40 and (out / "scene.html").stat().st_size > 1e6
     assert (out / "objects.ply").stat().st_size > 1e3
 
 
@@ -178,15 +178,15 @@ def test_eval_agrees_with_the_public_files(example: Path, tmp_path: Path) -> Non
 
 
 def printed(capsys: pytest.CaptureFixture[str]) -> dict[str, float]:
-    """The first row of the table that `eval` prints, in shares."""
+    """The first row of the table that `eval` prints, as fractions."""
     names, numbers = capsys.readouterr().out.splitlines()[:2]
     return dict(zip(names.split(), map(float, numbers.split()[1:]), strict=True))
 
 
-def test_eval_sees_what_is_wrong(
+def test_eval_scores_drop_after_an_identity_swap(
     out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A tracks.txt, and one in which two chairs change their numbers half way."""
+    """A tracks.txt, and one in which the identities of two chairs are swapped half way."""
     lines = (out / "tracks.txt").read_text().splitlines()
     rows = np.loadtxt(lines, delimiter=",")
     late = rows[:, 0] > 60
@@ -258,7 +258,7 @@ def check_tracks(read: Callable[[Path], tuple[list[list[float]], dict[int, str]]
 
 
 def near_true(names: list[str], centres: np.ndarray, limit_m: float = 0.15) -> None:
-    """Nearly all solids lie at a true object of their class; the median is near."""
+    """Nearly all ellipsoids are near a true object of their class; so is their median."""
     true = true_objects()
     goal = np.array([o["center"] for o in true])
     same = np.array([o["class"] for o in true])[:, None] == np.array(names)
@@ -299,8 +299,8 @@ def check_nerfstudio(path: Path) -> None:
     cams = np.linalg.inv(poses @ np.diag([1, -1, -1, 1]))[:, :3]
     np.testing.assert_allclose(cams, true_cameras(SHORT), atol=1e-5)
     image = cv2.imread(str(path.parent / data["frames"][7]["file_path"]))
-    film = cv2.VideoCapture(str(ROOM / "room.mp4"))
-    true = [film.read()[1] for _ in range(22)][21]
+    video = cv2.VideoCapture(str(ROOM / "room.mp4"))
+    true = [video.read()[1] for _ in range(22)][21]
     assert np.abs(image.astype(int) - true).mean() < 6  # JPEG of frame 21, of no neighbour
 
 
@@ -341,8 +341,8 @@ def test_every_export(out: Path, to: str, capsys: pytest.CaptureFixture[str]) ->
 # ---- models, --options, --version, --help ----
 
 
-def said(capsys: pytest.CaptureFixture[str], *words: str) -> str:
-    """What a command prints that does nothing else."""
+def printed_by(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    """Text printed by an information-only command."""
     with pytest.raises(SystemExit) as ended:
         cli(*words)
     found = capsys.readouterr()
@@ -350,15 +350,15 @@ def said(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     return found.out
 
 
-def test_there_are_no_other_commands(capsys: pytest.CaptureFixture[str]) -> None:
-    """A new one needs tests here."""
-    commands = re.findall(r"^    (\w+) ", said(capsys, "--help"), re.M)
+def test_all_commands_are_tested_here(capsys: pytest.CaptureFixture[str]) -> None:
+    """A new command needs tests here."""
+    commands = re.findall(r"^    (\w+) ", printed_by(capsys, "--help"), re.M)
     assert commands == ["run", "track", "poses", "objects", "eval", "export", "models"]
 
 
 def test_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
     version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
-    assert said(capsys, "--version") == f"reobj_track {version}\n"
+    assert printed_by(capsys, "--version") == f"reobj_track {version}\n"
 
 
 def test_models_lists_and_verifies(capsys: pytest.CaptureFixture[str]) -> None:
@@ -372,12 +372,12 @@ def test_models_lists_and_verifies(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_every_listed_option_can_be_set(room: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """`--options` as it is printed, into `--set` as it is read."""
-    options = re.findall(r"^(\w+\.\w+=\S*)(?:  |$)", said(capsys, "--options"), re.M)
+    options = re.findall(r"^(\w+\.\w+=\S*)(?:  |$)", printed_by(capsys, "--options"), re.M)
     assert len(options) > 40 and len({o.split(".")[0] for o in options}) >= 7
     assert cli("objects", room, "--validate", *(w for o in options for w in ("--set", o))) == 0
 
 
-def test_a_reader_that_stops_early_is_no_fault() -> None:
+def test_a_reader_that_stops_early_is_no_error() -> None:
     """`--options | head -1`"""
     command = f"{sys.executable} {ROOT / 'reobj_track.py'} --options | head -n 1"
     done = subprocess.run(command, shell=True, capture_output=True, text=True, check=False)

@@ -1,8 +1,7 @@
-"""Detections and tracks of other tools through the command line: the right boxes and frames.
+"""Detections and tracks of other tools, imported through the command line.
 
-One truth, a chair that moves through a small video, is written in every format and variant that
-users bring; the tracks that come out are compared with it. What cannot be meant is refused in one
-line that names the cause.
+The ground truth, a chair that moves through a small video, is written in every format and variant;
+the resulting tracks are compared with it. Invalid input is refused in one line with the cause.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ def box(frame: int) -> tuple[int, int, int, int]:
     return 10 + 4 * frame, 20, 50 + 4 * frame, 60
 
 
-def film(path: Path, frames: int = FRAMES) -> Path:
+def write_clip(path: Path, frames: int = FRAMES) -> Path:
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 25, SIZE)
     for _ in range(frames):
         writer.write(np.zeros((*SIZE[::-1], 3), np.uint8))
@@ -48,7 +47,7 @@ def images(folder: Path, names: Sequence[str]) -> Path:
 
 @dataclasses.dataclass
 class Tracked:
-    """What a run wrote and said."""
+    """Output and messages of a run."""
 
     code: int
     frames: list[int]  # from 0
@@ -82,12 +81,12 @@ def tracked(
 
 
 def is_truth(made: Tracked, name: str = "chair", frames: Sequence[int] = range(FRAMES)) -> bool:
-    """Whether the chair is in its place in these frames, and nothing else."""
+    """Whether the tracks are exactly the true boxes of the chair in these frames."""
     same = np.allclose(made.boxes, [box(f) for f in made.frames], atol=0.05)
     return made.frames == list(frames) and same and made.classes == [name]
 
 
-# ---- One truth in every format -------------------------------------------------------------------
+# ---- The ground truth in every format -----------------------------------------------------------
 
 
 def lines(row: Callable[[int, tuple[int, int, int, int]], str], header: str = "") -> str:
@@ -186,7 +185,7 @@ def test_tables(tmp_path: Path, tracked: Callable[..., Tracked], what: str) -> N
     named = (
         what[:3] in ("mot", "box") and "commas" not in what and "own" not in what
     ) or "floats" in what
-    made = tracked(film(tmp_path / "v.avi"), "--detections", path, *(names if named else ()))
+    made = tracked(write_clip(tmp_path / "v.avi"), "--detections", path, *(names if named else ()))
     assert is_truth(made, "object" if "commas" in what else "chair"), made
 
 
@@ -249,11 +248,11 @@ def test_ids_from_0_of_images_whose_names_count_from_1(
     assert is_truth(tracked(source, "--detections", tmp_path / "res.json"))
 
 
-def test_numbers_of_other_videos_are_not_taken(
+def test_frame_numbers_in_the_image_names_of_cvat(
     tmp_path: Path, tracked: Callable[..., Tracked]
 ) -> None:
     """CVAT's names of a video's frames: the number is the frame; of every 3rd, from 0 or from 1."""
-    source = film(tmp_path / "v.avi", 16)
+    source = write_clip(tmp_path / "v.avi", 16)
     for begin in (0, 1):
         data = {
             "images": [{"id": i, "file_name": f"frame_{begin + 3 * i:06d}.PNG"} for i in range(5)],
@@ -267,11 +266,11 @@ def test_numbers_of_other_videos_are_not_taken(
             assert is_truth(made, frames=range(0, 15, 3)), (option, begin, made)
 
 
-def test_numbers_that_count_from_0_or_from_1_are_asked_for(
+def test_an_ambiguous_first_frame_number_needs_an_option(
     tmp_path: Path, tracked: Callable[..., Tracked]
 ) -> None:
-    """Frames 3 to 6 of a longer video: nothing shows what they count from."""
-    source = film(tmp_path / "v.avi", 12)
+    """Frames 3 to 6 of a longer video: whether they count from 0 or 1 is not determined."""
+    source = write_clip(tmp_path / "v.avi", 12)
     (tmp_path / "labels").mkdir()
     for f in range(3, 7):
         (tmp_path / "labels" / f"other_{f}.txt").write_text(yolo(f))
@@ -347,7 +346,7 @@ def test_yolo_labels_of_a_video(
     """Ultralytics' NAME_N.txt counts from 1."""
     labels = yolo_folder(tmp_path / "predict/labels", row, "v_{}.txt", 1)
     (labels.parent / "classes.txt").write_text("chair\nlamp\n")
-    made = tracked(film(tmp_path / "v.avi"), option, labels)
+    made = tracked(write_clip(tmp_path / "v.avi"), option, labels)
     assert is_truth(made), made
 
 
@@ -361,11 +360,11 @@ def test_yolo_labels_of_a_video(
         ("99 .5 .5 .2 .2\n", "class 99, but there are only 80 class names"),
     ],
 )
-def test_label_files_that_cannot_be_meant(
+def test_invalid_label_files_are_refused(
     tmp_path: Path, tracked: Callable[..., Tracked], text: str, expected: str
 ) -> None:
     labels = yolo_folder(tmp_path / "labels", lambda f: text, "v_{}.txt", 1)
-    made = tracked(film(tmp_path / "v.avi"), "--detections", labels)
+    made = tracked(write_clip(tmp_path / "v.avi"), "--detections", labels)
     assert made.code == 2 and expected in made.said and "v_1.txt" in made.said
     (tmp_path / "empty").mkdir()
     made = tracked(tmp_path / "v.avi", "--detections", tmp_path / "empty")
@@ -378,12 +377,12 @@ def test_labels_of_several_videos_in_one_folder(
     labels = yolo_folder(tmp_path / "labels", yolo, "v_{}.txt", 1)
     for f in range(4):
         (labels / f"other_{f + 1}.txt").write_text("1 .5 .5 .2 .2\n")
-    made = tracked(film(tmp_path / "v.avi"), "--detections", labels)
+    made = tracked(write_clip(tmp_path / "v.avi"), "--detections", labels)
     assert is_truth(made) and "4 files of other names than the video's left out" in made.said
 
 
 def test_labels_from_roboflow(tmp_path: Path, tracked: Callable[..., Tracked]) -> None:
-    """Its names have the original one before a hash, whose digits are no frame number."""
+    """Their file names are the original name and a hash, whose digits are no frame number."""
     source = images(tmp_path / "im", [f"room{f}.png" for f in range(FRAMES)])
     folder = tmp_path / "train/labels"
     folder.mkdir(parents=True)
@@ -392,17 +391,17 @@ def test_labels_from_roboflow(tmp_path: Path, tracked: Callable[..., Tracked]) -
     assert is_truth(tracked(source, "--detections", tmp_path / "train"))
 
 
-# ---- What is left out is counted -----------------------------------------------------------------
+# ---- Dropped rows are counted -----------------------------------------------------------------
 
 
-def test_no_box_of_a_file_is_left_out_by_itself(
+def test_boxes_of_a_file_are_limited_only_by_the_users_option(
     tmp_path: Path, tracked: Callable[..., Tracked]
 ) -> None:
-    """150 boxes a frame; a limit that the user sets is said."""
+    """150 boxes per frame; a limit set by the user is reported."""
     rows = [f"{f + 1},{k + 1},{2 * k},{10 + k % 3 * 60},9,40,.9\n" for f in range(4)
             for k in range(150)]  # fmt: skip
     (tmp_path / "det.txt").write_text("".join(rows))
-    source = film(tmp_path / "v.avi", 4)
+    source = write_clip(tmp_path / "v.avi", 4)
     found = rt.read_detections(tmp_path / "det.txt", rt.Video(source))
     assert len(found) == 600 and found.messages == []
     made = tracked(source, "--detections", tmp_path / "det.txt", "--set",
@@ -427,11 +426,11 @@ def test_no_box_of_a_file_is_left_out_by_itself(
         (TABLES["numbers from 1"], "are taken as counted from 1"),
     ],
 )
-def test_what_is_left_out_or_guessed_is_said_once(
+def test_dropped_rows_and_assumptions_are_reported_once(
     tmp_path: Path, tracked: Callable[..., Tracked], text: str, said: str
 ) -> None:
     (tmp_path / "det.txt").write_text(text)
-    made = tracked(film(tmp_path / "v.avi"), "--detections", tmp_path / "det.txt")
+    made = tracked(write_clip(tmp_path / "v.avi"), "--detections", tmp_path / "det.txt")
     assert made.code == 0 and made.said.count(said) == 1, made.said
 
 
@@ -465,17 +464,17 @@ def test_a_class_0_counts_from_0_where_that_fits_the_names(
     (tmp_path / "names.txt").write_text("\n".join(rt.COCO_NAMES[:count]))
     (tmp_path / "det.txt").write_text(mot(tail=".9,57") + "2,1,200,100,40,40,.9,0\n")
     config = rt.DetectConfig(class_names=str(tmp_path / "names.txt"))
-    video = rt.Video(film(tmp_path / "v.avi"))
+    video = rt.Video(write_clip(tmp_path / "v.avi"))
     found = rt.read_detections(tmp_path / "det.txt", video, config)
     assert {found.class_names[c] for c in found.class_id} == names
     assert len(found) == 9 and "class numbers" in found.messages[0]
 
 
-def test_csv_from_1_that_does_not_show_it(tmp_path: Path, tracked: Callable[..., Tracked]) -> None:
-    """Frames 1 to 7 of 8: read as documented, from 0, and said; the other reading on request."""
+def test_an_ambiguous_csv_counts_from_0(tmp_path: Path, tracked: Callable[..., Tracked]) -> None:
+    """Frames 1 to 7 of 8: read from 0 as documented, with a warning; from 1 by an option."""
     text = "".join(TABLES["csv"].splitlines(keepends=True)[:1] + TABLES["csv"].splitlines(True)[2:])
     (tmp_path / "det.csv").write_text(text)
-    source = film(tmp_path / "v.avi")
+    source = write_clip(tmp_path / "v.avi")
     made = tracked(source, "--detections", tmp_path / "det.csv")
     assert is_truth(made, frames=range(1, 8)) and "detect.first_frame=1" in made.said
     made = tracked(source, "--detections", tmp_path / "det.csv", "--set", "detect.first_frame=1")
@@ -494,17 +493,15 @@ def test_csv_from_1_that_does_not_show_it(tmp_path: Path, tracked: Callable[...,
         (csv("filename,x1,y1,x2,y2", "a/img.jpg,1,2,30,40"), "match no frame of the video"),
     ],
 )  # fmt: skip
-def test_tables_that_cannot_be_meant(
+def test_invalid_tables_are_refused(
     tmp_path: Path, tracked: Callable[..., Tracked], text: str, expected: str
 ) -> None:
     (tmp_path / "det.csv").write_text(text)
-    made = tracked(film(tmp_path / "v.avi"), "--detections", tmp_path / "det.csv")
+    made = tracked(write_clip(tmp_path / "v.avi"), "--detections", tmp_path / "det.csv")
     assert made.code == 2 and expected in made.said and made.said.count("\n") <= 1, made.said
 
 
-def test_boxes_of_frames_that_were_not_turned_upright(
-    tmp_path: Path, tracked: Callable[..., Tracked]
-) -> None:
+def test_boxes_of_frames_before_rotation(tmp_path: Path, tracked: Callable[..., Tracked]) -> None:
     """Boxes of 320 x 240 on an upright video of 240 x 320, in a table and in COCO."""
     folder = tmp_path / "upright"
     folder.mkdir()
@@ -588,7 +585,7 @@ def test_npz_whose_image_size_is_none(
 
 
 def test_two_datasets_beside_a_result_file(tmp_path: Path, tracked: Callable[..., Tracked]) -> None:
-    """The one whose ids fit; two that fit and differ are refused; two that agree are not."""
+    """The dataset with matching ids is used; two that match and differ are refused."""
     source = images(tmp_path / "im", [f"{f}.png" for f in range(FRAMES)])
     rows = [{"image_id": f, "category_id": 1, "bbox": coco_box(f), "score": 0.9}
             for f in range(FRAMES)]  # fmt: skip
@@ -658,7 +655,7 @@ def test_shapes_of_cvat(
 ) -> None:
     with zipfile.ZipFile(tmp_path / "task.zip", "w") as packed:
         packed.writestr("annotations.xml", cvat(shape))
-    made = tracked(film(tmp_path / "v.avi"), "--tracks", tmp_path / "task.zip")
+    made = tracked(write_clip(tmp_path / "v.avi"), "--tracks", tmp_path / "task.zip")
     assert is_truth(made) and said in made.said and ("taken as" in made.said) == bool(said)
 
 
@@ -670,7 +667,7 @@ def test_cvat_of_images_and_of_another_size(
         f'<image id="{f}" name="frame_{f:06d}">{cvat_box(f, label)}</image>' for f in range(FRAMES)
     )
     (tmp_path / "images.xml").write_text(f"<annotations>{shapes}</annotations>")
-    source = film(tmp_path / "v.avi")
+    source = write_clip(tmp_path / "v.avi")
     assert is_truth(tracked(source, "--detections", tmp_path / "images.xml"))
     size = "<original_size><width>240</width><height>320</height></original_size>"
     (tmp_path / "t.xml").write_text(cvat(cvat_box, f"<meta><task>{size}</task></meta>"))
@@ -691,15 +688,15 @@ def test_cvat_of_images_and_of_another_size(
 )  # fmt: skip
 def test_identities_of_tables(tmp_path: Path, tracked: Callable[..., Tracked], text: str) -> None:
     (tmp_path / "t.txt").write_text(text)
-    made = tracked(film(tmp_path / "v.avi"), "--tracks", tmp_path / "t.txt")
+    made = tracked(write_clip(tmp_path / "v.avi"), "--tracks", tmp_path / "t.txt")
     assert is_truth(made), made
     assert ("1 is added" in made.said) == (",0,10,20," in text)
     assert ("1 of 9 boxes without an identity left out" in made.said) == ("lamp" in text)
 
 
-def test_classes_are_lent_where_boxes_show_the_same(tmp_path: Path) -> None:
-    """Identities without classes: by the overlap of all frames; none where nothing overlaps."""
-    source = film(tmp_path / "v.avi")
+def test_classes_of_identities_come_from_overlapping_detections(tmp_path: Path) -> None:
+    """Identities without classes: by overlap over all frames; no class without overlap."""
+    source = write_clip(tmp_path / "v.avi")
     (tmp_path / "det.csv").write_text(TABLES["csv"])
     out = tmp_path / "out"
     assert rt.main(["track", str(source), "-o", str(out), "--detections",
@@ -741,7 +738,7 @@ def test_class_names_of_a_yaml_file(
     (tmp_path / "data.yaml").write_text(text)
     (tmp_path / "det.txt").write_text(mot(tail=".9,1"))
     config = rt.DetectConfig(class_names=str(tmp_path / "data.yaml"))
-    video = rt.Video(film(tmp_path / "v.avi"))
+    video = rt.Video(write_clip(tmp_path / "v.avi"))
     try:
         found: Any = rt.read_detections(tmp_path / "det.txt", video, config).class_names
     except rt.ReobjError as error:
@@ -783,13 +780,13 @@ class Supervision:
     ],
 )  # fmt: skip
 def test_labels_that_are_text(tmp_path: Path, made: Callable[[Any], Any]) -> None:
-    """Open vocabulary: the label is the class, whatever number it has in the detector."""
+    """Open vocabulary: the label is the class, regardless of its number in the detector."""
     frames = iter([*range(FRAMES)] * 2)
     config = rt.Config(embed=rt.EmbedConfig(model="none"))
     config = dataclasses.replace(
         config, output=dataclasses.replace(config.output, overlay="none", scene=False)
     )
-    result = rt.run(film(tmp_path / "v.avi"), tmp_path / "out", config,
+    result = rt.run(write_clip(tmp_path / "v.avi"), tmp_path / "out", config,
                     detections=lambda image: made(box(next(frames))), in_3d=False)  # fmt: skip
     assert [o.class_name for o in result.objects] == ["red mug"]
     assert result.tracks.frame.tolist() == list(range(FRAMES))

@@ -1,9 +1,9 @@
-"""Every documented command and every piece of Python in README and docs/ is run, or listed here.
+"""Runs the documented commands and Python code of README and docs/, or lists them as not run.
 
-The blocks of `sh` and `python` in the tutorials are run by tests/test_docs.py. All other commands
-are here: as they are written, in a folder with the files that they name, and with further options
-(`more`) that make them quick. Commands of benchmarks/ take long or need data: their options are
-compared with --help. A new command in the docs fails until it is listed here.
+tests/test_docs.py runs the `sh` and `python` blocks of the tutorials. All other commands are run
+here as written, in a folder with the files they name, plus options (`more`) that make them fast.
+Commands of benchmarks/ take long or need data: their options are compared with --help. A new
+command in the docs fails until it is listed here.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def benchmark_of(command: str) -> str | None:
     return found[1] if found else None
 
 
-# ---- The files that a reader has lying there ----
+# ---- The files of the reader ----
 
 
 @pytest.fixture
@@ -152,7 +152,7 @@ def quadrics_quaternion(turn: np.ndarray) -> np.ndarray:
 
 
 def output(desk: Path) -> None:
-    """An output folder of the whole clip, with cameras of its own; edits for it."""
+    """An output folder of the whole clip with reconstructed cameras; edits for it."""
     recording(desk)
     rows = np.loadtxt(desk / "out" / "tracks.txt", delimiter=",")
     frame, number, left, top, width, height = rows[0, :6].tolist()
@@ -202,7 +202,7 @@ def scanner_app(desk: Path) -> None:
 
 
 def mine(desk: Path) -> None:
-    """A detector of one's own, with its class names."""
+    """A custom detector with its class names."""
     recording(desk)
     (desk / "mine.onnx").symlink_to(small_detector())
     (desk / "names.txt").write_text("\n".join(rt.COCO_NAMES) + "\n")
@@ -215,7 +215,7 @@ def small_detector() -> Path:
         pytest.skip(f"no weights here: {error}")
 
 
-# ---- What must come out ----
+# ---- Expected results ----
 
 SUPPLIED = f"--poses poses.txt --camera {CAMERA}"
 SHORT = " ".join(map(str, FEW))
@@ -228,7 +228,7 @@ def right(desk: Path) -> None:
 
 
 def right_identities(desk: Path) -> None:
-    assert_right(desk / "out", share=0, idf1=0.94)
+    assert_right(desk / "out", hit_rate=0, idf1=0.94)
 
 
 def right_without_images(desk: Path) -> None:
@@ -271,7 +271,7 @@ def exported(desk: Path) -> None:
 
 
 def located(desk: Path) -> None:
-    """Own cameras are right up to a similarity."""
+    """Reconstructed cameras are right up to a similarity."""
     rows = np.loadtxt(desk / "out/poses.txt")
     true = true_centres()[np.round(rows[:, 0] * 12).astype(int)]
     scale, turn, shift = scores.similarity(rows[:, 1:4], true)
@@ -280,7 +280,7 @@ def located(desk: Path) -> None:
 
 
 def posed(desk: Path) -> None:
-    """Every picture has its own camera, and the objects their identities."""
+    """Every image has its camera, and the objects have the right identities."""
     rows = np.loadtxt(desk / "out/poses.txt")
     np.testing.assert_allclose(rows[:, 1:4], true_centres()[list(SIX)], atol=1e-5)
     truth = true_boxes().of_frames(SIX)
@@ -297,7 +297,7 @@ def renamed(desk: Path) -> None:
 
 
 def nothing(_: Path) -> None:
-    """The exit code says it all; the example has no errors to draw."""
+    """Only the exit code is checked: the example has no errors to draw."""
 
 
 @dataclass(frozen=True)
@@ -305,9 +305,9 @@ class Shown:
     """How a documented command is run.
 
     Attributes:
-        desk: makes the files that it names. check: what came out. more: words that make it quick.
-        swap: for words that stand for something. folder: name of the copy of the example's output
-            folder that it needs. code: exit code; says: what it then prints.
+        desk: creates its input files. check: checks its results. more: arguments that make it fast.
+        swap: for values of placeholders. folder: name of the copy of the example's output
+            folder that it needs. code: exit code; says: text printed in that case.
     """
 
     desk: Callable[[Path], None]
@@ -380,7 +380,7 @@ SHOWN = {
 
 
 def test_every_command_in_the_docs_is_run_or_has_a_reason() -> None:
-    """A command that is new, and an entry whose command has gone."""
+    """Fails for a new command and for an entry without a command."""
     known = {*ELSEWHERE, *SHOWN}
     unknown = {c: p for c, p in DOCUMENTED.items() if c not in known and not benchmark_of(c)}
     assert unknown == {}, "run them in SHOWN, or list them in ELSEWHERE"
@@ -388,7 +388,7 @@ def test_every_command_in_the_docs_is_run_or_has_a_reason() -> None:
     assert {b for c in DOCUMENTED if (b := benchmark_of(c))} <= set(SCRIPTS)
 
 
-def test_the_list_of_benchmarks_is_whole() -> None:
+def test_the_list_of_benchmarks_is_complete() -> None:
     listed = {benchmark_of(c) for c in commands_of(ROOT / "benchmarks" / "README.md")}
     assert listed - {None} == {n for n, p in SCRIPTS.items() if p.parent.name == "benchmarks"}
 
@@ -407,10 +407,10 @@ SCRIPTS = {
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
-def test_every_script_says_how_it_is_used(
+def test_every_script_prints_its_usage(
     script: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """And knows the flags that the docs call it with."""
+    """Its help lists the flags that the docs use."""
     path = SCRIPTS[script]
     monkeypatch.setattr(sys, "argv", [str(path), "--help"])
     monkeypatch.syspath_prepend(path.parent)
@@ -485,7 +485,7 @@ def python_of(page: str) -> list[str]:
     return fenced + [re.sub(r"^    ", "", block, flags=re.M) for block in indented]
 
 
-def test_python_is_where_it_is_known_to_be() -> None:
+def test_python_code_is_in_the_listed_documents() -> None:
     pages = {page_name(p) for p in PAGES if p.parent.name != "tutorials"}
     assert {p for p in pages if python_of(p)} == {"README.md", "docs/quadrics.md"}
     assert [len(python_of(p)) for p in ("README.md", "docs/quadrics.md")] == [1, 1]
@@ -509,7 +509,7 @@ def test_python_in_readme(desk: Path, capsys: pytest.CaptureFixture[str]) -> Non
 
 
 def test_python_in_quadrics(desk: Path) -> None:
-    """A chair and a cup of the clip from true boxes, where nothing hides them, and true cameras."""
+    """Fits a chair and a cup of the clip to unoccluded true boxes with true cameras."""
     (code,) = python_of("docs/quadrics.md")
     truth, frames = true_boxes(min_visible=0.95), range(0, 240, 2)
     views = {o["id"]: (truth.clear & (truth.identity == o["id"])).sum() for o in true_objects()}

@@ -1,4 +1,4 @@
-"""`eval`: scores what TrackEval scores, refuses what it refuses, and says what it assumes."""
+"""`eval`: same scores and same refusals as TrackEval; assumptions are reported."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_boxes_without_identity_are_refused(
     assert "1 of 150 boxes" in refused(capsys, write(tmp_path / "one.txt", rows), gt)
 
 
-def test_frames_from_0_are_taken_as_such_and_said(result: Path, tmp_path: Path) -> None:
+def test_frames_from_0_are_accepted_and_reported(result: Path, tmp_path: Path) -> None:
     rows = ROWS - np.eye(1, 6)
     zero = write(tmp_path / "zero.txt", rows, "1")
     for out, gt in ((result, zero), (zero, write(tmp_path / "gt.txt", ROWS, "1")), (zero, zero)):
@@ -88,7 +88,7 @@ def test_frames_from_0_are_taken_as_such_and_said(result: Path, tmp_path: Path) 
         ("0,-1,-1,-1", 150, "of 150 rows 150 are marked not to count"),
     ],
 )
-def test_truth_of_which_nothing_counts(
+def test_truth_without_scored_boxes(
     result: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
@@ -102,7 +102,7 @@ def test_truth_of_which_nothing_counts(
         assert f"{gt}: no true box counts: {why}" in text
 
 
-def test_a_result_without_a_box_is_worth_nothing(tmp_path: Path) -> None:
+def test_a_result_without_boxes_scores_0(tmp_path: Path) -> None:
     gt = write(tmp_path / "gt.txt", ROWS, "1")
     found, _ = score(write(tmp_path / "none.txt", ROWS[:0]), gt)
     assert found["HOTA"] == found["IDF1"] == found["MOTA"] == 0 and found["gt_objects"] == 5
@@ -115,7 +115,7 @@ def test_a_result_without_a_box_is_worth_nothing(tmp_path: Path) -> None:
         (ROWS * [1, 1, 1, 1, -1, 1], "frame 1, identity 1: width or height below 0"),
     ],
 )
-def test_rows_that_cannot_be_meant(
+def test_invalid_rows_are_refused(
     result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], rows: np.ndarray, what: str
 ) -> None:
     bad, gt = write(tmp_path / "bad.txt", rows), write(tmp_path / "gt.txt", ROWS, "1")

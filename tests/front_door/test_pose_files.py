@@ -1,4 +1,4 @@
-"""Supplied poses as a user brings them: which frame each belongs to, what is refused, and why."""
+"""Supplied poses in the formats of users: assignment to frames, refusals and their reasons."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def images() -> tuple[np.ndarray, ...]:
     return tuple(pictures)
 
 
-def film(folder: Path, blank: bool = False) -> Path:
+def write_clip(folder: Path, blank: bool = False) -> Path:
     path = folder / "v.avi"
     video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30, SIZE)
     for image in images():
@@ -103,10 +103,10 @@ def quaternions(frames: list[int]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def tum(path: Path, stamps: list[str], frames: list[int], head: str = "", sep: str = " ") -> Path:
-    place, xyzw = quaternions(frames)
+    centre, xyzw = quaternions(frames)
     rows = [
         sep.join([stamp, *map(repr, [*p.tolist(), *q.tolist()])])
-        for stamp, p, q in zip(stamps, place, xyzw, strict=True)
+        for stamp, p, q in zip(stamps, centre, xyzw, strict=True)
     ]
     path.write_text(head + "\n".join(rows) + "\n")
     return path
@@ -126,7 +126,7 @@ def detections(folder: Path) -> Path:
 
 
 def assert_right(poses: rt.Poses, frames: list[int]) -> None:
-    """The frames that have a pose are these, and it is theirs."""
+    """Exactly these frames have a pose, and it is the true one."""
     assert poses.frame[poses.known].tolist() == frames
     np.testing.assert_allclose(poses.cam_from_world[poses.known], path_of()[frames], atol=1e-6)
 
@@ -166,17 +166,17 @@ def test_numbers_of_a_video_count_from_0_or_1_as_the_images_show(
 ) -> None:
     frames = KEPT[kept]
     path = model(tmp_path / "m", frames, [f"{i + first:05d}.png" for i in frames])
-    poses = rt.read_poses(path, rt.Video(film(tmp_path)))
+    poses = rt.read_poses(path, rt.Video(write_clip(tmp_path)))
     assert_right(poses, frames)
     assert f"counted from {first}" in poses.reading
 
 
 @pytest.mark.parametrize("first", [0, 1])
 @pytest.mark.parametrize("every", [2, 3, 4])
-def test_every_kth_frame_numbered_anew(tmp_path: Path, every: int, first: int) -> None:
+def test_every_kth_frame_renumbered(tmp_path: Path, every: int, first: int) -> None:
     frames = ALL[::every]
     names = [f"frame_{i + first:05d}.png" for i in range(len(frames))]
-    video = rt.Video(film(tmp_path))
+    video = rt.Video(write_clip(tmp_path))
     unnamed = tmp_path / "kitti.txt"
     np.savetxt(unnamed, invert_rigid(path_of()[frames]).reshape(-1, 12))
     for path in (model(tmp_path / "m", frames, names), unnamed):
@@ -193,9 +193,9 @@ def test_photos_from_0_beside_names_from_1(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("first", "stop"), [(1, 0), (0, 24)])
-def test_boxes_decide_where_images_show_nothing(tmp_path: Path, first: int, stop: int) -> None:
-    """Also of a part of the video: the numbers are those of the source."""
-    source, frames = film(tmp_path, blank=True), ALL[:-1] if first else ALL[1:]
+def test_boxes_resolve_the_numbering_of_blank_images(tmp_path: Path, first: int, stop: int) -> None:
+    """Also for an excerpt of the video: the numbers are those of the source."""
+    source, frames = write_clip(tmp_path, blank=True), ALL[:-1] if first else ALL[1:]
     path = model(tmp_path / "m", frames, [f"{i + first:05d}.jpg" for i in frames])
     assert run(tmp_path, source, path, "--stop", str(stop)) == 0
     assert_chairs_in_place(tmp_path / "out")
@@ -206,7 +206,7 @@ def test_boxes_decide_where_images_show_nothing(tmp_path: Path, first: int, stop
 def test_without_evidence_both_readings_are_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    source = film(tmp_path, blank=True)
+    source = write_clip(tmp_path, blank=True)
     path = model(tmp_path / "m", ALL[1:-1], [f"{i:05d}.jpg" for i in ALL[1:-1]])
     words = ["poses", str(source), "-o", str(tmp_path / "out"), "--poses", str(path),
              "--set", "poses.size_px=160"]  # fmt: skip
@@ -231,7 +231,7 @@ def test_equal_file_names_in_two_folders_of_a_model(tmp_path: Path) -> None:
     with pytest.raises(rt.ReobjError, match="several images in different folders"):
         rt.read_poses(path, rt.Video(source.rename(tmp_path / "other")))
     with pytest.raises(rt.ReobjError, match="have the same number"):
-        rt.read_poses(path, rt.Video(film(tmp_path)))
+        rt.read_poses(path, rt.Video(write_clip(tmp_path)))
 
 
 # ---- Time stamps ---------------------------------------------------------------------------------
@@ -256,10 +256,10 @@ def test_as_many_rows_as_images_without_times(tmp_path: Path, stamps: list[str],
 
 @pytest.mark.parametrize("first", [0, 1])
 @pytest.mark.parametrize("kept", ["all", "last missing", "one in the middle missing"])
-def test_frame_numbers_in_place_of_times(tmp_path: Path, first: int, kept: str) -> None:
+def test_frame_numbers_in_the_column_of_times(tmp_path: Path, first: int, kept: str) -> None:
     frames = KEPT[kept]
     path = tum(tmp_path / "t.txt", [f"{i + first}.0" for i in frames], frames)
-    assert_right(rt.read_poses(path, rt.Video(film(tmp_path)), camera=LINE), frames)
+    assert_right(rt.read_poses(path, rt.Video(write_clip(tmp_path)), camera=LINE), frames)
 
 
 @pytest.mark.parametrize("per_s", [1e3, 1e6, 1e9])
@@ -267,7 +267,7 @@ def test_stamps_in_ms_us_and_ns(tmp_path: Path, per_s: float) -> None:
     """Of a video, since its start; and of images named in ns, as dates."""
     frames = ALL[::4]
     path = tum(tmp_path / "t.txt", [f"{round(i / 30 * per_s)}" for i in frames], frames)
-    poses = rt.read_poses(path, rt.Video(film(tmp_path)), camera=LINE)
+    poses = rt.read_poses(path, rt.Video(write_clip(tmp_path)), camera=LINE)
     assert_right(poses, frames)
     start = 1_700_000_000_000_000_000
     source = tmp_path / "ns"
@@ -287,13 +287,13 @@ def test_stamps_in_ms_us_and_ns(tmp_path: Path, per_s: float) -> None:
 @pytest.mark.parametrize("clock", ["ns", "s"])
 def test_csv_with_w_first(tmp_path: Path, head: bool, clock: str) -> None:
     """EuRoC's ns need no header; without one and in s the boxes decide."""
-    place, xyzw = quaternions(ALL)
+    centre, xyzw = quaternions(ALL)
     names = "#timestamp,p_x,p_y,p_z,q_w,q_x,q_y,q_z\n"
     rows = [
         ",".join(map(str, [stamp, *p, *q[[3, 0, 1, 2]]]))
         for stamp, p, q in zip(
             [1_700_000_000_000_000_000 + 50_000_000 * i if clock == "ns" else i / 20 for i in ALL],
-            place, xyzw, strict=True,
+            centre, xyzw, strict=True,
         )
     ]  # fmt: skip
     path = tmp_path / "gt.csv"
@@ -302,10 +302,10 @@ def test_csv_with_w_first(tmp_path: Path, head: bool, clock: str) -> None:
     assert_chairs_in_place(tmp_path / "out")
 
 
-def test_a_body_is_said_to_be_taken_for_the_camera(tmp_path: Path) -> None:
+def test_body_poses_are_used_as_camera_poses_with_a_warning(tmp_path: Path) -> None:
     path = tmp_path / "gt.csv"
-    place, xyzw = quaternions(ALL)
-    rows = np.column_stack([1.7e18 + 5e7 * np.arange(FRAMES), place, xyzw[:, [3, 0, 1, 2]]])
+    centre, xyzw = quaternions(ALL)
+    rows = np.column_stack([1.7e18 + 5e7 * np.arange(FRAMES), centre, xyzw[:, [3, 0, 1, 2]]])
     np.savetxt(path, rows, "%.9f", delimiter=",", header="timestamp [ns], p_RS_R_x [m], ...")
     poses = rt.read_poses(path, rt.Video(folder_of(tmp_path)), camera=LINE)
     assert_right(poses, ALL)

@@ -1,4 +1,4 @@
-"""Size priors of categories as a user meets them: a wrong one must not beat the boxes."""
+"""Size priors of categories through the public API: a wrong one must not override the boxes."""
 
 from __future__ import annotations
 
@@ -44,7 +44,9 @@ def overlap(fits: q.ObjectFits, truth: q.Ellipsoids) -> float:
 @pytest.mark.parametrize("scale", [0.4, 0.63, 1.0, 1.6, 2.5])
 @pytest.mark.parametrize("on_side", [False, True])
 @pytest.mark.parametrize("category", ["chair", "couch", "book"])
-def test_a_wrong_size_does_not_beat_the_boxes(category: str, on_side: bool, scale: float) -> None:
+def test_a_wrong_size_does_not_override_the_boxes(
+    category: str, on_side: bool, scale: float
+) -> None:
     for views, arc in ((8, 90.0), (20, 180.0)):
         boxes, cams, truth = scene(category, scale, views, arc, on_side)
         with_it = q.fit_objects(boxes, cams, syn.IMAGE, [category] * 4, PRIORS, up=UP)
@@ -68,7 +70,7 @@ def test_the_right_category_helps_where_views_are_few() -> None:
     assert np.mean(gain) > 0.03
 
 
-def test_one_wrong_name_does_not_spoil_the_scale() -> None:
+def test_one_wrong_class_does_not_corrupt_the_scale() -> None:
     boxes, cams, _, names = syn.furnished_room(np.random.default_rng(3))
     boxes, names = boxes[:, :8], names[:8]
     right = q.fit_objects(boxes, cams, syn.IMAGE, names, PRIORS, up=UP, metric=False)
@@ -77,7 +79,7 @@ def test_one_wrong_name_does_not_spoil_the_scale() -> None:
     assert abs(np.log(wrong.scale.value / right.scale.value)) < wrong.scale.rel_sigma < 0.25
 
 
-def test_millimetres_stay_far_from_the_origin() -> None:
+def test_millimetre_precision_far_from_the_origin() -> None:
     boxes, cams, _ = scene("chair", 1.0, 12, 120.0)
     shift = np.array([4.0e5, 5.4e6, 120.0])
     away = cams.copy()
@@ -90,7 +92,7 @@ def test_millimetres_stay_far_from_the_origin() -> None:
     assert np.abs(far.size - near.size).max() < 1e-3
 
 
-def test_boxes_that_are_not_finite_are_left_out() -> None:
+def test_non_finite_boxes_are_ignored() -> None:
     boxes, cams, truth = scene("chair", 1.0, 12, 120.0)
     boxes[3], boxes[5, :, 2] = np.nan, np.inf
     fits = q.fit_objects(boxes, cams, syn.IMAGE, ["chair"] * 4, PRIORS, up=UP)
@@ -117,10 +119,8 @@ def test_known_size_takes_synonyms() -> None:
 
 
 @pytest.mark.parametrize(("label", "same"), [("my favourite seat", True), ("cup", False)])
-def test_a_label_that_no_prior_knows_keeps_the_category(
-    tmp_path: Path, label: str, same: bool
-) -> None:
-    """Three frames hardly show a size: it is that of the category."""
+def test_a_label_without_a_prior_keeps_the_category(tmp_path: Path, label: str, same: bool) -> None:
+    """Three frames hardly constrain the size: it is that of the category."""
     poses = walk()
     tracks = tracks_of(poses)
     tracks = tracks[tracks.frame < 3]

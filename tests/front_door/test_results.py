@@ -191,7 +191,7 @@ KINDS = [
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
-def test_every_kind_of_result_is_written_drawn_and_exported(
+def test_every_result_is_written_drawn_and_exported(
     plain: rt.Result, source: rt.Video, tmp_path: Path, kind: Any,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
@@ -219,7 +219,7 @@ def test_every_kind_of_result_is_written_drawn_and_exported(
     assert not list(out.rglob(".part*"))
 
 
-# ---- A fault in a picture ----
+# ---- A failure while drawing ----
 
 
 @pytest.fixture(scope="module")
@@ -272,12 +272,12 @@ BROKEN = [
 
 
 @pytest.mark.parametrize(("owner", "name", "error", "option", "left"), BROKEN)
-def test_a_fault_in_a_picture_is_a_warning(
+def test_a_failure_while_drawing_is_a_warning(
     made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     owner: Any, name: str, error: Exception, option: str, left: list[str],
 ) -> None:  # fmt: skip
-    """The results are written, the other picture too; what there was of the old one is gone."""
+    """Results and the other visualisation are written; an old file of the failed one is deleted."""
     out, before = copied(made, tmp_path), contents(made)
     monkeypatch.delenv("REOBJ_RAISE")
     monkeypatch.setattr(owner, name, fails(error))
@@ -296,12 +296,12 @@ def test_a_fault_in_a_picture_is_a_warning(
     assert not list(out.rglob(".part*"))
 
 
-def test_debug_shows_where_a_picture_failed(
+def test_debug_prints_the_traceback_of_a_drawing_failure(
     made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = copied(made, tmp_path)
     monkeypatch.setattr(overlay.Overlay, "take", fails(ValueError("in the film")))
-    assert rt.main(["objects", str(out)]) == 1  # in our tests
+    assert rt.main(["objects", str(out)]) == 1  # raised in the tests
     monkeypatch.delenv("REOBJ_RAISE")
     capsys.readouterr()
     assert rt.main(["objects", str(out), "--debug"]) == 0
@@ -322,7 +322,7 @@ def test_ctrl_c_while_pictures_are_drawn_keeps_the_results(
     assert not list(out.rglob(".part*"))
 
 
-def test_a_video_that_is_gone_costs_pictures_only(
+def test_a_deleted_video_affects_visualisations_only(
     made: Path, source: rt.Video, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out, gone = copied(made, tmp_path), tmp_path / "gone"
@@ -336,35 +336,35 @@ def test_a_video_that_is_gone_costs_pictures_only(
     assert rt.main(["objects", str(out), "--tracks", str(out / "tracks.txt")]) == 2
 
 
-# ---- All results together ----
+# ---- All results or none ----
 
-PLACES = ["config.toml", "objects.json", "tracks.txt", "edits.json", "scene.html", "overlay.webm",
+OUTPUTS = ["config.toml", "objects.json", "tracks.txt", "edits.json", "scene.html", "overlay.webm",
           "objects.ply", "sparse", "cache/last-poses.npz"]  # fmt: skip
 
 
-@pytest.mark.parametrize("name", PLACES)
-def test_nothing_is_replaced_where_one_cannot_be(
+@pytest.mark.parametrize("name", OUTPUTS)
+def test_nothing_is_replaced_if_one_output_is_blocked(
     made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:
-    """A folder where a file belongs, or a file where a folder does."""
+    """A folder at the path of a file, or a file at the path of a folder."""
     out = copied(made, tmp_path)
-    place = out / name
+    path = out / name
     if name == "sparse":
-        shutil.rmtree(place)
-        place.write_text("mine")
+        shutil.rmtree(path)
+        path.write_text("mine")
     else:
-        place.unlink(missing_ok=True)
-        place.mkdir()
-        (place / "mine").write_text("mine")
+        path.unlink(missing_ok=True)
+        path.mkdir()
+        (path / "mine").write_text("mine")
     before = contents(out)
     assert rt.main(["objects", str(out), "--known-size", "chair=2m"]) == 2
     error = capsys.readouterr().err
-    assert str(place) in error and "move it away" in error and error.count("\n") == 1
+    assert str(path) in error and "move it away" in error and error.count("\n") == 1
     assert contents(out) == before
 
 
 @pytest.mark.skipif(os.name == "nt" or os.geteuid() == 0, reason="root may write anywhere")
-def test_a_folder_that_is_read_only_is_refused_before(made: Path, tmp_path: Path) -> None:
+def test_a_read_only_folder_is_refused_before_the_run(made: Path, tmp_path: Path) -> None:
     out = copied(made, tmp_path)
     (out / "sparse").chmod(0o555)
     before = contents(out)
@@ -375,15 +375,15 @@ def test_a_folder_that_is_read_only_is_refused_before(made: Path, tmp_path: Path
     assert contents(out) == before
 
 
-def test_an_export_that_fails_leaves_nothing(
+def test_a_failed_export_leaves_no_files(
     made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = copied(made, tmp_path)
     for name, (default, _) in EXPORTS.items():
-        place = out / "new" / name / Path(default).name
+        path = out / "new" / name / Path(default).name
         with monkeypatch.context() as patch:
             patch.setattr(Path, "replace", fails(OSError(errno.ENOSPC, "full")))
-            assert rt.main(["export", str(out), "--to", name, "-o", str(place)]) == 2
+            assert rt.main(["export", str(out), "--to", name, "-o", str(path)]) == 2
         assert not (out / "new").exists(), name
         folder = out / "folder"
         folder.mkdir()
@@ -406,9 +406,9 @@ def written_walk(folder: Path, away: np.ndarray, scale: float = 1.0) -> list[str
     (folder / "d.csv").write_text("\n".join(lines))
     tum = ["# units: arbitrary"] if scale != 1 else []  # as our own files say it
     for t, pose in zip(poses.time_s, poses.cam_from_world, strict=True):
-        place = -scale * pose[:, :3].T @ pose[:, 3] + away
+        center = -scale * pose[:, :3].T @ pose[:, 3] + away
         turn = Rotation.from_matrix(pose[:, :3].T).as_quat()
-        tum.append(" ".join(map(repr, [float(t), *place.tolist(), *turn.tolist()])))
+        tum.append(" ".join(map(repr, [float(t), *center.tolist(), *turn.tolist()])))
     (folder / "poses.txt").write_text("\n".join(tum))
     camera = "PINHOLE {} {} 520 520 320 240".format(*SIZE)
     where = ["-o", str(folder / "out"), "--detections", str(folder / "d.csv")]
@@ -443,8 +443,8 @@ def test_coordinates_of_a_map_projection_keep_their_millimetres(tmp_path: Path) 
         assert gap.max() < 2e-3, name
     scene_glb = trimesh.load(far / "objects.glb")
     origin = np.array(scene_glb.metadata["origin_in_world"])
-    place = scene_glb.graph["chair 1"][0][:3, 3][[0, 2, 1]] * [1, -1, 1]  # y is up there
-    assert np.abs(place).max() < 10 and np.abs(origin - UTM).max() < 10
+    center = scene_glb.graph["chair 1"][0][:3, 3][[0, 2, 1]] * [1, -1, 1]  # y is up there
+    assert np.abs(center).max() < 10 and np.abs(origin - UTM).max() < 10
     poses = np.loadtxt(far / "poses.txt")
     eyes = -np.einsum("fji,fj->fi", walk(16).cam_from_world[:, :, :3],
                       walk(16).cam_from_world[:, :, 3])  # fmt: skip
@@ -473,9 +473,9 @@ def test_nerfstudio_needs_images(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert rt.main(written_walk(tmp_path / "a", np.zeros(3))) == 0
     out = tmp_path / "a/out"
     before = contents(out)
-    for place in ([], ["-o", str(tmp_path / "new/t.json")]):
+    for target in ([], ["-o", str(tmp_path / "new/t.json")]):
         capsys.readouterr()
-        assert rt.main(["export", str(out), "--to", "nerfstudio", *place]) == 2
+        assert rt.main(["export", str(out), "--to", "nerfstudio", *target]) == 2
         error = capsys.readouterr().err
         assert "had no images" in error and error.count("\n") == 1
     assert contents(out) == before and not (tmp_path / "new").exists()
@@ -500,7 +500,7 @@ def test_paths_that_are_no_utf8(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="file names are bytes on Linux")
-def test_a_film_in_a_folder_that_is_no_utf8(
+def test_an_overlay_video_in_a_folder_that_is_no_utf8(
     made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """OpenCV 5.0 ends the process there."""
@@ -525,7 +525,7 @@ def test_a_film_in_a_folder_that_is_no_utf8(
         ("models >/dev/full", "2"),
     ],
 )
-def test_readers_that_leave_and_streams_that_are_closed(
+def test_closed_pipes_and_closed_standard_streams(
     made: Path, tmp_path: Path, line: str, codes: str
 ) -> None:
     out = copied(made, tmp_path)
@@ -556,12 +556,12 @@ def test_names_that_the_terminal_cannot_show(
     assert len(data["objects"]) == 3
 
 
-# ---- The film ----
+# ---- The overlay video ----
 
 
 @pytest.mark.parametrize("encoder", ["h264", "vp8"])
 @pytest.mark.parametrize("fps", [0.05, 0.5, 15.5, 58.8])
-def test_the_film_lasts_as_long_as_the_video(
+def test_the_overlay_lasts_as_long_as_the_video(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, encoder: str, fps: float
 ) -> None:
     if encoder == "vp8":
@@ -579,7 +579,7 @@ def test_the_film_lasts_as_long_as_the_video(
 
 
 @pytest.mark.parametrize("size", [(1, 1), (3000, 1), (5, 3)])
-def test_films_of_tiny_pictures(
+def test_overlays_of_tiny_images(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: tuple[int, int]
 ) -> None:
     for av in (film.import_av, lambda: None):
@@ -591,7 +591,7 @@ def test_films_of_tiny_pictures(
         assert writer.path.exists()
 
 
-def test_names_in_warnings_cannot_steer_a_terminal(
+def test_control_characters_in_warnings_are_escaped(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "\x1b[31mred"
@@ -605,7 +605,7 @@ def test_names_in_warnings_cannot_steer_a_terminal(
 
 
 @pytest.mark.parametrize("key", ["fl_x", "transform_matrix"])
-def test_a_number_that_no_float_holds_is_refused(
+def test_a_number_beyond_the_float_range_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], key: str
 ) -> None:
     frame = {"file_path": "0.png", "transform_matrix": np.eye(4).tolist()}

@@ -1,4 +1,4 @@
-"""A detector that was not run on every frame: frames nobody looked at are no misses."""
+"""A detector that was not run on every frame: unprocessed frames are no misses."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ WHEN |= {"late start": set(range(7, 300, 5)), "irregular": irregular()}
 
 @pytest.mark.parametrize("name", WHEN)
 @pytest.mark.parametrize("unseen", [None, []])
-def test_a_newcomer_has_an_identity_from_its_third_detection_on(name: str, unseen: object) -> None:
-    """Also where frames that nobody looked at come as frames without a detection."""
+def test_a_new_track_is_confirmed_at_its_third_detection(name: str, unseen: object) -> None:
+    """Also if unprocessed frames are given as frames without detections."""
     tracker, chair = rt.Tracker(), []
     for frame in range(300):
         looked = frame in WHEN[name]
@@ -52,8 +52,8 @@ def test_a_newcomer_has_an_identity_from_its_third_detection_on(name: str, unsee
     assert {ids[TABLE] for ids in chair} == {1}
 
 
-def test_an_object_that_is_looked_for_and_missed_still_leaves() -> None:
-    """Frames of `coast_frames` and of the tentative limit are frames looked at."""
+def test_a_track_missed_in_processed_frames_ends() -> None:
+    """`coast_frames` and the limit of tentative tracks count processed frames."""
     tracker = rt.Tracker(rt.TrackerConfig(coast_frames=4))
     for frame in range(30):
         tracker.update(scene(frame) if frame % 3 == 0 else None)
@@ -67,7 +67,7 @@ def test_an_object_that_is_looked_for_and_missed_still_leaves() -> None:
     assert len(tracker.state.tracks.identity) == 0
 
 
-def test_frames_without_a_box_are_looked_at_in_a_dense_video() -> None:
+def test_frames_without_boxes_count_as_processed_in_a_dense_video() -> None:
     """A tentative track of one detection ends after two empty frames, as before."""
     tracker = rt.Tracker()
     for frame in range(20):
@@ -79,7 +79,7 @@ def test_frames_without_a_box_are_looked_at_in_a_dense_video() -> None:
     assert tracker.state.tracks.identity.tolist() == [0, 1] and tracker.looked
 
 
-def test_a_saved_tracker_goes_on_as_the_other_does(tmp_path: Path) -> None:
+def test_a_restored_tracker_continues_like_the_original(tmp_path: Path) -> None:
     def feed(tracker: rt.Tracker, frames: range) -> list[list[float]]:
         steps = [tracker.update(scene(f) if f % 4 == 0 else []) for f in frames]
         return [step.to_array().tolist() for step in steps]
@@ -101,14 +101,14 @@ def test_a_saved_tracker_goes_on_as_the_other_does(tmp_path: Path) -> None:
         (range(0, 60, 3), 1, range(0, 60, 3)),
         ([0, 6, 9, 21, 24, 30, 51], 1, range(0, 60, 3)),  # nothing found in many of them
         (range(7, 50, 5), 2, range(2, 60, 5)),
-        ([0, 1, 10, 11, 30], 3, None),  # as many alone as not
+        ([0, 1, 10, 11, 30], 3, None),  # as many isolated frames as not
         ([3, 4, 9, 12, 20, 22, 31, 40, 47, 51], 3, [3, 4, 9, 12, 20, 22, 31, 40, 47, 51]),
-        ([3, 4, 9, 12, 20, 22, 31, 40, 47, 51], 1, None),  # one thing that is rarely found
+        ([3, 4, 9, 12, 20, 22, 31, 40, 47, 51], 1, None),  # one object that is rarely detected
         ([5, 40], 3, None),  # two frames are no interval
         ([], 1, None),
     ],
 )
-def test_the_frames_looked_at_are_inferred(frames: object, boxes: int, looked: object) -> None:
+def test_processed_frames_are_inferred(frames: object, boxes: int, looked: object) -> None:
     found = frames_looked_at(np.repeat(np.array(frames, np.int64), boxes), 60)
     assert (None if found is None else found.tolist()) == (looked and list(looked))
 
@@ -144,7 +144,7 @@ def track(images: Path, boxes: Path, out: Path, *more: str) -> list[str]:
 
 
 @pytest.mark.parametrize("n", [3, 10])
-def test_track_names_both_in_the_frames_looked_at(images: Path, tmp_path: Path, n: int) -> None:
+def test_both_objects_are_tracked(images: Path, tmp_path: Path, n: int) -> None:
     warnings = track(images, mot(tmp_path / "det.txt", range(0, FRAMES, n)), tmp_path / "out")
     (said,) = warnings
     assert f"1 frame in {n} (0, {n}, {2 * n}, " in said and "not run on the others" in said
@@ -163,7 +163,7 @@ def test_track_names_both_in_the_frames_looked_at(images: Path, tmp_path: Path, 
     assert dense == []
 
 
-def test_lists_of_images_say_which_were_looked_at(images: Path, tmp_path: Path) -> None:
+def test_lists_of_images_define_the_processed_frames(images: Path, tmp_path: Path) -> None:
     """COCO's `images` and npz's `done`: also frames without a box, whatever their intervals."""
     seen, clip = [0, 1, 7, 30, 31, 50], rt.Video(images)
     names = [{"id": f + 7, "file_name": f"{f:04d}.png"} for f in seen]
@@ -187,7 +187,7 @@ def test_lists_of_images_say_which_were_looked_at(images: Path, tmp_path: Path) 
         assert [len(a) for a in answers if a is not None] == [1, 0, 0, 2, 2, 0]
 
 
-def test_a_function_that_returns_none_did_not_look(images: Path, tmp_path: Path) -> None:
+def test_none_from_a_function_means_not_processed(images: Path, tmp_path: Path) -> None:
     calls = list[int]()
 
     def detector(image: np.ndarray) -> object:
@@ -212,8 +212,8 @@ def test_a_function_that_returns_none_did_not_look(images: Path, tmp_path: Path)
     assert "run on no frame (it returned None each time)" in nothing.warnings[-1]
 
 
-def test_a_cache_knows_the_frames_that_nobody_looked_at(images: Path, tmp_path: Path) -> None:
-    """Of a function that is asked for all frames before the cameras are known."""
+def test_the_cache_stores_the_unprocessed_frames(images: Path, tmp_path: Path) -> None:
+    """Of a function that is called for all frames before the poses are estimated."""
     calls = list[int]()
     made = as_source(lambda image: calls.append(0))  # returns None
     source = dataclasses.replace(made, cache=DetectionCache(tmp_path / "cache", (640, 480)))
@@ -222,7 +222,7 @@ def test_a_cache_knows_the_frames_that_nobody_looked_at(images: Path, tmp_path: 
     assert len(source(frame)) == 0
 
 
-def test_tracks_are_embedded_again_by_frames_looked_at() -> None:
+def test_the_embedding_interval_counts_processed_frames() -> None:
     tracker, seen = rt.Tracker(rt.TrackerConfig(embed_every=2)), list[int]()
     for frame in range(13):
         looked = frame % 4 == 0
@@ -232,7 +232,7 @@ def test_tracks_are_embedded_again_by_frames_looked_at() -> None:
     assert seen[::4] == [0, 0, 8, 8]
 
 
-def test_why_nothing_was_tracked_or_is_left(images: Path, tmp_path: Path) -> None:
+def test_the_reason_for_an_empty_result_is_reported(images: Path, tmp_path: Path) -> None:
     det = mot(tmp_path / "det.txt", range(0, FRAMES, 3))
     more = ("--set", "tracker.new_score=.9")
     (_, said) = track(images, det, tmp_path / "a", *more)
@@ -250,9 +250,9 @@ def moving(frames: list[int], step: float = 100.0) -> rt.Tracks:
     return rt.Tracks(n, one, one, xyxy, 0.9 * one, 0 * one, 0 * one)
 
 
-def test_gaps_are_filled_in_frames_that_were_looked_at() -> None:
+def test_gaps_are_filled_in_processed_frames() -> None:
     tracks, size = moving([0, 2, 6, 8, 10], step=5.0), (2000, 480)
-    even = fill_gaps(tracks, size, 5, np.arange(0, 11, 2))  # frame 4 was looked at, odd ones not
+    even = fill_gaps(tracks, size, 5, np.arange(0, 11, 2))  # frame 4 was processed, odd ones not
     assert even.frame.tolist() == [0, 2, 4, 6, 8, 10]
     assert abs(even.xyxy[2, 0] - 20) < 1
     irregular = fill_gaps(tracks, size, 5, np.array([0, 2, 5, 6, 8, 10]))
@@ -261,9 +261,9 @@ def test_gaps_are_filled_in_frames_that_were_looked_at() -> None:
     assert fill_gaps(tracks, size, 5).frame.tolist() == [0, 2, 4, 6, 8, 10]  # every second one read
 
 
-def test_solids_are_not_missed_in_frames_that_nobody_looked_at() -> None:
+def test_unprocessed_frames_do_not_lower_the_confidence() -> None:
     """The confidence of chairs whose boxes are those of every fourth frame."""
-    sure = []
+    confidences = []
     for looked in (np.arange(0, 40, 4), None):
         given = unlinked(walk())
         keep = given.tracks.frame % 4 == 0
@@ -271,6 +271,6 @@ def test_solids_are_not_missed_in_frames_that_nobody_looked_at() -> None:
         given.tracks.score[:] = 0.35
         given = dataclasses.replace(given, looked=looked)
         found = link_and_fit(given, rt.ObjectsConfig()).objects
-        sure.append([o.confidence or 0.0 for o in found])
-    assert len(sure[0]) == 3
-    assert min(sure[0]) > max(sure[1] or [0.0]) + 0.1
+        confidences.append([o.confidence or 0.0 for o in found])
+    assert len(confidences[0]) == 3
+    assert min(confidences[0]) > max(confidences[1] or [0.0]) + 0.1

@@ -79,7 +79,7 @@ def twice(path: Path) -> Path:
     return path
 
 
-FILES = {  # what is wrong with what is announced: how to write it, and its times in ms
+FILES = {  # wrong metadata: how to write it, and the true times in ms
     "rate of 10 where frames are 17 ms apart": (
         lambda d: write_video(d / "a.mkv", np.arange(40) * 17, rate=10), np.arange(40) * 17),
     "uneven times": (lambda d: write_video(d / "a.mkv", UNEVEN), UNEVEN),
@@ -96,7 +96,7 @@ FILES = {  # what is wrong with what is announced: how to write it, and its time
 
 
 @pytest.mark.parametrize("what", FILES)
-def test_frames_are_counted_and_timed_as_they_are_decoded(what: str, tmp_path: Path) -> None:
+def test_frame_count_and_times_are_those_of_the_decoded_frames(what: str, tmp_path: Path) -> None:
     make, times_ms = FILES[what]
     path, count = make(tmp_path), 40
     if times_ms is None:  # OpenCV 4 announces 1000 frames a second, OpenCV 5 25
@@ -131,10 +131,10 @@ def video_module_cache_cleared() -> None:
     video._measured_clocks.clear()
 
 
-def test_a_part_of_a_file_is_all_that_is_decoded(
+def test_only_the_requested_range_is_decoded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of an hour of video with --stop 10 not the hour."""
+    """With --stop 10, not the whole hour of a video."""
     path, grabs = write_video(tmp_path / "a.mkv", UNEVEN, rate=1000), list[float]()
     whole = rt.Video._grabbed
     monkeypatch.setattr(
@@ -146,22 +146,22 @@ def test_a_part_of_a_file_is_all_that_is_decoded(
     assert len(list(video)) == 10 and video.messages == []
 
 
-def test_the_film_lasts_as_long_as_the_video(tmp_path: Path) -> None:
+def test_the_overlay_lasts_as_long_as_the_video(tmp_path: Path) -> None:
     path = write_video(tmp_path / "a.webm", UNEVEN, rate=1000, codec="libvpx")
     rows = "".join(f"{i + 1},-1,{5 + i // 4},6,20,20,0.9\n" for i in range(40))
     (tmp_path / "d.txt").write_text(rows)
     args = ["--detections", str(tmp_path / "d.txt"), "--embed", "none"]
     assert rt.main(["track", str(path), "-o", str(tmp_path / "out"), *args]) == 0
     assert len((tmp_path / "out/tracks.txt").read_text().splitlines()) >= 38
-    film = cv2.VideoCapture(str(next((tmp_path / "out").glob("overlay.*"))))
+    overlay = cv2.VideoCapture(str(next((tmp_path / "out").glob("overlay.*"))))
     last_s = 0.0
-    while film.grab():
-        last_s = film.get(cv2.CAP_PROP_POS_MSEC) / 1000
+    while overlay.grab():
+        last_s = overlay.get(cv2.CAP_PROP_POS_MSEC) / 1000
     assert last_s == pytest.approx(UNEVEN[-1] / 1000, abs=0.2)
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.mkv", "a.avi"])
-def test_a_file_whose_end_is_missing_is_said_to_end_early(name: str, tmp_path: Path) -> None:
+def test_a_truncated_file_is_reported(name: str, tmp_path: Path) -> None:
     codec = "mjpeg" if name == "a.avi" else "libx264"
     data = write_video(tmp_path / name, EVEN, codec=codec, noise=True).read_bytes()
     (tmp_path / name).write_bytes(data[: 2 * len(data) // 3])
@@ -174,8 +174,8 @@ def test_a_file_whose_end_is_missing_is_said_to_end_early(name: str, tmp_path: P
     assert len(list(rt.Video(tmp_path / name, rt.InputConfig(stop=5)))) == 5
 
 
-def test_what_cannot_be_decoded_to_the_end_is_said(tmp_path: Path) -> None:
-    """The file has its length, but a hole, after which nothing is found."""
+def test_a_file_that_stops_decoding_is_reported(tmp_path: Path) -> None:
+    """The file has its full length, but a damaged section after which nothing can be decoded."""
     path = write_video(tmp_path / "a.mkv", EVEN, codec="mjpeg", noise=True)
     data = bytearray(path.read_bytes())
     data[len(data) // 4 : 3 * len(data) // 4] = bytes(3 * len(data) // 4 - len(data) // 4)
@@ -215,7 +215,7 @@ def test_without_times_the_rate_is_assumed(raw: list[float]) -> None:
 
 
 def test_pixels_that_are_not_square(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Boxes are in stored pixels; cameras are found in square ones, and have two focal lengths."""
+    """Boxes use stored pixels; cameras are estimated in square ones and get two focal lengths."""
     path = write_video(tmp_path / "a.mp4", EVEN, aspect=fractions.Fraction(4, 3))
     video = rt.Video(path)
     assert video.size == SIZE and video.pixel_aspect == pytest.approx(4 / 3)
@@ -229,7 +229,7 @@ def test_pixels_that_are_not_square(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 
 @pytest.mark.parametrize("model", ["SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"])
-def test_a_camera_of_square_pixels_becomes_one_of_others(model: str) -> None:
+def test_a_square_pixel_camera_is_converted_to_stored_pixels(model: str) -> None:
     params = {"SIMPLE_PINHOLE": (500, 320, 240), "SIMPLE_RADIAL": (500, 330, 240, 0.1),
               "RADIAL": (500, 330, 240, 0.1, -0.02),
               "OPENCV": (500, 510, 320, 250, 0.1, 0.02, 0.001, 0.002)}[model]  # fmt: skip
@@ -251,7 +251,7 @@ def test_a_camera_of_square_pixels_becomes_one_of_others(model: str) -> None:
     ["12:30.mp4", "50%.mp4", "a%03d.mp4", "a[1].mp4", "what?.mp4", "-x.mp4", "a b.mp4", 
      "file:a.mp4", "#1&2.mp4", "A.MP4", "no_suffix", "*.mp4", "zwölf.mp4"],
 )  # fmt: skip
-def test_a_file_opens_whatever_its_name(
+def test_files_with_unusual_names_open(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_video(tmp_path / "x.mp4", EVEN[:5]).rename(tmp_path / name)
@@ -260,9 +260,7 @@ def test_a_file_opens_whatever_its_name(
     assert len(list(video)) == video.frame_count == 5
 
 
-def test_a_video_of_the_time_of_day_through_the_command_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_video_with_time_of_day_stamps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_video(tmp_path / "x.mp4", EVEN[:9]).rename(tmp_path / "12:30.mp4")
     (tmp_path / "d.txt").write_text("".join(f"{i + 1},-1,5,6,20,20,0.9\n" for i in range(9)))
     monkeypatch.chdir(tmp_path)
@@ -290,7 +288,7 @@ def numbered(pattern: str, count: int = 6, first: int = 0) -> list[str]:
 
 
 def read(folder: Path | str, left: int, *said: str) -> rt.Video:
-    """Open a folder; check how many frames come out and what is said."""
+    """Open a folder; check the number of frames and the warnings."""
     video = rt.Video(folder)
     assert len(list(video)) == left, video.messages
     assert len(video.messages) == len(said)
@@ -299,7 +297,7 @@ def read(folder: Path | str, left: int, *said: str) -> rt.Video:
     return video
 
 
-def test_depth_maps_and_masks_beside_pictures_are_no_frames(tmp_path: Path) -> None:
+def test_depth_maps_and_masks_beside_images_are_no_frames(tmp_path: Path) -> None:
     scenes = write(tmp_path / "7scenes", numbered("frame-%06d.color.png"))
     write(scenes, numbered("frame-%06d.depth.png"), kind="depth")
     video = read(scenes, 6, "6 images are no frames (one channel with more than 8 bits")
@@ -332,7 +330,7 @@ def test_depth_maps_and_masks_beside_pictures_are_no_frames(tmp_path: Path) -> N
     assert read(named, 6, "by its name").names == numbered("rgb_%d.png")
 
 
-def test_pictures_that_are_all_of_a_kind_are_frames(tmp_path: Path) -> None:
+def test_images_of_a_single_kind_are_frames(tmp_path: Path) -> None:
     read(write(tmp_path / "gray", numbered("%d.png"), kind="gray"), 6)  # EuRoC
     read(write(tmp_path / "masks", numbered("mask_%d.png"), kind="gray"), 6)
     deep = write(tmp_path / "deep", numbered("%d.png"), kind="depth")  # TUM-VI has 16 bits
@@ -344,7 +342,7 @@ def test_pictures_that_are_all_of_a_kind_are_frames(tmp_path: Path) -> None:
     read(rooms, 4)
 
 
-def test_two_kinds_of_pictures_are_refused_and_a_glob_chooses(tmp_path: Path) -> None:
+def test_two_kinds_of_images_need_a_glob(tmp_path: Path) -> None:
     stereo = write(tmp_path / "ste[re]o", [*numbered("left_%03d.png"), *numbered("right_%03d.png")])
     with pytest.raises(rt.ReobjError, match=r"left_000\.png and right_000\.png; which") as caught:
         rt.Video(stereo)
@@ -376,7 +374,7 @@ def test_the_size_is_that_of_most_images(tmp_path: Path) -> None:
         rt.Video(every)
 
 
-def test_images_that_are_not_read_are_counted(tmp_path: Path) -> None:
+def test_unread_images_are_counted(tmp_path: Path) -> None:
     phone = write(tmp_path / "phone", ["IMG_0003.JPG", "IMG_0004.jpg"])
     for k in range(8):
         (phone / f"IMG_{k + 10:04d}.HEIC").write_bytes(b"\0\0\0\x18ftypheic")
@@ -454,7 +452,7 @@ with context.Pool(2) as pool:
 
 
 def test_threads_of_opencv_in_a_forked_process() -> None:
-    """They hang for ever where the parent's are thought to be there."""
+    """OpenCV would wait forever for the threads of the parent process."""
     done = subprocess.run([sys.executable, "-c", FORKED], cwd=ROOT, timeout=100, text=True,
                           capture_output=True, check=True)  # fmt: skip
     assert done.stdout.splitlines() == ["[3, 1, 1] 4", "[2] 4"]
@@ -479,7 +477,7 @@ signal.raise_signal(signal.SIGTERM)
 """
 
 
-def test_a_process_that_is_ended_prints_no_trace() -> None:
+def test_a_terminated_process_prints_no_traceback() -> None:
     done = subprocess.run([sys.executable, "-c", TERMINATED], cwd=ROOT, timeout=100, text=True,
                           capture_output=True, check=False)  # fmt: skip
     assert (done.returncode, done.stderr) == (-15, "")
