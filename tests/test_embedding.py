@@ -1,4 +1,4 @@
-"""Embeddings of detections from one feature map per frame: tiny networks and the bundled weights."""
+"""Embeddings from one feature map per frame: tiny networks and the bundled weights."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ def test_ellipsoids_are_estimated_and_projected() -> None:
     for box, ellipsoid in zip(projected[:2], objects, strict=True):
         x1, y1, x2, y2 = outline(ellipsoid, view_at(0.3, 8))
         np.testing.assert_allclose(box, [(x1 + x2) / 2, (y1 + y2) / 2, x2 - x1, y2 - y1], atol=3)
-    assert np.isnan(found[2:]).all()
+    assert np.isnan(projected[2:]).all()
 
 
 def test_ellipsoids_out_of_view_are_not_projected() -> None:

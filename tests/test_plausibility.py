@@ -1,4 +1,4 @@
-"""Results that look wrong as a whole: said once, in one line, with what to try; others are not."""
+"""Implausible results: one warning in one line with a remedy; none for plausible results."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def result(
     poses: rt.Poses | None = None,
     boxes: int = 10,
 ) -> rt.Result:
-    """So many objects of each class, of one status."""
+    """Objects of each class with this count, all of one status."""
     kinds = np.repeat(list(classes), list(classes.values())).tolist()
     tracks = [rows(boxes, i, kind) for i, kind in enumerate(kinds, 1)]
     objects = [
@@ -50,10 +50,10 @@ def said(found: rt.Result, **change: object) -> list[str]:
     return lines
 
 
-def lost(share: float, **change: object) -> rt.Poses:
-    """A walk of 40 frames of which so many have no pose."""
+def lost(fraction: float, **change: object) -> rt.Poses:
+    """A walk of 40 frames of which this fraction has no pose."""
     poses = walk()
-    poses.cam_from_world[: round(40 * share)] = np.nan
+    poses.cam_from_world[: round(40 * fraction)] = np.nan
     return dataclasses.replace(poses, **change)
 
 
@@ -67,7 +67,7 @@ def lost(share: float, **change: object) -> rt.Poses:
         ({CHAIR: 4, FRIDGE: 2}, False),  # a table
         ({CHAIR: 14, FRIDGE: 14}, False),
         ({PERSON: 20, FRIDGE: 4}, False),  # people come in crowds
-        ({CHAIR: 20}, False),  # nothing else was looked for
+        ({CHAIR: 20}, False),  # the only class of the detector
         ({}, False),
     ],
 )
@@ -82,8 +82,8 @@ def test_most_objects_of_one_class(classes: dict[int, int], warned: bool) -> Non
     assert said(result(classes), identities_given=True) == []
 
 
-def test_one_class_that_only_other_boxes_contradict() -> None:
-    """Boxes of other classes in no track show that others were looked for."""
+def test_unmatched_boxes_of_other_classes_prevent_the_warning() -> None:
+    """Boxes of other classes in no track prove that the detector has other classes."""
     assert len(said(result({CHAIR: 20}), untracked=rows(1, 0, FRIDGE, 0.1))) == 1
 
 
@@ -121,14 +121,14 @@ def test_people_are_never_measured() -> None:
     assert said(result({PERSON: 9}, "rejected", walk())) == []
 
 
-@pytest.mark.parametrize(("share", "warned"), [(0, 0), (0.5, 0), (0.55, 1), (0.9, 1), (1, 0)])
-def test_most_frames_without_a_camera(share: float, warned: bool) -> None:
+@pytest.mark.parametrize(("fraction", "warned"), [(0, 0), (0.5, 0), (0.55, 1), (0.9, 1), (1, 0)])
+def test_most_frames_without_a_camera(fraction: float, warned: bool) -> None:
     """Where none has one, the poses say why."""
     for source, remedy in (("user", "--poses is of this video"), ("pycolmap", "slower turns")):
-        lines = said(result({CHAIR: 3}, poses=lost(share, source=source)))
+        lines = said(result({CHAIR: 3}, poses=lost(fraction, source=source)))
         assert len(lines) == warned
         if warned:
-            assert f"only {40 - round(40 * share)} of 40 frames have a camera" in lines[0]
+            assert f"only {40 - round(40 * fraction)} of 40 frames have a camera" in lines[0]
             assert remedy in lines[0] and ("--camera" in lines[0]) == (source == "pycolmap")
 
 
@@ -146,14 +146,14 @@ def test_most_strong_boxes_unexplained(untracked: int, score: float, warned: boo
 
 
 def boxes(count: int, x: float, score: float = 0.9, apart: int = 1) -> rt.Tracks:
-    """Boxes of a chair in every `apart`-th frame at one place, in no track."""
+    """Boxes of a chair in every `apart`-th frame at one position, in no track."""
     found = rows(count, 0, CHAIR, score)
     xyxy = np.tile([x, 10, x + 40, 60], (count, 1)).astype(float)
     return dataclasses.replace(found, frame=found.frame * apart, xyxy=xyxy)
 
 
 def elsewhere(found: rt.Tracks) -> rt.Tracks:
-    """The same, at another place in each frame."""
+    """The same, at another position in each frame."""
     shift = 100.0 * np.arange(len(found))[:, None]
     return dataclasses.replace(found, xyxy=found.xyxy + shift)
 
@@ -164,12 +164,12 @@ def elsewhere(found: rt.Tracks) -> rt.Tracks:
         (boxes(70, 300, 0.45), "below the score at which a track starts (tracker.new_score=0.5)"),
         (rt.Tracks.joined([boxes(70, 300), boxes(70, 302, 0.8), boxes(70, 301, 0.7)]),
          "overlap a better box of their class in the same frame"),
-        (boxes(70, 300), ""),  # they go on: no cause is known
+        (boxes(70, 300), ""),  # continuous: no known cause
         (elsewhere(boxes(70, 300)), "overlap no box in the frames before and after"),
     ],
 )  # fmt: skip
-def test_the_cause_that_most_unexplained_boxes_have(untracked: rt.Tracks, cause: str) -> None:
-    """Another detector is advised only where boxes come and go."""
+def test_the_most_frequent_cause_is_reported(untracked: rt.Tracks, cause: str) -> None:
+    """Another detector is advised only for intermittent boxes."""
     found = result({CHAIR: 3, FRIDGE: 3}, status="tracked")
     number = 100 + np.arange(len(untracked))
     found = dataclasses.replace(
@@ -181,7 +181,7 @@ def test_the_cause_that_most_unexplained_boxes_have(untracked: rt.Tracks, cause:
     assert ("--detector" in line) == ("before and after" in cause)
 
 
-def test_boxes_of_doubtful_objects_are_unexplained_and_filled_ones_are_none() -> None:
+def test_boxes_of_doubtful_objects_are_unexplained() -> None:
     found = result({CHAIR: 3, FRIDGE: 3})
     for k in range(4):
         found.objects[k] = dataclasses.replace(found.objects[k], status="doubtful")
@@ -189,7 +189,7 @@ def test_boxes_of_doubtful_objects_are_unexplained_and_filled_ones_are_none() ->
     assert line.startswith("40 of 60 boxes") and "output.doubtful=true" in line
     filled = dataclasses.replace(rows(90, 6, score=0.0), detection_index=np.full(90, -1))
     assert said(found, tracks=rt.Tracks.joined([found.tracks, filled])) == [line]
-    # a box that joined a solid after the video is still among the untracked ones
+    # a box assigned to an object after the video is still among the untracked ones
     assert said(found, untracked=found.tracks[found.tracks.track_id == 6]) == [line]
     assert implausible(found, 0.95, MOVING) == []  # another scale of scores
     few = result({CHAIR: 3}, boxes=5)
@@ -197,8 +197,8 @@ def test_boxes_of_doubtful_objects_are_unexplained_and_filled_ones_are_none() ->
     assert said(few) == []
 
 
-def test_it_is_said_once_and_everywhere(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """By `objects`, as by `run`: on stderr, in objects.json and on the page."""
+def test_the_warning_appears_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """By `objects` and `run`: on stderr, in objects.json and in the viewer."""
     poses = two_parts()
     poses.cam_from_world[6:BREAK] = np.nan
     poses.cam_from_world[BREAK + 12 :] = np.nan

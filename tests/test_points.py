@@ -1,4 +1,4 @@
-"""Points triangulated with known poses: where they lie, who sees them, and what is refused."""
+"""Points triangulated with known poses: positions, observing frames, and refusals."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def corner(tmp_path_factory):
     return images, given, numbered, folder, run(numbered, given, folder)
 
 
-def test_points_lie_where_the_supplied_poses_have_the_walls(corner):
+def test_points_lie_on_the_walls_of_the_supplied_poses(corner):
     _, given, _, folder, poses = corner
     _, y, z = poses.points.T
     off = np.minimum(np.abs(z - 6), np.abs(y - 1.2))
@@ -76,7 +76,7 @@ def test_the_scale_is_that_of_the_poses_and_two_runs_agree(corner, tmp_path):
 
 
 @pytest.mark.parametrize("mistake", ["inverted", "of other frames"])
-def test_poses_that_do_not_explain_the_images_give_a_message(corner, tmp_path, mistake):
+def test_poses_that_do_not_fit_the_images_are_reported(corner, tmp_path, mistake):
     _, given, video, _, _ = corner
     wrong = invert_rigid(given.cam_from_world)
     if mistake == "of other frames":
@@ -88,8 +88,8 @@ def test_poses_that_do_not_explain_the_images_give_a_message(corner, tmp_path, m
     np.testing.assert_array_equal(poses.cam_from_world, turned.cam_from_world)
 
 
-def test_a_stretch_of_poses_that_is_off_is_named(corner, tmp_path):
-    """Frames 12 and 14 lie 40 m too low; between the two all is right."""
+def test_a_wrong_interval_of_poses_is_reported(corner, tmp_path):
+    """Frames 12 and 14 are 40 m too low; all others are right."""
     _, given, video, _, _ = corner
     cams = given.cam_from_world.copy()
     cams[6:8, 1, 3] += 40
@@ -102,7 +102,7 @@ def test_a_stretch_of_poses_that_is_off_is_named(corner, tmp_path):
 
 
 @pytest.mark.parametrize("images", [0, 1, 3])
-def test_nothing_to_triangulate_is_a_message_and_no_exception(images, tmp_path):
+def test_nothing_to_triangulate_gives_a_message(images, tmp_path):
     """No images at all, one alone, and three without texture."""
     video = FakeVideo([np.zeros((240, 320, 3), np.uint8)] * images)
     given = supplied(motion("orbit", max(images, 2)), CAMERA)
@@ -113,7 +113,7 @@ def test_nothing_to_triangulate_is_a_message_and_no_exception(images, tmp_path):
     assert "0 images have a pose" in run(video, unknown, tmp_path).messages[0]
 
 
-def test_a_child_that_stops_is_a_message(corner, tmp_path, monkeypatch):
+def test_an_aborted_child_gives_a_message(corner, tmp_path, monkeypatch):
     _, given, video, _, _ = corner
 
     def stop(module, folder, log_path):
@@ -158,7 +158,7 @@ def test_few_frames_are_all_keyframes_and_those_without_a_pose_none():
     assert choose_posed_keyframes(np.full((4, 6), np.nan)).tolist() == []
 
 
-def test_a_long_way_takes_wider_steps():
+def test_long_paths_have_wider_keyframe_steps():
     cams = np.concatenate([motion("orbit", 400), motion("orbit", 400)[::-1]] * 4)
     assert 60 < len(choose_posed_keyframes(path_steps(supplied(cams)))) <= 150
 

@@ -1,6 +1,6 @@
-"""Hostile input: whatever comes in, it is understood or refused in one line that says why.
+"""Hostile input: it is either read or refused in one line with the reason.
 
-`hypothesis` draws it; every defect that was found this way stays as an example. All of it takes
+`hypothesis` generates it; every defect found this way is kept as an example. The tests take
 less than a minute; `pytest -n 0 tests/test_properties.py --hypothesis-profile long` tries more.
 """
 
@@ -52,7 +52,7 @@ def video(folder: Path) -> Any:
     return ImagelessVideo("room", SIZE, times_s=np.arange(20) / 10, names=names)
 
 
-def understood(read: Callable[[], Any]) -> Any:
+def accepted(read: Callable[[], Any]) -> Any:
     """Call a reader; None if it refuses in one printable line."""
     try:
         with warnings.catch_warnings():
@@ -207,43 +207,43 @@ edits = st.lists(st.tuples(st.floats(0, 1), st.sampled_from(NASTY), st.integers(
 
 
 def edited(text: str, changes: list[tuple[float, str, int]]) -> str:
-    """Put hostile text in place of numbers and words; cut, double and turn around."""
+    """Replace numbers and words with hostile text; truncate, repeat and reverse."""
     for at, nasty, kind in changes:
         spots = list(re.finditer(r"[-+]?[0-9][0-9.eE+-]*|[A-Za-z_]+", text))
-        place = round(at * len(text))
+        split = round(at * len(text))
         if kind < 3 and spots:
             spot = spots[min(int(at * len(spots)), len(spots) - 1)]
             text = text[: spot.start()] + nasty + text[spot.end() :]
         elif kind == 3:
-            text = text[:place]
+            text = text[:split]
         else:
-            text = text[:place] + nasty + text[place:] + text[:place]
+            text = text[:split] + nasty + text[split:] + text[:split]
     return text
 
 
 @pytest.mark.parametrize("name", FILES)
 @given(changes=edits)
-@example(changes=[(0.0, "3.7", 0)])  # a frame between two
+@example(changes=[(0.0, "3.7", 0)])  # a fractional frame
 @example(changes=[(0.0, "1e30", 0)])
-@example(changes=[(0.99, '"', 4)])  # a quote that nothing ends
-@example(changes=[(0.99, "x" * 140000, 0)])  # a longer field than csv takes
+@example(changes=[(0.99, '"', 4)])  # an unclosed quote
+@example(changes=[(0.99, "x" * 140000, 0)])  # a field beyond the limit of csv
 @example(changes=[(0.3, "[" * 2000, 4)])
 @example(changes=[(0.45, "-1", 0)])
 @example(changes=[(0.0, "\x1b[31m", 4)])
-def test_files_are_understood_or_refused(
+def test_files_are_read_or_refused(
     name: str, folder: Path, video: Any, changes: list[tuple[float, str, int]]
 ) -> None:
     text, read, check = FILES[name]
     path = folder / name
     path.write_bytes(edited(text, changes).encode("utf-8", "surrogatepass"))
-    found = understood(lambda: read(path, video))
+    found = accepted(lambda: read(path, video))
     if found is not None:
         check(found, video)
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_the_files_that_are_changed_are_right(name: str, folder: Path, video: Any) -> None:
-    """Else only refusals would be tested."""
+def test_the_unmodified_files_are_valid(name: str, folder: Path, video: Any) -> None:
+    """Otherwise only refusals would be tested."""
     text, read, check = FILES[name]
     (folder / name).write_text(text)
     check(read(folder / name, video), video)
@@ -255,16 +255,16 @@ NODES = [
 ]  # fmt: skip
 
 
-def places(data: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+def value_paths(data: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
     """Paths of the values in a JSON value."""
     if path:
         yield path
     for key in data if isinstance(data, dict) else range(len(data) if type(data) is list else 0):
-        yield from places(data[key], (*path, key))
+        yield from value_paths(data[key], (*path, key))
 
 
 def replaced(data: Any, path: tuple[Any, ...], value: Any) -> None:
-    """Put a value at a path, or take what is there away ("gone")."""
+    """Set the value at a path, or delete it ("gone")."""
     for key in path[:-1]:
         data = data[key]
     if value == "gone":
@@ -320,14 +320,14 @@ def test_an_output_folder_is_read_or_refused(
     out, text = chairs_folder
     data = json.loads(text)
     for at, value in changes:
-        known = [path] if path else list(places(data))
+        known = [path] if path else list(value_paths(data))
         if known:
             replaced(data, known[min(int(at * len(known)), len(known) - 1)], value)
     (out / "objects.json").write_bytes(json.dumps(data).encode("utf-8", "surrogatepass"))
     for name in EXPORTED:
-        made = understood(lambda n=name: rt.export(out, n, out / "made"))
+        made = accepted(lambda n=name: rt.export(out, n, out / "made"))
         assert made is None or made.stat().st_size
-    result = understood(lambda: rt.Result.load(out))
+    result = accepted(lambda: rt.Result.load(out))
     if result is not None:
         assert all(c.isprintable() or c == "\n" for c in result.summary())
         ellipsoids = result.ellipsoids()
@@ -350,7 +350,7 @@ def with_applied(matrix: Any) -> str:
         (TRANSFORMS.replace('"fl_x": 500, "fl_y": 500', '"camera_angle_x": 0'), "angle_x 0"),
     ],
 )
-def test_cameras_that_cannot_be_meant(folder: Path, video: Any, text: str, what: str) -> None:
+def test_invalid_cameras(folder: Path, video: Any, text: str, what: str) -> None:
     path = folder / "transforms.json"
     path.write_text(text)
     with pytest.raises(rt.ReobjError, match=what):
@@ -395,14 +395,14 @@ ARGUMENTS: dict[str, tuple[str, Callable[[str], None]]] = {
 @example(changes=[(0.3, "1.2.3", 0)])
 @example(changes=[(0.5, "1e300", 0)])  # its square is infinite
 @example(changes=[(0.3, "9" * 23, 0)])
-@example(changes=[(0.99, "x" * 140000, 4)])  # messages repeat a part of it only
-def test_arguments_are_understood_or_refused(
+@example(changes=[(0.99, "x" * 140000, 4)])  # messages quote a part of it only
+def test_arguments_are_accepted_or_refused(
     name: str, changes: list[tuple[float, str, int]]
 ) -> None:
     text, check = ARGUMENTS[name]
     changed = edited(text, changes)
-    if "\x00" not in changed:  # no argument of a command can hold it
-        understood(lambda: check(changed))
+    if "\x00" not in changed:  # impossible in a command-line argument
+        accepted(lambda: check(changed))
 
 
 # ---- Arrays ----
@@ -422,14 +422,14 @@ def test_arguments_are_understood_or_refused(
 @example(rows=np.array([[30.0, 30, 10, 10, 0.9, 1]]), value=0.9, at=4)  # upside down
 @example(rows=np.array([[1.0, 1, 10, 10, 0.9, 1]]), value=1e300, at=2)
 @example(rows=np.array([[1.0, 1, 10, 10, 0.9, 1]]), value=9.0, at=4)
-def test_frames_of_a_tracker_are_understood_or_refused(rows: Any, value: float, at: int) -> None:
+def test_frames_of_a_tracker_are_accepted_or_refused(rows: Any, value: float, at: int) -> None:
     tracker = rt.Tracker()
     if rows.dtype.kind == "f" and rows.size:
         rows = rows.copy()
         with np.errstate(over="ignore"):  # float32
             rows.flat[at % rows.size] = value
     for _ in range(4):
-        tracks = understood(lambda: tracker.update(rows))
+        tracks = accepted(lambda: tracker.update(rows))
         if tracks is not None:
             assert (
                 np.isfinite(tracks.xyxy).all() and ((tracks.score >= 0) & (tracks.score <= 1)).all()
@@ -440,19 +440,19 @@ def test_frames_of_a_tracker_are_understood_or_refused(rows: Any, value: float, 
 @given(
     seed=st.integers(0, 2**32 - 1),
     value=st.sampled_from([np.nan, np.inf, 0.0, 1e300, -1e12, 1e-300]),
-    share=st.sampled_from([0.0, 0.05, 0.5, 1.0]),
+    fraction=st.sampled_from([0.0, 0.05, 0.5, 1.0]),
     cameras=st.booleans(),
 )
-@example(seed=5, value=1e300, share=0.05, cameras=False)
-@example(seed=5, value=np.inf, share=1.0, cameras=True)
-def test_fits_are_finite_or_not_there(seed: int, value: float, share: float, cameras: bool) -> None:
-    """Objects are located with finite numbers, or have none; factorisations as well."""
+@example(seed=5, value=1e300, fraction=0.05, cameras=False)
+@example(seed=5, value=np.inf, fraction=1.0, cameras=True)
+def test_fits_are_finite_or_none(seed: int, value: float, fraction: float, cameras: bool) -> None:
+    """Objects are located with finite numbers or not at all; the same for factorisations."""
     rng, poses = np.random.default_rng(seed), walk(5)
     img_from_world = poses.camera.K @ poses.cam_from_world
     boxes = quadrics.solid_boxes(chair_solids(), "box", img_from_world)
     boxes = np.concatenate([boxes, boxes + rng.normal(0, 2, boxes.shape)], 1)  # (5, 6, 4)
     target = img_from_world if cameras else boxes
-    target[rng.random(target.shape) < share] = value
+    target[rng.random(target.shape) < fraction] = value
     categories = ["chair"] * boxes.shape[1]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # squares of 1e300
@@ -503,12 +503,12 @@ CACHES = {f.__name__: f for f in (cached_poses, cached_tracks, cached_tracker, c
 def test_a_damaged_cache_is_computed_again(
     kind: str, folder: Path, at: list[float], value: int, cut: bool
 ) -> None:
-    """Never a traceback, and never other content than was written."""
+    """Without a traceback, and with the original content."""
     path = folder / f"{kind}.npz"
     read, content_of = CACHES[kind](path)
     written, data = content_of(read(path)), bytearray(path.read_bytes())
-    for share in at:
-        data[round(share * (len(data) - 1))] = value
+    for position in at:
+        data[round(position * (len(data) - 1))] = value
     path.write_bytes(data[: round(at[0] * len(data))] if cut else data)
     found = load_cached(path, read)
     if found is None:

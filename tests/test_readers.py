@@ -1,4 +1,4 @@
-"""Poses made elsewhere: every format reads back, damage is refused, frames are found."""
+"""Poses of other tools: round trip of every format, refusal of damaged files, frame lookup."""
 
 from __future__ import annotations
 
@@ -296,7 +296,7 @@ WITHOUT_CAMERA = (as_tum, as_seven_scenes, as_kitti, as_replica, as_orbslam3)
 
 
 @pytest.mark.parametrize("options", [{}, {"fmt": "splatting"}])
-def test_a_folder_with_cameras_json_stands_for_the_file(tmp_path, options):
+def test_a_folder_with_cameras_json_is_read(tmp_path, options):
     assert as_splatting(tmp_path, some_cameras()).is_file()
     poses = read(tmp_path, **options)
     np.testing.assert_allclose(poses.cam_from_world, some_cameras(), atol=1e-9)
@@ -311,7 +311,7 @@ def test_any_format_can_be_declared_metric(tmp_path, write, metric, up):
 
 @pytest.mark.parametrize("write, metric, up", FORMATS, ids=lambda v: getattr(v, "__name__", None))
 @pytest.mark.parametrize("named", [True, False])
-def test_poses_of_some_frames_say_which_have_none(tmp_path, write, metric, up, named):
+def test_frames_without_a_pose_are_known(tmp_path, write, metric, up, named):
     """Six poses for eight frames: all formats but the one that has neither names nor times."""
     path, cams = write(tmp_path, some_cameras()), some_cameras()
     names = [f"{i:04d}.jpg" for i in range(FRAMES + 2)] if named else ()
@@ -327,8 +327,8 @@ def test_poses_of_some_frames_say_which_have_none(tmp_path, write, metric, up, n
 
 
 @pytest.mark.parametrize("write, metric, up", FORMATS, ids=lambda v: getattr(v, "__name__", None))
-def test_some_images_of_those_with_poses_find_theirs(tmp_path, write, metric, up):
-    """Every second image, under its own name, as 7-Scenes' and Record3D's users thin them."""
+def test_a_subset_of_the_images_gets_its_poses(tmp_path, write, metric, up):
+    """Every second image under its original name, as in subsampled 7-Scenes and Record3D data."""
     path, cams = write(tmp_path, some_cameras()), some_cameras()
     name = {as_seven_scenes: "frame-{:06d}.color.png", as_3d_scanner_app: "frame_{:05d}.jpg"}
     names = [name.get(write, "{:04d}.jpg").format(i) for i in (0, 2, 4)]
@@ -338,7 +338,7 @@ def test_some_images_of_those_with_poses_find_theirs(tmp_path, write, metric, up
     np.testing.assert_allclose(poses.cam_from_world, cams[::2], atol=1e-9)
 
 
-def test_numbers_of_names_that_do_not_meet_are_not_forced(tmp_path):
+def test_mismatched_numbers_of_names_are_not_used(tmp_path):
     """Images counted from 1, poses from 0: both in order, as the frames' own numbers say."""
     path, cams = as_seven_scenes(tmp_path, some_cameras()), some_cameras()
     names = [f"IMG_{i:04d}.jpg" for i in range(1, FRAMES + 1)]
@@ -347,7 +347,7 @@ def test_numbers_of_names_that_do_not_meet_are_not_forced(tmp_path):
 
 
 @pytest.mark.parametrize("write", [as_seven_scenes, as_record3d])
-def test_every_second_image_counted_from_1_keeps_its_place(tmp_path, write):
+def test_every_second_image_counted_from_1_keeps_its_pose(tmp_path, write):
     """With --every 2 all their numbers have a pose, the wrong one."""
     for i in range(1, FRAMES + 1):
         cv2.imwrite(str(tmp_path / f"IMG_{i:04d}.png"), np.zeros((480, 640, 3), np.uint8))
@@ -358,7 +358,7 @@ def test_every_second_image_counted_from_1_keeps_its_place(tmp_path, write):
 
 
 @pytest.mark.parametrize("write", [as_colmap_text, as_colmap_binary, as_nerfstudio])
-def test_distorted_cameras_of_files_come_along(tmp_path, write):
+def test_distorted_cameras_of_files_are_read(tmp_path, write):
     """FULL_OPENCV of a COLMAP model, k3 of a transforms.json."""
     terms = (-0.1, 0.02, 0.001, 0.002, 0.3, 0.0, 0.0, 0.0)
     camera = rt.Camera("FULL_OPENCV", *SIZE, (FOCAL, FOCAL, 320.0, 240.0, *terms))
@@ -375,8 +375,8 @@ def test_distorted_cameras_of_files_come_along(tmp_path, write):
 
 
 @pytest.mark.parametrize("binary", [False, True])
-def test_who_observed_the_points_of_a_model_comes_along(tmp_path, binary):
-    """By rows of the frames, of which the first has no pose."""
+def test_observations_of_the_points_of_a_model_are_read(tmp_path, binary):
+    """As rows of frames, of which the first has no pose."""
     pycolmap = pytest.importorskip("pycolmap")
     options = pycolmap.SyntheticDatasetOptions()
     options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, 4, 20
@@ -398,7 +398,7 @@ def read(path, video=None, **options):
 
 
 @pytest.mark.parametrize("write, metric, up", FORMATS, ids=lambda v: getattr(v, "__name__", None))
-def test_every_format_reads_back_the_same(tmp_path, write, metric, up):
+def test_every_format_is_read_back_unchanged(tmp_path, write, metric, up):
     cams = some_cameras()
     poses = read(write(tmp_path, cams), camera=CAMERA if write in WITHOUT_CAMERA else "")
     np.testing.assert_allclose(poses.cam_from_world, cams, atol=1e-9)
@@ -408,8 +408,8 @@ def test_every_format_reads_back_the_same(tmp_path, write, metric, up):
 
 
 @pytest.mark.parametrize("fmt", ["tum", "transforms", "scannet", "record3d", "colmap"])
-def test_the_format_is_obeyed(tmp_path, fmt):
-    """A name that says nothing is read as TUM unless another format is given."""
+def test_the_format_option_is_used(tmp_path, fmt):
+    """A file with an unknown name is read as TUM unless another format is given."""
     write = {"tum": as_tum, "transforms": as_instant_ngp, "scannet": as_scannet,
              "record3d": as_record3d, "colmap": as_colmap_text}[fmt]  # fmt: skip
     path = write(tmp_path, some_cameras())
@@ -427,7 +427,7 @@ def test_the_given_camera_replaces_the_files(tmp_path):
 
 
 @pytest.mark.parametrize("write", [as_colmap_text, as_colmap_binary])
-def test_colmap_points_come_along_in_the_order_of_their_numbers(tmp_path, write):
+def test_colmap_points_are_sorted_by_id(tmp_path, write):
     path = write(tmp_path, some_cameras())
     if write is as_colmap_text:
         points = path / "sparse" / "0" / "points3D.txt"
@@ -440,7 +440,7 @@ def test_colmap_points_come_along_in_the_order_of_their_numbers(tmp_path, write)
 
 
 @pytest.mark.parametrize("binary", [False, True])
-def test_colmap_observations_come_along_as_rows_of_frames_and_points(tmp_path, binary):
+def test_colmap_observations_become_rows_of_frames_and_points(tmp_path, binary):
     """Ids count from 1 here; images 1 and 6 of the model are no frames of the video."""
     folder = model(tmp_path / "text", some_cameras())
     observed = {1: [1, 2], 2: [2], 3: [1], 4: [], 5: [1, 2], 6: [1]}  # points of each image
@@ -466,18 +466,18 @@ def test_colmap_observations_come_along_as_rows_of_frames_and_points(tmp_path, b
     assert len(poses.points) == 2
 
 
-def test_own_files_read_back(tmp_path):
+def test_own_files_are_read_back(tmp_path):
     cams = some_cameras()
     cams[2] = np.nan
     poses = dataclasses.replace(supplied(cams), source="pycolmap")
     write_tum(tmp_path / "poses.txt", poses)
     back = read(tmp_path / "poses.txt", camera=CAMERA)
     np.testing.assert_allclose(back.cam_from_world, cams, atol=1e-8)
-    assert not back.metric  # our header says that the scale is unknown
+    assert not back.metric  # the header states that the scale is unknown
     assert "5 of 6" in back.messages[0]
 
 
-# ---- Negative cases: where, what was found, what was expected, what to do ------------------------
+# ---- Damaged files: location, found and expected content, remedy ---------------------------------
 
 
 def edit(path, line, change):
@@ -604,7 +604,7 @@ def test_damaged_files_are_refused_in_one_clear_line(tmp_path, write, file, dama
     assert "\n" not in str(refused.value)
 
 
-def test_a_folder_in_no_known_format_is_refused_with_what_is_known(tmp_path):
+def test_a_folder_in_no_known_format_is_refused_with_the_formats(tmp_path):
     with pytest.raises(rt.ReobjError, match=r"COLMAP model, or transforms.json, pose/N.txt"):
         read(tmp_path)
 
@@ -639,7 +639,7 @@ def test_a_binary_model_of_zero_images_is_refused(tmp_path):
         read(tmp_path)
 
 
-def test_missing_unknown_and_without_intrinsics(tmp_path):
+def test_missing_files_unknown_formats_and_missing_intrinsics(tmp_path):
     with pytest.raises(rt.ReobjError, match="no such file"):
         read(tmp_path / "no.txt")
     with pytest.raises(rt.ReobjError, match="--camera"):
@@ -653,10 +653,10 @@ def test_missing_unknown_and_without_intrinsics(tmp_path):
         read(as_record3d(tmp_path, some_cameras()), blank(0))
 
 
-# ---- Which pose belongs to which frame -----------------------------------------------------------
+# ---- Assignment of poses to frames ---------------------------------------------------------------
 
 
-def test_scannets_pose_folder_may_be_named_itself(tmp_path):
+def test_scannets_pose_folder_may_be_given_directly(tmp_path):
     path = as_scannet(tmp_path, some_cameras())
     poses, whole = read(path / "pose", blank(FRAMES)), read(path, blank(FRAMES))
     assert poses.camera == whole.camera and poses.known.all()
@@ -665,10 +665,8 @@ def test_scannets_pose_folder_may_be_named_itself(tmp_path):
 
 
 @pytest.mark.parametrize("start, every, count, known", [(1, 2, 6, True), (0, 1, 7, False)])
-def test_stamps_of_another_clock_may_be_one_a_frame_of_the_source(
-    tmp_path, start, every, count, known
-):
-    """Of some frames of a video; with more stamps than frames nothing tells which are whose."""
+def test_stamps_of_another_clock_match_in_order(tmp_path, start, every, count, known):
+    """For a subset of frames; with more stamps than frames the assignment is undetermined."""
     for i in range(FRAMES):
         cv2.imwrite(str(tmp_path / f"{i}.png"), np.zeros((480, 640, 3), np.uint8))
     video = rt.Video(tmp_path, rt.InputConfig(start=start, every=every))
@@ -723,9 +721,7 @@ def test_time_stamps_are_matched_within_half_a_frame(tmp_path, stamps, known):
         (1.0, np.arange(0, 4, 0.01), 0.067, [1, 2, 3, 4]),  # begins 67 ms after the first image
     ],
 )
-def test_images_with_times_in_their_names_meet_poses_of_a_higher_rate(
-    tmp_path, step, stamps, offset, known
-):
+def test_times_in_image_names_match_poses_of_a_higher_rate(tmp_path, step, stamps, offset, known):
     """TUM: 1305031102.175304.png; the pose is that of its time, between two of the file."""
     start = 1305031102.175304
     times = start + step * np.arange(FRAMES)
@@ -766,7 +762,7 @@ def test_a_rotation_between_two_stamps_is_interpolated(tmp_path):
     np.testing.assert_allclose(poses.cam_from_world[2], cams[2], atol=1e-9)  # the last one: nearest
 
 
-def test_poses_at_the_times_of_the_frames_are_taken_as_they_are(tmp_path):
+def test_poses_at_the_times_of_the_frames_are_not_interpolated(tmp_path):
     """Times rounded to a millisecond are the same times: nothing is interpolated."""
     path = as_tum(tmp_path, some_cameras())
     exact = read(path, camera=CAMERA).cam_from_world
@@ -790,7 +786,7 @@ def test_time_stamps_of_another_clock_are_refused_when_counts_differ(tmp_path):
         ((1, 2, 6), "", [0, 1, 5]),  # a 6 of six frames: from 1
         ((1, 3, 5), "number0", [1, 3, 5]),
         ((1, 3, 5), "number1", [0, 2, 4]),
-        ((1, 3, 5), "", None),  # nothing tells, and the images are blank
+        ((1, 3, 5), "", None),  # undetermined, and the images are blank
     ],
 )
 def test_numbers_in_names_are_frame_numbers_for_a_video(tmp_path, numbers, frames_by, known):
@@ -817,7 +813,7 @@ def test_intrinsics_follow_the_size_of_the_frames(tmp_path):
 
 
 def test_slightly_different_focal_lengths_are_one_camera(tmp_path):
-    """Autofocus: the median of what lies within two percent; more are several cameras."""
+    """Autofocus: the median if all are within two percent; else there are several cameras."""
     path = as_instant_ngp(tmp_path, some_cameras())
     for i, focal in enumerate([500, 508, 501, 502, 503, 504]):
         edit_json(path, lambda d, i=i, focal=focal: d["frames"][i].update(fl_x=focal))
@@ -828,7 +824,7 @@ def test_slightly_different_focal_lengths_are_one_camera(tmp_path):
 
 
 def test_rotations_of_binary_models_are_checked(tmp_path, monkeypatch):
-    """pycolmap takes a quaternion of any length; nearly right ones are made right."""
+    """pycolmap accepts quaternions of any length; nearly normalised ones are normalised."""
     path = as_colmap_binary(tmp_path, some_cameras())
     model = colmap_model.read_sparse_model(path)
 
@@ -852,8 +848,8 @@ def test_rotations_of_binary_models_are_checked(tmp_path, monkeypatch):
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize("number", [1e300, -1.7e308, 1e12])
-def test_numbers_without_end_are_refused_without_overflow(tmp_path, number):
-    """In one line, and no warning of numpy's beside it."""
+def test_huge_numbers_are_refused_without_overflow(tmp_path, number):
+    """In one line, without a NumPy warning."""
     cams, names = some_cameras(), NAMES[:FRAMES]
     path = as_tum(tmp_path, cams)
     rows = [line.split() for line in path.read_text().splitlines()[1:]]

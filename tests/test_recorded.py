@@ -48,13 +48,13 @@ def test_round_trip(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def test_a_file_may_say_which_frames_were_done(tmp_path: Path) -> None:
+def test_a_file_may_list_the_processed_frames(tmp_path: Path) -> None:
     path = write(tmp_path / "a.npz", (3, three()))
     arrays = dict(np.load(path))
     np.savez(path, **arrays | {"done": [4, 3, 2]})
     found, done = recorded.read_npz(path, SIZE, SIZE)
     assert done.tolist() == found.looked.tolist() == [2, 3, 4]
-    del arrays["done"]  # files of version 0.2 do not say
+    del arrays["done"]  # files of version 0.2 have no such list
     np.savez(path, **arrays)
     found, done = recorded.read_npz(path, SIZE, SIZE)
     assert found.looked is None and done.tolist() == [3, 3, 3]
@@ -70,9 +70,9 @@ def test_boxes_and_masks_follow_the_working_size(tmp_path: Path) -> None:
     path = write(tmp_path / "a.npz", (0, rt.Detections(BOXES[:1], np.ones(1), np.zeros(1), masks)))
     found = recorded.read_npz(path, SIZE, (32, 16))[0].at(0)
     np.testing.assert_allclose(found.xyxy, [[0.625, 2 / 3, 15, 40 / 3]])
-    share = masks[0].reshape(16, 3, 32, 2).mean((1, 3))
-    assert 0.5 in share and found.masks is not None
-    np.testing.assert_array_equal(found.masks[0], share >= 0.5)
+    covered = masks[0].reshape(16, 3, 32, 2).mean((1, 3))
+    assert 0.5 in covered and found.masks is not None
+    np.testing.assert_array_equal(found.masks[0], covered >= 0.5)
 
 
 def test_masks_of_the_wrong_size_are_refused(tmp_path: Path) -> None:
@@ -102,8 +102,8 @@ def test_wrong_arrays_are_named(tmp_path: Path, change: dict[str, Any], expected
         recorded.read_npz(path, SIZE, SIZE)
 
 
-def test_masks_may_be_left_out(tmp_path: Path) -> None:
-    """The format as other tools write it: mask_counts and mask_offsets are optional."""
+def test_masks_are_optional(tmp_path: Path) -> None:
+    """As other tools write the format: without mask_counts and mask_offsets."""
     path = write(tmp_path / "a.npz", (0, three()))
     arrays = {k: v for k, v in np.load(path).items() if not k.startswith("mask_")}
     np.savez(path, **arrays)

@@ -1,4 +1,4 @@
-"""Gallery and calibrated similarity: against formulas and rooms written down here."""
+"""Gallery and calibrated similarity: against formulas and examples defined here."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def one(value: int = 0) -> np.ndarray:
 
 
 def filled(angles: tuple[float, ...], **options) -> Gallery:
-    """A gallery that was shown views of identity 0 in these directions, one after the other."""
+    """A gallery updated with views of identity 0 in these directions, one after the other."""
     gallery = Gallery(**options)
     gallery.foreground_width = 2
     for row in at_degrees(*angles):
@@ -56,11 +56,11 @@ def kept(gallery: Gallery) -> list[int]:
         ((0, 30), {"novelty": 0.8}, [3]),
         ((0, 15), {"novelty": 0.98}, [0, 15]),
         ((0, 90, 100), {}, [0, 91]),  # blended into the nearest view
-        ((0, 30, 150, 270), {"views": 3}, [270, 30, 150]),  # takes the place of one of two alike
+        ((0, 30, 150, 270), {"views": 3}, [270, 30, 150]),  # replaces one of the two most similar
         ((0, 150, 180, 90), {"views": 3}, [0, 90, 180]),
     ],
 )
-def test_views_that_are_kept(angles, options, expected) -> None:
+def test_kept_views(angles, options, expected) -> None:
     gallery = filled(angles, **options)
     assert [k % 360 for k in kept(gallery)] == expected
     assert gallery.rows.shape[1] == options.get("views", 12)
@@ -68,7 +68,7 @@ def test_views_that_are_kept(angles, options, expected) -> None:
     np.testing.assert_allclose(lengths, 1, atol=1e-6)
 
 
-def test_a_gallery_is_bounded_and_of_its_own_views() -> None:
+def test_a_gallery_is_bounded_and_per_identity() -> None:
     rng, gallery = np.random.default_rng(9), Gallery(views=6)
     for _ in range(40):
         gallery.add(np.array([0, 3]), unit(rng, 2).astype(np.float32), np.repeat(UNKNOWN, 2, 0))
@@ -79,7 +79,7 @@ def test_a_gallery_is_bounded_and_of_its_own_views() -> None:
     assert gallery.rows.nbytes == sizes
 
 
-def test_memory_follows_the_identities() -> None:
+def test_memory_grows_with_the_identities() -> None:
     gallery = Gallery(views=2)
     for identity in range(100):
         gallery.add(one(identity), at_degrees(identity), UNKNOWN)
@@ -87,7 +87,7 @@ def test_memory_follows_the_identities() -> None:
     np.testing.assert_allclose(gallery.rows[:100, 0], at_degrees(*range(100)), atol=1e-6)
 
 
-def test_gallery_parts_are_of_the_most_similar_view() -> None:
+def test_gallery_parts_come_from_the_most_similar_view() -> None:
     gallery = Gallery()
     gallery.foreground_width = 2
     views = np.array([[1, 0, 1, 0], [0, 1, 0, 1.0]], np.float32) / np.sqrt(2)
@@ -104,13 +104,13 @@ def test_gallery_parts_are_of_the_most_similar_view() -> None:
     assert (fore, back) == (pytest.approx(0.8), pytest.approx(1))
 
 
-def test_unused_views_are_compared_with_nothing() -> None:
-    """Also where all used ones are less than 0 alike."""
+def test_unused_slots_are_not_compared() -> None:
+    """Also if all used views have a negative cosine."""
     fore, _, _ = filled((0, 30)).parts(at_degrees(150), one(), UNKNOWN)
     np.testing.assert_allclose(fore, [[-0.5]], atol=1e-6)
 
 
-def test_gallery_parts_of_what_is_not_known() -> None:
+def test_gallery_parts_of_unknown_identities() -> None:
     gallery = filled((0, 90))
     gallery.add(one(2), at_degrees(45), UNKNOWN)
     row = at_degrees(45)
@@ -123,7 +123,7 @@ def test_gallery_parts_of_what_is_not_known() -> None:
 
 
 def test_identities_after_the_last_with_a_view_are_unknown() -> None:
-    """They were confirmed in frames without an image; room is made 16 at a time."""
+    """They were confirmed in frames without an image; slots are allocated 16 at a time."""
     fore, _, _ = filled((0, 90)).parts(at_degrees(0), np.array([0, 16, 40]), UNKNOWN)
     np.testing.assert_allclose(fore, [[1, np.nan, np.nan]], rtol=1e-6)
 
@@ -153,13 +153,13 @@ def test_paired_cosine() -> None:
 
 
 def reference_logit(pairs, weight, foreground, background, angle_deg=45.0) -> float:
-    """The documented formula, from all pairs; the usual ones stand in as samples of their mean and
+    """The documented formula, from all pairs; the default ones are samples of their mean and
     spread. pairs: {same: (n, 2) cosines}, NaN where unknown.
     """
     total = 0.0
     a = np.radians(angle_deg)
     facing = ((1 + np.cos(a)) / 2, max(np.cos(a), 0))
-    for k, (cosine, share) in enumerate(zip((foreground, background), (0.55, 0.5), strict=True)):
+    for k, (cosine, factor) in enumerate(zip((foreground, background), (0.55, 0.5), strict=True)):
         if np.isnan(cosine):
             continue
         samples = []
@@ -172,7 +172,7 @@ def reference_logit(pairs, weight, foreground, background, angle_deg=45.0) -> fl
         std = np.sqrt((samples[0].var() + samples[1].var()) / 2)
         separation = max((same_mean - different) / std, 0)
         middle = (different + same_mean) / 2
-        total += share * facing[k] * (-np.log(1.03 - cosine) - middle) / std * (1 + separation)
+        total += factor * facing[k] * (-np.log(1.03 - cosine) - middle) / std * (1 + separation)
     odds = np.exp(total)
     return float(np.log((odds + 1e-3) / (1 + 1e-3 * odds)))
 
@@ -201,13 +201,13 @@ def test_log_odds_follow_the_documented_formula(
     assert calibration.logit(foreground, background) == pytest.approx(unknown, abs=1e-9)
 
 
-def test_the_usual_pairs_are_worth_ten() -> None:
+def test_the_prior_counts_as_ten_pairs() -> None:
     ten = SimilarityCalibration(10)
     assert SimilarityCalibration().logit(0.7, 0.4) == ten.logit(0.7, 0.4)
 
 
-def test_probability_follows_its_evidence() -> None:
-    """Monotone in both cosines; a background from another side counts less; bounded."""
+def test_probability_is_monotone_in_its_evidence() -> None:
+    """In both cosines; a background from another viewpoint weighs less; bounded."""
     same = SimilarityCalibration()
     high, low = same.logit(0.9, 0.9), same.logit(0.9, 0.2)
     assert high > low and same.logit(0.95, 0.9) > high
@@ -229,13 +229,13 @@ def test_probability_has_a_prior() -> None:
 
 
 def test_probability_adapts_to_the_video() -> None:
-    """Where all objects look alike the same cosine says less; unknown parts teach nothing."""
-    plain, alike = SimilarityCalibration(), SimilarityCalibration()
-    alike.add(np.full(200, 0.95), np.full(200, np.nan), False)
-    assert alike.logit(0.92, 0.92) < plain.logit(0.92, 0.92)
-    np.testing.assert_array_equal(alike.moments[:, :, 1], plain.moments[:, :, 1])
-    alike.add(np.full(200, 0.99), np.full(200, 0.99), True)
-    assert alike.logit(0.99, 0.99) > 0 > alike.logit(0.93, 0.9)
+    """If all objects are similar, a cosine is weaker evidence; unknown parts do not calibrate."""
+    plain, similar = SimilarityCalibration(), SimilarityCalibration()
+    similar.add(np.full(200, 0.95), np.full(200, np.nan), False)
+    assert similar.logit(0.92, 0.92) < plain.logit(0.92, 0.92)
+    np.testing.assert_array_equal(similar.moments[:, :, 1], plain.moments[:, :, 1])
+    similar.add(np.full(200, 0.99), np.full(200, 0.99), True)
+    assert similar.logit(0.99, 0.99) > 0 > similar.logit(0.93, 0.9)
 
 
 def test_match_probability_equals_brute_force() -> None:
@@ -255,8 +255,8 @@ def test_match_probability_equals_brute_force() -> None:
 @pytest.mark.parametrize(
     ("logit", "expected"),
     [
-        ([[0.0]], [[0.5]]),  # alone: as likely as none
-        ([[0.0, 0.0]], [[1 / 3, 1 / 3]]),  # two that fit equally well: in doubt
+        ([[0.0]], [[0.5]]),  # alone: as probable as no match
+        ([[0.0, 0.0]], [[1 / 3, 1 / 3]]),  # two equally good ones: ambiguous
         ([[5.0], [5.0]], [[0.4983, 0.4983]]),
         ([[-np.inf]], [[0.0]]),
     ],

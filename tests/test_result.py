@@ -1,4 +1,4 @@
-"""What a run found, written and read again; every file is read by somebody else's reader too."""
+"""Results of a run, written and read back; every file is also read by an independent reader."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_save_then_load_gives_the_same(chairs: rt.Result, tmp_path: Path) -> Non
     assert {after.class_names[c] for c in after.tracks.class_id} == {"chair"}
 
 
-def test_what_is_loaded_saves_the_same_bytes(saved: Path, tmp_path: Path) -> None:
+def test_a_loaded_result_saves_the_same_bytes(saved: Path, tmp_path: Path) -> None:
     again = tmp_path / "again"
     rt.Result.load(saved).save(again)
     for name in ("tracks.txt", "objects.json", "poses.txt", "cache/last-poses.npz"):
@@ -122,7 +122,7 @@ def test_ellipsoids_leave_rejected_objects_out(chairs: rt.Result) -> None:
 
 
 def test_rows_of_a_class_get_that_of_their_object(chairs: rt.Result, tmp_path: Path) -> None:
-    """tracks.txt has no classes; of a result without poses and objects nothing is missed."""
+    """tracks.txt has no classes; a result without poses and objects loads completely."""
     tracks = chairs.tracks[chairs.tracks.track_id < 3]
     tracks = with_columns(tracks, class_id=np.where(tracks.track_id == 1, CHAIR, CUP))
     fitted(tracks, None).save(tmp_path)
@@ -142,7 +142,7 @@ def test_an_empty_result(tmp_path: Path) -> None:
     assert "distinct objects: none" in after.summary()
 
 
-def test_files_of_an_earlier_run_go(chairs: rt.Result, saved: Path) -> None:
+def test_files_of_an_earlier_run_are_deleted(chairs: rt.Result, saved: Path) -> None:
     stale = ("poses.txt", "cameras.csv", "objects.ply", "overlay.mp4", "overlay.webm",
              "scene.html")  # fmt: skip
     for name in stale:
@@ -154,7 +154,7 @@ def test_files_of_an_earlier_run_go(chairs: rt.Result, saved: Path) -> None:
 
 
 def test_a_full_disk_keeps_the_files_of_an_earlier_run(chairs: rt.Result, saved: Path) -> None:
-    """Whatever fails last: here what the caller adds."""
+    """Also if the last step fails: here a file added by the caller."""
     (saved / "scene.html").write_text("old page")
     before = {p: p.read_bytes() for p in saved.rglob("*") if p.is_file()}
 
@@ -177,7 +177,7 @@ def test_evidence_is_rounded_to_four_digits() -> None:
     assert again.to_json()["links"] == written and again.links[0].tracklets == (1, 2)
 
 
-# ---- The files, as others read them ----
+# ---- The files, read by other tools ----
 
 
 def test_tracks_are_motchallenge_rows(tmp_path: Path) -> None:
@@ -202,7 +202,7 @@ def test_cameras_are_tum_rows(saved: Path) -> None:
     np.testing.assert_allclose(world, -poses.cam_from_world[:, :, 3], atol=1e-6)
 
 
-def test_ply_is_a_closed_mesh_at_the_right_place(tmp_path: Path) -> None:
+def test_ply_is_a_closed_mesh_at_the_right_position(tmp_path: Path) -> None:
     trimesh = pytest.importorskip("trimesh", reason="pip install trimesh (dev extra)")
     solids = chair_solids()
     write_ply(tmp_path / "o.ply", solids, [1, 2, 3])
@@ -229,7 +229,7 @@ def test_ply_has_the_located_objects_only(chairs: rt.Result, tmp_path: Path) -> 
     np.testing.assert_allclose(x, [-1.1, 1.1], atol=0.05)
 
 
-def test_objects_json_says_what_it_means(saved: Path) -> None:
+def test_objects_json_is_self_describing(saved: Path) -> None:
     data = json.loads((saved / "objects.json").read_text())
     assert validate_objects(saved / "objects.json") == []
     assert data["reobj_track"] == rt.__version__ and data["video"]["tracked_frames"] == 40
@@ -244,7 +244,7 @@ def test_objects_json_says_what_it_means(saved: Path) -> None:
     np.testing.assert_allclose(np.sort(local), np.sort(true.half_axes[0]), atol=0.06)
 
 
-def test_summary_is_the_table_that_run_prints(chairs: rt.Result, saved: Path) -> None:
+def test_the_summary_is_the_table_printed_by_run(chairs: rt.Result, saved: Path) -> None:
     result = copy_of(chairs, out=saved, seconds={"track": 1.25})
     result = dataclasses.replace(result, objects=[*chairs.objects[:2], dataclasses.replace(
         chairs.objects[2], status="rejected", reason="too far", size=None, size_m=None,
@@ -260,7 +260,7 @@ def test_summary_is_the_table_that_run_prints(chairs: rt.Result, saved: Path) ->
     assert f"look at: {saved / 'objects.json'}" in text
 
 
-def test_sizes_have_the_decimals_that_the_best_known_side_is_worth(chairs: rt.Result) -> None:
+def test_sizes_are_rounded_by_the_smallest_sigma(chairs: rt.Result) -> None:
     found = dataclasses.replace(
         chairs.objects[0], size=np.array([4.1234, 2.0, 1.0]), size_m=np.array([0.41234, 0.2, 0.1]),
         size_rel_sigma=np.array([0.1, 0.3, 0.6]),
@@ -272,7 +272,7 @@ def test_sizes_have_the_decimals_that_the_best_known_side_is_worth(chairs: rt.Re
 
 
 def test_the_summary_fits_the_terminal(chairs: rt.Result) -> None:
-    """However many objects there are, with reasons, in parts; each reason is said once."""
+    """For many objects, with reasons, in components; each reason is printed once."""
     reason = "size along x, y rests on the prior"
     result = copy_of(chairs, out=None)
     result = dataclasses.replace(result, objects=[
@@ -312,7 +312,7 @@ def test_validate_finds_faults(saved: Path, change: dict[str, object], fault: st
 
 
 @pytest.mark.parametrize("key", ["format", "world", "objects"])
-def test_validate_misses_nothing_that_must_be_there(saved: Path, key: str) -> None:
+def test_validate_reports_missing_fields(saved: Path, key: str) -> None:
     data = json.loads((saved / "objects.json").read_text())
     del data[key]
     (saved / "objects.json").write_text(json.dumps(data))
@@ -384,7 +384,7 @@ def test_validate_names_the_missing_package(
         (lambda d: d.update(video=None), r"\$.video: None, expected an object"),
     ],
 )
-def test_what_does_not_fit_together_is_not_loaded(saved: Path, change: Any, fault: str) -> None:
+def test_inconsistent_files_are_not_loaded(saved: Path, change: Any, fault: str) -> None:
     data = json.loads((saved / "objects.json").read_text())
     change(data)
     (saved / "objects.json").write_text(json.dumps(data))
@@ -392,7 +392,7 @@ def test_what_does_not_fit_together_is_not_loaded(saved: Path, change: Any, faul
         rt.Result.load(saved)
 
 
-# ---- Tracks and embeddings, as the tracker had them ----
+# ---- Tracks and embeddings of the tracker ----
 
 
 def embedded_result() -> rt.Result:
@@ -415,7 +415,7 @@ def test_embeddings_belong_to_their_rows() -> None:
     assert result.embeddings.foreground.dtype == np.float16
 
 
-def test_without_a_width_all_is_foreground() -> None:
+def test_without_a_width_rows_are_foreground() -> None:
     tracks = tracks_of(walk(2))
     embedded = [(np.array([1]), np.ones((1, 3), np.float32))]
     embeddings, _ = tracked_embeddings(tracks, [0], embedded, 0)
@@ -425,7 +425,7 @@ def test_without_a_width_all_is_foreground() -> None:
     assert embeddings.foreground.shape == (0, 0) and len(row) == 0
 
 
-def test_tracked_is_read_as_it_was(tmp_path: Path) -> None:
+def test_tracker_output_is_read_back(tmp_path: Path) -> None:
     before = embedded_result()
     before = dataclasses.replace(before, warnings=["dark"], identities_given=True)
     before.save_tracked(tmp_path / "a.npz")
@@ -495,7 +495,7 @@ COMMANDS: dict[str, Callable[[Path], tuple[object, ...]]] = {
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_an_old_folder_says_who_wrote_it(
+def test_an_old_folder_is_refused_with_its_version(
     saved: Path, command: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     old_objects(saved)
@@ -509,7 +509,7 @@ def test_an_old_folder_says_who_wrote_it(
 
 
 @pytest.mark.parametrize("command", ["export", "eval"])
-def test_objects_of_another_form_say_who_wrote_them(
+def test_objects_of_another_schema_are_refused_with_their_version(
     saved: Path, command: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     data = json.loads((saved / "objects.json").read_text())
@@ -523,7 +523,7 @@ def test_objects_of_another_form_say_who_wrote_them(
         assert ("9.9" in error) == isinstance(changed, dict)
 
 
-def test_a_damaged_file_of_this_version_is_no_other_version(saved: Path) -> None:
+def test_a_damaged_file_is_not_reported_as_another_version(saved: Path) -> None:
     np.savez(saved / "cache/last-poses.npz", frame=np.arange(3))
     with pytest.raises(rt.ReobjError, match=r"last-poses\.npz: is damaged: run the video again"):
         rt.Result.load(saved)

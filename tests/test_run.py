@@ -1,4 +1,4 @@
-"""The command line as a user meets it: whole runs, resuming, every way input can be wrong."""
+"""The command line: complete runs, resuming, invalid input."""
 
 from __future__ import annotations
 
@@ -74,13 +74,13 @@ def cli(*args: object) -> int:
     return rt.main([str(a) for a in args])
 
 
-def film_in(out: Path) -> str:
-    """The one film in an output folder, whichever encoder is here."""
+def overlay_in(out: Path) -> str:
+    """The only overlay video in an output folder, for either encoder."""
     (name,) = (path.name for path in out.glob("overlay.*"))
     return name
 
 
-# ---- What must work ----
+# ---- Complete runs ----
 
 
 def test_track_writes_identities(
@@ -106,7 +106,7 @@ def test_track_writes_identities(
 def test_run_without_parallax_keeps_the_2d_results(
     clip: Path, detections: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A camera that stands still: no crash, the reason and the remedy are said."""
+    """A static camera: no crash; the reason and a remedy are reported."""
     for image in sorted(clip.iterdir())[1:]:
         image.write_bytes((clip / "000.png").read_bytes())
     lines = [line for line in detections.read_text().splitlines() if line.startswith("1,")]
@@ -134,7 +134,7 @@ def test_poses_none_stays_in_2d(
 def test_same_input_same_bytes(clip: Path, detections: Path, tmp_path: Path) -> None:
     for name in ("a", "b"):
         assert cli("track", clip, "-o", tmp_path / name, "--detections", detections) == 0
-    for file in ("tracks.txt", "scene.html", film_in(tmp_path / "a"), "cache/last-tracks.npz"):
+    for file in ("tracks.txt", "scene.html", overlay_in(tmp_path / "a"), "cache/last-tracks.npz"):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes(), file
     objects = [
         json.loads((tmp_path / n / "objects.json").read_text())["objects"] for n in ("a", "b")
@@ -202,7 +202,7 @@ def test_python_callable_as_detector(clip: Path, tmp_path: Path) -> None:
 
 
 def test_run_from_another_folder(clip: Path, detections: Path, tmp_path: Path) -> None:
-    """`python /somewhere/reobj_track.py run frames -o out`: paths are those of the working folder,
+    """`python /somewhere/reobj_track.py run frames -o out`: paths are in the current folder,
     the package is found beside the script.
     """
     args = ["track", "frames", "-o", "out", "--detections", "det.txt", *QUICK]
@@ -213,22 +213,20 @@ def test_run_from_another_folder(clip: Path, detections: Path, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("option", ["overlay", "scene"])
-def test_pictures_can_be_switched_off(
+def test_visualisations_can_be_disabled(
     clip: Path, detections: Path, tmp_path: Path, option: str
 ) -> None:
-    """And those of the run before go: they would show other results."""
+    """Those of an earlier run are deleted: they would show other results."""
     args = ("track", clip, "-o", tmp_path / "out", "--detections", detections, "--embed", "none")
     assert cli(*args) == 0
-    files = {"overlay": film_in(tmp_path / "out"), "scene": "scene.html"}
+    files = {"overlay": overlay_in(tmp_path / "out"), "scene": "scene.html"}
     assert cli(*args, "--set", f"output.{option}=0") == 0
     left = {name for name, file in files.items() if (tmp_path / "out" / file).exists()}
     assert left == set(files) - {option}
 
 
-def test_gaps_are_filled_as_far_as_the_option_says(
-    clip: Path, detections: Path, tmp_path: Path
-) -> None:
-    """Three frames without detections; what is filled in has no score and shapes nothing."""
+def test_gaps_are_filled_up_to_the_option(clip: Path, detections: Path, tmp_path: Path) -> None:
+    """Three frames without detections; filled boxes have score 0 and do not affect shapes."""
     lines = detections.read_text().splitlines(keepends=True)
     detections.write_text("".join(x for x in lines if x.split(",")[0] not in ("6", "7", "8")))
     args = ("track", clip, "-o", tmp_path / "out", "--detections", detections, *QUICK)
@@ -285,7 +283,7 @@ def counting(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> type[CountingDe
     return CountingDetector
 
 
-def test_ctrl_c_keeps_what_was_computed(
+def test_ctrl_c_keeps_computed_stages(
     clip: Path, tmp_path: Path, counting: type[CountingDetector], capsys: pytest.CaptureFixture[str]
 ) -> None:
     counting.stop_at = 7
@@ -306,12 +304,12 @@ def test_a_changed_option_recomputes_only_what_depends_on_it(
     cache = tmp_path / "out/cache"
     tracks = {p: p.stat().st_mtime_ns for p in cache.glob("tracks-*.npz")}
     assert cli(*args) == 0 and len(tracks) == 1
-    assert {p: p.stat().st_mtime_ns for p in cache.glob("tracks-*.npz")} == tracks  # as they were
+    assert {p: p.stat().st_mtime_ns for p in cache.glob("tracks-*.npz")} == tracks  # unchanged
     assert cli(*args, "--set", "tracker.n_init=2") == 0
     assert counting.calls == FRAMES  # detections are kept,
     assert len(list(cache.glob("tracks-*.npz"))) == 2  # tracks are not
     assert cli(*args, "--set", "objects.min_views=4") == 0
-    assert len(list(cache.glob("tracks-*.npz"))) == 2  # nothing of the tracker's depends on it
+    assert len(list(cache.glob("tracks-*.npz"))) == 2  # the tracker does not depend on it
     assert cli(*args, "--set", "detect.min_score=0.3") == 0 and counting.calls == 2 * FRAMES
 
 
@@ -326,11 +324,11 @@ def panning(frames: int = FRAMES) -> rt.Poses:
 
 
 class Stages:
-    """Stands in for the reconstruction and watches the tracker; any stage can be interrupted."""
+    """Replaces the reconstruction and records the tracker's poses; any stage can be interrupted."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, counting: type[CountingDetector]) -> None:
         self.log: list[str] = []
-        self.told: list[object] = []
+        self.poses: list[object] = []
         self.masked: list[int] = []
         self.stop_at = ""
         update = rt.Tracker.update
@@ -341,11 +339,11 @@ class Stages:
             (work / "sparse").mkdir(parents=True)
             return panning()
 
-        def watched(tracker: rt.Tracker, *args: object, **told: object) -> rt.Tracks:
-            if "cam_from_world" in told:
+        def watched(tracker: rt.Tracker, *args: object, **inputs: object) -> rt.Tracks:
+            if "cam_from_world" in inputs:
                 self.step("track", counting.calls)
-                self.told.append(told["cam_from_world"])
-            return update(tracker, *args, **told)
+                self.poses.append(inputs["cam_from_world"])
+            return update(tracker, *args, **inputs)
 
         monkeypatch.setattr("reobj.poses.stage.estimate_poses", estimate)
         monkeypatch.setattr(rt.Tracker, "update", watched)
@@ -359,11 +357,11 @@ class Stages:
 
 
 @pytest.mark.parametrize("stop_at", ["", "detect", "poses", "track"])
-def test_first_all_detections_then_cameras_then_tracks_with_them(
+def test_detections_then_poses_then_tracks_with_poses(
     clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop_at: str,
     counting: type[CountingDetector],
 ) -> None:  # fmt: skip
-    """Every stage once, with what the one before found; also where it was interrupted before."""
+    """Every stage runs once, with the results of the one before; also after an interruption."""
     stages = Stages(monkeypatch, counting)
     counting.stop_at, stages.stop_at = 7 if stop_at == "detect" else -1, stop_at
     args = ("run", clip, "-o", tmp_path / "out", "--detector", tmp_path / "fake.onnx", *QUICK)
@@ -373,10 +371,10 @@ def test_first_all_detections_then_cameras_then_tracks_with_them(
     assert cli(*args) == 0
     assert counting.calls == FRAMES
     assert stages.log == [f"poses {FRAMES}", f"track {FRAMES}"]
-    told = np.array(stages.told[-FRAMES:])
-    np.testing.assert_array_equal(told, panning().cam_from_world)
+    tracked = np.array(stages.poses[-FRAMES:])
+    np.testing.assert_array_equal(tracked, panning().cam_from_world)
     assert cli(*args) == 0  # all from the cache
-    assert counting.calls == FRAMES and len(stages.told) == FRAMES
+    assert counting.calls == FRAMES and len(stages.poses) == FRAMES
     assert cli(*args, "--poses", "none") == 0  # other tracks, the same detections
     assert counting.calls == FRAMES and len(list((tmp_path / "out/cache").glob("tracks-*"))) == 2
 
@@ -384,7 +382,7 @@ def test_first_all_detections_then_cameras_then_tracks_with_them(
 def test_masks_are_not_kept_while_tracking(
     clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Those of a minute of video would be gigabytes."""
+    """Masks of a minute of video would take gigabytes."""
     kept: list[rt.Detections] = []
     untracked = stages_module._untracked
     monkeypatch.setattr(
@@ -402,10 +400,10 @@ def test_masks_are_not_kept_while_tracking(
     assert all(len(found) == 1 and found.masks is None for found in kept)
 
 
-def test_a_function_detects_once_too_and_sure_people_are_masked(
+def test_a_function_detects_once_and_confident_people_are_masked(
     clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, counting: type[CountingDetector]
 ) -> None:
-    """Nothing is known of what it depends on, so nothing of it is kept for another run."""
+    """Its dependencies are unknown, so its detections are not cached for another run."""
     stages, calls = Stages(monkeypatch, counting), []
 
     def people(image: np.ndarray) -> list[list[float]]:
@@ -415,36 +413,36 @@ def test_a_function_detects_once_too_and_sure_people_are_masked(
     output = rt.OutputConfig(overlay="none", scene=False)
     config = rt.Config(output=output, embed=rt.EmbedConfig(model="none"))
     rt.run(clip, tmp_path / "out", config, detections=people)
-    assert len(calls) == FRAMES and len(stages.told) == FRAMES
+    assert len(calls) == FRAMES and len(stages.poses) == FRAMES
     assert stages.masked == [1] * FRAMES
     left = [p.name for p in (tmp_path / "out/cache").iterdir()]
     assert not [name for name in left if name.startswith(("detections", "boxes"))]
 
 
 def test_a_killed_run_leaves_nothing_broken(clip: Path, detections: Path, tmp_path: Path) -> None:
-    """SIGKILL in the middle of the tracking, and while the pictures are made: the next run gives
-    what an undisturbed one does.
+    """SIGKILL during tracking and while visualisations are written: the next run gives the
+    result of an uninterrupted one.
     """
     args = ["track", str(clip), "--detections", str(detections), "--embed", "none"]
     assert cli(*args, "-o", tmp_path / "good") == 0
-    for place in ("rt.Tracker.update", "scene._jpeg"):
+    for target in ("rt.Tracker.update", "scene._jpeg"):
         code = (
             "import os, signal, sys, reobj_track as rt; from reobj.results import scene\n"
-            f"calls, own = [], {place}\n"
+            f"calls, own = [], {target}\n"
             "def killing(*args, **more):\n"
             "    calls.append(1)\n"
             "    if len(calls) == 7: os.kill(os.getpid(), signal.SIGKILL)\n"
             "    return own(*args, **more)\n"
-            f"{place} = killing\n"
+            f"{target} = killing\n"
             "sys.exit(rt.main(sys.argv[1:]))"
         )
-        out = tmp_path / place
+        out = tmp_path / target
         command = [sys.executable, "-c", code, *args, "-o", str(out)]
         done = subprocess.run(command, cwd=ROOT, capture_output=True)
         assert done.returncode == -signal.SIGKILL
         assert not (out / "scene.html").exists() and not list(out.glob("overlay.*"))
         assert cli(*args, "-o", out) == 0
-        for file in ("tracks.txt", "scene.html", film_in(out), "cache/last-tracks.npz"):
+        for file in ("tracks.txt", "scene.html", overlay_in(out), "cache/last-tracks.npz"):
             assert (out / file).read_bytes() == (tmp_path / "good" / file).read_bytes(), file
         assert not [p for p in out.rglob(".part-*")]
 
@@ -473,7 +471,7 @@ def test_foreign_folder_is_not_written_into(
     assert (tmp_path / "out/thesis.tex").read_text() == "precious"
 
 
-def test_results_of_two_videos_never_mix(
+def test_results_of_two_videos_are_never_mixed(
     clip: Path, detections: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
@@ -486,7 +484,7 @@ def test_results_of_two_videos_never_mix(
     assert "--overwrite" in capsys.readouterr().err
 
 
-# ---- What goes wrong ----
+# ---- Invalid input and failures ----
 
 
 @pytest.mark.parametrize(
@@ -513,12 +511,12 @@ def assert_one_clear_line(capsys: pytest.CaptureFixture[str], message: str) -> N
     assert err.startswith("error: ") and err.count("\n") == 1, err
 
 
-def test_some_frames_that_do_not_exist_are_said(
+def test_missing_frames_are_reported(
     clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "det.txt").write_text(mot_rows() + "900,-1,10,10,20,20,0.9,-1,-1,-1\n")
     assert cli("track", clip, "-o", tmp_path / "out", "--detections", tmp_path / "det.txt") == 0
-    assert "899" in capsys.readouterr().err  # 0-based inside, as documented
+    assert "899" in capsys.readouterr().err  # 0-based internally, as documented
 
 
 @pytest.mark.parametrize(
@@ -612,7 +610,7 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_every_stage_is_shown_and_ends_at_100_percent(
+def test_every_stage_shows_progress_up_to_100_percent(
     clip: Path, detections: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     args = ("track", clip, "-o", tmp_path / "out", "--detections", detections, "--embed", "none")
@@ -625,7 +623,7 @@ def test_every_stage_is_shown_and_ends_at_100_percent(
         assert all("100 %" in line for line in lines if not line.startswith("objects"))
 
 
-def test_disk_full_leaves_nothing_half_written(
+def test_a_full_disk_leaves_no_incomplete_files(
     clip: Path,
     detections: Path,
     tmp_path: Path,
@@ -646,7 +644,7 @@ def test_disk_full_leaves_nothing_half_written(
 def test_overlay_cut_by_a_full_disk_is_not_kept(
     clip: Path, detections: Path, tmp_path: Path
 ) -> None:
-    """A real limit on file sizes (RLIMIT_FSIZE) stands for the full disk; the rest is written."""
+    """A real limit on file sizes (RLIMIT_FSIZE) replaces the full disk; the rest is written."""
     code = (
         "import resource, sys, reobj_track as rt; "
         "resource.setrlimit(resource.RLIMIT_FSIZE, (10000, 10000)); "
@@ -668,7 +666,7 @@ def test_overlay_cut_by_a_full_disk_is_not_kept(
     assert (tmp_path / "out/tracks.txt").exists() and (tmp_path / "out/config.toml").exists()
 
 
-# ---- Promises of the module ----
+# ---- The module and its help ----
 
 
 def test_import_loads_no_heavy_package() -> None:
@@ -696,7 +694,7 @@ COMMANDS = ["", "run", "track", "poses", "objects", "eval", "export", "models"]
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_is_there(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_of_every_command(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         cli(*([command] if command else []), "--help")
     assert stop.value.code == 0
@@ -705,7 +703,7 @@ def test_help_is_there(command: str, capsys: pytest.CaptureFixture[str]) -> None
 
 @pytest.mark.parametrize("command", COMMANDS[:-1])  # bare `models` lists the weights
 def test_a_bare_command_prints_short_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """What it does, one example that is right, and where all flags are."""
+    """Purpose, one valid example, and a pointer to all flags."""
     assert cli(*([command] if command else [])) == 2
     said = capsys.readouterr().err
     lines = said.splitlines()
@@ -729,7 +727,7 @@ def test_a_bare_command_prints_short_help(command: str, capsys: pytest.CaptureFi
         ("track a.mp4 -o out --known-size chair=.8m", "unrecognized arguments: --known-size"),
     ],
 )
-def test_a_wrong_word_is_one_line_with_the_right_one(
+def test_a_misspelt_argument_gives_one_line_with_a_suggestion(
     args: str, expected: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as stop:
@@ -739,7 +737,7 @@ def test_a_wrong_word_is_one_line_with_the_right_one(
     assert expected in said and "--help)" in said
 
 
-def test_a_wrong_class_is_one_line_with_the_right_one(
+def test_a_misspelt_class_gives_one_line_with_a_suggestion(
     clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rows = "".join(f"{i},100,60,140,110,.9,chair\n" for i in range(FRAMES))
@@ -751,7 +749,7 @@ def test_a_wrong_class_is_one_line_with_the_right_one(
     assert not (tmp_path / "out/tracks.txt").exists()
 
 
-def test_known_sizes_and_other_options_stay_with_the_folder(
+def test_options_are_stored_in_the_folder(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """`objects OUT` takes the options of the last run there; a flag replaces one."""
@@ -779,7 +777,7 @@ def test_known_sizes_and_other_options_stay_with_the_folder(
     assert cli("export", out, "--to", "cvat", "-o", tmp_path / "a.xml") == 0
     assert cli("objects", out, "--tracks", tmp_path / "a.xml") == 0 and scale() == known_scale
     assert rt.refit(out).world.scale.source == "known_size"
-    assert not list(out.glob("overlay.*"))  # nor does it forget what it need not write
+    assert not list(out.glob("overlay.*"))  # options that need not be written are kept as well
     assert cli("objects", out, "--known-size", "Sports_Ball=11cm") == 0
     assert scale() == (pytest.approx(0.22, rel=0.1), "known_size")
     assert cli("objects", out, "--known-size", "") == 0 and scale()[1] == "poses"
@@ -800,7 +798,7 @@ def test_known_sizes_and_other_options_stay_with_the_folder(
         (("--set", "tracker.return_probability=nan"), "expected =FLOAT, finite, 0 or more"),
     ],
 )
-def test_what_the_fit_cannot_use_is_said_first(
+def test_unusable_options_of_the_fit_are_refused_first(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], option: tuple[object, ...], said: str
 ) -> None:
     """Before the video is read, and before anything is written."""
@@ -809,10 +807,10 @@ def test_what_the_fit_cannot_use_is_said_first(
     assert said in capsys.readouterr().err and not out.exists()
 
 
-def test_a_size_that_sets_nothing_is_said(
+def test_a_known_size_without_effect_is_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A class that the detector has, but no object with a solid."""
+    """A class of the detector without a located object."""
     frames, _, path = rendered_tracks(tmp_path, "right")
     (tmp_path / "names.txt").write_text("ball\ndoor\n")
     mot = (tmp_path / "det.txt").read_text().splitlines()
@@ -825,7 +823,7 @@ def test_a_size_that_sets_nothing_is_said(
     assert "no door" in " ".join(rt.Result.load(tmp_path / "out").warnings)
 
 
-def test_a_camera_line_of_colmap_is_taken_as_it_is(tmp_path: Path) -> None:
+def test_a_camera_line_of_colmap_is_accepted(tmp_path: Path) -> None:
     """`--camera "$(cat examples/room/camera.txt)"`."""
     line = (ROOT / "examples/room/camera.txt").read_text().strip()
     args = list(posed_run(tmp_path, "right"))
@@ -838,7 +836,7 @@ def test_a_camera_line_of_colmap_is_taken_as_it_is(tmp_path: Path) -> None:
     assert "PINHOLE 640 480 492.7567" in camera
 
 
-def test_cameras_alone_that_are_not_wanted(
+def test_poses_none_is_refused_by_the_poses_command(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     room = ROOT / "examples/room/room.mp4"
@@ -886,7 +884,7 @@ def test_eval_of_no_output_folder(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert_one_clear_line(capsys, r"tracks\.txt")
 
 
-def test_objects_of_no_folder_leaves_nothing_behind(
+def test_objects_of_a_missing_folder_creates_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli("objects", tmp_path / "nowhere") == 2
@@ -894,7 +892,7 @@ def test_objects_of_no_folder_leaves_nothing_behind(
     assert not (tmp_path / "nowhere").exists()
 
 
-def test_damaged_cache_is_said(
+def test_a_damaged_cache_is_reported(
     clip: Path, detections: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli("track", clip, "-o", tmp_path / "out", "--detections", detections, *QUICK) == 0
@@ -907,7 +905,7 @@ def test_damaged_cache_is_said(
 def test_a_damaged_cache_is_computed_again(
     clip: Path, detections: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Cut, or whole but with another content: one line, and the same result."""
+    """Truncated, or valid with other content: one line, and the same result."""
     out = tmp_path / "out"
     args = ("track", clip, "-o", out, "--detections", detections, "--embed", "none")
     assert cli(*args) == 0
@@ -1005,7 +1003,7 @@ def test_damaged_poses_are_computed_again(
 
 
 def test_a_closed_pipe_is_no_error(clip: Path, detections: Path, tmp_path: Path) -> None:
-    """`reobj_track.py objects OUT | head -1`: the rest of the table is not wanted."""
+    """`reobj_track.py objects OUT | head -1`: the rest of the table is discarded."""
     assert cli("track", clip, "-o", tmp_path / "out", "--detections", detections, *QUICK) == 0
     code = (
         "import os, sys, reobj_track as rt; r, w = os.pipe(); os.dup2(w, 1); os.close(w); "
@@ -1052,8 +1050,8 @@ def test_bad_options_of_the_fit(
     assert_one_clear_line(capsys, message)
 
 
-def test_stale_3d_files_go_when_the_options_change(tmp_path: Path) -> None:
-    """A second run in 2D leaves no cameras or ellipsoids of the first beside its own results."""
+def test_stale_3d_files_are_deleted_when_the_options_change(tmp_path: Path) -> None:
+    """A second run in 2D keeps no cameras or ellipsoids of the first."""
     args = posed_run(tmp_path, "right")
     made = ("poses.txt", "objects.ply", "sparse")
     assert cli(*args) == 0 and all((tmp_path / "out" / name).exists() for name in made)
@@ -1068,7 +1066,7 @@ URL = "rtsp://me:w0rd@127.0.0.1:9/cam?pwd=w0rd"
     "words",
     [
         ["run", URL, "-o", "out", "--offline"],
-        ["run", "a.mp4", "-o", "out", URL],  # argparse repeats what it does not know
+        ["run", "a.mp4", "-o", "out", URL],  # argparse quotes unknown arguments
         ["run", "a.mp4", "-o", "out", f"--{URL}"],
         [URL],
         ["run", "a.mp4", "-o", "out", "--every", URL],
@@ -1100,7 +1098,7 @@ def test_passwords_reach_no_message(
 def test_passwords_reach_no_log_line_and_no_traceback(
     capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also where the fault is ours, which ends with exit code 1."""
+    """Also for internal errors, which end with exit code 1."""
 
     def fails(*_: object, **__: object) -> None:
         rt.log.warning("opening %s", URL)

@@ -1,4 +1,4 @@
-"""Samples of a feature map for foreground and background, against masks and maps that are known."""
+"""Samples of a feature map for foreground and background, on known masks and maps."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_masks_of_all_objects_are_no_background() -> None:
 
 
 @pytest.mark.parametrize(("score", "hides"), [(0.29, False), (0.3, True)])
-def test_only_confident_objects_hide_the_background_of_others(score: float, hides: bool) -> None:
+def test_only_confident_objects_mask_the_background_of_others(score: float, hides: bool) -> None:
     masks = np.zeros((2, 200, 400), bool)
     masks[0, 50:150, 100:200] = masks[1, :, 200:] = True
     found = rt.Detections(
@@ -84,11 +84,11 @@ def test_only_confident_objects_hide_the_background_of_others(score: float, hide
     right = back.index[0] % 100 >= 50
     assert back.weight[0][right].any() is np.bool_(not hides)
     assert bool(back.others[0][:, 3].any()) is hides
-    strict = samples(found, rt.SamplingLayout(object_score=0.95))[1]  # the own outline goes too
+    strict = samples(found, rt.SamplingLayout(object_score=0.95))[1]  # own outline removed too
     assert strict.weight[0][strict.index[0] % 100 >= 50].all()
 
 
-def test_a_mask_without_any_pixel_is_no_mask() -> None:
+def test_an_empty_mask_is_no_mask() -> None:
     masks = np.zeros((2, 200, 400), bool)
     masks[1, :40, :40] = True
     xyxy = ((100, 50, 200, 150), (0, 0, 50, 50))
@@ -118,7 +118,7 @@ def test_points_inside_an_object() -> None:
     assert inside_object(masked, rows, at, centre, half).tolist() == [False, True]
 
 
-def test_the_margin_has_a_least_size() -> None:
+def test_the_margin_has_a_minimum_size() -> None:
     """A tenth of the longer side of the image, 40 px on every side of a box of 10."""
     layout = rt.SamplingLayout(context=0.5, min_margin=0.1, samples=4)
     _, near = samples(boxes((100, 100, 110, 110)))
@@ -126,7 +126,7 @@ def test_the_margin_has_a_least_size() -> None:
     assert np.ptp(near.index % 100) * 4 <= 20 and 76 <= np.ptp(far.index % 100) * 4 <= 92
 
 
-def test_the_wider_box_holds_other_objects_but_not_the_own() -> None:
+def test_the_wider_box_contains_other_objects_but_not_its_own() -> None:
     masks = np.zeros((2, 200, 400), bool)
     masks[0, 80:120, 180:220] = masks[1, :, 240:] = True
     found = boxes((180, 80, 220, 120), (240, 0, 400, 200), masks=masks)
@@ -142,8 +142,8 @@ def test_the_wider_box_holds_other_objects_but_not_the_own() -> None:
     np.testing.assert_allclose(wide.others[0][:, 4], 1.0)
 
 
-def test_cells_are_means_of_the_samples_that_count() -> None:
-    """On a map that holds its own columns and rows; the foreground reads only the first channel."""
+def test_cells_are_means_of_the_valid_samples() -> None:
+    """On a map of column and row indices; the foreground uses only the first channel."""
     layout = rt.SamplingLayout(
         context=0.5, samples=4, surround_scale=1.0, surround_cells=5, foreground_channels=1
     )
@@ -160,7 +160,7 @@ def test_cells_are_means_of_the_samples_that_count() -> None:
     assert back[1, 20, 2] == both.weight[4 + 41 + 20].mean()
 
 
-def test_cells_where_no_sample_counts_are_zero() -> None:
+def test_cells_without_valid_samples_are_zero() -> None:
     found = boxes((900, 900, 950, 950))
     rows = [np.array([0])] * 2
     both = sample_parts(found, rows, (200, 400), np.zeros((50, 100), bool), LAYOUT)
@@ -169,7 +169,7 @@ def test_cells_where_no_sample_counts_are_zero() -> None:
 
 
 @pytest.mark.parametrize("box", [(-50, -50, 20, 20), (395, 190, 600, 400), (900, 900, 950, 950)])
-def test_samples_out_of_the_image_do_not_count(box: tuple[float, ...]) -> None:
+def test_samples_outside_the_image_are_ignored(box: tuple[float, ...]) -> None:
     for part in samples(boxes(box)):
         assert part.index.min() >= 0 and part.index.max() < 5000
         assert part.share.max() <= 1
@@ -179,7 +179,7 @@ def test_samples_out_of_the_image_do_not_count(box: tuple[float, ...]) -> None:
     assert box[0] != 900 or not (fore.weight.any() or back.weight.any())
 
 
-def test_layouts_of_older_models_are_understood() -> None:
+def test_layouts_of_older_models_are_read() -> None:
     old = {"size_px": 320, "reach": 0.05, "wide": 1.5, "wide_reach": 0.1, "wide_cells": 3}
     layout = rt.SamplingLayout(neighbours=0.1).updated({"layout": old})
     assert layout == rt.SamplingLayout(

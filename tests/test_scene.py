@@ -1,7 +1,6 @@
-"""The scene page in a real browser, and its bytes: what it holds, how large it is, that it is
-safe.
+"""The 3D viewer in a real browser, and its file: content, size and escaping.
 
-The browser is driven through Chromium's own protocol over two pipes, so no package is needed.
+The browser is controlled by Chromium's DevTools protocol over two pipes, without a package.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ class Browser:
         os.close(theirs_out)
         self.rest, self.number, self.session = b"", 0, ""
         self.errors: list[str] = []
-        self.asked = 0  # times that the page asked before it was left
+        self.asked = 0  # number of unload dialogs of the page
         target = self.send("Target.createTarget", url="about:blank")["targetId"]
         attach = {"targetId": target, "flatten": True}
         self.session = self.send("Target.attachToTarget", **attach)["sessionId"]
@@ -80,7 +79,7 @@ class Browser:
                 return dict(answer["result"])
 
     def receive(self, seconds: float = 60) -> dict[str, Any]:
-        """The next message; what the page complains about, or asks the network for, is kept."""
+        """Read the next message; errors and network requests of the page are recorded."""
         while b"\0" not in self.rest:
             assert select.select([self.inp], [], [], seconds)[0], "the browser does not answer"
             chunk = os.read(self.inp, 1 << 20)
@@ -154,8 +153,8 @@ class Browser:
         self.settle()
 
     def touch(self, kind: str, *points: tuple[float, float]) -> None:
-        places = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(points)]
-        self.send("Input.dispatchTouchEvent", type=kind, touchPoints=places)
+        touches = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(points)]
+        self.send("Input.dispatchTouchEvent", type=kind, touchPoints=touches)
         self.settle()
 
     def picture(self, path: Path) -> None:
@@ -258,7 +257,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Facts:
-    """Stands in for a video where only its facts are asked for."""
+    """Replaces a video of which only the metadata are used."""
 
     config, fps, scale, source, is_live = rt.InputConfig(), 30.0, 1.0, "a.mp4", False
     size = (WIDTH, HEIGHT)
@@ -271,12 +270,12 @@ SCREENSHOTS = Path(__file__).resolve().parent.parent / "build/screenshots"
 
 
 def complaints(browser: Browser) -> list[str]:
-    """Errors of the page; the driver's remark on screenshots is not the page's."""
+    """Errors of the page, without the driver's message on screenshots."""
     return [e for e in browser.errors if "GPU stall due to ReadPixels" not in e]
 
 
 def center_of(browser: Browser, number: int) -> tuple[float, float]:
-    """Place of an object's centre in the window."""
+    """Position of an object's centre in the window."""
     x, y, left, top = browser.eval(
         f"(r => [...project(solid.find(o => o.id === {number}).at).slice(0, 2), r.left, r.top])"
         "($('view').getBoundingClientRect())"
@@ -315,7 +314,7 @@ def test_rejected_objects_are_listed_with_their_reason(browser: Browser, page: P
     assert "a <b>warning</b>" in browser.eval("$('list').innerText")
 
 
-def test_merges_and_splits_are_told(browser: Browser, page: Path) -> None:
+def test_merges_and_splits_are_listed(browser: Browser, page: Path) -> None:
     browser.open(page)
     data = data_of(page)
     assert data["links"] == [{"kind": "join", "tracklets": [2, 6], "place_iou": 0.12,
@@ -359,8 +358,8 @@ def test_the_slider_plays_the_cameras(browser: Browser, page: Path) -> None:
     assert browser.eval("$('play').textContent") == "▶" and complaints(browser) == []
 
 
-def test_riding_along_sees_what_the_camera_saw(browser: Browser, page: Path) -> None:
-    """The page's projection against K [R | t]."""
+def test_the_followed_camera_has_the_projection_of_the_video(browser: Browser, page: Path) -> None:
+    """The viewer's projection against K [R | t]."""
     browser.open(page)
     poses = poses_of_walk()
     browser.eval("setRide(true); goTo(17)")
@@ -375,8 +374,8 @@ def test_riding_along_sees_what_the_camera_saw(browser: Browser, page: Path) -> 
         np.testing.assert_allclose(found, expected, atol=0.1)
 
 
-def test_wires_are_the_solids(browser: Browser, page: Path) -> None:
-    """The drawn edges, projected, span the box that quadrics projects the solid to."""
+def test_wireframes_have_the_extent_of_the_shapes(browser: Browser, page: Path) -> None:
+    """The drawn edges, projected, span the box of the shape projected by quadrics."""
     browser.open(page)
     browser.eval("setRide(true); goTo(9)")
     browser.settle()
@@ -409,8 +408,8 @@ def test_a_box_has_twelve_edges_along_its_axes(browser: Browser, page: Path) -> 
         np.testing.assert_allclose(radius, 1)
 
 
-def test_riding_along_shows_the_frame_of_the_camera(browser: Browser, page: Path) -> None:
-    """Only frames with a picture and a pose are shown, where the camera's pixels are."""
+def test_following_a_camera_shows_its_frame(browser: Browser, page: Path) -> None:
+    """Only frames with an image and a pose are shown, aligned with the camera's pixels."""
     browser.open(page)
     browser.eval("S.thumbs = S.thumbs.filter(([frame]) => frame % 4 === 0)")
     browser.eval("goTo(10); setRide(true)")
@@ -461,8 +460,8 @@ def test_keys(browser: Browser, page: Path) -> None:
     browser.eval("select(here[0])")
     browser.press("Escape")
     assert browser.eval("state.selected") is None
-    told = browser.eval("[...document.querySelectorAll('#help kbd')].map(k => k.textContent)")
-    assert {"Space", "←", "→", "Esc", "?", "r", "f"} <= set(told)
+    keys = browser.eval("[...document.querySelectorAll('#help kbd')].map(k => k.textContent)")
+    assert {"Space", "←", "→", "Esc", "?", "r", "f"} <= set(keys)
     assert complaints(browser) == []
 
 
@@ -482,8 +481,8 @@ def test_the_followed_camera_stays_in_view(browser: Browser, page: Path) -> None
     assert len(from_behind) == 1  # it turns with the camera
 
 
-def test_first_sight_is_framed_by_points_and_path(browser: Browser, page: Path) -> None:
-    """An object far away moves nothing; what counts is in the view, and fills it."""
+def test_the_initial_view_frames_points_and_trajectory(browser: Browser, page: Path) -> None:
+    """A distant object has no effect; points and trajectory are in the view and fill it."""
     browser.open(page)
     start = browser.eval(VIEW)
     seen = np.array(browser.eval("room.anchors.map(a => project(a).slice(0, 2))"))
@@ -501,7 +500,7 @@ def test_first_sight_is_framed_by_points_and_path(browser: Browser, page: Path) 
     assert bar[0].endswith(" m") and 40 < bar[1] < 200
 
 
-def test_doubtful_objects_hide_behind_a_switch(browser: Browser, page: Path) -> None:
+def test_doubtful_objects_are_shown_on_request(browser: Browser, page: Path) -> None:
     browser.open(page)
     browser.eval("S.objects[2].status = 'doubtful'; replay(); draw()")
     state = "[here[2].row.hidden, here[2].group.visible, $('notes').innerText.split(',')[0]]"
@@ -514,7 +513,7 @@ def test_doubtful_objects_hide_behind_a_switch(browser: Browser, page: Path) -> 
 def test_a_distance_has_the_sigma_of_both_ends_and_of_the_scale(
     browser: Browser, page: Path
 ) -> None:
-    """Against derivatives of the places by differences, and the covariances of the file."""
+    """Against finite differences of the end points, and the covariances of the file."""
     browser.open(page)
     browser.eval("S.parts[0].scale.rel_sigma = .1; enter(0); setMeasure(true)")
     for number in (1, 3):
@@ -523,15 +522,15 @@ def test_a_distance_has_the_sigma_of_both_ends_and_of_the_scale(
     assert [number for _, number in ends] == [1, 3]
     rows = np.array(browser.eval("level.rows"))  # level from world; both in metres here
     height = browser.eval("level.height")
-    places = [(np.array(at) + np.array([0, 0, height])) @ rows for at, _ in ends]
-    along = (places[1] - places[0]) / np.linalg.norm(places[1] - places[0])
-    variance = (0.1 * np.linalg.norm(places[1] - places[0])) ** 2
-    for place, (_, number) in zip(places, ends, strict=True):
+    points = [(np.array(at) + np.array([0, 0, height])) @ rows for at, _ in ends]
+    along = (points[1] - points[0]) / np.linalg.norm(points[1] - points[0])
+    variance = (0.1 * np.linalg.norm(points[1] - points[0])) ** 2
+    for point, (_, number) in zip(points, ends, strict=True):
         obj = data_of(page)["objects"][number - 1]
         turn = Rotation.from_quat(np.array(obj["quat_wxyz"])[[1, 2, 3, 0]])
         half = np.array(obj["half_axes"])
-        local = turn.inv().apply(place - obj["center"]) / half
-        assert np.abs(local).max() == pytest.approx(1, abs=1e-4)  # it lies on the solid
+        local = turn.inv().apply(point - obj["center"]) / half
+        assert np.abs(local).max() == pytest.approx(1, abs=1e-4)  # it lies on the surface
 
         def moved(p: np.ndarray, o: Any = obj, t: Any = turn, h: Any = half, x: Any = local) -> Any:
             return o["center"] + p[:3] + (t * Rotation.from_rotvec(p[6:])).apply(
@@ -542,14 +541,14 @@ def test_a_distance_has_the_sigma_of_both_ends_and_of_the_scale(
         cov = np.frombuffer(base64.b64decode(obj["cov"]), "<f4").reshape(9, 9)
         variance += along @ jacobian @ cov @ jacobian.T @ along
     value, sigma = browser.eval("distanceOf(state.measured)")
-    assert value == pytest.approx(np.linalg.norm(places[1] - places[0]))
+    assert value == pytest.approx(np.linalg.norm(points[1] - points[0]))
     assert sigma == pytest.approx(np.sqrt(variance), rel=1e-3)
     digits = decimals(sigma)
     text = browser.eval("document.querySelector('.measure text').textContent")
     assert text == f"{value:.{digits}f} ± {sigma:.{digits}f} m"
     browser.picture(SCREENSHOTS / "measure.png")
     within = browser.eval("""distanceOf([1, -1].map(s => ({ object: solid[0],
-        at: add(solid[0].at, solid[0].axes[2], s) })))""")  # one solid: where it is does not matter
+        at: add(solid[0].at, solid[0].axes[2], s) })))""")  # one object: independent of position
     size, rel = (data_of(page)["objects"][0][name][2] for name in ("size", "size_rel_sigma"))
     np.testing.assert_allclose(within, [size, size * np.hypot(rel, 0.1)], rtol=0.01)
     browser.press("Escape")
@@ -560,8 +559,8 @@ def test_a_distance_has_the_sigma_of_both_ends_and_of_the_scale(
 def test_points_can_be_measured(browser: Browser, page: Path) -> None:
     browser.open(page)
     browser.eval("setMeasure(true); state.hidden = new Set(here.map(o => o.class)); draw()")
-    place = "cloud.geometry.attributes.position.array"
-    at = [browser.eval(f"project([...{place}.slice({i}, {i} + 3)])") for i in (30, 300)]
+    array = "cloud.geometry.attributes.position.array"
+    at = [browser.eval(f"project([...{array}.slice({i}, {i} + 3)])") for i in (30, 300)]
     for x, y, _ in at:
         browser.eval(f"measureAt({x}, {y})")
     value, sigma = browser.eval("distanceOf(state.measured)")
@@ -572,7 +571,7 @@ def test_points_can_be_measured(browser: Browser, page: Path) -> None:
 
 
 @pytest.mark.parametrize("sigma", [0.2, 0.1, 0.046, 0.0099, 0.01, 3.0, 30.0, 0.0, float("inf")])
-def test_decimals_are_the_same_in_both_languages(
+def test_decimals_are_the_same_in_python_and_javascript(
     browser: Browser, page: Path, sigma: float
 ) -> None:
     if not browser.eval("typeof decimals === 'function'"):
@@ -581,7 +580,7 @@ def test_decimals_are_the_same_in_both_languages(
     assert browser.eval(f"decimals({said})") == decimals(sigma)
 
 
-def test_the_list_says_names_and_sizes_and_can_be_searched(browser: Browser, page: Path) -> None:
+def test_the_list_has_names_and_sizes_and_a_search(browser: Browser, page: Path) -> None:
     browser.open(page)
     objects = data_of(page)["objects"]
     sides = " \u00d7 ".join(side for side, _ in objects[0]["sides"])
@@ -602,7 +601,7 @@ def test_the_list_says_names_and_sizes_and_can_be_searched(browser: Browser, pag
     assert "seen in frames 0" in browser.eval("$('legend').innerText")
 
 
-def test_a_chosen_object_keeps_its_colour(browser: Browser, page: Path) -> None:
+def test_a_selected_object_keeps_its_colour(browser: Browser, page: Path) -> None:
     browser.open(page)
     ink = "[solid[0].group.parts.wire.material.color.getHex(), solid[0].group.parts.halo.visible]"
     before = browser.eval(f"draw(); {ink}")
@@ -625,10 +624,10 @@ def test_light_and_dark_follow_the_system(browser: Browser, page: Path) -> None:
     assert paper["dark"][1] != paper["light"][1] and complaints(browser) == []
 
 
-def test_corrections_made_in_the_page_are_applied(
+def test_corrections_made_in_the_viewer_are_applied(
     browser: Browser, parted_folder: Path, tmp_path: Path
 ) -> None:
-    """Merge, split, rename, delete, undo; the file that is saved makes the same of the objects."""
+    """Merge, split, rename, delete, undo; the saved file gives the same objects in Python."""
     out = shutil.copytree(parted_folder, tmp_path / "out")
     browser.open(out / "scene.html")
     browser.eval("select(here[0])")
@@ -667,9 +666,9 @@ def test_corrections_made_in_the_page_are_applied(
         "rename", "delete", "split"
     ]  # fmt: skip
     assert complaints(browser) == []
-    browser.click(700, 780)  # else the browser does not ask
+    browser.click(700, 780)  # else the browser shows no dialog
     before = browser.asked
-    browser.open(out / "scene.html")  # unsaved corrections: the browser asks
+    browser.open(out / "scene.html")  # unsaved corrections: the browser shows a dialog
     assert browser.asked == before + 1
 
 
@@ -704,7 +703,7 @@ def test_mouse_turns_zooms_and_pans(browser: Browser, page: Path) -> None:
     assert browser.eval(VIEW)[3:] != zoomed[3:] and browser.eval("state.selected") is None
 
 
-def test_fingers_and_a_phone_screen(browser: Browser, page: Path) -> None:
+def test_touch_gestures_on_a_phone_screen(browser: Browser, page: Path) -> None:
     browser.open(page, 390, 844, phone=True)
     start = browser.eval(VIEW)
     browser.touch("touchStart", (200, 200))
@@ -725,7 +724,7 @@ def test_fingers_and_a_phone_screen(browser: Browser, page: Path) -> None:
     assert complaints(browser) == []
 
 
-def test_parts_are_chosen_and_everything_follows(browser: Browser, parted_folder: Path) -> None:
+def test_selecting_a_component_updates_everything(browser: Browser, parted_folder: Path) -> None:
     browser.open(parted_folder / "scene.html")
     rows = "[...document.querySelectorAll('.row b')].map(b => +b.textContent.split(' ').at(-1))"
     shown = (
@@ -759,10 +758,10 @@ def test_parts_are_chosen_and_everything_follows(browser: Browser, parted_folder
     assert browser.eval("S.steps.part[state.step]") == 1
     browser.eval("$('slider').value = 23; $('slider').oninput()")
     assert browser.eval("[state.step, $('clock').textContent]") == [63, "frame 63"]
-    browser.eval("$('play').click()")  # from the end of the part to its first frame
+    browser.eval("$('play').click()")  # from the end of the component to its first frame
     moved = "new Promise(f => setInterval(() => state.step !== 63 && f(state.step), 20))"
     assert 40 <= browser.eval(moved) < 60
-    browser.eval("$('play').click(); goTo(3)")  # of the other part
+    browser.eval("$('play').click(); goTo(3)")  # of the other component
     assert browser.eval(f"[+$('part').value, +$('slider').value, {rows}]") == [0, 3, [1, 2, 3]]
     for phone in (False, True):
         size = {"width": 390, "height": 780} if phone else {"width": 1280, "height": 800}
@@ -774,13 +773,13 @@ def test_parts_are_chosen_and_everything_follows(browser: Browser, parted_folder
     assert complaints(browser) == []
 
 
-def test_one_part_has_no_selector(browser: Browser, page: Path) -> None:
+def test_a_single_component_has_no_selector(browser: Browser, page: Path) -> None:
     browser.open(page)
     assert browser.eval("[$('part').hidden, $('part').offsetWidth]") == [True, 0]
 
 
-def test_identities_only_still_open(browser: Browser, tmp_path: Path) -> None:
-    """No cameras: pictures and a timeline, and the reason."""
+def test_a_2d_result_opens(browser: Browser, tmp_path: Path) -> None:
+    """No cameras: images and a timeline, and the reason."""
     browser.open(write_page(tmp_path / "flat", in_3d=False))
     assert "No 3D view: no camera poses" in browser.eval("$('why').innerText")
     browser.eval("here[1].row.click(); goTo(3)")
@@ -791,7 +790,7 @@ def test_identities_only_still_open(browser: Browser, tmp_path: Path) -> None:
     assert set(browser.eval(rows)) == {"tracked"}
     assert "tracked" in browser.eval("$('panel').innerText")
     colors = "[here[0].row, $('list')].map((e) => getComputedStyle(e).color)"
-    assert len(set(browser.eval(colors))) == 1  # not dimmed: there is nothing to set it apart from
+    assert len(set(browser.eval(colors))) == 1  # not dimmed: there is no other object
     browser.picture(SCREENSHOTS / "flat.png")
     assert complaints(browser) == []
 
@@ -809,11 +808,11 @@ def test_without_webgl_the_list_remains(browser: Browser, page: Path) -> None:
 # ---- Without a browser ----
 
 
-def test_same_input_same_page(page: Path, tmp_path: Path) -> None:
+def test_same_input_gives_the_same_page(page: Path, tmp_path: Path) -> None:
     assert write_page(tmp_path / "again").read_bytes() == page.read_bytes()
 
 
-def test_no_name_can_leave_the_data(page: Path) -> None:
+def test_names_are_escaped_in_the_data(page: Path) -> None:
     text = page.read_text()
     assert EVIL not in text and text.count("</script>") == 3 and text.count("<script") == 3
     assert data_of(page)["objects"][1]["class"] == EVIL
@@ -821,7 +820,7 @@ def test_no_name_can_leave_the_data(page: Path) -> None:
     assert hosts == {"www.w3.org"} and "default-src 'none'" in text  # names of XML
 
 
-def test_the_page_carries_the_licence_of_three() -> None:
+def test_the_page_contains_the_licence_of_three() -> None:
     """Its text goes with the code; without data the page leaves room for 3 MB of them."""
     text, folder = page_text(), Path(scene.__file__).with_name("page")
     licence = (folder / "three.LICENSE.txt").read_text().strip()
@@ -834,7 +833,7 @@ def test_the_page_carries_the_licence_of_three() -> None:
         re.findall(r"{(.*?)}", (folder / "three.entry.js").read_text(), re.S))))  # fmt: skip
 
 
-def test_the_page_holds_the_scene(page: Path) -> None:
+def test_the_page_contains_the_scene(page: Path) -> None:
     data, poses = data_of(page), poses_of_walk()
     found = np.frombuffer(base64.b64decode(data["poses"]), "<f4").reshape(-1, 3, 4)
     np.testing.assert_allclose(found, invert_rigid(poses.cam_from_world), atol=1e-6)
@@ -864,15 +863,15 @@ def test_the_data_are_strict_json(page: Path) -> None:
 
     text = page.read_text().split('id="data">')[1].split("</script>")[0]
     json.loads(text, parse_constant=refuse)
-    assert "<" not in text  # no name can end the script
+    assert "<" not in text  # names cannot end the script
 
 
-def test_scene_can_be_switched_off(tmp_path: Path) -> None:
+def test_the_viewer_can_be_disabled(tmp_path: Path) -> None:
     assert not write_page(tmp_path / "off", scene=False).exists()
 
 
 def test_three_minutes_stay_below_ten_megabytes(tmp_path: Path) -> None:
-    """5,400 frames, 50 objects, 100,000 points, and pictures that do not compress at all."""
+    """5,400 frames, 50 objects, 100,000 points, and incompressible images."""
     frames, objects = 5400, 50
     rng = np.random.default_rng(0)
     at = poses_of_walk()
@@ -901,8 +900,8 @@ def test_three_minutes_stay_below_ten_megabytes(tmp_path: Path) -> None:
     assert 2e6 < (tmp_path / "scene.html").stat().st_size < 10e6
 
 
-def test_pictures_show_the_object(tmp_path: Path) -> None:
-    """Crops and frames of a video that is read at half its size: the green box is in place."""
+def test_crops_show_the_object(tmp_path: Path) -> None:
+    """Crops and frames of a video that is read at half its size: the green box is centred."""
     image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     image[60:120, 200:280] = (0, 255, 0)
     cv2.imwrite(str(tmp_path / "0.png"), image)
@@ -922,8 +921,8 @@ def test_pictures_show_the_object(tmp_path: Path) -> None:
     assert whole.shape[:2] == (HEIGHT // 2, WIDTH // 2) and whole[45, 120, 1] > 200
 
 
-def test_pictures_show_different_views() -> None:
-    """The views chosen of an object are spread over time and directions, not neighbours."""
+def test_crops_show_different_views() -> None:
+    """The selected views of an object are spread over time and directions."""
     poses = poses_of_walk()
     tracks = tracks_of_walk(poses)
     found = rt.Object(3, "suitcase", 1.0, "ok", "", center=np.array(CENTERS[2]))
@@ -932,8 +931,8 @@ def test_pictures_show_different_views() -> None:
     assert set(tracks.track_id[diverse_rows(tracks, found, None, 30)]) == {3}
 
 
-def test_views_from_other_sides_are_shown() -> None:
-    """The camera stands still for 21 frames, then it looks from three other sides, a frame each."""
+def test_views_from_other_directions_are_shown() -> None:
+    """The camera is static for 21 frames, then has three other viewpoints, one frame each."""
     poses = poses_of_walk()
     tracks = tracks_of_walk(poses)
     found = rt.Object(3, "suitcase", 1.0, "ok", "", center=np.array(CENTERS[2]))
@@ -947,7 +946,7 @@ def test_views_from_other_sides_are_shown() -> None:
     assert late[0] >= 2 and late[1] == 1  # by time alone: the last one
 
 
-def test_views_are_those_of_the_cameras_of_the_part(parted: rt.Result) -> None:
+def test_views_come_from_the_cameras_of_the_component(parted: rt.Result) -> None:
     wanted = set(Pictures(parted, VIDEO).wanted.tolist())
     for o in parted.objects:
         chosen = [
@@ -957,8 +956,8 @@ def test_views_are_those_of_the_cameras_of_the_part(parted: rt.Result) -> None:
         assert chosen[0] != chosen[1] and wanted >= set(chosen[0])
 
 
-def test_frames_are_shrunk_and_clean(tmp_path: Path) -> None:
-    """A frame of 960 px is shown with 640; its boxes are data, in pixels of the video."""
+def test_frames_are_downscaled_without_boxes(tmp_path: Path) -> None:
+    """A frame of 960 px is shown with 640; boxes are stored in pixels of the video."""
     cv2.imwrite(str(tmp_path / "0.png"), np.zeros((720, 960, 3), np.uint8))
     zero, one = np.zeros(1, np.int64), np.ones(1, np.int64)
     box = np.array([[300.0, 300, 600, 600]])
@@ -975,8 +974,8 @@ def test_frames_are_shrunk_and_clean(tmp_path: Path) -> None:
     assert (frame, boxes) == (0, [[1, 300, 300, 600, 600]])
 
 
-def test_frames_behind_the_solids_have_no_distortion(tmp_path: Path) -> None:
-    """A line that a lens bends is straight again, where the pinhole of the page projects it."""
+def test_background_frames_are_undistorted(tmp_path: Path) -> None:
+    """A distorted line is straight again, at the projection of the viewer's pinhole camera."""
     lens = rt.Camera("SIMPLE_RADIAL", WIDTH, HEIGHT, (250.0, WIDTH / 2, HEIGHT / 2, -0.15))
     y = np.linspace(20, HEIGHT - 20, 400)
     line = np.column_stack([np.full(400, 60.0), y])  # of the pinhole
@@ -998,7 +997,7 @@ def test_frames_behind_the_solids_have_no_distortion(tmp_path: Path) -> None:
     np.testing.assert_allclose(found, 60, atol=0.7)
 
 
-def test_the_best_picture_comes_first() -> None:
+def test_the_best_crop_comes_first() -> None:
     tracks = tracks_of_walk(poses_of_walk())
     own = np.flatnonzero(tracks.track_id == 3)
     tracks.xyxy[own[7]] = [0, 0, 300, 200]  # the largest box
@@ -1008,7 +1007,7 @@ def test_the_best_picture_comes_first() -> None:
     assert diverse_rows(weak, found, None, 3)[0] != own[7]
 
 
-def test_doubtful_objects_take_no_pictures_from_others() -> None:
+def test_doubtful_objects_take_no_crops_from_others() -> None:
     result = fitted(tracks_of_walk(poses_of_walk()), None, names=NAMES)
     result.objects[:2] = [dataclasses.replace(o, status="doubtful") for o in result.objects[:2]]
     pictures = Pictures(result, VIDEO, max_crops=18)
@@ -1016,8 +1015,8 @@ def test_doubtful_objects_take_no_pictures_from_others() -> None:
     assert np.bincount(of, minlength=5).tolist() == [0, 1, 1, 8, 8]
 
 
-def test_pictures_are_cut_of_wanted_frames_only() -> None:
-    """Each picture has the number of the frame that it was cut from, and is there once."""
+def test_crops_come_from_requested_frames_only() -> None:
+    """Each crop has the number of its frame and is stored once."""
     tracks = tracks_of_walk(poses_of_walk())
     pictures = Pictures(fitted(tracks, None, names=NAMES), VIDEO)
     rows = pictures.wanted
@@ -1031,8 +1030,8 @@ def test_pictures_are_cut_of_wanted_frames_only() -> None:
     assert [f for f, _ in pictures.frames] == list(range(FRAMES))
 
 
-def test_up_is_guessed_from_level_cameras(tmp_path: Path) -> None:
-    """Without objects or poses that tell: the cameras of the walk are level, z is up."""
+def test_up_is_estimated_from_level_cameras(tmp_path: Path) -> None:
+    """Without objects or poses that define up: the cameras of the walk are level, z is up."""
     poses = dataclasses.replace(poses_of_walk(), up_in_world=None)
     result = rt.Result(tracks_of_walk(poses), NAMES, VideoInfo("a", WIDTH, HEIGHT, 25.0))
     result = dataclasses.replace(result, poses=poses, world=rt.World("m", "user", 23, 0, 24))
@@ -1042,7 +1041,7 @@ def test_up_is_guessed_from_level_cameras(tmp_path: Path) -> None:
     assert part["facts"].endswith("units: m · up is guessed from the cameras")
 
 
-def test_long_videos_are_thinned(tmp_path: Path) -> None:
+def test_long_videos_are_subsampled(tmp_path: Path) -> None:
     """4,000 frames: the slider has every third one, and plays as long as the video."""
     poses = walk(4000)
     tracks = tracks_of(poses, 0.0)
@@ -1059,7 +1058,7 @@ def test_long_videos_are_thinned(tmp_path: Path) -> None:
 
 
 class Source:
-    """A video that counts how often its frames are read, and can be interrupted."""
+    """A video that counts the reads of its frames, and can be interrupted."""
 
     has_images = True
 
@@ -1079,8 +1078,8 @@ class Source:
             yield frame
 
 
-def test_one_pass_writes_both_and_leaves_nothing_half(tmp_path: Path) -> None:
-    """Interrupted in the middle: no film, no page. Else each frame is read once for both."""
+def test_one_pass_writes_overlay_and_viewer_atomically(tmp_path: Path) -> None:
+    """If interrupted, neither exists. Otherwise each frame is read once for both."""
     write_page(tmp_path / "a", scene=False)
     out, source = tmp_path / "a/out", Source(rt.Video(tmp_path / "a/frames"))
     result = fitted(tracks_of_walk(poses_of_walk()), None, names=NAMES)

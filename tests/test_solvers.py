@@ -1,4 +1,4 @@
-"""The published solvers on what an output folder holds: right ellipsoids, the same files."""
+"""The published solvers on an output folder: right ellipsoids, the same files."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def truth(mirror: int = 1) -> quadrics.Ellipsoids:
 
 
 def recorded(shift: float = 0.0, mirror: int = 1) -> rt.Result:
-    """Exact boxes of them, from a camera 14 m away that goes round and up and down.
+    """Exact boxes of them, from a camera 14 m away that moves around, up and down.
 
     (shift: of one edge, px; mirror: -1 for the mirror image of all.)
     """
@@ -51,10 +51,10 @@ def solved(result: rt.Result, **options: object) -> rt.Result:
 
 
 @pytest.mark.parametrize(
-    ("solver", "overlap"),  # mean O3D: a box does not tell how its ellipse is turned
+    ("solver", "overlap"),  # mean O3D: boxes leave the rotation of the ellipse free
     [("lfd", 0.8), ("psfmo", 0.75), ("sfmo", 0.6)],
 )
-@pytest.mark.parametrize("mirror", [1, -1])  # affine views do not tell which
+@pytest.mark.parametrize("mirror", [1, -1])  # affine views are ambiguous
 def test_each_solver_finds_the_ellipsoids(solver: str, overlap: float, mirror: int) -> None:
     result = solved(recorded(mirror=mirror), solver=solver)
     assert [o.status for o in result.objects] == ["ok"] * 6
@@ -65,8 +65,8 @@ def test_each_solver_finds_the_ellipsoids(solver: str, overlap: float, mirror: i
         assert 1 - 2 * (x * x + y * y) > 0.7
 
 
-def test_what_a_solver_does_not_know_is_null() -> None:
-    """No covariance; the shape of SfMO has no metres; and a warning says it."""
+def test_values_that_a_solver_does_not_estimate_are_null() -> None:
+    """No covariance; the size of SfMO is not metric, with a warning."""
     ours = solved(recorded(), solver="solids")
     assert ours.warnings == [] and ours.fits is not None
     for solver, metres in (("lfd", True), ("psfmo", True), ("sfmo", False)):
@@ -82,14 +82,14 @@ def test_what_a_solver_does_not_know_is_null() -> None:
 
 
 def test_the_solvers_differ() -> None:
-    """Of boxes that are too wide on one side, each makes something else."""
+    """Boxes that are too wide on one side give different results."""
     sizes = [solved(recorded(shift=15), solver=s).ellipsoids().half_axes
              for s in ("solids", "lfd", "psfmo", "sfmo")]  # fmt: skip
     for i, a in enumerate(sizes):
         assert all(np.abs(a - b).max() > 1e-3 for b in sizes[:i])
 
 
-def test_sfmo_of_three_objects_says_what_it_needs() -> None:
+def test_sfmo_of_three_objects_reports_its_requirement() -> None:
     result = recorded()
     result = dataclasses.replace(result, tracks=result.tracks[result.tracks.track_id <= 3])
     result = solved(result, solver="sfmo")
@@ -100,7 +100,7 @@ def test_sfmo_of_three_objects_says_what_it_needs() -> None:
     assert all(o.center is None for o in result.objects)
 
 
-def test_no_such_solver(room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unknown_solver(room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     shutil.copytree(room, out)
     before = (out / "objects.json").read_bytes()

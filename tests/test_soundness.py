@@ -1,4 +1,4 @@
-"""What makes a model sound: the covariance of its cameras, and two mappers that agree."""
+"""Soundness of a model: covariance of its cameras, and agreement of two mappers."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def noisy(scene, noise_px, seed):
     return model
 
 
-def test_the_sigma_of_centres_is_what_repeated_noise_shows():
-    """80 adjustments with fresh noise, each brought to the truth by a similarity."""
+def test_the_sigma_of_centres_equals_that_of_repeated_noise():
+    """80 adjustments with new noise, each aligned to the truth by a similarity."""
     scene, truth = Scene(count=6, points=150), None
     off, estimated = [], []
     for seed in range(80):
@@ -47,19 +47,19 @@ def test_the_sigma_of_centres_is_what_repeated_noise_shows():
     assert np.median(estimated) == pytest.approx(shown, rel=0.3)
 
 
-def test_less_parallax_and_a_free_focal_length_are_less_sure():
+def test_less_parallax_and_a_free_focal_length_increase_the_sigma():
     far, near = Scene(count=6, points=150), Scene(count=6, points=150)
     rotation = far.truth[:, :, :3]
     centre = -np.einsum("nji,nj->ni", rotation, far.truth[:, :, 3])
     near.poses = near.truth = np.concatenate([rotation, -rotation @ (0.2 * centre)[:, :, None]], 2)
     near.xy = np.array([near.project(pose)[0] for pose in near.truth])
     near.seen = far.seen & np.array([near.project(pose)[1] for pose in near.truth])
-    sure, unsure = (relative_sigmas(read_arrays(noisy(s, 0.5, 0)), False)[0] for s in (far, near))
-    assert unsure > 3 * sure
-    assert relative_sigmas(read_arrays(noisy(near, 0.5, 0)), True)[0] > unsure
+    small, large = (relative_sigmas(read_arrays(noisy(s, 0.5, 0)), False)[0] for s in (far, near))
+    assert large > 3 * small
+    assert relative_sigmas(read_arrays(noisy(near, 0.5, 0)), True)[0] > large
 
 
-def test_what_nothing_determines_is_infinite():
+def test_undetermined_sigmas_are_infinite():
     scene = Scene(count=6, points=150)
     scene.seen[:, 2:] = False  # two points
     assert relative_sigmas(read_arrays(scene.model()), False)[0] == np.inf
@@ -67,8 +67,8 @@ def test_what_nothing_determines_is_infinite():
 
 
 @pytest.mark.parametrize("turns", [True, False])
-def test_a_focal_length_is_taken_if_the_views_determine_it(turns):
-    """Of a walk with a shake of the hand; a dolly's depths may be stretched with any."""
+def test_a_focal_length_is_accepted_if_determined_by_the_views(turns):
+    """It is for a walk with camera shake; a dolly fits any focal length by scaling the depths."""
     scene = Scene(count=8, points=400)
     if not turns:
         centre = -np.einsum("nji,nj->ni", scene.truth[:, :, :3], scene.truth[:, :, 3])
@@ -88,7 +88,7 @@ def test_a_focal_length_is_taken_if_the_views_determine_it(turns):
 
 @pytest.mark.parametrize("focal, good", [(505.0, True), (430.0, False)])
 def test_a_focal_length_that_depends_on_the_principal_point_is_refused(monkeypatch, focal, good):
-    """The principal point drifts off when it is freed: in a wrong minimum to make up for one."""
+    """The principal point drifts when it is freed: it compensates a wrong focal length."""
     model, freed = noisy(Scene(count=16, points=400), 0.3, 0), []
 
     def set_intrinsics(model, calibrate, free_centre):
@@ -104,8 +104,8 @@ def test_a_focal_length_that_depends_on_the_principal_point_is_refused(monkeypat
     assert freed == [(True, True), (True, False), (False, False)][: 2 + (not good)]
 
 
-def test_two_cameras_at_one_position_break_no_model():
-    """Their distance, which is noise alone, does not fix the scale."""
+def test_coincident_cameras_do_not_fix_the_scale():
+    """Their distance is noise only, so it must not be the gauge."""
     scene = Scene(count=8, points=400)
     rotation = scene.truth[:, :, :3]
     centre = -np.einsum("nji,nj->ni", rotation, scene.truth[:, :, 3])
@@ -124,7 +124,7 @@ def test_two_cameras_at_one_position_break_no_model():
 
 
 def test_points_at_a_camera_centre_have_no_weight():
-    """Chance matches are triangulated there; their derivatives would be infinite."""
+    """Accidental matches are triangulated there; their derivatives would be infinite."""
     scene = Scene(count=6, points=300)
     sigma, _ = relative_sigmas(read_arrays(noisy(scene, 0.5, 0)), True)
     model = noisy(scene, 0.5, 0)
@@ -155,7 +155,7 @@ def moved(step_m=0.0, turn_deg=0.0, count=12):
 
 
 @pytest.mark.parametrize(
-    "other, sure",
+    "other, sound",
     [
         (dict(), True),
         (dict(step_m=0.08), True),  # 3 % of the path
@@ -165,11 +165,11 @@ def moved(step_m=0.0, turn_deg=0.0, count=12):
         (dict(count=7), False),  # half of the images
     ],
 )
-def test_weak_geometry_needs_the_same_from_another_mapper(other, sure):
+def test_weak_geometry_needs_agreement_of_another_mapper(other, sound):
     weak = component(Scene().model(), 0.002)
     second = component(moved(**other), 0.002)
     (found,) = confirmed([weak], [second], FocalSource.MATCHES)
-    assert (not found.problem) == sure and ("parallax" in found.problem) != sure
+    assert (not found.problem) == sound and ("parallax" in found.problem) != sound
 
 
 def piece(first, last):
@@ -180,9 +180,9 @@ def piece(first, last):
 
 
 @pytest.mark.parametrize(
-    "ends, count, sure",
+    "ends, count, sound",
     [
-        ([(1, 7), (7, 13)], None, True),  # two pieces, by all that both sides see
+        ([(1, 7), (7, 13)], None, True),  # two pieces, by all common points
         ([(7, 13), (1, 4), (4, 7)], None, True),  # in any order
         ([(1, 7), (7, 13)], MIN_JOINT, True),
         ([(1, 7), (7, 13)], MIN_JOINT - 1, False),
@@ -191,9 +191,9 @@ def piece(first, last):
         ([(1, 9), (9, 11)], None, False),  # the scale of a pair is arbitrary
     ],
 )
-def test_pieces_of_another_mapper_count_where_points_prove_how_they_are_joined(ends, count, sure):
+def test_pieces_of_another_mapper_count_if_points_connect_them(ends, count, sound):
     scene = Scene()
-    if count is not None:  # other points that both sides see are two
+    if count is not None:  # other common points are split into two
         arrays, seen = read_arrays(scene.model()), scene.seen
         joint = arrays.triangulated_by(np.arange(6)) & arrays.triangulated_by(np.arange(6, 12))
         ids = np.flatnonzero(seen.sum(0) >= 2)[joint]  # as the model has them
@@ -201,12 +201,12 @@ def test_pieces_of_another_mapper_count_where_points_prove_how_they_are_joined(e
         scene.untie(6, int(np.flatnonzero(both == ids[count])[0]))
     weak = component(scene.model(), 0.002)
     (found,) = confirmed([weak], [piece(*end) for end in ends], FocalSource.MATCHES)
-    assert (not found.problem) == sure
-    if sure:  # only what both have stays
+    assert (not found.problem) == sound
+    if sound:  # only images of both stay
         assert set(found.kept) == {i for end in ends for i in range(*end)}
 
 
-def test_images_that_the_other_mapper_lacks_are_left_out():
+def test_images_missing_in_the_other_mapper_are_dropped():
     weak = component(Scene().model(), 0.002)
     (found,) = confirmed([weak], [piece(1, 11)], FocalSource.MATCHES)
     (model,) = models_of_one_camera([found])
@@ -224,17 +224,17 @@ def test_points_are_triangulated_by_images_whose_rays_spread():
     assert [mark(np.array(rows)).sum() for rows in ([0], [0, 1], [0, 2], [2, 3])] == [0, 0, 50, 10]
 
 
-def test_two_mappers_prove_less_where_the_focal_length_was_a_guess():
+def test_agreement_is_weaker_with_a_guessed_focal_length():
     other = component(moved(), 0.002)
     matches, guess = FocalSource.MATCHES, FocalSource.GUESS
-    for sigma, source, sure in (
+    for sigma, source, sound in (
         (0.005, matches, True), (0.005, guess, False), (0.003, guess, True)
     ):  # fmt: skip
         (found,) = confirmed([component(Scene().model(), sigma)], [other], source)
-        assert (not found.problem) == sure
+        assert (not found.problem) == sound
 
 
-def test_strong_geometry_needs_nobody_and_a_problem_stays():
+def test_strong_geometry_needs_no_confirmation_and_problems_remain():
     strong = component(Scene().model(), 0.0005)
     bad = component(Scene().model(), 0.0005, "too few points")
     first, second = confirmed([bad, strong], [], FocalSource.MATCHES)

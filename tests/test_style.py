@@ -1,4 +1,4 @@
-"""House style that a machine can check, in all rooms: docstrings, imports, comments."""
+"""Style checks of all modules: docstrings, imports, comments."""
 
 from __future__ import annotations
 

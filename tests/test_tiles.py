@@ -1,4 +1,4 @@
-"""Detection in tiles: what is cut, how tiles are merged, and the published fusion."""
+"""Detection in tiles: tiling, merging, and the published fusion."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SIZE = (640, 480)  # (w, h)
 
 
 @pytest.mark.parametrize("text", ["2", "2x", "x2", "0x2", "9x1", "2x2x2", "-1x2", "two"])
-def test_no_grid(text: str) -> None:
+def test_invalid_grids(text: str) -> None:
     with pytest.raises(rt.ReobjError, match="expected COLUMNSxROWS of 1 to 8, such as 2x2"):
         parse_tiles(text)
 
@@ -30,7 +30,7 @@ def test_no_tiles_by_default() -> None:
 
 @pytest.mark.parametrize("grid", [(1, 1), (2, 2), (3, 2), (1, 4), (8, 8)])
 def test_tiles_cover_the_image_and_overlap(grid: tuple[int, int]) -> None:
-    """Of a strange size; row by row."""
+    """For odd sizes; in row order."""
     w, h = 641, 479
     tiles = tile_boxes((w, h), grid)
     assert len(tiles) == grid[0] * grid[1]
@@ -83,7 +83,7 @@ WHERE = (
 
 
 @pytest.mark.parametrize("masks", [False, True])
-def test_every_thing_is_found_once_and_whole(masks: bool) -> None:
+def test_every_object_is_detected_once_and_complete(masks: bool) -> None:
     sizes, detect = painter(masks=masks)
     image = picture(*WHERE)
     found = detect_in_tiles(detect, image, (2, 2))
@@ -98,7 +98,7 @@ def test_every_thing_is_found_once_and_whole(masks: bool) -> None:
             np.testing.assert_array_equal(mask, image[..., 0] == label)
 
 
-def test_small_things_are_found_in_tiles_only() -> None:
+def test_small_objects_are_detected_in_tiles_only() -> None:
     """40 px of 640 are below a tenth of the width, and above it in a tile of 366."""
     _, detect = painter(min_px=0.1)
     image = picture(*WHERE)
@@ -107,7 +107,7 @@ def test_small_things_are_found_in_tiles_only() -> None:
     assert sorted(found.class_id.tolist()) == [1, 2, 3, 4]
 
 
-def test_nothing_found() -> None:
+def test_no_detections() -> None:
     for masks in (False, True):
         found = detect_in_tiles(painter(masks=masks)[1], picture(), (2, 2))
         assert len(found) == 0 and found.xyxy.shape == (0, 4)
@@ -122,7 +122,7 @@ def test_fusion_weighs_by_score_within_a_class() -> None:
     assert boxes.shape == (0, 4) and len(best) == 0
 
 
-def test_fusion_is_the_published_one() -> None:
+def test_fusion_equals_the_published_one() -> None:
     other = pytest.importorskip("ensemble_boxes", reason="pip install ensemble-boxes")
     rng = np.random.default_rng(0)
     corner = np.repeat(rng.random((40, 2)) * 0.8, 3, 0) + rng.normal(0, 0.01, (120, 2))

@@ -44,14 +44,14 @@ def update(tracker: rt.Tracker, *args: Any, **known: Any) -> rt.Tracks:
 
 
 def noise_scale(mean: np.ndarray) -> np.ndarray:
-    """What noise is relative to (T, 4): mean side for x and y, own side for w and h."""
+    """Reference length of the noise (T, 4): mean side for x and y, the side itself for w and h."""
     size = np.maximum(mean[:, 2:, 0], 1)
     side = np.sqrt(size[:, :1] * size[:, 1:])
     return np.concatenate([side, side, size], 1)
 
 
 def filterpy_of(state: rt.TrackState, i: int) -> KalmanFilter:
-    """The same model as 8-state filterpy filter: cx, cy, w, h, then their velocities."""
+    """The same model as an 8-state filterpy filter: cx, cy, w, h, then their velocities."""
     kf = KalmanFilter(dim_x=8, dim_z=4)
     kf.F = np.eye(8) + np.eye(8, k=4)
     kf.H = np.eye(4, 8)
@@ -109,8 +109,8 @@ def test_gate_is_the_distance_over_the_whole_innovation() -> None:
         assert found[i, j] == pytest.approx(mahalanobis(center[j], kf.x[:2, 0], inverse) ** 2)
 
 
-def test_what_overlaps_passes_the_gate_though_its_centre_lies_outside() -> None:
-    """A thing of 200 px at rest, of which only the right end is detected."""
+def test_overlapping_boxes_pass_the_gate_with_a_distant_centre() -> None:
+    """A static object of 200 px, of which only the right end is detected."""
     tracker, appearance = rt.Tracker(rt.TrackerConfig(n_init=1)), [[1.0, 0, 0]]
     whole, end = [100, 100, 300, 300, 0.9, 0], [256, 100, 301, 300, 0.9, 0]
     for _ in range(20):
@@ -137,8 +137,8 @@ def test_states_follow_a_zoom_of_the_camera(scale: float) -> None:
     np.testing.assert_allclose(spread, scale**2 * cov)
 
 
-def test_states_follow_a_perspective_by_its_local_scale() -> None:
-    """Where a small square goes through the homography, its area tells the scale."""
+def test_states_are_scaled_by_the_local_area_of_a_homography() -> None:
+    """The scale is the square root of the area ratio of a small square under the homography."""
     homography = np.array([[1.05, 0.02, 4], [-0.03, 0.97, 8], [2e-4, -3e-4, 1]])
     mean, cov = np.ones((2, 4, 2)), np.ones((2, 4, 3))
     mean[:, :2, 0] = [[50, 400], [600, 30]]
@@ -159,8 +159,8 @@ def test_a_broken_homography_changes_sizes_by_two_at_most() -> None:
         np.testing.assert_allclose(moved[0, 2:, 0], 50 * bounded)
 
 
-def test_a_doubtful_box_moves_a_track_less() -> None:
-    """A box of low score is noisier: the track goes less far to meet it."""
+def test_a_low_score_moves_a_track_less() -> None:
+    """A box of low score has a larger variance: the track moves less towards it."""
     at = {}
     for score in (0.95, 0.6):
         tracker = rt.Tracker()
@@ -178,7 +178,7 @@ def textured(rng: np.random.Generator) -> np.ndarray:
     return cv2.GaussianBlur(rng.integers(0, 256, (480, 640, 3), dtype=np.uint8), (0, 0), 3)
 
 
-def test_identity_survives_a_jerk_of_the_camera() -> None:
+def test_identity_survives_a_camera_jerk() -> None:
     """The view jumps by 100 px: without motion compensation the gate loses the object."""
     image = textured(np.random.default_rng(2))
     jerk = np.float64([[1, 0, -60], [0, 1, 0]])
@@ -195,7 +195,7 @@ def test_identity_survives_a_jerk_of_the_camera() -> None:
 
 
 def test_tracks_move_with_the_parallax_of_a_deep_scene() -> None:
-    """Four bands of the image move sideways; a track in the last one goes along with that one."""
+    """Four bands of the image move sideways; a track in the last one moves with it."""
     image, tracker = textured(np.random.default_rng(6)), rt.Tracker()
     for _ in range(4):
         tracker.update(rows((300, 420, 340, 460)), image)
@@ -226,7 +226,7 @@ def test_known_pose_replaces_the_image_motion() -> None:
 # ---- Identities ----
 
 
-def test_identities_start_at_one_and_belong_to_the_tracker() -> None:
+def test_identities_start_at_one_in_every_tracker() -> None:
     for _ in range(2):
         tracker = rt.Tracker(rt.TrackerConfig(n_init=1))
         assert tracker.update(rows((0, 0, 50, 50), (100, 0, 150, 50))).track_id.tolist() == [1, 2]
@@ -237,10 +237,10 @@ def test_identities_start_at_one_and_belong_to_the_tracker() -> None:
 @pytest.mark.parametrize(
     ("score", "low", "first"), [(0.5, 0.5, 2), (0.74, 0.74, 2), (0.75, 0.75, 1), (0.6, 0.31, 3)]
 )
-def test_a_newcomer_is_tentative_until_its_scores_sum_to_n_init_halves(
+def test_a_new_track_is_tentative_until_its_scores_sum_to_n_init_halves(
     score: float, low: float, first: int
 ) -> None:
-    """The first frame's objects are known at once: nothing is there to be confused with."""
+    """Tracks of the first frame are confirmed immediately."""
     tracker = rt.Tracker(rt.TrackerConfig(n_init=3))
     known, new = (0, 0, 50, 50), (100, 0, 150, 50)
     assert tracker.update(rows(known)).track_id.tolist() == [1]
@@ -249,7 +249,7 @@ def test_a_newcomer_is_tentative_until_its_scores_sum_to_n_init_halves(
     assert ids == [[1]] * first + [[1, 2]] * (5 - first)
 
 
-def test_a_return_is_known_one_detection_earlier_than_a_newcomer() -> None:
+def test_a_return_is_confirmed_one_detection_earlier() -> None:
     views = unit(np.random.default_rng(12), 2)
     tracker = rt.Tracker()
     for _ in range(12):
@@ -261,7 +261,7 @@ def test_a_return_is_known_one_detection_earlier_than_a_newcomer() -> None:
     assert ids == [[], [1], [1, 2]]
 
 
-def test_latest_tells_tentative_tracks_and_their_tracklet() -> None:
+def test_latest_contains_tentative_tracks_and_their_tracklet() -> None:
     tracker = rt.Tracker(rt.TrackerConfig(n_init=2))
     both = rows((0, 0, 50, 50), (100, 0, 150, 50), score=0.6)
     first, second, third = (update(tracker, part) for part in (both[:1], both, both))
@@ -269,7 +269,7 @@ def test_latest_tells_tentative_tracks_and_their_tracklet() -> None:
     assert second.tracklet_id.tolist() == third.tracklet_id.tolist()
 
 
-def test_every_row_names_its_detection() -> None:
+def test_every_row_has_the_index_of_its_detection() -> None:
     tracker = rt.Tracker(rt.TrackerConfig(n_init=1))
     detections = rows(
         (300, 0, 350, 50, 0.05), (0, 0, 50, 50), (100, 0, 150, 50)
@@ -295,7 +295,7 @@ def test_low_scores_continue_tracks_but_start_none() -> None:
 
 
 def test_crossing_objects_keep_their_identity_by_appearance() -> None:
-    """Two objects swap places between frames: motion says stay, the embeddings say swapped."""
+    """Two objects swap positions between frames: motion contradicts the embeddings."""
     views = unit(np.random.default_rng(3), 2)
     tracker = rt.Tracker(rt.TrackerConfig(n_init=1, appearance_weight=0.8))
     for _ in range(5):
@@ -307,8 +307,8 @@ def test_crossing_objects_keep_their_identity_by_appearance() -> None:
 
 
 @pytest.mark.parametrize("left", [130, 140, 145])
-def test_a_coasting_track_does_not_take_a_newcomer_that_looks_different(left: int) -> None:
-    """The newcomer lies nearer to a third object, which has a detection of its own."""
+def test_a_coasting_track_is_not_matched_to_a_dissimilar_detection(left: int) -> None:
+    """The new object is nearer to a third track, which has its own detection."""
     seen, gone, new = unit(np.random.default_rng(13), 3)
     tracker = rt.Tracker(rt.TrackerConfig(n_init=1))
     both = rows((100, 100, 150, 150), (left, 100, left + 50, 150))
@@ -322,8 +322,8 @@ def test_a_coasting_track_does_not_take_a_newcomer_that_looks_different(left: in
 
 
 @pytest.mark.parametrize(("left", "score", "kind"), [(120, 0.2, CHAIR), (112, 0.9, CUP)])
-def test_a_doubtful_match_must_look_alike(left: int, score: float, kind: int) -> None:
-    """Low scores and changes of class may go on with a track, but not with another thing."""
+def test_a_weak_match_requires_a_similar_appearance(left: int, score: float, kind: int) -> None:
+    """Low scores and changed classes may continue a track, but not one of another object."""
     seen, other = unit(np.random.default_rng(13), 2)
     for view, expected in ((seen, [1]), (other, [])):
         tracker = rt.Tracker()
@@ -334,14 +334,14 @@ def test_a_doubtful_match_must_look_alike(left: int, score: float, kind: int) ->
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_second_box_for_one_frame_does_not_take_the_identity(seed: int) -> None:
-    """The track of the second box has no embedding yet: that speaks neither for nor against it."""
+def test_a_duplicate_box_does_not_take_the_identity(seed: int) -> None:
+    """The track of the second box has no embedding yet, which is no evidence."""
     rng, tracker = np.random.default_rng(seed), rt.Tracker()
     own, beside, second = (100, 100, 140, 200), (300, 100, 340, 200), (105, 100, 145, 200)
     common, seen = unit(rng, 2), []
     for step in range(30):
         boxes = [own if step <= 24 else second, beside] + [second] * (step == 24)
-        view = common[[0, 1, 0][: len(boxes)]] + 0.9 * unit(rng, len(boxes))  # views .55 alike
+        view = common[[0, 1, 0][: len(boxes)]] + 0.9 * unit(rng, len(boxes))  # cosine .55
         seen.append(tracker.update(rows(*boxes), embeddings=view).track_id.tolist())
     assert seen[23] == [1, 2]
     assert seen[25:] == [[1, 2]] * 5
@@ -363,9 +363,7 @@ def away_and_back(
 
 
 def test_objects_that_return_elsewhere_get_their_identity_back() -> None:
-    """After 200 frames, at the other side of the picture, with another shape: never gated by
-    overlap.
-    """
+    """After 200 frames, at the other side of the image, with another shape: not gated by overlap."""
     rng = np.random.default_rng(4)
     views = unit(rng, 4)
     back = views[::-1] + 0.05 * unit(rng, 4)
@@ -373,35 +371,35 @@ def test_objects_that_return_elsewhere_get_their_identity_back() -> None:
 
 
 @pytest.mark.parametrize(("gone", "expected"), [(3, 2), (100, 1)])
-def test_a_newcomer_is_not_who_should_be_elsewhere(gone: int, expected: int) -> None:
-    """It looks rather like an object that was seen far off a moment ago, or long ago."""
+def test_a_new_object_is_not_one_expected_elsewhere(gone: int, expected: int) -> None:
+    """It is similar to an object that was seen far away a moment ago, or long ago."""
     rng = np.random.default_rng(4)
     view = unit(rng, 1)
-    alike = view + 0.09 * rng.normal(size=view.shape)
+    similar = view + 0.09 * rng.normal(size=view.shape)
     tracker = rt.Tracker()
     for _ in range(12):
         tracker.update(rows((0, 0, 50, 50)), embeddings=view)
     for _ in range(gone):
         tracker.update(rt.Detections.empty())
     for _ in range(4):
-        tracks = tracker.update(rows((600, 400, 650, 450)), embeddings=alike)
+        tracks = tracker.update(rows((600, 400, 650, 450)), embeddings=similar)
     assert tracks.track_id.tolist() == [expected]
 
 
-def test_a_newcomer_does_not_steal_an_identity() -> None:
+def test_a_new_object_does_not_take_an_old_identity() -> None:
     rng = np.random.default_rng(5)
     assert away_and_back(rt.Tracker(), unit(rng, 3), unit(rng, 3)) == [4, 5, 6]
 
 
 def test_an_ambiguous_return_gets_a_new_identity() -> None:
-    """Twins left; one of them returns and fits both about equally well: left to the linker."""
+    """One of two identical objects returns and fits both equally well: left to the linker."""
     rng = np.random.default_rng(6)
     base = unit(rng, 1)
-    twins = np.concatenate([base + 0.02 * unit(rng, 1), base + 0.02 * unit(rng, 1)])
-    assert away_and_back(rt.Tracker(), twins, base) == [3]
+    pair = np.concatenate([base + 0.02 * unit(rng, 1), base + 0.02 * unit(rng, 1)])
+    assert away_and_back(rt.Tracker(), pair, base) == [3]
 
 
-def test_twins_are_told_apart_by_their_background() -> None:
+def test_identical_objects_are_distinguished_by_their_background() -> None:
     """Same foreground, different surroundings."""
     rng = np.random.default_rng(7)
     same = np.repeat(unit(rng, 1), 3, 0)
@@ -431,7 +429,7 @@ def test_another_class_never_takes_over_an_identity() -> None:
     assert tracks.track_id.tolist() == [2]
 
 
-def test_embeddings_stay_with_their_boxes() -> None:
+def test_embeddings_stay_aligned_with_their_boxes() -> None:
     """Weak and unmatched detections in between must not shift the rows."""
     rng = np.random.default_rng(10)
     views = unit(rng, 2)
@@ -473,9 +471,7 @@ BEYOND[0, 3], MIRRORED[0, 0] = 1e200, -1
         ({"part": 0.5}, "part 0.5, expected"),
     ],
 )
-def test_what_cannot_be_meant_leaves_the_tracker_as_it_was(
-    wrong: dict[str, Any], message: str
-) -> None:
+def test_invalid_input_leaves_the_tracker_unchanged(wrong: dict[str, Any], message: str) -> None:
     found = rows((10, 10, 50, 90), (60, 10, 90, 90))
     found = rt.Detections(found.xyxy, found.score, found.class_id, np.ones((2, 48, 64), bool))
     good = {
@@ -497,13 +493,13 @@ def test_what_cannot_be_meant_leaves_the_tracker_as_it_was(
     assert after.frame.tolist() == [1, 1]
 
 
-def test_a_pose_with_nan_is_none() -> None:
+def test_a_pose_with_nan_is_ignored() -> None:
     tracker = rt.Tracker()
     tracker.update([], cam_from_world=np.full((3, 4), np.nan), camera=K640)
     assert tracker.state.last_pose is None
 
 
-def test_frames_of_one_pixel_are_frames() -> None:
+def test_frames_of_one_pixel_are_accepted() -> None:
     tracker = rt.Tracker()
     for size in ((1, 1), (1, 640), (480, 1), (2, 3)):
         tracker.update(rows((0, 0, 5, 5)), np.zeros((*size, 3), np.uint8))
@@ -538,9 +534,9 @@ def test_state_does_not_grow_with_time() -> None:
     assert sizes[0] == sizes[1]
 
 
-def test_a_newcomer_does_not_take_over_a_missed_track() -> None:
-    """An object is missed and another one turns up beside it: alike, the track goes on; unlike, the
-    detection starts a track of its own and the missed object comes back to its own.
+def test_a_new_object_does_not_take_over_a_missed_track() -> None:
+    """An object is missed and another one appears beside it: if similar, the track continues; else
+    the detection starts a new track and the missed object returns to its own.
     """
     views = unit(np.random.default_rng(14), 3)
     here, beside = (100, 100, 160, 160), (125, 105, 185, 165)
@@ -559,21 +555,21 @@ def test_a_newcomer_does_not_take_over_a_missed_track() -> None:
 
 
 def rows_of_clip(tracker: rt.Tracker, frames: list[rt.Frame], posed: bool) -> list[np.ndarray]:
-    """What the tracker says about frames of the example clip."""
+    """Tracks of frames of the example clip."""
     recorded = rt.read_detections(ROOM / "detections.npz", rt.Video(ROOM / "room.mp4"))
-    told: list[dict[str, object]] = [{}] * 100
+    inputs: list[dict[str, object]] = [{}] * 100
     if posed:
         camera = rt.Camera("PINHOLE", 640, 480, (492.756788421, 492.756788421, 320.0, 240.0))
         quat = np.loadtxt(ROOM / "poses.txt")  # TUM: seconds, camera centre, quaternion xyzw
         cam_from_world = Rotation.from_quat(quat[:, 4:]).inv().as_matrix()
         pose = np.concatenate([cam_from_world, -cam_from_world @ quat[:, 1:4, None]], 2)
-        told = [{"cam_from_world": p, "camera": camera} for p in pose]
-    step = [update(tracker, recorded.at(f.index), f.image, **told[f.index]) for f in frames]
+        inputs = [{"cam_from_world": p, "camera": camera} for p in pose]
+    step = [update(tracker, recorded.at(f.index), f.image, **inputs[f.index]) for f in frames]
     return [np.c_[t.to_array(), t.tracklet_id] for t in step]
 
 
 @pytest.mark.parametrize("posed", [False, True])
-def test_a_restored_tracker_goes_on_as_if_it_had_never_stopped(posed: bool, tmp_path: Path) -> None:
+def test_a_restored_tracker_continues_identically(posed: bool, tmp_path: Path) -> None:
     frames = list(itertools.islice(rt.Video(ROOM / "room.mp4"), 60))
     whole = rows_of_clip(rt.Tracker(embedder=rt.Embedder()), frames, posed)
     first = rt.Tracker(rt.TrackerConfig(), rt.Embedder())
@@ -596,7 +592,7 @@ def test_an_unused_tracker_can_be_saved(options: dict[str, int], tmp_path: Path)
     assert len(loaded.update(both)) == 1 + (options.get("n_init") == 1)
 
 
-def test_what_is_no_saved_tracker_is_refused(tmp_path: Path) -> None:
+def test_invalid_saved_trackers_are_refused(tmp_path: Path) -> None:
     """Missing, no npz, another npz, another version."""
     np.savez(tmp_path / "other.npz", a=1)
     np.savez(tmp_path / "old.npz", facts='{"version": 0, "config": {}}')
@@ -611,7 +607,7 @@ def test_what_is_no_saved_tracker_is_refused(tmp_path: Path) -> None:
 # ---- With poses ----
 
 CAMERA = rt.Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
-BALLS = quadrics.Ellipsoids(  # two in a row, their twin far to the right
+BALLS = quadrics.Ellipsoids(  # two in a row, an identical one far to the right
     np.array([[-0.5, 0, 4.0], [0.5, 0.1, 4.2], [3.5, 0, 4.0]]),
     np.full((3, 3), 0.2),
     np.repeat(np.eye(3)[None], 3, 0),
@@ -635,9 +631,9 @@ def balls_seen(pose: np.ndarray) -> tuple[rt.Detections, np.ndarray]:
 
 def walk(tracker: rt.Tracker, poses: list[np.ndarray], posed: bool = True) -> list[dict[int, int]]:
     """Identity of every ball in every frame."""
-    told = [{"cam_from_world": p, "camera": CAMERA} if posed else {} for p in poses]
+    inputs = [{"cam_from_world": p, "camera": CAMERA} if posed else {} for p in poses]
     result = []
-    for pose, known in zip(poses, told, strict=True):
+    for pose, known in zip(poses, inputs, strict=True):
         found, which = balls_seen(pose)
         tracks = tracker.update(found, **known)
         ids = zip(which[tracks.detection_index].tolist(), tracks.track_id.tolist(), strict=True)
@@ -651,16 +647,16 @@ HOME = [pose_at(0.5 - 0.01 * i, 180 - 3.0 * i) for i in range(61)]
 
 
 @pytest.mark.parametrize("posed", [True, False])
-def test_with_poses_objects_are_known_by_their_place(posed: bool) -> None:
-    """No appearance: the camera turns away for 100 frames and comes back from another spot."""
+def test_with_poses_objects_are_reidentified_by_position(posed: bool) -> None:
+    """No appearance: the camera turns away for 100 frames and returns at another position."""
     seen = walk(rt.Tracker(), PAST + AWAY + HOME, posed)
     before, after = seen[49], seen[-1]
     assert sorted(before) == sorted(after) == [0, 1]
     assert (before == after) is posed
 
 
-def test_with_poses_a_twin_elsewhere_is_another_object() -> None:
-    """All balls look the same. The third is first seen when the others are out of view."""
+def test_with_poses_an_identical_object_elsewhere_is_new() -> None:
+    """All balls look the same. The third appears while the others are out of view."""
     tracker, view = rt.Tracker(), unit(np.random.default_rng(15), 1)
     ids: dict[int, set[int]] = {}
     for pose in (
@@ -677,18 +673,18 @@ def test_with_poses_a_twin_elsewhere_is_another_object() -> None:
 
 
 @pytest.mark.parametrize(("turn_deg", "known"), [(0, False), (90, True)])
-def test_from_another_side_other_surroundings_say_nothing(turn_deg: int, known: bool) -> None:
-    """Its place unknown (no parallax), an object comes back with what is now behind it."""
+def test_backgrounds_from_other_viewpoints_are_no_evidence(turn_deg: int, known: bool) -> None:
+    """An object of unknown position (no parallax) returns in front of another background."""
     tracker, box = rt.Tracker(), rows((300, 200, 340, 260))
-    thing, wall = (
+    front, wall = (
         np.array([[1, 0], [0.9, 0.436]]),
         np.eye(2),
-    )  # before, after: much, not at all alike
+    )  # before, after: very similar, dissimilar
     seen = []
     for step in range(60):
         back = step >= 55
         found = box if step < 15 or back else rt.Detections.empty()
-        view = (part[[int(back)]][: len(found)] for part in (thing, wall))
+        view = (part[[int(back)]][: len(found)] for part in (front, wall))
         tracks = tracker.update(
             found, embeddings=rt.Embeddings(*view),
             cam_from_world=pose_at(0, turn_deg * (step >= 50)), camera=CAMERA,
@@ -698,14 +694,14 @@ def test_from_another_side_other_surroundings_say_nothing(turn_deg: int, known: 
     assert seen[-1] == [1 if known else 2]
 
 
-def test_a_frame_without_pose_changes_no_place() -> None:
+def test_a_frame_without_pose_changes_no_ellipsoid() -> None:
     tracker = rt.Tracker()
     walk(tracker, PAST)
-    places = tracker.ellipsoid_map.dual_q.copy()
+    before = tracker.ellipsoid_map.dual_q.copy()
     assert tracker.ellipsoid_map.known.sum() == 2
     for _ in range(20):
         tracker.update(rt.Detections.empty(), cam_from_world=np.full((3, 4), np.nan), camera=CAMERA)
-    np.testing.assert_array_equal(tracker.ellipsoid_map.dual_q, places)
+    np.testing.assert_array_equal(tracker.ellipsoid_map.dual_q, before)
 
 
 def points_on_balls(scale: float) -> np.ndarray:
@@ -717,9 +713,9 @@ def points_on_balls(scale: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.02, 37.0])
-def test_twins_keep_their_identities_over_steps_wider_than_their_boxes(scale: float) -> None:
-    """Two balls that look the same, 125 px apart and 50 wide; the camera steps aside by 100 px, so
-    each is seen next beside where the other was. Known cameras of any unit, and a few points.
+def test_identical_objects_keep_identities_over_wide_steps(scale: float) -> None:
+    """Two balls that look the same, 125 px apart and 50 wide; the camera moves by 100 px, so each
+    appears beside the last position of the other. Given poses of any unit, and a few points.
     """
     tracker, points = rt.Tracker(), points_on_balls(scale)
     seen, alone, last = [], rt.Tracker(), None
@@ -747,9 +743,9 @@ def test_twins_keep_their_identities_over_steps_wider_than_their_boxes(scale: fl
     )
 
 
-def test_a_new_part_of_the_path_knows_no_place_of_another() -> None:
-    """Half a second without a new picture, then the cameras go on in a world of their own: turned,
-    moved and smaller. The tracks go on; back in the first world its places are known again.
+def test_a_new_component_does_not_use_ellipsoids_of_another() -> None:
+    """Half a second without a new image, then the poses continue in another component: rotated,
+    moved and scaled. Tracks continue; back in the first one its ellipsoids are used again.
     """
     tracker = rt.Tracker()
     walk(tracker, PAST)
@@ -768,14 +764,14 @@ def test_a_new_part_of_the_path_knows_no_place_of_another() -> None:
     found, _ = balls_seen(pose_at(0.1))
     tracks = tracker.update(found, cam_from_world=pose_at(0.1), camera=CAMERA)
     assert tracks.track_id.tolist() == [1, 2] and tracker.ellipsoid_map is first
-    assert (first.frame != before).sum() <= 2  # nothing of the other part came into it
+    assert (first.frame != before).sum() <= 2  # nothing of the other component was added
 
 
 # ---- Rules of the association ----
 
 
-def test_another_class_costs() -> None:
-    """Two boxes about as near to a chair's track: the cup is a little nearer, the chair is it."""
+def test_another_class_has_a_cost() -> None:
+    """Two boxes near a chair's track: the cup is slightly nearer, the chair is matched."""
     tracker = rt.Tracker()
     for _ in range(5):
         tracker.update(rows((100, 100, 200, 200)))
@@ -785,15 +781,15 @@ def test_another_class_costs() -> None:
 
 
 @pytest.mark.parametrize(("kind", "expected"), [(CHAIR, [1]), (CUP, [])])
-def test_another_class_speaks_against_one_object(kind: int, expected: list[int]) -> None:
-    """Rather unlike, but well overlapping: enough for the same class, too little for another."""
+def test_another_class_is_evidence_against_a_match(kind: int, expected: list[int]) -> None:
+    """Dissimilar, but overlapping: enough for the same class, too little for another."""
     seen, new = unit(np.random.default_rng(21), 2)
     new = new - (new @ seen) * seen
     new = 0.3 * seen + np.sqrt(1 - 0.3**2) * new / np.linalg.norm(new)
     tracker = rt.Tracker()
     for _ in range(12):
         tracker.update(rows((100, 100, 150, 150)), embeddings=seen[None])
-    for _ in range(12):  # the longer away, the more a track gives way: now the match is weak
+    for _ in range(12):  # a longer absence widens the gate: the match is weak
         tracker.update(rt.Detections.empty())
     found = rows((114, 100, 164, 150), class_id=kind)
     assert tracker.update(found, embeddings=new[None]).track_id.tolist() == expected
@@ -803,10 +799,10 @@ def test_another_class_speaks_against_one_object(kind: int, expected: list[int])
     ("box", "same"),
     [
         ((103, 100, 113, 350), True),
-        ((72, 170, 138, 280), False),  # in the same place, but of another shape
+        ((72, 170, 138, 280), False),  # at the same position, but of another shape
     ],
 )
-def test_without_appearance_boxes_must_be_of_a_shape(box: tuple[float, ...], same: bool) -> None:
+def test_without_appearance_boxes_must_be_similar(box: tuple[float, ...], same: bool) -> None:
     tracker = rt.Tracker()
     for _ in range(5):
         tracker.update(rows((100, 100, 110, 350)))
@@ -815,7 +811,7 @@ def test_without_appearance_boxes_must_be_of_a_shape(box: tuple[float, ...], sam
 
 @pytest.mark.parametrize(("left", "same"), [(103, True), (111, False)])
 def test_without_appearance_boxes_must_overlap(left: int, same: bool) -> None:
-    """After some frames unseen, a place beside so tall a box is well within the gate."""
+    """After some missed frames, a position beside so tall a box is well within the gate."""
     tracker = rt.Tracker()
     for _ in range(5):
         tracker.update(rows((100, 100, 110, 350)))
@@ -826,7 +822,7 @@ def test_without_appearance_boxes_must_overlap(left: int, same: bool) -> None:
 
 
 @pytest.mark.parametrize(("half", "same"), [(47, True), (60, False)])
-def test_without_appearance_no_side_doubles(half: int, same: bool) -> None:
+def test_without_appearance_no_side_may_double(half: int, same: bool) -> None:
     tracker = rt.Tracker()
     for _ in range(5):
         tracker.update(rows((100, 100, 150, 150)))
@@ -834,7 +830,7 @@ def test_without_appearance_no_side_doubles(half: int, same: bool) -> None:
     assert (found.tracklet_id == 1).tolist() == [same]
 
 
-def test_who_was_just_seen_chooses_first() -> None:
+def test_recently_seen_tracks_are_matched_first() -> None:
     """One detection between two tracks, a little nearer to the one that was missed for a while."""
     tracker = rt.Tracker()
     seen, missed = (100, 100, 200, 200), (110, 100, 210, 200)
@@ -845,7 +841,7 @@ def test_who_was_just_seen_chooses_first() -> None:
     assert tracker.update(rows((107, 100, 207, 200))).track_id.tolist() == [1]
 
 
-def test_who_has_an_identity_chooses_first() -> None:
+def test_confirmed_tracks_are_matched_first() -> None:
     """One detection between two tracks, a little nearer to the tentative one."""
     tracker = rt.Tracker()
     known, tentative = (100, 100, 200, 200), (110, 100, 210, 200)
@@ -858,7 +854,7 @@ def test_who_has_an_identity_chooses_first() -> None:
 
 
 class Counted:
-    """An embedder that notes which rows of which frames it is asked for."""
+    """An embedder that records the requested rows of each frame."""
 
     def __init__(self, tracker: rt.Tracker | None = None) -> None:
         self.asked: list[tuple[int, list[int]]] = []
@@ -878,9 +874,9 @@ def counted(config: rt.TrackerConfig) -> tuple[rt.Tracker, Counted]:
 
 
 @pytest.mark.parametrize("every", [4, 10])
-def test_clear_matches_are_embedded_now_and_then(every: int) -> None:
-    """All of them in one pass in every n-th frame, a newcomer twice before it gets its identity,
-    and where the match is weak: nothing else costs the network.
+def test_unambiguous_matches_are_embedded_at_intervals(every: int) -> None:
+    """All of them in one pass every n-th frame, a new track twice before it is confirmed, and weak
+    matches: nothing else is embedded.
     """
     tracker, embedder = counted(rt.TrackerConfig(embed_every=every, camera_motion=False))
     image = np.zeros((300, 400, 3), np.uint8)
@@ -919,13 +915,13 @@ def test_tracks_wait_for_coast_frames(gap: int, same: bool) -> None:
 
 
 def test_missed_identities_have_predicted_boxes() -> None:
-    """One goes on at 4 px a frame unseen, the other is seen; a tentative one is none."""
+    """One continues at 4 px per frame undetected, the other is detected; tentative: none."""
     tracker = rt.Tracker()
     assert not len(tracker.predicted())
     for f in range(20):
         tracker.update(rows((100 + 4 * f, 100, 150 + 4 * f, 180), (400, 100, 450, 180, 0.9, CUP)))
         assert not len(tracker.predicted())
-    tracker.update(rows((400, 100, 450, 180, 0.9, CUP), (600, 300, 650, 380)))  # a newcomer
+    tracker.update(rows((400, 100, 450, 180, 0.9, CUP), (600, 300, 650, 380)))  # a new track
     for f in range(21, 27):
         tracker.update(rows((400, 100, 450, 180, 0.9, CUP)))
         found = tracker.predicted()
@@ -936,8 +932,8 @@ def test_missed_identities_have_predicted_boxes() -> None:
             assert (found.score, found.class_id, found.detection_index) == (0, CHAIR, -1)
 
 
-def test_tracks_are_given_up_one_by_one() -> None:
-    """One is lost a frame later than the other, and is given up a frame later."""
+def test_tracks_end_individually() -> None:
+    """One is lost a frame later than the other, and ends a frame later."""
     tracker, counts = rt.Tracker(rt.TrackerConfig(coast_frames=5)), []
     both = rows((100, 100, 150, 150), (300, 100, 350, 150))
     for found in [both] * 4 + [both[:1]] + [both[:0]] * 6:
@@ -956,9 +952,9 @@ def test_scores_below_the_low_one_continue_nothing(score: float, found: list[int
 @pytest.mark.parametrize(
     ("shift", "score", "kind", "unseen", "same"),
     [
-        (36, 0.9, CHAIR, 15, True),  # IoU .16: after a while unseen the gate is that wide
+        (36, 0.9, CHAIR, 15, True),  # IoU .16: the gate after some missed frames
         (36, 0.9, CHAIR, 0, False),
-        (22, 0.3, CHAIR, 0, True),  # IoU .39: enough for a faint box
+        (22, 0.3, CHAIR, 0, True),  # IoU .39: enough for a low score
         (30, 0.3, CHAIR, 0, False),  # IoU .25
         (22, 0.9, CUP, 0, True),  # enough for a change of class
         (22, 0.9, CUP, 15, True),
@@ -966,7 +962,7 @@ def test_scores_below_the_low_one_continue_nothing(score: float, found: list[int
         (30, 0.9, CHAIR, 0, True),
     ],
 )
-def test_how_far_a_match_may_be(
+def test_the_limit_of_the_matching_distance(
     shift: int, score: float, kind: int, unseen: int, same: bool
 ) -> None:
     """A box of 50 px that moved; no appearance."""
@@ -980,7 +976,7 @@ def test_how_far_a_match_may_be(
 
 
 def test_low_scores_are_matched_after_high_ones() -> None:
-    """A faint box right on the track, a clear one beside it: the clear one goes on."""
+    """A low score exactly on the track, a high one beside it: the high one continues it."""
     tracker = rt.Tracker()
     for _ in range(5):
         tracker.update(rows((100, 100, 200, 200)))
@@ -1000,7 +996,7 @@ def gone(tracker: rt.Tracker, view: np.ndarray, frames: int = 60) -> None:
 
 
 def test_an_identity_goes_to_one_of_two_newcomers() -> None:
-    """Both look like the object that is gone; even where little is asked for, one is another."""
+    """Both look like the absent object; even with a low threshold one gets a new identity."""
     view = unit(np.random.default_rng(23), 1)
     tracker = rt.Tracker(rt.TrackerConfig(return_probability=0.01))
     gone(tracker, view)
@@ -1010,9 +1006,9 @@ def test_an_identity_goes_to_one_of_two_newcomers() -> None:
     assert sorted(tracks.track_id.tolist()) == [1, 2]
 
 
-def test_who_was_seen_beside_the_newcomer_is_another_object() -> None:
-    """The newcomer turns up in the last frame of an object that it equals, and is missed once; a
-    third one comes a frame later, so that both are named at once.
+def test_simultaneous_objects_are_different() -> None:
+    """The new object appears in the last frame of an identical one, and is missed once; a third
+    one appears a frame later, so that both are confirmed simultaneously.
     """
     views = unit(np.random.default_rng(24), 2)
     old, new, third = (0, 0, 50, 50), (300, 0, 350, 50), (600, 0, 650, 50)
@@ -1027,7 +1023,7 @@ def test_who_was_seen_beside_the_newcomer_is_another_object() -> None:
 
 
 def test_a_return_ends_the_track_that_still_coasts() -> None:
-    """Its object is elsewhere: what turns up in the old place is another one."""
+    """Its object is elsewhere: a detection at the old position is another one."""
     views = unit(np.random.default_rng(25), 2)
     old, new = (0, 0, 50, 50), (400, 0, 450, 50)
     tracker = rt.Tracker()
@@ -1041,7 +1037,7 @@ def test_a_return_ends_the_track_that_still_coasts() -> None:
 
 
 def test_a_track_votes_for_its_class() -> None:
-    """Most of its score is a cup's: it may be the cup that left, though it last was a chair."""
+    """Most of its score is a cup's: it may match the lost cup, although it last was a chair."""
     view = unit(np.random.default_rng(26), 1)
     tracker = rt.Tracker()
     for _ in range(12):
@@ -1057,7 +1053,7 @@ def test_a_track_votes_for_its_class() -> None:
 # ---- Rules with poses ----
 
 
-def test_tracks_follow_their_places_through_a_jerky_camera() -> None:
+def test_tracks_follow_their_positions_under_camera_jerks() -> None:
     """The camera jumps to and fro by more than a ball's width; no track is lost for a frame."""
     tracker = rt.Tracker()
     walk(tracker, PAST)
@@ -1071,8 +1067,8 @@ def test_tracks_follow_their_places_through_a_jerky_camera() -> None:
         assert tracks.track_id.tolist() == [1, 2]
 
 
-def test_tracks_grow_as_their_places_come_near() -> None:
-    """Steps of a metre towards the balls and back: boxes half as large again."""
+def test_tracks_grow_as_the_camera_approaches() -> None:
+    """Steps of a metre towards the balls and back: boxes grow by half."""
     tracker = rt.Tracker()
     walk(tracker, PAST)
     for i in range(6):
@@ -1087,8 +1083,8 @@ def test_tracks_grow_as_their_places_come_near() -> None:
         assert i < 2 or (np.abs(np.log(before / width)) > 0.3).all()
 
 
-def test_out_of_view_no_time_passes_for_a_track_of_known_place() -> None:
-    """Half a turn away and back takes longer than a track waits; the same tracklets go on."""
+def test_tracks_of_known_position_do_not_expire_out_of_view() -> None:
+    """Half a turn and back takes longer than `coast_frames`; the same tracklets continue."""
     tracker = rt.Tracker(rt.TrackerConfig(coast_frames=5))
     walk(tracker, PAST)
     before = tracker.latest.tracklet_id.tolist()
@@ -1098,7 +1094,7 @@ def test_out_of_view_no_time_passes_for_a_track_of_known_place() -> None:
     assert tracker.latest.tracklet_id.tolist() == before
 
 
-def test_in_view_a_missed_track_of_known_place_is_given_up() -> None:
+def test_tracks_of_known_position_expire_in_view() -> None:
     tracker = rt.Tracker(rt.TrackerConfig(coast_frames=5))
     walk(tracker, PAST)
     counts = []
@@ -1108,8 +1104,8 @@ def test_in_view_a_missed_track_of_known_place_is_given_up() -> None:
     assert counts == [2] * 5 + [0] * 2
 
 
-def test_a_missed_track_of_known_place_waits_where_that_is_seen_now() -> None:
-    """The detector finds nothing while the camera steps aside by three balls' widths."""
+def test_a_missed_track_of_known_position_follows_its_projection() -> None:
+    """No detections while the camera moves sideways by three ball widths."""
     tracker = rt.Tracker()
     walk(tracker, PAST)
     before = tracker.latest.tracklet_id.tolist()
@@ -1120,11 +1116,11 @@ def test_a_missed_track_of_known_place_waits_where_that_is_seen_now() -> None:
     assert tracker.latest.tracklet_id.tolist() == before
 
 
-# ---- Appearance: where it is compared, and what is kept of it ----
+# ---- Appearance: comparison and stored embeddings ----
 
 
-def test_rivals_are_embedded_in_one_pass() -> None:
-    """Two boxes beside a track: both are asked for, also the one that would not be matched."""
+def test_competing_boxes_are_embedded_in_one_pass() -> None:
+    """Two boxes beside a track: both are embedded, also the one that would not be matched."""
     tracker, embedder = counted(rt.TrackerConfig(camera_motion=False))
     image = np.zeros((300, 400, 3), np.uint8)
     for _ in range(12):
@@ -1133,7 +1129,7 @@ def test_rivals_are_embedded_in_one_pass() -> None:
     assert embedder.asked[-1] == (12, [0, 1])
 
 
-def test_two_classes_around_one_thing_are_no_rivals() -> None:
+def test_two_classes_on_one_object_do_not_compete() -> None:
     tracker, embedder = counted(rt.TrackerConfig(camera_motion=False))
     image = np.zeros((300, 400, 3), np.uint8)
     for _ in range(12):
@@ -1143,8 +1139,8 @@ def test_two_classes_around_one_thing_are_no_rivals() -> None:
     assert len(embedder.asked) == before
 
 
-def test_what_was_refused_is_not_matched_by_overlap_alone() -> None:
-    """A box around two tracks, like neither: it begins a track of its own."""
+def test_a_rejected_match_is_not_made_by_overlap_alone() -> None:
+    """A box around two tracks, similar to neither: it starts a new track."""
     views = unit(np.random.default_rng(31), 3)
     tracker = rt.Tracker()
     for _ in range(12):
@@ -1155,8 +1151,8 @@ def test_what_was_refused_is_not_matched_by_overlap_alone() -> None:
 
 
 @pytest.mark.parametrize(("shift", "same"), [(20, True), (32, False)])
-def test_a_costly_match_is_none(shift: int, same: bool) -> None:
-    """A track without an embedding: what lies beside it in the gate, but far out, is not it."""
+def test_a_match_above_the_cost_limit_is_rejected(shift: int, same: bool) -> None:
+    """A track without an embedding, and a box near the limit of the gate."""
     view, tracker = unit(np.random.default_rng(32), 1), rt.Tracker()
     known, new = (300, 300, 350, 350), (100, 20, 110, 270)
     for _ in range(4):
@@ -1168,7 +1164,7 @@ def test_a_costly_match_is_none(shift: int, same: bool) -> None:
 
 
 def test_embedding_of_a_track_is_a_running_mean() -> None:
-    """A fifth of the new one, four fifths of what it was."""
+    """A fifth of the new one, four fifths of the old mean."""
     first, second = np.eye(2, 8)
     tracker = rt.Tracker(rt.TrackerConfig(embed_every=1))
     for view in (first, second):
@@ -1178,8 +1174,8 @@ def test_embedding_of_a_track_is_a_running_mean() -> None:
 
 
 @pytest.mark.parametrize("weight", [0.5, 0.9])
-def test_foreground_has_its_share_of_the_appearance(weight: float) -> None:
-    """A cosine of two fused rows is that share of the foregrounds' cosine, plus the rest."""
+def test_the_foreground_weight_of_the_appearance(weight: float) -> None:
+    """The cosine of two fused rows is the weighted mean of the cosines of both parts."""
     tracker = rt.Tracker(rt.TrackerConfig(foreground_weight=weight, embed_every=1))
     both = rt.Embeddings(np.eye(2, 3), np.ones((2, 1)))  # unlike objects, one background
     tracker.update(rows((0, 0, 50, 50), (90, 0, 140, 50)), embeddings=both)
@@ -1189,8 +1185,8 @@ def test_foreground_has_its_share_of_the_appearance(weight: float) -> None:
 
 
 @pytest.mark.parametrize(("kind", "pairs"), [(CHAIR, 2), (CUP, 0)])
-def test_side_by_side_objects_of_a_class_calibrate(kind: int, pairs: int) -> None:
-    """Each of two chairs is compared with the other; a chair and a cup say nothing."""
+def test_simultaneous_objects_of_a_class_calibrate_the_similarity(kind: int, pairs: int) -> None:
+    """Two chairs are compared with each other; a chair and a cup are not used."""
     views = unit(np.random.default_rng(33), 2)
     tracker = rt.Tracker(rt.TrackerConfig(n_init=1, embed_every=1))
     both = rows((0, 0, 50, 50), (90, 0, 140, 50, 0.9, kind))
@@ -1202,11 +1198,11 @@ def test_side_by_side_objects_of_a_class_calibrate(kind: int, pairs: int) -> Non
     assert counts == [(0, 0), (pairs, 2), (2 * pairs, 4)]
 
 
-# ---- Identities by place ----
+# ---- Identities by 3D position ----
 
 
-def test_an_object_like_another_one_elsewhere_is_new() -> None:
-    """It equals the first ball, which is out of view, in a place where that cannot be."""
+def test_an_identical_object_at_another_position_is_new() -> None:
+    """It equals the first ball, which is out of view, at an impossible position."""
     views = unit(np.random.default_rng(34), 2)[[0, 1, 0]]
     tracker = rt.Tracker()
     for pose in PAST + [pose_at(0.5, 62.0)] * 6:
@@ -1215,8 +1211,8 @@ def test_an_object_like_another_one_elsewhere_is_new() -> None:
     assert which.tolist() == [2] and tracks.track_id.tolist() == [3]
 
 
-def test_without_appearance_the_place_names_an_object() -> None:
-    """The detector is blind for longer than tracks wait; tracks are new, identities are not."""
+def test_without_appearance_the_position_identifies_an_object() -> None:
+    """No detections for longer than `coast_frames`: tracks are new, identities are not."""
     tracker = rt.Tracker(rt.TrackerConfig(coast_frames=5))
     walk(tracker, PAST)
     for _ in range(10):
@@ -1227,9 +1223,9 @@ def test_without_appearance_the_place_names_an_object() -> None:
 
 
 @pytest.mark.parametrize(("shift", "look", "found"), [(0, 1, 1), (0.3, 1, 3), (0.3, 0, 1)])
-def test_half_a_place_does_not_outweigh_another_look(shift: float, look: int, found: int) -> None:
-    """After a blind time: what lies where an object was is that object, what overlaps half of its
-    box and looks different is new."""
+def test_half_the_overlap_does_not_outweigh_appearance(shift: float, look: int, found: int) -> None:
+    """After frames without detections: a box at an object's projection is that object; one that
+    overlaps half of it and looks different is new."""
     views = unit(np.random.default_rng(35), 3)
     tracker = rt.Tracker(rt.TrackerConfig(coast_frames=5))
     for pose in PAST:
@@ -1253,7 +1249,7 @@ NOT_SAVED = ("state.camera_motion.residual_flow", "state.camera_motion._ahead") 
 
 
 def everything(owner: Any, name: str = "state") -> dict[str, np.ndarray]:
-    """All attributes of a tracker's state and of what it holds, by their path."""
+    """All attributes of a tracker's state, recursively, by their path."""
     if isinstance(owner, list):
         items = dict(enumerate(owner))
     else:
@@ -1269,7 +1265,7 @@ def everything(owner: Any, name: str = "state") -> dict[str, np.ndarray]:
 
 
 def filled() -> rt.Tracker:
-    """A tracker that has seen the balls with poses and appearance, without images."""
+    """A tracker after frames of the balls with poses and appearance, without images."""
     views, tracker = unit(np.random.default_rng(35), 3), rt.Tracker()
     for pose in PAST + AWAY[:10]:
         found, which = balls_seen(pose)
@@ -1287,14 +1283,14 @@ def test_everything_is_saved(tmp_path: Path) -> None:
     assert len(mine) > 40 and mine.keys() == theirs.keys()
     for name, value in mine.items():
         np.testing.assert_array_equal(value, theirs[name], err_msg=name)
-    for pose in AWAY[10:20]:  # without an image the turn since the last pose counts
+    for pose in AWAY[10:20]:  # without an image the rotation since the last pose is used
         for one in (tracker, loaded):
             one.update(rt.Detections.empty(), cam_from_world=pose, camera=CAMERA)
         np.testing.assert_array_equal(tracker.state.tracks.mean, loaded.state.tracks.mean)
 
 
-def test_the_first_turn_after_loading_counts(tmp_path: Path) -> None:
-    """A tracked box of unknown place (no parallax) is where the camera's turn takes it."""
+def test_the_first_rotation_after_loading_is_used(tmp_path: Path) -> None:
+    """A tracked box of unknown position (no parallax) moves with the camera rotation."""
     tracker, box = rt.Tracker(), rows((300, 200, 340, 260))
     for _ in range(4):
         tracker.update(box, cam_from_world=pose_at(0), camera=CAMERA)
@@ -1306,7 +1302,7 @@ def test_the_first_turn_after_loading_counts(tmp_path: Path) -> None:
     )
 
 
-def test_reset_forgets_everything() -> None:
+def test_reset_clears_the_whole_state() -> None:
     tracker = filled()
     assert tracker.ellipsoid_map.known.any() and tracker.state.gallery.count.any()
     tracker.reset()

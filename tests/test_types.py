@@ -1,4 +1,4 @@
-"""Shapes that flow through the tool: boxes, detections, tables of tracks."""
+"""Data types: boxes, detections, frames, tables of tracks."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ PARTS = (ROWS[:, :4], ROWS[:, 4], ROWS[:, 5])
 
 
 class Tensor:
-    """An array as torch shows it: on a device, asked for by `__array__` once it is on the CPU."""
+    """An array with the interface of torch: on a device, converted by `__array__` on the CPU."""
 
     def __init__(self, values: Any, where: str = "cuda:0") -> None:
         self.values, self.where = np.asarray(values), where
@@ -138,13 +138,13 @@ def supervision(**other: Any) -> Any:
         rt.Detections(*PARTS[:2], PARTS[2].astype(np.int64)),
         ultralytics(),
         ultralytics().boxes,
-        [ultralytics()],  # what a model returns: a batch of one
+        [ultralytics()],  # output of a model: a batch of one
         torchvision(),
         [torchvision(masks=None)],
         supervision(),
     ],
 )
-def test_detections_as_the_field_has_them(found: Any) -> None:
+def test_detections_of_common_libraries(found: Any) -> None:
     made = as_detections(found)
     np.testing.assert_allclose(made.xyxy, PARTS[0])
     np.testing.assert_allclose(made.score, PARTS[1])
@@ -160,11 +160,11 @@ def test_a_frame_without_detections(none: Any) -> None:
     assert as_detections(none).xyxy.shape == (0, 4) and len(as_detections(none)) == 0
 
 
-def test_masks_of_a_padded_input_come_back_to_the_image() -> None:
+def test_masks_of_a_padded_input_are_mapped_to_the_image() -> None:
     """640 x 480 in a square of 320: rows 40 to 280 are the image, at half its size."""
     data = np.zeros((2, 320, 320), np.float32)
     data[0, 40 + 10 : 40 + 110, 5:55] = 1
-    data[1, :40] = 1  # in the border: nothing of the image
+    data[1, :40] = 1  # in the padding: outside the image
     masks = as_detections(ultralytics(SimpleNamespace(data=Tensor(data)))).masks
     assert masks is not None and masks.shape == (2, 480, 640)
     expected = np.zeros((480, 640), bool)
@@ -218,20 +218,20 @@ REFUSED = [
     (changed(0, 4, -1), "detection 0: -1.0, expected a confidence"),
     (changed(0, 4, np.nan), "nan, expected a confidence"),
     (changed(0, 5, -1), "-1.0, expected a class number from 0"),
-    (changed(0, 5, 2e9), "expected a class number from 0 to 32767"),  # gigabytes of votes
+    (changed(0, 5, 2e9), "expected a class number from 0 to 32767"),  # gigabytes of class votes
     (changed(0, 5, 1.5), "1.5, expected a class number"),
     (np.repeat(ROWS, 1501, 0), "3002 detections in a frame, at most 3000"),
 ]
 
 
 @pytest.mark.parametrize(("found", "message"), REFUSED)
-def test_what_cannot_be_meant_is_refused_in_one_line(found: Any, message: str) -> None:
+def test_invalid_detections_are_refused_in_one_line(found: Any, message: str) -> None:
     with pytest.raises(rt.ReobjError, match=message) as caught:
         as_detections(found)
     assert "\n" not in str(caught.value)
 
 
-def test_rows_alone_are_rows() -> None:
+def test_arrays_of_a_wrong_width_are_refused() -> None:
     with pytest.raises(rt.ReobjError, match=r"expected \(N, 6\)"):
         rt.Detections.from_array(np.ones((6, 5)))
 
@@ -285,8 +285,8 @@ def test_a_frame_without_pixels_is_refused() -> None:
 # ---- Tables of tracks ----
 
 
-def test_concatenate_gives_earlier_rows_the_identity_confirmed_later() -> None:
-    """Tracklet 2 is named in the last frame, tracklet 3 never, tracklet 4 is a return of 1."""
+def test_concatenate_backfills_the_confirmed_identity() -> None:
+    """Tracklet 2 is confirmed in the last frame, tracklet 3 never, tracklet 4 is a return of 1."""
     steps = [
         step((1, 1, 0), (0, 2, 50)),
         step((0, 3, 90), (0, 2, 52)),
@@ -325,7 +325,7 @@ def test_rows_of_a_table_are_selected_together() -> None:
 
 
 def test_a_class_is_voted_by_the_sum_of_scores() -> None:
-    """Two faint boxes say 5, one clear box says 7; the second object is always 5."""
+    """Two low scores vote for class 5, one high score for 7; the second object is always 5."""
     table = step((1, 1, 0), (1, 1, 0), (1, 1, 0), (2, 2, 0))
     score, kind = np.array([0.3, 0.3, 0.9, 0.2]), np.array([5, 5, 7, 5])
     table = rt.Tracks(*(table.frame, table.track_id, table.tracklet_id, table.xyxy), score, kind,
@@ -371,7 +371,7 @@ def test_neighbouring_identities_have_clearly_different_colours() -> None:
         ("rtsp://me:se@cret@10.0.0.7:554/a/b", "rtsp://10.0.0.7:554/a/b"),
         ("rtsp://me:se/cret@10.0.0.7/stream", "rtsp://10.0.0.7/stream"),
         ("rtsp://me:1/2@3/4@cam/stream", "rtsp://cam/stream"),
-        ("rtsp://me:s?c@cam/stream", "rtsp://..."),  # or a query with "@": nothing tells
+        ("rtsp://me:s?c@cam/stream", "rtsp://..."),  # or a query with "@": ambiguous
         ("http://cam/v.mp4?user=me@x.org&pwd=secret", "http://..."),
         ("http://cam/v.mp4?user=me&pwd=secret", "http://cam/v.mp4"),
         ("http://cam/v.mp4#t=secret", "http://cam/v.mp4"),
@@ -410,7 +410,7 @@ def test_messages_are_one_printable_short_line_without_secrets(text: str) -> Non
         assert found.isprintable() and 0 < len(found) <= 700 and "w0rd" not in found
 
 
-def test_messages_keep_their_begin_and_their_end() -> None:
+def test_long_messages_keep_their_beginning_and_end() -> None:
     assert one_line("begin " + "x" * 2000 + " end")[:7] == "begin x"
     assert one_line("begin " + "x" * 2000 + " end").endswith("x end")
     assert one_line("x" * 700) == "x" * 700

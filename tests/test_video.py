@@ -1,4 +1,4 @@
-"""Videos, image folders, cameras and streams, with everything that can be wrong with them."""
+"""Videos, image folders, cameras and streams, valid and damaged."""
 
 from __future__ import annotations
 
@@ -198,7 +198,7 @@ def test_cut_video_is_reported(tmp_path: Path) -> None:
     assert not video.frame_count or video.frame_count == count or "ends early" in video.messages[0]
 
 
-def test_images_are_sorted_as_people_count(tmp_path: Path) -> None:
+def test_images_are_sorted_naturally(tmp_path: Path) -> None:
     folder = write_images(tmp_path / "im", ["f1.png", "f2.png", "f10.png"])
     (folder / "notes.txt").write_text("no image")
     video = rt.Video(folder)
@@ -312,10 +312,10 @@ def fake_video(
             10,
             "damaged: 10 frames up to 0.90 s can be read, frames up to 9.90 s are stored",
         ),
-        (100, 100, {98, 99}, 98, ""),  # damaged to the end: as if they were not there
+        (100, 100, {98, 99}, 98, ""),  # damaged to the end: counted as missing
     ],
 )
-def test_how_a_file_may_end(
+def test_damaged_and_missing_frames_at_the_end_of_a_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, announced: int, frames: int,
     damaged: set[int], read: int, message: str,
 ) -> None:  # fmt: skip
@@ -325,7 +325,7 @@ def test_how_a_file_may_end(
     assert len(video.messages) == bool(message) and message in "".join(video.messages)
 
 
-def test_a_file_without_times_has_those_of_its_rate(
+def test_a_file_without_times_uses_its_frame_rate(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     video = fake_video(tmp_path, monkeypatch, 5, 5, set(), times=False)
@@ -333,9 +333,7 @@ def test_a_file_without_times_has_those_of_its_rate(
     assert not video.times_are_known and "10 frames a second are assumed" in video.messages[0]
 
 
-def test_the_number_of_frames_may_not_be_announced(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_unknown_number_of_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     video = fake_video(tmp_path, monkeypatch, 0, 5, set())
     assert video.expected == 0 and video.frame_count == 5
     limited = rt.Video(tmp_path / "a.mp4", rt.InputConfig(start=1, stop=4, every=2))
@@ -352,7 +350,7 @@ def test_portrait_phone_clip() -> None:
 
 
 def test_resizing_averages() -> None:
-    """Every pixel of the small image is the mean of those that it covers."""
+    """Every pixel of the small image is the mean of the pixels it covers."""
     image = np.random.default_rng(0).integers(0, 256, (120, 160, 3)).astype(np.uint8)
     small = video_room.resized(image, (20, 15))
     assert small.shape == (15, 20, 3)
@@ -384,7 +382,7 @@ def test_a_changed_source_has_another_fingerprint(movie: Path, tmp_path: Path) -
     assert fingerprint("rtsp://camera/1") == "rtsp://camera/1" and fingerprint(0) == "0"
 
 
-def test_a_file_whose_name_looks_like_a_glob_is_itself(tmp_path: Path) -> None:
+def test_a_file_with_glob_characters_in_its_name(tmp_path: Path) -> None:
     fingerprint = video_room.source_fingerprint
     for name in ("det[1].txt", "det1.txt"):
         (tmp_path / name).write_text("1")
@@ -395,7 +393,7 @@ def test_a_file_whose_name_looks_like_a_glob_is_itself(tmp_path: Path) -> None:
     assert fingerprint(tmp_path / "det[1].txt") != before
 
 
-def test_fingerprints_of_urls_tell_them_apart_and_no_secret() -> None:
+def test_fingerprints_of_urls_are_unique_without_secrets() -> None:
     urls = [f"http://me:secret@cam/v.mp4?id={i}&pwd=secret" for i in range(2)]
     first, second = map(video_room.source_fingerprint, urls)
     assert first != second and first.startswith("http://cam/v.mp4 ")
@@ -439,7 +437,7 @@ def test_an_image_of_gigabytes_is_refused_by_its_header(
         ("a.webp", [cv2.IMWRITE_WEBP_QUALITY, 101]),  # lossless
     ],
 )
-def test_headers_tell_the_number_of_pixels(
+def test_the_number_of_pixels_is_read_from_headers(
     name: str, options: list[int], size: tuple[int, int], tmp_path: Path
 ) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (*size[::-1], 3), dtype=np.uint8)
@@ -450,7 +448,7 @@ def test_headers_tell_the_number_of_pixels(
         header_of(data[:end])
 
 
-def test_a_name_that_is_no_utf8_is_one_line(tmp_path: Path, movie: Path) -> None:
+def test_a_name_that_is_no_utf8_gives_one_line(tmp_path: Path, movie: Path) -> None:
     path = os.fsencode(tmp_path) + b"/room\xff.mp4"
     Path(os.fsdecode(path)).write_bytes(movie.read_bytes())
     with pytest.raises(rt.ReobjError, match="the name is not UTF-8; rename the file") as caught:
@@ -464,7 +462,7 @@ SIZE = (64, 48)
 
 
 class FakeCamera:
-    """A capture whose frame n is grey with value n; it stands still where a gate is closed."""
+    """A capture whose frame n is grey with value n; it blocks at a closed gate."""
 
     def __init__(self, count: int, gates: dict[int, threading.Event] | None = None) -> None:
         self.count, self.gates, self.n, self.released = count, gates or {}, 0, False
@@ -509,7 +507,7 @@ def wait_until(condition: Any) -> None:
 def test_a_slow_consumer_sees_the_newest_frames(
     monkeypatch: pytest.MonkeyPatch, quick: None
 ) -> None:
-    """While frame 1 is worked on, 2 to 10 come: 9 and 10 are seen next, the others never."""
+    """While frame 1 is processed, 2 to 10 arrive: 9 and 10 are next, the others are dropped."""
     gates = {2: threading.Event(), 11: threading.Event()}
     camera = FakeCamera(14, gates)
     opened(monkeypatch, camera)
@@ -530,8 +528,8 @@ def test_a_slow_consumer_sees_the_newest_frames(
     assert all(a.time_s <= b.time_s for a, b in itertools.pairwise(seen))
 
 
-def test_a_driver_that_hangs_is_the_end(monkeypatch: pytest.MonkeyPatch, quick: None) -> None:
-    """A stream that stalls blocks OpenCV for half a minute; the frames before are used."""
+def test_a_driver_that_hangs_ends_the_video(monkeypatch: pytest.MonkeyPatch, quick: None) -> None:
+    """A stalled stream blocks OpenCV for half a minute; earlier frames are used."""
     gate = threading.Event()
     opened(monkeypatch, FakeCamera(5, {3: gate}))
     video = rt.Video(0)
@@ -542,7 +540,7 @@ def test_a_driver_that_hangs_is_the_end(monkeypatch: pytest.MonkeyPatch, quick: 
 
 
 class Flaky:
-    """cv2.VideoCapture of a source that is there on some attempts only, with three frames each."""
+    """cv2.VideoCapture of a source available on some attempts only, with three frames each."""
 
     def __init__(self, there: str) -> None:
         self.there, self.cameras = there, list[FakeCamera]()
@@ -559,13 +557,13 @@ class Flaky:
 @pytest.mark.parametrize(
     ("reconnect", "there", "frames", "attempts", "waits"),
     [
-        (0, "xxx", 2, 1, []),  # as it was before: the first end is the end
-        (1, "xxx-", 8, 4, ["0.01", "0.01", "0.01"]),  # every frame is a new hope
+        (0, "xxx", 2, 1, []),  # no reconnection: the first end is final
+        (1, "xxx-", 8, 4, ["0.01", "0.01", "0.01"]),  # every frame resets the attempts
         (3, "x--x---", 5, 7, ["0.01", "0.02", "0.03"] * 2),  # twice as long each time, at most .03
         (2, "x-----", 2, 3, ["0.01", "0.02"]),
     ],
 )
-def test_a_lost_source_is_connected_again(
+def test_a_lost_source_is_reconnected(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture,
     reconnect: int, there: str, frames: int, attempts: int, waits: list[str],
 ) -> None:  # fmt: skip
@@ -582,8 +580,8 @@ def test_a_lost_source_is_connected_again(
     assert all(camera.released for camera in flaky.cameras if camera.n)
 
 
-def test_a_source_that_stays_away_is_asked_for_days(monkeypatch: pytest.MonkeyPatch) -> None:
-    """1,100 attempts: twice as long each time is more than a number holds."""
+def test_the_reconnection_delay_does_not_overflow(monkeypatch: pytest.MonkeyPatch) -> None:
+    """1,100 attempts: doubling the delay each time would overflow."""
     monkeypatch.setattr(video_room, "LIVE_TIMEOUT_S", 0.1)
     monkeypatch.setattr(video_room, "RECONNECT_S", (1e-9, 1e-9))
     flaky = Flaky("x")
@@ -592,7 +590,7 @@ def test_a_source_that_stays_away_is_asked_for_days(monkeypatch: pytest.MonkeyPa
     assert len(flaky.cameras) == 1101
 
 
-def test_what_has_reached_its_stop_is_not_connected_again(
+def test_a_source_at_its_stop_is_not_reconnected(
     monkeypatch: pytest.MonkeyPatch, quick: None
 ) -> None:
     flaky = Flaky("xxx")
@@ -625,7 +623,7 @@ def test_every_start_and_stop_count_frames_of_the_source(
 
 
 def test_a_driver_that_fails_ends_the_video(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Not: waits for ever. What came before is kept."""
+    """Instead of waiting forever. Earlier frames are kept."""
     camera = FakeCamera(10)
     opened(monkeypatch, camera)
     video, failures = rt.Video(0), []
@@ -635,7 +633,7 @@ def test_a_driver_that_fails_ends_the_video(monkeypatch: pytest.MonkeyPatch) -> 
     assert [f.index for f in video] == [0] and len(failures) == 1
 
 
-def test_a_camera_that_is_not_there(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_a_missing_camera(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert rt.main(["track", "97", "-o", str(tmp_path / "out")]) == 2
     assert "97: cannot be opened as a camera (is it connected?)" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
@@ -645,7 +643,7 @@ def test_a_camera_that_is_not_there(capsys: pytest.CaptureFixture[str], tmp_path
 
 
 class Stream(http.server.ThreadingHTTPServer):
-    """MJPEG as IP cameras send it; one client after the other sees all the frames."""
+    """MJPEG stream of an IP camera; each client gets all frames."""
 
     def __init__(self, count: int, pause_s: float, stalls_s: float = 0.0) -> None:
         super().__init__(("127.0.0.1", 0), Handler)
@@ -697,7 +695,7 @@ def test_a_stream_is_read_to_its_end(stream: tuple[Stream, str], quick: None) ->
     for frame in video:
         seen.append((frame.index, round(float(frame.image[5:15, 5:15].mean()))))
         time.sleep(0.02)
-    assert video.read == 39 and len(seen) + video.dropped == 39  # one more told the size
+    assert video.read == 39 and len(seen) + video.dropped == 39  # one more gave the size
     assert seen[-1][0] == 38 and [i for i, _ in seen] == sorted({i for i, _ in seen})
     for index, grey in seen:
         assert abs(grey - index - 1) <= 2  # the number in the picture; JPEG
@@ -705,7 +703,7 @@ def test_a_stream_is_read_to_its_end(stream: tuple[Stream, str], quick: None) ->
 
 @pytest.fixture
 def silent(request: pytest.FixtureRequest) -> Iterator[str]:
-    """URL of a camera that sends no more than `request.param`, and holds the connection."""
+    """URL of a camera that sends `request.param` only, and keeps the connection open."""
     done, held = threading.Event(), list[socket.socket]()
     with socket.create_server(("127.0.0.1", 0)) as listening:
         listening.settimeout(0.05)
@@ -730,10 +728,8 @@ HEAD = b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary=fr
 
 
 @pytest.mark.parametrize("silent", [b"", HEAD, HEAD + b"--frame\r\n"], indirect=True)
-def test_a_camera_that_does_not_answer_is_not_waited_for(
-    silent: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """OpenCV alone waits for half a minute."""
+def test_an_unresponsive_camera_times_out(silent: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """OpenCV itself waits for half a minute."""
     monkeypatch.setattr(video_room, "OPEN_TIMEOUT_S", 0.5)
     began = time.monotonic()
     with pytest.raises(rt.ReobjError, match=r"cannot be opened as a stream \(is it there"):
@@ -745,7 +741,7 @@ def test_a_camera_that_does_not_answer_is_not_waited_for(
 def test_a_stream_that_stalls_ends_soon(
     stream: tuple[Stream, str], quick: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In the time that is promised, and half a second to notice."""
+    """Within the documented time plus half a second."""
     url = stream[1]
     video = rt.Video(url)
     last = began = time.monotonic()
@@ -757,10 +753,10 @@ def test_a_stream_that_stalls_ends_soon(
 
 
 @pytest.mark.parametrize("stream", [(6, 0.02)], indirect=True)
-def test_a_stream_is_connected_again(
+def test_a_stream_is_reconnected(
     stream: tuple[Stream, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Over real connections: each serves six frames, then ends; fourteen need three."""
+    """Over real connections: each serves six frames; fourteen frames need three."""
     monkeypatch.setattr(video_room, "LIVE_TIMEOUT_S", 0.5)
     monkeypatch.setattr(video_room, "RECONNECT_S", (0.05, 0.1))
     video = rt.Video(stream[1], rt.InputConfig(reconnect=2, stop=14))
@@ -769,7 +765,7 @@ def test_a_stream_is_connected_again(
 
 
 def test_a_file_behind_a_url_is_read_like_a_file(tmp_path: Path) -> None:
-    """Its length is known: no thread, nothing dropped, as often as wanted."""
+    """Its length is known: no thread, no dropped frames, repeatable."""
     writer = cv2.VideoWriter(str(tmp_path / "a.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 25, SIZE)
     for n in range(12):
         writer.write(np.full((SIZE[1], SIZE[0], 3), 20 * n, np.uint8))
@@ -809,14 +805,14 @@ sys.exit(rt.main(sys.argv[2:]))
 
 @pytest.mark.parametrize("stream", [(10**6, 0.01)], indirect=True)
 def test_ctrl_c_leaves_complete_files(stream: tuple[Stream, str], tmp_path: Path) -> None:
-    """A live run ended by SIGINT: exit code 0, all its files whole, and what was lost is said."""
+    """A live run ended by SIGINT: exit code 0, complete files, and losses are reported."""
     server, url = stream
     ready = tmp_path / "ready"
     rows = [f"{i},-1,{x},60,40,50,0.9,-1,-1,-1" for i in range(1, 5000) for x in (100, 220)]
     (tmp_path / "det.txt").write_text("\n".join(rows) + "\n")
     out, env = tmp_path / "out", os.environ | {"PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-c", SAYS_WHEN_IT_TRACKS, str(ready), "run", url, "-o", str(out)]
-    for _ in range(2):  # again into the same folder: what it shows now, not what is cached
+    for _ in range(2):  # again into the same folder: current frames, not cached ones
         process = subprocess.Popen(
             [*command, "--detections", str(tmp_path / "det.txt"), "--embed", "none"],
             env=env, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,

@@ -38,7 +38,7 @@ def test_every_box_lies_in_its_frame_and_group() -> None:
     assert views.image_size == SIZE
 
 
-def test_frames_without_a_pose_are_no_views() -> None:
+def test_frames_without_a_pose_give_no_views() -> None:
     poses = walk(5)
     poses.cam_from_world[2] = np.nan
     tracks = one_box_each([0, 1, 2, 3, 99])
@@ -52,7 +52,7 @@ def test_frames_without_a_pose_are_no_views() -> None:
 @pytest.mark.parametrize(
     ("min_score", "seen"), [(0.0, 3), (0.3, 3), (0.31, 2), (0.9, 1), (0.95, 0)]
 )
-def test_boxes_below_the_score_are_no_views(min_score: float, seen: int) -> None:
+def test_boxes_below_the_score_give_no_views(min_score: float, seen: int) -> None:
     tracks = with_columns(one_box_each([0, 1, 2]), score=np.array([0.3, 0.5, 0.9]))
     views = gather_views(tracks, walk(3), np.zeros(3, np.int64), 1, min_score)
     assert np.isfinite(views.boxes[:, 0, 0]).sum() == (views.score > 0).sum() == seen
@@ -97,7 +97,7 @@ def test_cameras_of_views_project_like_the_poses() -> None:
     np.testing.assert_allclose([x / z, y / z], expected, atol=1e-9)
 
 
-def test_points_in_boxes_are_those_that_project_into_them() -> None:
+def test_points_in_boxes_project_into_them() -> None:
     """Against a loop; points behind the camera lie in no box, although they project into one."""
     rng = np.random.default_rng(0)
     points = rng.uniform(-6, 6, (800, 3))
@@ -134,7 +134,7 @@ def sparse_walk(count: int = 7, **options: Any) -> rt.Poses:
     return dataclasses.replace(poses, points=points, colors=colors, visibility=visibility)
 
 
-def test_frames_see_what_they_or_their_neighbours_observed() -> None:
+def test_frames_have_the_points_observed_by_neighbours() -> None:
     poses = sparse_walk()
     visible = VisiblePoints(poses)
     assert visible.observed(4).tolist() == [0, 2, 3] and visible.observed(1).tolist() == []
@@ -144,7 +144,7 @@ def test_frames_see_what_they_or_their_neighbours_observed() -> None:
     assert not any(1 in visible.in_frame(row) for row in range(7))  # observed by no frame
 
 
-def test_frames_without_a_pose_or_of_another_part_see_nothing() -> None:
+def test_frames_without_a_pose_or_of_another_component_have_no_points() -> None:
     poses = dataclasses.replace(sparse_walk(), part=np.array([0, 0, 0, 1, 1, 2, 2]))
     poses.cam_from_world[1] = np.nan
     visible = VisiblePoints(poses)
@@ -168,7 +168,7 @@ def test_boxes_of_a_frame_get_their_points_with_depth() -> None:
     np.testing.assert_allclose(depth, in_cam[[2, 0, 2], 2])
 
 
-def test_poses_without_points_show_none() -> None:
+def test_poses_without_points() -> None:
     visible = VisiblePoints(walk(3))
     assert visible.in_frame(1).tolist() == []
     assert [len(column) for column in visible.in_boxes(1, np.array([[0.0, 0, 640, 480]]))] == [
@@ -195,8 +195,8 @@ def rows_of(found: np.ndarray, points: np.ndarray) -> list[list[int]]:
     return [[int((points == p).all(1).argmax()) for p in own] for own in known]
 
 
-def test_points_on_a_thing_are_in_most_of_its_boxes() -> None:
-    """Those far behind it are in some; six of each chair, on its front."""
+def test_points_on_an_object_are_in_most_of_its_boxes() -> None:
+    """Points far behind it are in some; six points on the front of each chair."""
     rng = np.random.default_rng(0)
     near = [c + rng.uniform(-0.15, 0.15, (6, 3)) for c in CHAIRS.center_in_world]
     points = np.concatenate([*near, CHAIRS.center_in_world + np.array([0, 2.5, 0])])
@@ -205,11 +205,11 @@ def test_points_on_a_thing_are_in_most_of_its_boxes() -> None:
     assert [sorted(own) for own in found] == [[*range(6)], [*range(6, 12)], [*range(12, 18)]]
     views.boxes[2:5, 1] = [0, 0, 5, 5]  # in three of eight views elsewhere: not in most
     assert rows_of(points_on(views, poses, CHAIRS), points)[1] == []
-    views.boxes[2:5, 1] = np.nan  # not seen there: that says nothing
+    views.boxes[2:5, 1] = np.nan  # not observed there: no evidence
     assert len(rows_of(points_on(views, poses, CHAIRS), points)[1]) == 6
 
 
-def test_one_view_and_few_points_tell_nothing() -> None:
+def test_one_view_or_few_points_are_insufficient() -> None:
     points = CHAIRS.center_in_world[1] + np.random.default_rng(1).uniform(-0.1, 0.1, (5, 3))
     poses, views = seen_points(points)
     assert len(rows_of(points_on(views, poses, CHAIRS), points)[1]) == 5
@@ -219,7 +219,7 @@ def test_one_view_and_few_points_tell_nothing() -> None:
     assert not any(rows_of(points_on(views, poses, CHAIRS), points))
 
 
-def test_a_point_is_of_the_nearest_solid_that_of_two_the_smallest() -> None:
+def test_a_point_belongs_to_the_nearest_then_smallest_object() -> None:
     """A cup on a table, and its neighbour: all have the same boxes."""
     points = np.tile([[0.0, 0, 0.5]], (12, 1)) + 0.01 * np.arange(12)[:, None]
     poses, views = seen_points(points)
@@ -232,14 +232,14 @@ def test_a_point_is_of_the_nearest_solid_that_of_two_the_smallest() -> None:
     assert [len(own) for own in rows_of(points_on(views, poses, solids), points)] == [0, 12, 0]
 
 
-def test_of_many_points_some_are_taken_evenly() -> None:
+def test_many_points_are_subsampled_evenly() -> None:
     points = CHAIRS.center_in_world[1] + np.linspace(-0.1, 0.1, 250)[:, None]
     poses, views = seen_points(points)
     found = rows_of(points_on(views, poses, CHAIRS), points)
     assert found == [[], [*range(0, 250, 3)], []]
 
 
-def test_without_points_none_are_on_anything() -> None:
+def test_without_points_no_object_has_points() -> None:
     poses = walk(4)
     tracks = tracks_of(poses, 0.0)
     views = gather_views(tracks, poses, tracks.track_id - 1, 3, 0.0)

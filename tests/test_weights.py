@@ -1,4 +1,4 @@
-"""Weights: found, verified, downloaded whole or not at all; onnxruntime sessions."""
+"""Weights: lookup, verification, atomic download; onnxruntime sessions."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ GIT_BLOB = hashlib.sha1(b"blob 300000\0" + BLOB).hexdigest()  # as `git hash-obj
 
 
 class Handler(http.server.BaseHTTPRequestHandler):
-    """Serves BLOB; `server.mode` says how badly."""
+    """Serves BLOB; `server.mode` selects a failure."""
 
     server: Any
 
@@ -68,7 +68,7 @@ class Handler(http.server.BaseHTTPRequestHandler):
         if not mode.endswith("without a length"):
             self.send_header("Content-Length", str(len(body)))
         self.end_headers()
-        with contextlib.suppress(OSError):  # who stops reading
+        with contextlib.suppress(OSError):  # a client that stops reading
             self.wfile.write(body[: 100_000 if mode.startswith("cut") else None])
 
     def log_message(self, *args: Any) -> None:
@@ -116,7 +116,7 @@ def test_a_download_is_announced_verified_and_done_once(
     assert here(server) == [server.target]
 
 
-def test_another_file_than_expected_is_not_kept(server: Any) -> None:
+def test_an_unexpected_file_is_not_kept(server: Any) -> None:
     for server.mode, body in (("wrong", BLOB[::-1]), ("long", BLOB + b"more" * 1)):
         found = hashlib.sha256(body).hexdigest()
         with pytest.raises(rt.ReobjError, match=f"sha256 is {found}, expected {SHA256}: not kept"):
@@ -127,7 +127,7 @@ def test_another_file_than_expected_is_not_kept(server: Any) -> None:
 def test_a_git_blob_id_verifies_a_file_of_unknown_size(
     server: Any, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As a download, as a file that is here, and in the table."""
+    """As a download, as an existing file, and in the table."""
     toy = dataclasses.replace(weights.WEIGHTS[0], digest=GIT_BLOB, size=0)
     monkeypatch.setattr(weights, "WEIGHTS", (toy,))
     for server.mode in ("wrong", "long", "cut without a length"):
@@ -150,7 +150,7 @@ def test_a_git_blob_id_verifies_a_file_of_unknown_size(
         rt.model_path("toy")
 
 
-def test_a_git_blob_id_is_gits(tmp_path: Path) -> None:
+def test_a_git_blob_id_equals_that_of_git(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(BLOB)
     done = subprocess.run(
         ["git", "hash-object", tmp_path / "a"], capture_output=True, text=True, check=True
@@ -173,10 +173,10 @@ def test_a_download_of_unknown_size_ends(server: Any, monkeypatch: pytest.Monkey
         written.clear()
 
 
-def test_another_detector_is_named_but_not_taken(
+def test_another_detector_is_suggested_but_not_used(
     server: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The default cannot be had, though the small one is here: one line and exit code 2."""
+    """The default is unavailable, the small one is installed: one line and exit code 2."""
     small = dataclasses.replace(weights.WEIGHTS[0], name="small", file="small.onnx", alias="fast")
     default = dataclasses.replace(weights.WEIGHTS[0], name="deimv2-n", file="n.onnx")
     monkeypatch.setattr(weights, "WEIGHTS", (default, small))
@@ -195,12 +195,12 @@ def test_another_detector_is_named_but_not_taken(
         assert len(server.asked) == asked and not (tmp_path / "out/tracks.txt").exists()
     monkeypatch.setattr(weights, "WEIGHTS", (dataclasses.replace(default, alias="fast"),))
     with pytest.raises(rt.ReobjError) as caught:
-        rt.model_path("fast")  # nothing smaller to name
+        rt.model_path("fast")  # nothing smaller to suggest
     assert "--detector" not in str(caught.value)
 
 
 @pytest.mark.parametrize("mode", ["cut", "cut without a length"])
-def test_a_cut_download_leaves_nothing_and_starts_again(server: Any, mode: str) -> None:
+def test_a_truncated_download_leaves_nothing_and_restarts(server: Any, mode: str) -> None:
     server.mode = mode
     expected = r"cut after 100000 of 300000 bytes.: run again"
     with pytest.raises(rt.ReobjError, match=expected) as caught:
@@ -229,7 +229,7 @@ def test_404_names_url_and_hash(server: Any) -> None:
     assert here(server) == []
 
 
-def test_no_network_says_what_to_do(server: Any) -> None:
+def test_without_network_the_message_has_a_remedy(server: Any) -> None:
     server.shutdown()
     server.server_close()
     with pytest.raises(rt.ReobjError) as caught:
@@ -261,8 +261,8 @@ def test_a_full_disk(server: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     assert here(server) == []
 
 
-def test_the_page_of_a_captive_portal_is_no_file(server: Any) -> None:
-    """Also where neither size nor digest would tell it before it is read to its end."""
+def test_the_page_of_a_captive_portal_is_refused(server: Any) -> None:
+    """Also if neither size nor digest could detect it before the end of the download."""
     server.mode = "portal"
     with pytest.raises(rt.ReobjError, match=r"a web page came instead: must you log in") as caught:
         rt.model_path("toy")
@@ -278,7 +278,7 @@ def test_redirects_are_followed_but_never_off_https(
     server.target.unlink()
     headers = email.message.Message()
     plain = weights.WEIGHTS[0].url
-    headers["Location"] = plain  # where the file can be had without encryption
+    headers["Location"] = plain  # where the file is served without encryption
 
     def answers(_: Any, request: Any) -> Any:
         made = urllib.response.addinfourl(io.BytesIO(), headers, request.full_url, 302)
@@ -291,7 +291,7 @@ def test_redirects_are_followed_but_never_off_https(
     server.asked.clear()
     with pytest.raises(rt.ReobjError, match=f"redirected to {plain}, which is not encrypted"):
         rt.model_path("toy")
-    assert server.asked == [] and here(server) == []  # not even asked
+    assert server.asked == [] and here(server) == []  # not even requested
 
 
 FETCHES = """
@@ -302,8 +302,8 @@ print(rt.model_path("toy"))
 """
 
 
-def test_two_downloads_at_once_are_one(server: Any, caplog: pytest.LogCaptureFixture) -> None:
-    """Of two processes one fetches, the other waits and takes the same file."""
+def test_simultaneous_downloads_are_one(server: Any, caplog: pytest.LogCaptureFixture) -> None:
+    """One of two processes downloads, the other waits and uses the same file."""
     server.mode = "slow"
     row = repr(dataclasses.astuple(weights.WEIGHTS[0]))
     command = [sys.executable, "-c", FETCHES, row]
@@ -332,7 +332,7 @@ def test_a_download_waits_for_another_but_not_for_ever(
 # ---- Folders and states --------------------------------------------------------------------------
 
 
-def test_own_folder_comes_first_and_may_be_read_only(
+def test_the_users_folder_comes_first_and_may_be_read_only(
     server: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     own = tmp_path / "own"
@@ -382,12 +382,12 @@ def test_a_changed_file_is_refused_but_not_deleted(server: Any) -> None:
     for name in ("toy", "toy_416.onnx"):
         with pytest.raises(rt.ReobjError, match="delete the file to fetch it again"):
             rt.model_path(name)
-    assert rt.model_path(server.target) == server.target  # by its path: as it is
+    assert rt.model_path(server.target) == server.target  # by its path: not verified
     assert [row.state for row in rt.list_models()] == ["changed"]
     assert server.target.read_bytes() == b"changed"
 
 
-def test_a_file_of_that_name_is_taken_as_it_is(
+def test_a_file_given_by_path_is_not_verified(
     server: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -398,7 +398,7 @@ def test_a_file_of_that_name_is_taken_as_it_is(
 def test_states_and_unknown_names(server: Any) -> None:
     (row,) = rt.list_models()
     assert (row.weights.name, row.state, row.path) == ("toy", "missing", None)
-    assert server.asked == []  # to list is not to fetch
+    assert server.asked == []  # listing does not download
     rt.model_path("toy")
     (row,) = rt.list_models()
     assert (row.state, row.path) == ("verified", server.target)
@@ -407,7 +407,7 @@ def test_states_and_unknown_names(server: Any) -> None:
         rt.model_path("yolo99")
 
 
-def test_nowhere_to_write(server: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_writable_folder(server: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", "/proc/none")
     with pytest.raises(rt.ReobjError, match=r"cannot write to /proc/none.*: set REOBJ_MODELS"):
         rt.model_path("toy")
@@ -435,7 +435,7 @@ def test_table_of_weights() -> None:
             assert (weights.own_models() / row.file).stat().st_size == row.size
 
 
-def test_what_comes_along_needs_no_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bundled_weights_need_no_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.delenv("REOBJ_MODELS", raising=False)
     assert rt.model_path("reobj", offline=True).parent == weights.own_models()
@@ -461,14 +461,14 @@ def test_a_model_is_loaded_with_its_metadata() -> None:
     assert isinstance(metadata, dict) and metadata
 
 
-def test_no_onnx_file_is_one_line(tmp_path: Path) -> None:
+def test_an_invalid_onnx_file_gives_one_line(tmp_path: Path) -> None:
     (tmp_path / "a.onnx").write_bytes(b"no model")
     with pytest.raises(rt.ReobjError, match=r"a.onnx: onnxruntime cannot load it") as caught:
         weights.onnx_session(tmp_path / "a.onnx")
     assert "\n" not in str(caught.value)
 
 
-def test_onnxruntime_is_asked_for_when_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_onnxruntime_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(rt.ReobjError, match="pip install onnxruntime"):
         weights.onnx_session(Path("any.onnx"))
@@ -477,7 +477,7 @@ def test_onnxruntime_is_asked_for_when_it_is_missing(monkeypatch: pytest.MonkeyP
 REOBJ = weights.own_models() / "reobj.onnx"
 
 
-def test_devices_that_are_not_here_are_named() -> None:
+def test_unavailable_devices_are_named() -> None:
     import onnxruntime
 
     assert weights.onnx_session(REOBJ, 1, "cpu").get_providers() == ["CPUExecutionProvider"]
@@ -490,8 +490,8 @@ def test_devices_that_are_not_here_are_named() -> None:
 
 
 @pytest.mark.parametrize("starts", [True, False])
-def test_a_device_is_onnxruntimes_provider(monkeypatch: pytest.MonkeyPatch, starts: bool) -> None:
-    """onnxruntime goes on with the CPU where a provider does not start: that must be said."""
+def test_a_device_selects_its_provider(monkeypatch: pytest.MonkeyPatch, starts: bool) -> None:
+    """onnxruntime falls back to the CPU if a provider fails: that must be reported."""
     import onnxruntime
 
     own = "CoreMLExecutionProvider"

@@ -1,4 +1,4 @@
-"""The wheel: built, installed into a fresh environment, and used from there as a user would."""
+"""The wheel: built, installed into a fresh environment, and used from there."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ BAD = {
     "rt.TrackerConfig(n_int=1)": "Unexpected keyword argument",
     "rt.Tracker().update()": "Missing positional argument",
     "rt.Result.load('out').objects[0].centre": 'no attribute "centre"',
-    "rt.unit_rows": "does not explicitly export",  # a name of its own module
+    "rt.unit_rows": "does not explicitly export",  # a name in its own module
 }
 
 
@@ -114,9 +114,7 @@ def program(folder: Path, name: str) -> Path:
     return next(p for p in folder.glob("[Sb]*in*/*") if p.stem == name)
 
 
-def test_the_wheel_is_what_is_used_and_holds_what_the_repository_does(
-    installed: Path, tmp_path: Path
-) -> None:
+def test_the_wheel_is_used_and_complete(installed: Path, tmp_path: Path) -> None:
     here = site_packages(installed)
     text = "import quadrics, reobj, reobj_track, sys; print(*sys.path, sep='\\n'); " + (
         "print(*(m.__file__ for m in (quadrics, reobj, reobj_track)), sep='\\n'); "
@@ -142,7 +140,7 @@ def test_the_wheel_is_what_is_used_and_holds_what_the_repository_does(
     } == set()
 
 
-def test_a_users_program_sees_the_types(installed: Path, tmp_path: Path) -> None:
+def test_a_users_program_is_type_checked(installed: Path, tmp_path: Path) -> None:
     """Types of results; the documented calls are accepted, and each mistake is found."""
     pytest.importorskip("mypy", reason="the types cannot be checked without mypy")
     (tmp_path / "program.py").write_text(PROGRAM)

@@ -1,4 +1,4 @@
-"""The output folder: what may be written where, what is found again, what never mixes."""
+"""The output folder: ownership, cached results, separation of videos."""
 
 from __future__ import annotations
 
@@ -34,20 +34,20 @@ def frames(folder: Path, grey: int) -> Path:
     return folder
 
 
-# ---- Whose folder it is ----
+# ---- Ownership of the folder ----
 
 
-def test_a_folder_of_others_is_not_written_into(tmp_path: Path) -> None:
+def test_a_foreign_folder_is_not_written_into(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("precious")
     with pytest.raises(rt.ReobjError, match=r"not made by reobj_track.*--overwrite"):
         Workspace(tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
     Workspace(tmp_path, overwrite=True)
     assert (tmp_path / "thesis.tex").read_text() == "precious"
-    Workspace(tmp_path)  # it is ours now
+    Workspace(tmp_path)  # it belongs to the tool now
 
 
-def test_a_model_of_others_is_never_lost(tmp_path: Path) -> None:
+def test_a_foreign_model_is_never_deleted(tmp_path: Path) -> None:
     (tmp_path / "sparse").mkdir()
     with pytest.raises(rt.ReobjError, match="sparse/ of its own"):
         Workspace(tmp_path, overwrite=True)
@@ -61,7 +61,7 @@ def test_a_file_is_no_folder(tmp_path: Path) -> None:
             Workspace(tmp_path / "out", overwrite)
 
 
-def test_new_and_empty_folders_are_taken(tmp_path: Path) -> None:
+def test_new_and_empty_folders_are_accepted(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     for out in (tmp_path / "empty", tmp_path / "a" / "b"):
         assert Workspace(out).cache.is_dir()
@@ -79,8 +79,8 @@ def test_only_folders_of_earlier_runs_are_opened(tmp_path: Path) -> None:
 # ---- One video a folder ----
 
 
-def test_results_of_two_videos_never_mix(video: rt.Video, tmp_path: Path) -> None:
-    """Another video needs --overwrite, and then nothing of the first one is left."""
+def test_results_of_two_videos_are_never_mixed(video: rt.Video, tmp_path: Path) -> None:
+    """Another video requires --overwrite, which deletes all results of the first."""
     space = Workspace(tmp_path / "out")
     space.bind(video)
     poses = walk(2)
@@ -98,7 +98,7 @@ def test_results_of_two_videos_never_mix(video: rt.Video, tmp_path: Path) -> Non
     assert left == ["cache", "cache/source.json"]
 
 
-def test_a_changed_video_is_another_one(video: rt.Video, tmp_path: Path) -> None:
+def test_a_changed_video_is_another_video(video: rt.Video, tmp_path: Path) -> None:
     space = Workspace(tmp_path / "out")
     space.bind(video)
     space.save_last(fitted(tracks_of(walk(2)), None), None)
@@ -129,7 +129,7 @@ with Workspace(sys.argv[1]):
 
 
 def test_one_run_at_a_time_writes_into_a_folder(tmp_path: Path) -> None:
-    """The lock ends with its process, also by kill -9, and leaves nothing to be cleaned up."""
+    """The lock ends with its process, also by kill -9, and needs no cleanup."""
     out = tmp_path / "out"
     command = [sys.executable, "-c", HOLD, str(out)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=ROOT) as other:
@@ -137,7 +137,7 @@ def test_one_run_at_a_time_writes_into_a_folder(tmp_path: Path) -> None:
         with pytest.raises(rt.ReobjError, match="out: another run is writing into this folder"):
             with Workspace(out):
                 pass
-        Workspace(out)  # who only reads needs no lock
+        Workspace(out)  # reading needs no lock
         other.kill()
         other.wait()
     for _ in range(2):
@@ -179,14 +179,14 @@ FRAMES = '{"source": "a", "input": {}, "frames": {"size": [640, %s], "count": 3%
         FRAMES % (480, ', "names": [5]'),
     ],
 )  # fmt: skip
-def test_a_damaged_binding_is_said(tmp_path: Path, text: str) -> None:
+def test_a_damaged_source_file_is_reported(tmp_path: Path, text: str) -> None:
     space = Workspace(tmp_path)
     (space.cache / "source.json").write_text(text)
     with pytest.raises(rt.ReobjError, match=r"source\.json"):
         space.video()
 
 
-def test_frames_without_images_are_bound_as_they_were(tmp_path: Path) -> None:
+def test_frames_without_images_are_restored(tmp_path: Path) -> None:
     space = Workspace(tmp_path)
     (space.cache / "source.json").write_text(FRAMES % (480, ', "times_s": [0, 1, 5]'))
     assert [(f.index, f.time_s) for f in space.video()] == [(0, 0), (1, 1), (2, 5)]
@@ -198,7 +198,7 @@ def test_frames_without_images_are_bound_as_they_were(tmp_path: Path) -> None:
 # ---- The cache ----
 
 
-def test_a_stage_is_found_again_under_the_same_inputs_only(
+def test_cached_stages_require_the_same_inputs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     space = Workspace(tmp_path)
@@ -239,8 +239,8 @@ def published(out: Path, models: list[Path] | None) -> dict[str, list[str]]:
     return found
 
 
-def test_every_part_has_its_model(tmp_path: Path) -> None:
-    """Copies; of fewer parts than before, the models of the others go; what is no part's stays."""
+def test_every_component_has_its_model(tmp_path: Path) -> None:
+    """Copies; models of components that no longer exist are deleted, other folders are kept."""
     out, models = tmp_path / "out", [tmp_path / name for name in "abc"]
     for model in models:
         model.mkdir()
@@ -257,8 +257,8 @@ def test_every_part_has_its_model(tmp_path: Path) -> None:
     assert published(out, []) == kept
 
 
-def test_models_of_a_run_that_was_killed_are_published_later(tmp_path: Path) -> None:
-    """They are remembered with the poses until the results are written."""
+def test_models_of_a_killed_run_are_published_later(tmp_path: Path) -> None:
+    """They are stored with the poses until the results are written."""
     space, poses = Workspace(tmp_path / "out"), walk(2)
     result = fitted(tracks_of(poses), poses)
     space.save_last(result, poses, [space.cache / "poses-1.sparse"])
@@ -269,7 +269,7 @@ def test_models_of_a_run_that_was_killed_are_published_later(tmp_path: Path) -> 
     assert space.last_models() is None
 
 
-def test_the_binding_is_written_whole_or_not_at_all(
+def test_the_source_file_is_written_atomically(
     video: rt.Video, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     space = Workspace(tmp_path / "out")

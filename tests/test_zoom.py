@@ -1,4 +1,4 @@
-"""A camera that zooms: found by each image against its neighbours on one side."""
+"""Zoom detection: each image is compared with its neighbours on one side."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from reobj.poses.verification import constant_focal
 
 
 def zoomed_scene(zoomed, ratio, seed=0, noise_px=0.3):
-    """A walk whose model is right, but for the pictures of a stretch at another focal length.
+    """A walk whose model is right, except for an interval of images at another focal length.
 
-    The pixels of those images are what a camera with that focal length sees, each put back by the
-    distance that hides it best: the model of a mapper that knows of one focal length only.
+    Those images are rendered with that focal length, and their poses are shifted by the distance
+    that compensates it best: the model of a mapper with a single focal length.
     """
     scene = Scene(count=20, seed=seed)
     centre = np.array([CAMERA.principal_point_x, CAMERA.principal_point_y])
@@ -34,7 +34,7 @@ def views_of(*scene, **options):
 
 
 @pytest.mark.parametrize("ratio", [1.3, 1 / 1.3])
-def test_images_of_another_focal_length_are_found(ratio):
+def test_images_of_another_focal_length_are_detected(ratio):
     others, changes = constant_focal([views_of(range(7, 13), ratio)])
     assert set(range(8, 14)) <= set(others.tolist())
     assert [(a, b) for a, b, _ in changes] == [(7, 8), (13, 14)]
@@ -42,8 +42,8 @@ def test_images_of_another_focal_length_are_found(ratio):
 
 
 @pytest.mark.parametrize("log, sigma, found", [(0.3, 0.03, 1), (0.2, 0.01, 0), (0.3, 0.07, 0)])
-def test_one_side_alone_must_be_clearer(monkeypatch, log, sigma, found):
-    """By the images before it, one image has another focal length; those after it measure none."""
+def test_evidence_of_one_side_must_be_stronger(monkeypatch, log, sigma, found):
+    """Earlier images give another focal length for one image; later ones give none."""
     views = views_of(range(0), 1.0)
 
     def log_focal(arrays, image, side):
@@ -63,26 +63,26 @@ def test_the_focal_length_of_most_images_is_kept():
 
 @pytest.mark.parametrize("ratio", [1.0, 1.04])
 def test_one_focal_length_is_no_zoom(ratio):
-    """Also where the lens breathes by a few per cent as it focuses."""
+    """Also with focus breathing of a few per cent."""
     others, changes = constant_focal([views_of(range(7, 13), ratio, noise_px=1.0)])
     assert len(others) == 0 and changes == []
 
 
 def test_a_short_zoom_separates_its_two_sides(monkeypatch):
-    """Between two changes near each other no focal length is measured without the other side."""
+    """Between two near changes no focal length can be measured from one side alone."""
     views = views_of(range(7, 13), 1.3)
     assert constant_focal([views])[0].tolist() == list(range(8, 21))  # the first of equal sides
-    monkeypatch.setattr(verification, "WINDOW", 6)  # now both sides of it are measured alone
+    monkeypatch.setattr(verification, "WINDOW", 6)  # both sides of it are measured separately
     assert constant_focal([views])[0].tolist() == list(range(8, 14))
 
 
-def test_models_are_checked_one_by_one():
+def test_models_are_checked_individually():
     one, other = views_of(range(0), 1.0), views_of(range(7, 13), 1.3)
     assert constant_focal([one])[1] == [] and len(constant_focal([one, other])[1]) == 2
     assert constant_focal([])[0].tolist() == []
 
 
-def test_too_few_points_show_no_zoom():
+def test_too_few_points_give_no_zoom():
     scene = zoomed_scene(range(7, 13), 1.3)
     scene.seen[:, 30:] = False
     assert constant_focal([read_arrays(scene.model())])[1] == []
