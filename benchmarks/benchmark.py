@@ -165,13 +165,13 @@ def make_stream(
     low = rng.random(len(f)) < 0.08
     score = np.where(low, rng.uniform(0.15, 0.45, len(f)), rng.uniform(0.6, 0.95, len(f)))
     clutter = rng.integers(0, frames, round(0.02 * len(f)))
-    places, sizes = rng.uniform(0, 1, (2, len(clutter), 2))
+    corners, sizes = rng.uniform(0, 1, (2, len(clutter), 2))
     frame = np.r_[f, clutter]
     order = np.argsort(frame, kind="stable")
     visit = paths.visit[f, o]
     embedding = embeddings(rng, o, visit, dim, *COSINES.get(kind, (0.88, 0.31, 0.88)))
     embedding = np.r_[embedding, unit(rng.normal(size=(len(clutter), dim)))]
-    all_box = np.r_[measured, np.c_[places * SIZE, 40 + 120 * sizes]]
+    all_box = np.r_[measured, np.c_[corners * SIZE, 40 + 120 * sizes]]
     xyxy = np.c_[all_box[:, :2] - all_box[:, 2:] / 2, all_box[:, :2] + all_box[:, 2:] / 2]
     g, k = np.nonzero(paths.seen)
     corner = np.c_[box[g, k, :2] - box[g, k, 2:] / 2, box[g, k, 2:]]
@@ -185,11 +185,11 @@ def make_stream(
 
 
 def occlusions(rng: np.random.Generator, shape: tuple[int, ...]) -> npt.NDArray[np.bool_]:
-    """(F, O): hidden for 4-15 frames now and then (3 % of the time)."""
-    hidden = np.zeros(shape, bool)
+    """(F, O): occluded for 4-15 frames from time to time (3 % of the time)."""
+    occluded = np.zeros(shape, bool)
     for f, o in zip(*np.nonzero(rng.random(shape) < 0.003), strict=True):
-        hidden[f : f + rng.integers(4, 16), o] = True
-    return hidden
+        occluded[f : f + rng.integers(4, 16), o] = True
+    return occluded
 
 
 def unit(rows: Array) -> Array:

@@ -161,7 +161,7 @@ def simulated(gt: Path) -> list[rt.Detections]:
     """Boxes of pedestrians as a detector might find them, from MOT17's truth.
 
     Found with the probability of what is visible of them, at most .95; corners off by 4 % of the
-    size; score .3 to .9 by visibility; one box in twenty is nothing.
+    size; score .3 to .9 by visibility; one box in twenty is a false positive.
     """
     rows = np.loadtxt(gt, delimiter=",")
     rows, rng = rows[(rows[:, 7] == 1) & (rows[:, 6] == 1)], np.random.default_rng(len(rows))
@@ -399,7 +399,7 @@ def with_embeddings(
 def jobs(seq: Sequence, args: Any) -> dict[str, tuple[str, Callable[[], IntArray]]]:
     """For every tracker: what its result depends on, and how to make it.
 
-    `appearance NAME` gives the ranks of the returns in place of identities.
+    `appearance NAME` gives the ranks of the returns instead of identities.
     """
     part, source = functools.partial, SOURCE + EMBEDDER
     result: dict[str, tuple[str, Callable[[], IntArray]]] = {
@@ -522,14 +522,14 @@ def report(found: dict[str, dict[str, IntArray]], seqs: list[Sequence]) -> list[
 
 def cells(row: dict[str, Any]) -> list[str]:
     """One line of a table."""
-    share = [f"{100 * row[c]:.1f}" for c in "HOTA DetA AssA IDF1 MOTA".split()]
+    scores = [f"{100 * row[c]:.1f}" for c in "HOTA DetA AssA IDF1 MOTA".split()]
     for c, at in SPREAD.items():
         if row[f"{c}_min"] < row[f"{c}_max"]:
-            share[at] += f" ({100 * row[f'{c}_min']:.0f}-{100 * row[f'{c}_max']:.0f})"
+            scores[at] += f" ({100 * row[f'{c}_min']:.0f}-{100 * row[f'{c}_max']:.0f})"
     kept = f"{round(row['returns'] * row['returns_kept'])} of {row['returns']}"
     rank1 = "-" if np.isnan(row["rank1"]) else f"{100 * row['rank1']:.0f}"
     ids = [f"{row['ids_per_object']:.2f}", f"{row['identities']} / {row['gt_objects']}"]
-    return [row["tracker"], *share, str(row["IDSW"]), *ids, kept, rank1]
+    return [row["tracker"], *scores, str(row["IDSW"]), *ids, kept, rank1]
 
 
 SPREAD = {"HOTA": 0, "IDF1": 3}  # columns with the least and largest of the sequences
@@ -569,7 +569,7 @@ def verdicts(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def write_page(rows: list[dict[str, Any]], out: Path) -> None:
-    """compare.html: the plots and all tables on one page that needs nothing else."""
+    """compare.html: the plots and all tables on one self-contained page."""
     parts = ["<!doctype html><meta charset=utf-8><title>Identities compared</title><style>"
              "body{font:14px sans-serif;margin:2em}td,th{padding:2px 9px;text-align:right}"
              "td:first-child{text-align:left}tr.ours{background:#e3f4e3}img{max-width:100%}"

@@ -41,18 +41,18 @@ class Case:
     found: LabelledBoxes
     truth_row: IntArray  # (M,) matched rows
     found_row: IntArray  # (M,)
-    visibility: Array  # (N,) of the truth, NaN where the file does not say
+    visibility: Array  # (N,) of the truth, NaN if not in the file
     score: Array  # of the result's rows
     seen_as: npt.NDArray[np.str_]  # class of each detection, "" where unknown
 
 
 @dataclass(frozen=True, slots=True)
 class Error:
-    """A true object under an identity that does not stand for it.
+    """A true object with an identity that is not assigned to it.
 
     Attributes:
-        right: identity that stands for it (None: no identity does); wrong: the one it has here.
-        owner: true object that `wrong` stands for, or None.
+        right: identity assigned to it (None: no identity); wrong: the one it has here.
+        owner: true object that `wrong` is assigned to, or None.
         pairs: rows of `Case.truth_row` (and `found_row`) where that is so, by frame.
     """
 
@@ -118,19 +118,19 @@ def absence(case: Case, true: int, start: int) -> str:
     if last == start - 1:
         return "switched while in view"
     gap = (mine > last) & (mine < start)
-    away, hidden = start - last - 1 - gap.sum(), int((visible[gap] < 0.5).sum())
+    away, occluded = start - last - 1 - gap.sum(), int((visible[gap] < 0.5).sum())
     parts = [f"out of view for {away} frames"] if away else []
     if gap.any():
-        parts.append(f"not detected for {gap.sum()} frames ({hidden} of them half hidden)")
+        parts.append(f"not detected for {gap.sum()} frames ({occluded} of them half hidden)")
     return "; ".join(parts)
 
 
 def causes(case: Case, error: Error, size: tuple[int, int]) -> str:
-    """What the boxes, scores and classes say about how the error began; size: of the image."""
+    """Causes of the error according to boxes, scores and classes; size: of the image."""
     g, p = (int(rows[error.pairs[0]]) for rows in (case.truth_row, case.found_row))
     start, box, name = int(case.truth.frame[g]), case.truth.xyxy[g], case.truth.name[g]
     same = (case.truth.frame == start) & (case.truth.name == name)
-    twins = case.truth.xyxy[same & (case.truth.identity != error.true)]
+    identical = case.truth.xyxy[same & (case.truth.identity != error.true)]
     facts = {
         absence(case, error.true, start): True,
         "cut by the border": (box[:2] < 3).any() or (box[2:] > np.array(size) - 3).any(),
@@ -139,13 +139,13 @@ def causes(case: Case, error: Error, size: tuple[int, int]) -> str:
         f"{100 * case.visibility[g]:.0f} % visible": case.visibility[g] < 0.6,
         "low scores": np.median(case.score[case.found_row[error.pairs[:5]]]) < 0.5,
         f"seen as {case.seen_as[p]}": bool(name) and case.seen_as[p] != name,
-        "overlaps its twin": len(twins) and box_iou(box[None], twins).max() > 0.2,
+        "overlaps its twin": len(identical) and box_iou(box[None], identical).max() > 0.2,
     }
     return "; ".join(text for text, true in facts.items() if true)
 
 
 def title(case: Case, error: Error) -> str:
-    """One line that says what went wrong."""
+    """Describe the error in one line."""
     frames = case.truth.frame[case.truth_row[error.pairs]]
     name = case.truth.name[case.truth_row[error.pairs[0]]] or "object"
     what = "a second identity" if error.owner is None else f"taken for {name} {error.owner}"
@@ -157,7 +157,7 @@ def title(case: Case, error: Error) -> str:
 
 
 def panels(case: Case, error: Error) -> list[tuple[int, int, str]]:
-    """(frame, true object, caption): right, wrong, and the object that the identity stands for."""
+    """(frame, true object, caption): right, wrong, object of the identity."""
     true, ids = case.truth.identity[case.truth_row], case.found.identity[case.found_row]
     frame = case.truth.frame[case.truth_row]
     start = int(frame[error.pairs[0]])

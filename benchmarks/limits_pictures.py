@@ -55,7 +55,7 @@ def run(folder: Path, detections: Path, **options: int) -> Entry:
 
 
 def fitted(data: Entry, near: Array, reach: float) -> list[Entry]:
-    """Fitted chairs and tables around a place, with their rotation as a matrix."""
+    """Fitted chairs and tables around a position, with their rotation as a matrix."""
     kept = [o for o in data["objects"] if o["center"] and o["class"] in ("chair", "dining table")]
     for o in kept:
         o["world_from_obj"] = Rotation.from_quat(np.roll(o["quat_wxyz"], -1)).as_matrix()
@@ -154,9 +154,9 @@ def most_hidden(work: Path) -> tuple[int, Entry, Array]:
         inside = whole.min() > 5 and (whole.max(0) < [635, 475]).all()
         if inside and iou.max(initial=0) > 0.6:
             box = corners[iou.argmax()]
-            share = np.prod(box[2:] - box[:2]) / np.prod(np.ptp(whole, axis=0))
-            if share < best[0]:
-                best = (float(share), (int(row[0]) - 1, true[int(row[1])], box))
+            visible = np.prod(box[2:] - box[:2]) / np.prod(np.ptp(whole, axis=0))
+            if visible < best[0]:
+                best = (float(visible), (int(row[0]) - 1, true[int(row[1])], box))
     index, chair, box = best[1]
     return index, chair, box
 
@@ -190,7 +190,7 @@ def around(points: Array) -> Array:
 
 
 def carry_away(work: Path) -> None:
-    """Move a chair by a metre in the second half, by its boxes alone, and say what comes out."""
+    """Move a chair by a metre in the second half, by changing its boxes, and print the result."""
     video = rt.Video(ROOM / "room.mp4")
     rows = np.loadtxt(ROOM / "gt_mot.txt", delimiter=",")
     chair = next(o for o in true_objects() if o["class"] == "chair")

@@ -142,7 +142,7 @@ def changed(node: ast.AST, rng: random.Random) -> ast.AST | None:
     return None if ast.dump(new) == ast.dump(node) else new
 
 
-def places(tree: ast.AST) -> Iterator[ast.AST]:
+def mutable_nodes(tree: ast.AST) -> Iterator[ast.AST]:
     """Yield the nodes that may be changed: no annotations, messages, strings."""
     for name, value in ast.iter_fields(tree):
         if name in ("annotation", "returns", "decorator_list", "type_params"):
@@ -153,12 +153,12 @@ def places(tree: ast.AST) -> Iterator[ast.AST]:
             ):
                 continue
             yield node
-            yield from places(node)
+            yield from mutable_nodes(node)
 
 
 @dataclass
 class Mutant:
-    """A changed place: bytes `begin` to `end` of a file become `text`."""
+    """A change: bytes `begin` to `end` of a file become `text`."""
 
     file: str
     line: int
@@ -177,7 +177,7 @@ def mutants_of(root: Path, file: str, executed: set[int], rng: random.Random) ->
     for line in source.splitlines(keepends=True):
         starts.append(starts[-1] + len(line))
     found = []
-    for node in places(ast.parse(source)):
+    for node in mutable_nodes(ast.parse(source)):
         at: Any = node
         if getattr(node, "lineno", None) not in executed:
             continue
@@ -242,7 +242,7 @@ def chosen(by_file: dict[str, list[Mutant]], count: int) -> list[Mutant]:
 
 
 def report(mutants: Sequence[Mutant]) -> str:
-    """Format the share of killed changes of each file, and the survivors."""
+    """Format the fraction of killed changes of each file, and the survivors."""
     lines = []
     done = [m for m in mutants if m.seconds]
     for file in sorted({m.file for m in done}):
@@ -258,7 +258,7 @@ def report(mutants: Sequence[Mutant]) -> str:
 
 
 def copy_checkout(folder: Path) -> Path:
-    """Copy what git knows of the checkout."""
+    """Copy the files of the checkout tracked by git."""
     listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
     for name in listed.stdout.splitlines():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)

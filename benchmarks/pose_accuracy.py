@@ -194,15 +194,15 @@ def score(found: rt.Poses, truth: rt.Poses) -> dict[str, float]:
     error = np.linalg.norm(scale * a @ rotation.T + shift - b, axis=1)  # (F,)
     turn = np.swapaxes(rotation @ turn_a, 1, 2) @ turn_b
     cosine = np.clip((np.trace(turn, axis1=1, axis2=2) - 1) / 2, -1, 1)
-    share = 100 / float(np.linalg.norm(np.ptp(b, axis=0)))
+    percent = 100 / float(np.linalg.norm(np.ptp(b, axis=0)))
     status = found.status[both]
     ratio = float("nan")
     if (status == "pnp").any() and (status == "keyframe").any():
         ratio = np.median(error[status == "pnp"]) / np.median(error[status == "keyframe"])
     return {
-        "median": share * float(np.median(error)),
-        "rmse": share * float(np.sqrt((error**2).mean())),
-        "max": share * float(error.max()),
+        "median": percent * float(np.median(error)),
+        "rmse": percent * float(np.sqrt((error**2).mean())),
+        "max": percent * float(error.max()),
         "cm": 100 * float(np.median(error)),
         "turn": float(np.degrees(np.median(np.arccos(cosine)))),
         "pnp": float(ratio),

@@ -20,7 +20,7 @@ Kinds of corruption, in clips of 24 to 40 images:
     corridor         rendered rooms in a row that look the same: a revisited view is another room
     turn             rendered: the camera only rotates for a stretch
     zoomed           a stretch is zoomed: another focal length
-    thin             a stretch is blurred or dark: its two sides share few points
+    thin             a stretch is blurred or dark: its two sides have few common points
 and besides
     issue            the two failures that were reported first, in full length, with the defaults
     good             unchanged recordings, with the defaults: they must still be registered
@@ -91,7 +91,7 @@ WHOLE_SHARE = 0.9  # of the frames in one part: whole
 def align(found: Array, truth: Array) -> tuple[Array, Array]:
     """Bring cameras to the truth by one similarity.
 
-    Centres and orientations have the same say, so that a straight path has no free roll.
+    Centres and orientations have equal weight, so that a straight path has no free roll.
 
     Args:
         found, truth: cam_from_world (n, 3, 4), n >= 1; a similarity of all of them is fitted.
@@ -163,7 +163,7 @@ def fit_part(found: Array, truth: Array, least_extent: float = 1e-9) -> tuple[Ar
 
 
 WINDOW_SHARE = 6  # of a part's frames on each side in which its local scale is taken (chosen)
-LEAST_SPREAD = 0.1  # of the true centres in it over that of all; less tells nothing (chosen)
+LEAST_SPREAD = 0.1  # of the true centres in it over that of all; less is uninformative (chosen)
 
 
 def local_scale(found: Array, truth: Array, noise: float = 0.0) -> Array:
@@ -201,7 +201,7 @@ class Verdict:
 
     Attributes:
         outcome: whole, partly, refused, said or passed (head of this file).
-        posed: share of the frames that have a pose. right: frames whose pose is right. parts:
+        posed: fraction of the frames that have a pose. right: frames whose pose is right. parts:
         number of parts with poses.
         strays: frames off their part that are too few to be a break. wrong: frame numbers of those
         that do not belong to their part. centre, turn_deg: their median errors (of all frames, if
@@ -397,8 +397,8 @@ class Recording:
         defaults, take its place. focal: true one over the width (0: the one found).
         room: RoomConfig of a rendered one. today: frames with a right pose, in one part, at the
         defaults with `good_every`, at commit a196537; interpolated ones do not count. 0: broken.
-        noise: largest error of a true centre, in its unit: smaller ones of ours tell nothing.
-        plan: of a rendered room, "" without. Rooms of one plan are one place in other colours, to
+        noise: largest error of a true centre, in its unit: smaller errors are not significant.
+        plan: of a rendered room, "" without. Rooms of one plan are one scene in other colours, to
         15 cm, and are rightly joined.
     """
 
@@ -582,7 +582,7 @@ def middle(count: int, rng: Rng, least: float, most: float) -> IntArray:
 
 
 def left_out(shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
-    """Leave out the stretch, of a share of the clip, over which the view turns most."""
+    """Leave out the interval, a fraction of the clip, over which the view turns most."""
     clip, what = stretch(shelf, [n for n in names if n != "table"], rng, 36)
     count, gap = len(clip.images), round(len(clip.images) * rng.uniform(0.3, 0.55))
     starts = np.arange(count // 5, max(count // 5 + 1, count - gap - count // 5))
@@ -607,7 +607,7 @@ def permuted(shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
 
 
 def two_rooms(shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
-    """Put recordings of two places into one file, one after the other or by turns."""
+    """Put recordings of two scenes into one file, one after the other or by turns."""
     first = str(rng.choice(list(names)))
     plan = RECORDINGS[first].plan
     others = [n for n in names if n != first and not (plan and RECORDINGS[n].plan == plan)]
@@ -643,7 +643,7 @@ def turn(shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
     name = str(rng.choice(["turn", "turn_b"]))
     clip, every = shelf.clip(name), int(rng.integers(1, 5))
     count = len(clip.images)
-    first, last = (round(share * count) for share in rr.TURNS_FROM_TO)
+    first, last = (round(fraction * count) for fraction in rr.TURNS_FROM_TO)
     before, after = rng.integers(8, first + 1), rng.integers(8, count - last + 1)
     rows = np.r_[first - before : first, first:last:every, last : last + after]
     if rng.random() < 0.25:
@@ -687,7 +687,7 @@ KINDS: dict[str, Callable[[Shelf, Sequence[str], Rng], Broken]] = {
     "zoomed": zoomed_stretch,
     "thin": thin,
 }
-KNOWN_CAMERA = 0.25  # share of the cases with given intrinsics (chosen)
+KNOWN_CAMERA = 0.25  # fraction of the cases with given intrinsics (chosen)
 
 
 # ---- Running ------------------------------------------------------------------------------------

@@ -121,7 +121,7 @@ class Crops(rt.CropEmbedder):
 
 
 class OneCrop(Crops):
-    """One crop of each object: "fg", "bg" (the other part hidden) or "full" (the grown crop as it
+    """One crop of each object: "fg", "bg" (the other part masked) or "full" (the grown crop as it
     is), through the backbone and, if `head` names one, a ConvBlock of its own.
     """
 
@@ -285,8 +285,8 @@ def rank_queries(
         nearer = len(wrong) - np.searchsorted(wrong, right, "right")
         equal = len(wrong) - np.searchsorted(wrong, right, "left") - nearer
         before = nearer + 0.5 * equal  # (P,) wrong ones in front of each right one
-        place = np.arange(1, len(right) + 1)
-        rank[i], precision[i] = 1 + before[0], np.mean(place / (place + before))
+        position = np.arange(1, len(right) + 1)
+        rank[i], precision[i] = 1 + before[0], np.mean(position / (position + before))
     return rank, precision
 
 
@@ -426,19 +426,21 @@ def cases_of(scene: Scene, parts: Sequence[npt.NDArray[Any]], weight: float, see
     pairs, rng, away = pairs_of([scene]), np.random.default_rng(seed), 30
     cosine = np.stack([p @ p.T for p in parts], -1)  # (N, N, 2)
     fused, angle = cosine @ [weight, 1 - weight], pairs.angle_deg()
-    alike, same = pairs.name[:, None] == pairs.name[None], pairs.same()
+    same_class, same = pairs.name[:, None] == pairs.name[None], pairs.same()
     gap = (pairs.frame[:, None] - pairs.frame[None]).astype(np.int64)  # (N, N) frames since row j
     begun = np.array([began(pairs.frame[same[q] & (gap[q] >= 0)], away) for q in range(len(gap))])
     rows, shown = [], ([], [])  # type: ignore[var-annotated]
     for q in range(len(gap)):  # over queries
-        here = np.flatnonzero(alike[q] & (gap[q] == 0))
+        here = np.flatnonzero(same_class[q] & (gap[q] == 0))
         for k in here:
             first = np.flatnonzero(same[k] & (pairs.frame == begun[k]))[0]
             if begun[k] <= pairs.frame[q] - away:
                 shown[int(k == q)].append(cosine[q, first])
         least, views = rng.choice((15, 30, 60, 120)), rng.choice((1, 2, 4, 8, 12))
         known = (
-            alike[q] & (gap[q] > least) & ~np.isin(pairs.identity, pairs.identity[here[here != q]])
+            same_class[q]
+            & (gap[q] > least)
+            & ~np.isin(pairs.identity, pairs.identity[here[here != q]])
         )
         for i in np.unique(pairs.identity[known]):
             own = np.flatnonzero(known & (pairs.identity == i))
@@ -497,7 +499,7 @@ def log_loss(probability: Array, same: BoolArray) -> Array:
 def reliability(
     probability: Array, same: BoolArray, weight: Array, bins: int = 10
 ) -> list[dict[str, float]]:
-    """Weighted mean probability and share of right ones in equal bins of probability."""
+    """Weighted mean probability and fraction of right ones in equal bins of probability."""
     row = np.minimum((probability * bins).astype(int), bins - 1)
     total = np.bincount(row, weight, bins)
     said = np.bincount(row, weight * probability, bins) / np.maximum(total, 1e-12)
@@ -571,9 +573,9 @@ def reliabilities(cases: Sequence[Cases]) -> list[dict[str, Any]]:
             p, same = (np.concatenate(x) for x in both)
             weight = np.ones(len(p))
         else:
-            hidden = np.where([True, known != "f"], 1, np.nan)
+            mask = np.where([True, known != "f"], 1, np.nan)
             p = np.concatenate([
-                c.decider().probability(*(c.cosine * hidden).T, c.angle if angle else np.nan)
+                c.decider().probability(*(c.cosine * mask).T, c.angle if angle else np.nan)
                 for c in own
             ])  # fmt: skip
             same = np.concatenate([c.same for c in own])
@@ -623,7 +625,7 @@ def cost_ms(scene: Scene, methods: dict[str, Any], objects: int = 10) -> dict[st
     for _ in range(7):
         for name, (look, _) in methods.items():
             started = time.perf_counter()
-            look(image.copy(), found, rows)  # a new frame: nothing is remembered
+            look(image.copy(), found, rows)  # a new frame: the cache is cleared
             spent[name].append(1e3 * (time.perf_counter() - started))
     return {name: float(np.median(values[1:])) for name, values in spent.items()}
 
@@ -685,9 +687,9 @@ def ratio(rows: Sequence[dict[str, Any]], ours: str, protocol: str, gap: str) ->
 
 def write_csv(path: Path, rows: Sequence[dict[str, Any]]) -> None:
     """Write rows, lists left out."""
-    hidden = ("ranks", "identity", "bins")
+    omitted = ("ranks", "identity", "bins")
     with atomic(path) as part, part.open("w", newline="") as file:
-        names = list(dict.fromkeys(k for r in rows for k in r if k not in hidden))
+        names = list(dict.fromkeys(k for r in rows for k in r if k not in omitted))
         writer = csv.DictWriter(file, names, extrasaction="ignore")
         writer.writeheader()
         for row in rows:
@@ -763,16 +765,18 @@ def draw_matches(
     near = ~(same & allowed).any(1)
     allowed[near] = pairs.gallery("open", 0)[near]
     queries = chosen_queries(same & allowed, ~same & allowed, pairs.identity, count)
-    place = [(s, int(r)) for s in scenes for r in s.scored]  # of the rows of the pairs
+    detection = [(s, int(r)) for s in scenes for r in s.scored]  # of the rows of the pairs
     lines = []
     for q in queries:
         for setup, cosine in cosines.items():
             best = best_matches(cosine[q], allowed[q])
-            cells = [match_cell(*place[int(q)], QUERY, f"query: {setup}")]
+            cells = [match_cell(*detection[int(q)], QUERY, f"query: {setup}")]
             for rank, j in enumerate(best, 1):
                 text = "right" if same[q, j] else "wrong"
                 color = RIGHT if same[q, j] else WRONG
-                cells.append(match_cell(*place[int(j)], color, f"{rank} {text} {cosine[q, j]:.2f}"))
+                cells.append(
+                    match_cell(*detection[int(j)], color, f"{rank} {text} {cosine[q, j]:.2f}")
+                )
             blank = np.full_like(cells[0], 255)
             lines.append(np.hstack(cells + [blank] * (BEST + 1 - len(cells))))
     if not lines:

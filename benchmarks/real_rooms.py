@@ -135,11 +135,11 @@ CASES = [
 
 
 def nothing(*_: Any) -> None:
-    """Stand in for what finds something."""
+    """Replace a function whose result is not used."""
 
 
 def all_visible(views: Views, *_: Any) -> BoolArray:
-    """Stand in for what finds hidden edges."""
+    """Replace the detection of occluded edges."""
     return np.zeros(views.boxes.shape, bool)
 
 
@@ -153,7 +153,7 @@ def untracked(rows: rt.Tracks) -> BoolArray:
     return np.asarray(rows.tracklet_id == 0)
 
 
-# What can be left out, by name: values and functions that take the place of others meanwhile.
+# Ablations by name: replacements of values and functions.
 LIKELIHOOD = "reobj.objects.likelihood"
 ASSOCIATION = "reobj.objects.association"
 COMPONENT = "reobj.objects.component"
@@ -343,7 +343,7 @@ def frames_of(truth: LabelledBoxes, found: LabelledBoxes) -> Iterator[tuple[IntA
 
 
 def shares_inside(a_xyxy: Array, b_xyxy: Array) -> Array:
-    """Return the share (A, B) of each box b that lies inside each box a."""
+    """Return the fraction (A, B) of each box b inside each box a."""
     low = np.maximum(a_xyxy[:, None, :2], b_xyxy[:, :2])
     inter = (np.minimum(a_xyxy[:, None, 2:], b_xyxy[:, 2:]) - low).clip(0).prod(-1)
     return np.asarray(inter / np.maximum(box_area(b_xyxy), 1e-9))
@@ -358,7 +358,7 @@ def common_frames(truth: IntArray, found: IntArray) -> tuple[Array, IntArray, In
     return common, true_ids, ids
 
 
-INSIDE = 0.7  # share of a box in that of a hidden object: it is that one's, too
+INSIDE = 0.7  # fraction of a box inside that of an occluded object: assigned to it as well
 
 
 def identity_f1(truth: LabelledBoxes, found: LabelledBoxes, min_iou: float) -> float:
@@ -466,7 +466,7 @@ def judge(
     return Verdicts(shows, unjudged, common, boxes - outside, np.array(true_ids, np.int64))
 
 
-# Frames of a true object that a list must hold: as many, or this share of those annotated
+# Frames of a true object that a list must hold: as many, or this fraction of those annotated
 NEEDED_FRAMES, NEEDED_SHARE = 10, 0.25
 
 
@@ -496,18 +496,18 @@ def score_lists(truth_folder: Path, folder: Path) -> Figures:
         "elsewhere": judged - len(shown),
         "precision": len(shown) / max(judged, 1),
         "recall": len(must & set(shown)) / max(len(must), 1),
-        "sure": sure_of(result.objects, every.best(), ~every.unjudged),
+        "sure": rated_objects(result.objects, every.best(), ~every.unjudged),
     }
 
 
-Sure = tuple[float, bool, bool]  # confidence, is it real, has it a solid
+Rated = tuple[float, bool, bool]  # confidence, is it real, has it a shape
 
 
-def sure_of(objects: Sequence[rt.Object], real: BoolArray, counts: BoolArray) -> list[Sure]:
+def rated_objects(objects: Sequence[rt.Object], real: BoolArray, counts: BoolArray) -> list[Rated]:
     """List the confidence of objects that count beside the truth."""
     able = zip(objects, real.tolist(), counts.tolist(), strict=True)
-    sure = [(o.confidence, r, o.center is not None) for o, r, c in able if c]
-    return [(c, r, solid) for c, r, solid in sure if c is not None]
+    rated = [(o.confidence, r, o.center is not None) for o, r, c in able if c]
+    return [(c, r, solid) for c, r, solid in rated if c is not None]
 
 
 # ---- Solids ------------------------------------------------------------------------------------
@@ -561,7 +561,7 @@ class Matched:
 
     Attributes:
         true, solid: (M,). center_error: (M,) m. size_error: (M, 3) relative; in_sigma: (M, 3).
-        doubles, elsewhere: how many other solids lie in reach of a true one, and of none.
+        doubles, elsewhere: how many other shapes lie within reach of a true one, and of none.
     """
 
     true: IntArray
@@ -654,7 +654,7 @@ def score_solids(truth_folder: Path, folder: Path) -> Figures:
         "centre_m": median(matched.center_error),
         "size_error": median(matched.size_error),
         "inside": fraction_within_2_sigma(matched.in_sigma),
-        "sure": sure_of_solids(true, placed, truth, every, rt.Result.load(folder).objects),
+        "sure": rated_shapes(true, placed, truth, every, rt.Result.load(folder).objects),
     }
 
 
@@ -663,22 +663,22 @@ def median(values: Array) -> float | None:
     return float(np.median(values)) if values.size else None
 
 
-def sure_of_solids(
+def rated_shapes(
     true: Sequence[dict[str, Any]],
     placed: Placed,
     truth: LabelledBoxes,
     found: LabelledBoxes,
     objects: Sequence[rt.Object],
-) -> list[Sure]:
-    """Say which objects are real: by their solids; those without by boxes of what is left.
+) -> list[Rated]:
+    """Decide which objects are real, by their shapes, else by their boxes on the other objects.
 
-    The surest takes the nearest true object of its class first, as in COCO's average precision.
+    The most confident one takes the nearest true object first, as in COCO's average precision.
     """
     known = [t for t in true if t["coco"]]
     full, _, _, able = distances(known, placed)
-    sure = np.array([o.confidence or 0.0 for o in placed.objects])
+    confidence = np.array([o.confidence or 0.0 for o in placed.objects])
     taken, real_ids = list[int](), set[int]()
-    for s in np.argsort(-sure, kind="stable").tolist():
+    for s in np.argsort(-confidence, kind="stable").tolist():
         if able[:, s].any():
             nearest = int(np.where(able[:, s], full[:, s], np.inf).argmin())
             able[nearest] = False
@@ -688,7 +688,8 @@ def sure_of_solids(
     bare = np.array([o.center is None for o in objects], bool)
     real = np.array([o.id in real_ids for o in objects], bool)
     real |= verdicts.best(bare & ~np.isin(verdicts.shows, taken))
-    return sure_of(objects, real, np.array([o.class_name in WALK_KINDS for o in objects], bool))
+    counted = np.array([o.class_name in WALK_KINDS for o in objects], bool)
+    return rated_objects(objects, real, counted)
 
 
 def kinds_of(truth: LabelledBoxes) -> dict[int, Kind]:
@@ -724,7 +725,7 @@ def score_as_eval(truth_folder: Path, folder: Path) -> Figures:
         "size_error": in_3d.get("size_error_median"),
         "inside": in_3d.get("sizes_inside"),
         "o3d": in_3d.get("o3d_found"),
-        "sure": sure_of(objects, verdicts.best(), annotated),
+        "sure": rated_objects(objects, verdicts.best(), annotated),
     }
 
 
@@ -732,7 +733,7 @@ def score_as_eval(truth_folder: Path, folder: Path) -> Figures:
 
 
 def percent(value: float) -> str:
-    """Format a share."""
+    """Format a fraction as a percentage."""
     return f"{100 * value:.0f} %"
 
 
@@ -816,14 +817,14 @@ def left_out_table(made: dict[str, list[Figures]]) -> str:
 BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 
 
-def reliability(sure: Sequence[Sure]) -> list[tuple[int, float, float, float, float]]:
+def reliability(rated: Sequence[Rated]) -> list[tuple[int, float, float, float, float]]:
     """Bin objects by confidence.
 
     Returns:
-        of every bin: objects, mean confidence, share that is real, and the 95 % interval of it
+        of every bin: objects, mean confidence, fraction that is real, and the 95 % interval of it
         (Wilson, JASA 1927); NaN in an empty bin.
     """
-    confidence, real = np.array([row[:2] for row in sure], np.float64).reshape(-1, 2).T
+    confidence, real = np.array([row[:2] for row in rated], np.float64).reshape(-1, 2).T
     bin_of = np.digitize(confidence, BINS[1:-1])
     rows, z2 = [], 1.96**2
     for k in range(len(BINS) - 1):
@@ -832,27 +833,27 @@ def reliability(sure: Sequence[Sure]) -> list[tuple[int, float, float, float, fl
         if not n:
             rows.append((0, np.nan, np.nan, np.nan, np.nan))
             continue
-        share = float(real[own].mean())
-        middle = (share + z2 / (2 * n)) / (1 + z2 / n)
-        reach = np.sqrt(z2 * (share * (1 - share) / n + z2 / (4 * n**2))) / (1 + z2 / n)
-        rows.append((n, float(confidence[own].mean()), share, middle - reach, middle + reach))
+        rate = float(real[own].mean())
+        middle = (rate + z2 / (2 * n)) / (1 + z2 / n)
+        reach = np.sqrt(z2 * (rate * (1 - rate) / n + z2 / (4 * n**2))) / (1 + z2 / n)
+        rows.append((n, float(confidence[own].mean()), rate, middle - reach, middle + reach))
     return rows
 
 
-def reliability_table(groups: dict[str, list[Sure]]) -> str:
+def reliability_table(groups: dict[str, list[Rated]]) -> str:
     """Format the bins of the first group, and how many are real in the others."""
     lines = []
     for k, bins in enumerate(zip(*map(reliability, groups.values()), strict=True)):
         n, *numbers = bins[0]
-        mean, share, low, high = map(short, numbers)
+        mean, rate, low, high = map(short, numbers)
         of = [f"{round(b[0] * b[2])} of {b[0]}" if b[0] else "-" for b in bins]
-        whole = [mean, f"{share} ({low} to {high})"] if n else ["-", "-"]
+        whole = [mean, f"{rate} ({low} to {high})"] if n else ["-", "-"]
         lines.append([f"{BINS[k]:g} to {BINS[k + 1]:g}", *whole, *of])
     return table(["confidence", "mean", "real (95 %)", *(f"real: {g}" for g in groups)], lines)
 
 
-def draw_reliability(groups: dict[str, list[Sure]], path: Path) -> None:
-    """Draw the share of real objects over their confidence, a line for each group."""
+def draw_reliability(groups: dict[str, list[Rated]], path: Path) -> None:
+    """Draw the fraction of real objects over their confidence, a line for each group."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -860,11 +861,11 @@ def draw_reliability(groups: dict[str, list[Sure]], path: Path) -> None:
 
     figure, axes = plt.subplots(figsize=(3.8, 3.4), dpi=110, layout="constrained")
     axes.plot([0, 1], [0, 1], ":", color="0.5", lw=1)
-    for name, sure in groups.items():
-        count, mean, share, low, high = np.array([row for row in reliability(sure) if row[0]]).T
-        error = [share - low, high - share]
+    for name, rated in groups.items():
+        count, mean, rate, low, high = np.array([row for row in reliability(rated) if row[0]]).T
+        error = [rate - low, high - rate]
         label = f"{name}, {count.sum():.0f} objects"
-        axes.errorbar(mean, share, error, fmt="o-", ms=5, lw=1.4, capsize=3, label=label)
+        axes.errorbar(mean, rate, error, fmt="o-", ms=5, lw=1.4, capsize=3, label=label)
     axes.legend(frameon=False, fontsize=8)
     axes.set(xlim=(0, 1), ylim=(-0.02, 1.02), xlabel="confidence", ylabel="share that is real")
     axes.spines[["top", "right"]].set_visible(False)
@@ -954,7 +955,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         for title, rows in found.items():
             write_table(args.results / "RESULTS.md", title, rows)
         if not left_out:
-            groups = sure_by_group(cases, made[""])
+            groups = rated_by_group(cases, made[""])
             drawn = {k: v for k, v in groups.items() if v and k in ("other boxes", DETECTOR.model)}
             draw_reliability(drawn, args.results / "img" / "confidence.png")
     return 0
@@ -981,9 +982,9 @@ def scores(
     return found
 
 
-def sure_by_group(cases: Sequence[Case], figures: Sequence[Figures]) -> dict[str, list[Sure]]:
+def rated_by_group(cases: Sequence[Case], figures: Sequence[Figures]) -> dict[str, list[Rated]]:
     """List the confidence of the objects of all runs, and by what they were detected."""
-    groups: dict[str, list[Sure]] = {"all": [], "other boxes": [], DETECTOR.model: []}
+    groups: dict[str, list[Rated]] = {"all": [], "other boxes": [], DETECTOR.model: []}
     for case, of in zip(cases, figures, strict=True):
         boxes = DETECTOR.model if BOXES[case.boxes] == DETECTOR.model else "other boxes"
         groups[boxes] += of["sure"]
@@ -998,7 +999,7 @@ def tables(cases: Sequence[Case], made: dict[str, list[Figures]]) -> dict[str, s
     rows = [(case.title, figures) for case, figures in zip(cases, made[""], strict=True)]
     return {
         "real rooms": figures_table(["recording", "boxes", "cameras"], rows),
-        "confidence": reliability_table(sure_by_group(cases, made[""])),
+        "confidence": reliability_table(rated_by_group(cases, made[""])),
     }
 
 

@@ -116,7 +116,7 @@ class Recording:
     """A video of a room whose objects are known.
 
     Attributes:
-        poses: options of the true cameras. cameras: file of their places, for an alignment.
+        poses: options of the true cameras. cameras: file of their centres, for an alignment.
         detections: file of the boxes; None: boxes are the true ones.
         truth: true boxes of G objects, with identity and class. min_iou: from which a box is one.
         ids, solids: (G,) identities and ellipsoids of the true objects. category: of each.
@@ -385,9 +385,9 @@ def score(folder: Path, rec: Recording) -> Scored:
     solids = quadrics.Ellipsoids(*(np.concatenate([getattr(p, n) for p in parts]) for n in arrays))
     truth = rec.truth[np.isin(rec.truth.identity, rec.ids)]
     verdicts = judge(truth, kinds_of(truth), read_result(folder), result.objects, rec.min_iou)
-    place = {o.id: i for i, o in enumerate(result.objects)}
-    of_solid = np.array([place[i] for i in ids], np.int64)
-    best = verdicts.best(np.isin(np.arange(len(place)), of_solid))[of_solid]  # (S,)
+    index = {o.id: i for i, o in enumerate(result.objects)}
+    of_solid = np.array([index[i] for i in ids], np.int64)
+    best = verdicts.best(np.isin(np.arange(len(index)), of_solid))[of_solid]  # (S,)
     column = {int(k): g for g, k in enumerate(rec.ids)}
     shows = np.array([column.get(int(k), -1) for k in verdicts.shows[of_solid]], np.int64)
     count = len(rec.ids)
@@ -456,8 +456,8 @@ def draw_solvers(rows: Sequence[Row], path: Path) -> None:
     for axes, name in zip(panels[:, 0], names, strict=True):
         own = [r for r in rows if r["recording"] == name]
         for k, solver in enumerate(SOLVERS):
-            place = np.arange(len(own)) + 0.2 * (k - 1.5)
-            axes.bar(place, [r[f"{solver}_o3d"] for r in own], 0.18, label=LABELS[solver])
+            x = np.arange(len(own)) + 0.2 * (k - 1.5)
+            axes.bar(x, [r[f"{solver}_o3d"] for r in own], 0.18, label=LABELS[solver])
         ticks = [f"{r['category']} ({r['true']})" for r in own]
         axes.set_xticks(np.arange(len(own)), ticks, fontsize=8)
         axes.set_title(name, fontsize=9)

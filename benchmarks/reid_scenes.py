@@ -35,7 +35,7 @@ from reobj.types import Array, Image, IntArray
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Images of one place with labelled detections, as a struct of arrays (F frames, N rows).
+    """Images of one scene with labelled detections, as a struct of arrays (F frames, N rows).
 
     Attributes:
         images: F files. number: (F,) frame numbers in the recording.
@@ -88,7 +88,7 @@ class Scene:
 
 
 def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> npt.NDArray[Any]:
-    """Read an image (BGR unless flags say otherwise), or say which one cannot be read."""
+    """Read an image (BGR by default); the error names an unreadable one."""
     image = cv2.imread(str(path), flags)
     if image is None:
         raise rt.ReobjError(f"{path}: cannot be read as an image")
@@ -220,8 +220,8 @@ def pinhole(numbers: dict[str, Any]) -> Array:
 def depth_scene(folder: Path, min_score: float = 0.3, reach: float = 0.3) -> Scene:
     """Identities without annotation: detections of the frames that have depth, clustered in 3D.
 
-    A detection's place is the median back-projected point of the middle of its box; detections of
-    a class belong together when their places chain within `reach` times 1 m (single linkage).
+    Its position is the median back-projected point of the middle of its box; detections of
+    a class belong together if their positions chain within `reach` times 1 m (single linkage).
     """
     from scipy.cluster.hierarchy import fcluster, linkage
 
@@ -233,19 +233,19 @@ def depth_scene(folder: Path, min_score: float = 0.3, reach: float = 0.3) -> Sce
     stems = {p.stem: f for f, p in enumerate(files)}
     depths = {stems[p.stem]: p for p in sorted((folder / "depth").glob("*.png"))}
     found = found[np.isin(found[:, 0], list(depths))]
-    place = np.array([
+    position = np.array([
         center_in_world(rt_depth, box, poses[int(f)], numbers)
         for f, box in zip(found[:, 0], found[:, 1:5], strict=True)
         for rt_depth in [depths[int(f)]]
     ])  # (N, 3)  # fmt: skip
-    good = np.isfinite(place).all(1)
-    found, place = found[good], place[good]
+    good = np.isfinite(position).all(1)
+    found, position = found[good], position[good]
     identity, count = np.zeros(len(found), np.int64), 0
     for c in np.unique(found[:, 6]):
         own = np.flatnonzero(found[:, 6] == c)
         labels = np.ones(1, int)
         if len(own) > 1:
-            labels = fcluster(linkage(place[own], "average"), reach, "distance")
+            labels = fcluster(linkage(position[own], "average"), reach, "distance")
         identity[own] = labels + count
         count += int(labels.max())
     row = found[:, 0].astype(np.int64)
@@ -281,7 +281,7 @@ def center_in_world(path: Path, xyxy: Array, world_from_cam: Array, numbers: Any
 COLOUR = {"ScanNet": "color", "Matterport3D": "undistorted_color_images"}  # folders of images
 STRUCTURE = ("wall", "floor", "ceiling")  # labelled as instances, but no objects
 MATTERPORT_NAME = re.compile(r"(\w+)_i(\d)_(\d)")  # panorama, camera 0-2, yaw 0-5
-PANORAMA = 1000  # frame numbers from one panorama to the next: another place, never "near in time"
+PANORAMA = 1000  # frame numbers from one panorama to the next: elsewhere, never "near in time"
 EXPORT = (
     "python reader.py --filename SCENE.sens --output_path {} --export_color_images --export_poses "
     "--export_intrinsics  # SensReader/python of ScanNet"
@@ -464,8 +464,8 @@ def detected_scene(scene: Scene, detect: Detect, class_names: Sequence[str]) -> 
     for f, path in enumerate(scene.images):
         found, own = detect(read_image(path)), np.flatnonzero(scene.row == f)
         names = own_name[found.class_id]  # (D,)
-        alike = names[:, None] == true_name[own]  # (D, T)
-        overlap = np.where(alike, quadrics.box_iou(found.xyxy[:, None], scene.xyxy[own]), 0.0)
+        same_class = names[:, None] == true_name[own]  # (D, T)
+        overlap = np.where(same_class, quadrics.box_iou(found.xyxy[:, None], scene.xyxy[own]), 0.0)
         source = np.full(len(found), -1)
         d, t = linear_sum_assignment(np.where(overlap >= MIN_OVERLAP, overlap, 0.0), maximize=True)
         good = overlap[d, t] >= MIN_OVERLAP

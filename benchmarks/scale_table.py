@@ -162,7 +162,7 @@ def given(truth: Array, names: Sequence[str], rows: Array) -> Array:
 
 
 def tracked(name: str, rows: Array, cams: tuple[Array, tuple[int, int]], K: Array) -> Recording:
-    """Track detections (frame, xyxy, score, class) by motion and place; one object an identity."""
+    """Track detections (frame, xyxy, score, class) by motion and position."""
     img_from_world, size = cams
     camera = rt.Camera("PINHOLE", *size, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
     cam_from_world = np.linalg.inv(K) @ img_from_world
@@ -281,7 +281,7 @@ def measure(case: tuple[Recording, float]) -> Row:
 
 
 def summary(rows: Sequence[Row]) -> str:
-    """Share within 2 sigma and typical errors by recording, and of all of a kind."""
+    """Fraction within 2 sigma and typical errors by recording, and of all of a kind."""
     kinds: dict[str, list[Row]] = {}
     for row in rows:
         name = re.sub(r"^room \d+", "rooms", row.name.split(" | ")[0])

@@ -29,7 +29,7 @@ from quadrics import Array, BoolArray, Ellipsoids, FitConfig, Priors
 IMAGE = (1280, 960)  # px
 FOCAL = 1000.0  # px
 UP = (0.0, 0.0, 1.0)
-TILT_DEG = 1.5  # deg, how upright things stand according to fit_objects
+TILT_DEG = 1.5  # deg, sigma of the tilt of objects in fit_objects
 CUBOIDS = ((0.59, 0.60, 0.82), (0.60, 0.19, 0.45), (0.22, 0.28, 0.04))  # m
 
 
@@ -53,7 +53,7 @@ def arc_cameras(
     distance: float = 2.5,
     elevation_deg: float = 25.0,
 ) -> Array:
-    """n cameras on an arc around the origin, with jitter in place, aim and roll."""
+    """n cameras on an arc around the origin, with jitter in position, aim and roll."""
     yaw = np.deg2rad(np.linspace(-0.5, 0.5, n) * arc_deg) + rng.uniform(0, 2 * np.pi)
     lift = np.deg2rad(elevation_deg + rng.normal(0, 4, n))
     center = np.stack([np.cos(yaw) * np.cos(lift), np.sin(yaw) * np.cos(lift), np.sin(lift)], 1)
@@ -70,10 +70,10 @@ def random_yaw(n: int, rng: np.random.Generator, tilt_deg: float = 0.0) -> Array
     return np.asarray(yaw @ quadrics.rotations(lean))
 
 
-def noisy(boxes: Array, share: float, rng: np.random.Generator) -> Array:
-    """Move edges by Gaussian noise of `share` of the width (left, right) or height."""
+def noisy(boxes: Array, sigma: float, rng: np.random.Generator) -> Array:
+    """Move edges by Gaussian noise of `sigma` times the width (left, right) or height."""
     side = np.tile(boxes[..., 2:] - boxes[..., :2], 2)
-    return boxes + rng.normal(0, share, boxes.shape) * side
+    return boxes + rng.normal(0, sigma, boxes.shape) * side
 
 
 def individual_priors(log_size: Array, sigma: float, support: str) -> tuple[Priors, list[str]]:
@@ -247,7 +247,7 @@ def far_scene(
 def furnished_room(
     rng: np.random.Generator, noise: float = 0.02
 ) -> tuple[Array, Array, Ellipsoids, list[str]]:
-    """Known things in a 5 m room, sizes drawn from priors.json, 24 cameras around, cut boxes."""
+    """Known objects in a 5 m room, sizes drawn from priors.json, 24 cameras around, cut boxes."""
     names = (
         "chair,chair,couch,dining table,refrigerator,toilet,night stand,microwave,bed,bottle,"
         "cup,laptop,vase,keyboard,potted plant,sports ball"
@@ -262,7 +262,7 @@ def furnished_room(
     log_size[round_, 1] = log_size[round_, 0]
     half = 0.5 * np.exp(log_size)
     spot = np.array([(x, y) for x in np.linspace(-2, 2, 4) for y in np.linspace(-2, 2, 4)])
-    lift = np.where(half.max(1) < 0.25, 0.75, 0.0) + half[:, 2]  # small things on tables
+    lift = np.where(half.max(1) < 0.25, 0.75, 0.0) + half[:, 2]  # small objects on tables
     center = np.concatenate([rng.permutation(spot)[: len(names)], lift[:, None]], 1)
     truth = Ellipsoids(center, half, random_yaw(len(names), rng, 1.0))
     turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
@@ -312,9 +312,9 @@ def coverage(
     n: int, views: int, arc_deg: float, noise: float, support: str, rng: np.random.Generator,
     config: FitConfig | None = None,
 ) -> dict[str, float]:  # fmt: skip
-    """Share of trials with the truth in the 95 % region: all nine, and each block of three.
+    """Rate of trials with the truth in the 95 % region: all nine, and each block of three.
 
-    The truth is drawn from the prior, tilt included, so that the region means what it says.
+    The truth is drawn from the prior, tilt included, so that the region is calibrated.
     """
     boxes, cams, truth, priors, names = scenes(
         n, views, arc_deg, noise, support, rng, tilt_deg=TILT_DEG
@@ -344,7 +344,7 @@ def time_fit(n: int, views: int, support: str) -> float:
 
 
 def ugly_scene(f: int, o: int, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Boxes (F, O, 4) and cameras (F, 3, 4) with everything that can be wrong in them."""
+    """Boxes (F, O, 4) and cameras (F, 3, 4) with all kinds of defects."""
     spread = rng.choice([0.0, 1e-6, 0.01, 1.0, 10.0, 1e4, 1e8])
     center = rng.normal(0, spread, (f, 3))
     rot = quadrics.rotations(rng.normal(0, rng.choice([0.0, 0.1, 0.3, 3.0]), (f, 3)))
@@ -353,7 +353,7 @@ def ugly_scene(f: int, o: int, rng: np.random.Generator) -> tuple[Array, Array]:
     with np.errstate(all="ignore"):
         cams[rng.random(f) < 0.05] *= rng.choice([-1.0, 0.0, 1e-200, 1e200, np.inf, np.nan])
         middle = rng.uniform(-200, [840, 680], (f, o, 2))
-        if rng.random() < 0.5:  # boxes that one place explains
+        if rng.random() < 0.5:  # boxes consistent with one position
             point = rng.normal(0, 1, (o, 3)) + np.array([0, 0, 3])
             image = np.einsum("fij,oj->foi", cams[:, :, :3], point) + cams[:, None, :, 3]
             middle = image[..., :2] / image[..., 2:]
@@ -424,7 +424,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
 
 
 def lfd_overlap(boxes: Array, cams: Array, truth: Ellipsoids) -> tuple[float, float]:
-    """Mean O3D of closed-form LfD (0 where it is no ellipsoid at all) and share of ellipsoids."""
+    """Mean O3D of closed-form LfD (0 if it is no ellipsoid) and fraction of ellipsoids."""
     dual_q, real = quadrics.fit_lfd(*as_one(boxes, cams))
     found = Ellipsoids.from_dual_quadrics(dual_q)[0]
     return float(np.nan_to_num(quadrics.volume_overlap(found, truth)).mean()), float(real.mean())
@@ -459,8 +459,8 @@ def cuboids_table(trials: int) -> str:
         for support in ("ellipsoid", "box", "evidence"):
             fits = solve(boxes, cams, priors, names, support=support)
             iou = box_overlap(fits.ellipsoids, truth).mean()
-            share = (fits.support == "box").mean()
-            row.append(f"{iou:.3f}" + (f" ({share:.0%} boxes)" if support == "evidence" else ""))
+            cuboids = (fits.support == "box").mean()
+            row.append(f"{iou:.3f}" + (f" ({cuboids:.0%} boxes)" if support == "evidence" else ""))
         rows.append(row)
     return table(["size m", "ellipsoid", "box", "evidence"], rows)
 
@@ -485,7 +485,7 @@ def wrong_table(trials: int) -> str:
 
 
 def coverage_table(trials: int) -> str:
-    """Share of truths inside the 95 % region."""
+    """Fraction of truths inside the 95 % region."""
     rows = []
     config = FitConfig(correlation_deg=0.0)  # the noise of these boxes is independent
     for support in quadrics.SUPPORTS:

@@ -91,8 +91,8 @@ class Clip:
 
     Attributes:
         images: (H, W, 3) BGR. labels: (H, W) uint8 `identity` + 1 at each pixel, or None.
-        xyxy: (D, 4) boxes. identity: (D,) within the clip. look: (D,) things of one look share it.
-        sure: (D,) whether it hides the background of others (pseudo-objects do not).
+        xyxy: (D, 4) boxes. identity: (D,) within the clip. look: (D,) same for identical instances.
+        sure: (D,) whether it masks the background of others (pseudo-objects do not).
     """
 
     name: str
@@ -192,7 +192,9 @@ def sparse_clip(folder: Path, model: Path, seed: int = 0, points: int = 400) -> 
     long = sorted(i for i, point in scene.points3D.items() if point.track.length() >= 3)
     keep = rng.permutation(long)[: 4 * points]
     row_of = {int(point): row for row, point in enumerate(keep)}
-    share = np.exp(rng.uniform(np.log(0.05), np.log(0.3), len(keep)))  # box side / picture's height
+    relative = np.exp(
+        rng.uniform(np.log(0.05), np.log(0.3), len(keep))
+    )  # box side / picture's height
     size = np.zeros(len(keep))  # ball's diameter, set by the first view
     clip = Clip(f"{folder.parent.name}/{folder.name}", [], None, [], [], [], False)
     for image in sorted(scene.images.values(), key=lambda image: str(image.name)):
@@ -205,7 +207,7 @@ def sparse_clip(folder: Path, model: Path, seed: int = 0, points: int = 400) -> 
         pose = np.asarray(image.cam_from_world().matrix())
         depth = np.maximum(world @ pose[2, :3] + pose[2, 3], 1e-6)
         focal = image.camera.mean_focal_length() / image.camera.height
-        size[rows] = np.where(size[rows] > 0, size[rows], share[rows] * depth / focal)
+        size[rows] = np.where(size[rows] > 0, size[rows], relative[rows] * depth / focal)
         side = size[rows] * focal / depth * picture.shape[0]
         xy = np.array([p.xy for p in seen]).reshape(-1, 2) * (picture.shape[1] / image.camera.width)
         add_view(clip, picture, np.c_[xy - side[:, None] / 2, xy + side[:, None] / 2], rows)
@@ -216,7 +218,7 @@ def sparse_clip(folder: Path, model: Path, seed: int = 0, points: int = 400) -> 
 def apart(center: Array, size: Array) -> IntArray:
     """Rows of balls that were seen and hardly overlap with an earlier one.
 
-    Overlapping balls would be the same place under two names.
+    Overlapping balls would give one position two identities.
     """
     kept: list[int] = []
     for row in np.flatnonzero(size > 0):
@@ -314,9 +316,9 @@ def add_view(
     limit = np.array(picture.shape[1::-1] * 2, float)
     inside = np.clip(xyxy, 0, limit)
     area = np.prod(inside[:, 2:] - inside[:, :2], axis=1)
-    share = area / np.maximum(np.prod(xyxy[:, 2:] - xyxy[:, :2], axis=1), 1e-9)
+    filled = area / np.maximum(np.prod(xyxy[:, 2:] - xyxy[:, :2], axis=1), 1e-9)
     side = (inside[:, 2:] - inside[:, :2]).min(1, initial=np.inf) / limit[0]
-    keep = (share > 0.6) & (side > 0.025) & (side < 0.8)
+    keep = (filled > 0.6) & (side > 0.025) & (side < 0.8)
     clip.images.append(picture)
     clip.xyxy.append(inside[keep])
     clip.identity.append(identity[keep])
@@ -397,7 +399,7 @@ def augmented(
     size_wh: tuple[int, int] = SIZE_WH,
     masked: float = 0.5,
 ) -> tuple[Image, rt.Detections, IntArray]:
-    """Augment one frame (change None: leave it, for validation). masked: share that keeps masks.
+    """Augment one frame (change None: leave it, for validation). masked: fraction that keeps masks.
 
     Returns a picture of this size, all boxes in it, and the rows (N,) of the wanted identities.
     """
@@ -652,7 +654,7 @@ class PartHead(nn.Module):
 
     def forward(self, rows: Any) -> Any:
         cells = rows.reshape(-1, self.channels + 2)  # of all objects: exports as few, plain nodes
-        if self.training:  # some cells are hidden
+        if self.training:  # some cells are masked
             cells = cells * (torch.rand_like(cells[:, :1]) > 0.1)
         colours, rest, share, others = cells.split([COLOURS, self.channels - COLOURS, 1, 1], 1)
         words = self.word(torch.cat([(colours + 1e-6).sqrt(), rest, share, others], 1))
@@ -811,7 +813,7 @@ LOSSES = ("soft", "triplet", "hardest")  # the negative: soft maximum, semi-hard
 
 
 def rank_one(net: Net, clips: Sequence[Clip], device: Any) -> dict[str, float]:
-    """Rank-1 among things of the same scene: `twins`: only those that look alike, where there are
+    """Rank-1 among objects of one scene: `twins`: only identical instances, where there are
     two or more; `single`: as twins, among one random view of each (ten draws); `all`: any. Queries
     search frames at least 30 % of the clip away from their own.
     """
@@ -842,8 +844,12 @@ def mean_hits(clips: Sequence[Any]) -> dict[str, float]:
         cosines = [part @ part.T for part in rows]
         named = dict(zip(PARTS, cosines, strict=False)) if len(rows) > 1 else {}
         far = np.abs(frame[:, None] - frame) >= max(1, int(0.3 * (frame.max() + 1)))
-        alike = far & (look[:, None] == look)
-        galleries = {"twins": [alike], "single": single_views(alike, identity), "all": [far]}
+        identical = far & (look[:, None] == look)
+        galleries = {
+            "twins": [identical],
+            "single": single_views(identical, identity),
+            "all": [far],
+        }
         for part, cosine in {**named, "fused": sum(cosines)}.items():
             for group, draws in galleries.items():
                 for gallery in draws:
@@ -1031,7 +1037,7 @@ class Trainer:
         self.net.train()
 
     def progress(self) -> float:
-        """Share of the training that is done, by steps or by time."""
+        """Fraction of the training that is done, by steps or by time."""
         limit = self.args.minutes * 60
         return float(max(self.step / self.args.steps, self.seconds / limit if limit else 0.0))
 

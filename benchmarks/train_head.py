@@ -164,7 +164,7 @@ class CellHead(nn.Module):
     def forward(self, rows: Any) -> Any:
         plain, share = self.split(rows)
         seen = torch.cat([plain * 6.0, share], -1)
-        if self.training:  # some cells are hidden
+        if self.training:  # some cells are masked
             seen = seen * (torch.rand_like(seen[..., :1]) > 0.1)
         words, lines = self.word(seen), []
         for part, n in zip(words.split([n * n for n in self.grids], 1), self.grids, strict=True):
@@ -184,9 +184,9 @@ class CellHead(nn.Module):
 class ConvBlock(nn.Module):
     """re-OBJ: the maps (N, C, n, n) of one crop, or of two concatenated in C, to unit rows.
 
-    Convolution 3x3, batch norm, ReLU and max-pooling by two, until one place is left: 7, 4, 2, 1.
+    Convolution 3x3, batch norm, ReLU and max-pooling by two, until one cell is left: 7, 4, 2, 1.
     Ref: Bansal et al., ICIAP 2019; widths as in ut-amrl/CLOVER: of 2 x 512 channels 1024, 2048,
-    4096, here `width` and its doubles (0: C, as published).
+    4096, here `width` and its multiples by 2 (0: C, as published).
     """
 
     def __init__(self, channels: int, side: int, width: int = 0) -> None:
@@ -212,7 +212,7 @@ class CropBlock(nn.Module):
     """Maps (N, C, n, n) of one crop to unit rows; two crops have one each, their rows make one.
 
     re-OBJ style, not as published: better by 3 points of Rank-1 on the validation rooms than a
-    block in common, and what comes along (benchmarks/RESULTS.md).
+    block in common, and the bundled one (benchmarks/RESULTS.md).
     """
 
     def __init__(self, channels: int, side: int, width: int, inner: int = 64) -> None:
@@ -226,13 +226,13 @@ class CropBlock(nn.Module):
 
     def forward(self, maps: Any) -> Any:
         maps = self.norm(maps)
-        if self.training:  # some channels, and some places of all of them, are hidden
+        if self.training:  # some channels, and some positions of all of them, are masked
             maps = F.dropout2d(maps, 0.1) * (torch.rand_like(maps[:, :1]) > 0.1)
         deep = self.out(self.mix(self.squeeze(maps)).flatten(1))
         return F.normalize(deep + self.project(self.short(maps).flatten(1)), dim=1)
 
     def start(self, maps: Any) -> None:
-        """Begin with the principal components of features, then of places side by side."""
+        """Begin with the principal components of features, then of adjacent positions."""
         self.norm.running_mean[:] = maps.mean((0, 2, 3))
         self.norm.running_var[:] = maps.var((0, 2, 3))
         maps = self.norm(maps)

@@ -43,7 +43,7 @@ class Truth:
     """Boxes with identities: frame (N,), identity (N,), xyxy (N, 4), clear (N,).
 
     Attributes:
-        clear: False: hidden so far that the box need not be found. kinds: by identity. complete:
+        clear: False: so occluded that the box need not be found. kinds: by identity. complete:
             the classes of which all objects are annotated; empty: all classes.
     """
 
@@ -135,7 +135,7 @@ class Output:
 
 
 def _iou(a: Array, b: Array) -> tuple[Array, Array]:
-    """Return the IoU (A, B) of boxes, and the share of each box b that lies in each box a."""
+    """Return the IoU (A, B) of boxes, and the fraction of each box b inside each box a."""
     low, high = np.maximum(a[:, None, :2], b[:, :2]), np.minimum(a[:, None, 2:], b[:, 2:])
     inter = (high - low).clip(0).prod(-1)
     area_a, area_b = (a[:, 2:] - a[:, :2]).prod(1), (b[:, 2:] - b[:, :2]).prod(1)
@@ -158,7 +158,7 @@ class Found:
     false: int
 
 
-# Frames of a true object that a list must hold: as many, or this share of those annotated
+# Frames of a true object that a list must hold: as many, or this fraction of those annotated
 NEEDED_FRAMES, NEEDED_SHARE = 10, 0.25
 
 
@@ -167,7 +167,7 @@ def score_2d(
 ) -> Found:
     """Score boxes and the list of objects.
 
-    IDF1 (Ristani et al., 2016): the share of boxes that agree, true and found identities matched
+    IDF1 (Ristani et al., 2016): the fraction of boxes that agree, true and found identities matched
     one to one over the video; a pair agrees in a frame if it overlaps by `min_iou` and the class
     fits. An object shows a true one if it does in half of its frames (`min_iou_list`). What lies
     on areas without annotation, or on objects that need not be found, does not count.

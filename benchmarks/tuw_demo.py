@@ -82,8 +82,8 @@ def shape_table(boxes: Array, cams: Array) -> str:
         depth = float(np.mean(cams[:, 2] @ np.append(fits.ellipsoids.center_in_world[k], 1.0)))
         size = " x ".join(f"{1e3 * x:.0f}" for x in fits.size[k])
         px = fits.rms_px[k]
-        thing = "carton" if k < 4 else "bottle"
-        rows.append([thing, fits.support[k], size, f"{px:.2f}", f"{1e3 * px * depth / focal:.2f}"])
+        shape = "carton" if k < 4 else "bottle"
+        rows.append([shape, fits.support[k], size, f"{px:.2f}", f"{1e3 * px * depth / focal:.2f}"])
     return table(["object", "shape found", "size mm", "edge rms px", "edge rms mm"], rows)
 
 

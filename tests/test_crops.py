@@ -13,7 +13,7 @@ from test_embedding import (
     boxes,
     mean_backbone,
     save_onnx,
-    scene_with_twins,
+    scene_with_identical_objects,
     sum_head,
 )
 
@@ -71,7 +71,7 @@ def test_crops_use_the_backbone_with_a_bundled_block(monkeypatch) -> None:
     monkeypatch.setenv("REOBJ_MODELS", str(BACKBONE_FILES))
     crops = make_embedder("crops", threads=1, offline=True)
     assert isinstance(crops, rt.CropEmbedder) and crops.model == "crops:mobilenetv2_feat"
-    image, found = scene_with_twins()
+    image, found = scene_with_identical_objects()
     assert crops(image, found).foreground.shape == (2, 192)
     plain = make_embedder("crops", "none", threads=1)
     assert plain is not None and plain(image, found).foreground.shape == (2, 320 * 49)
@@ -191,7 +191,7 @@ def test_a_conv_block_defines_the_layout_and_must_match(net: str, tmp_path: Path
 
 
 def test_only_requested_rows_are_embedded(net: str) -> None:
-    image, found = scene_with_twins()
+    image, found = scene_with_identical_objects()
     crops = rt.CropEmbedder(net, layout=rt.SamplingLayout(crop_px=64), threads=1)
     whole, part = crops(image, found), crops(image, found, np.array([1]))
     np.testing.assert_allclose(whole.foreground[1:], part.foreground, atol=1e-6)

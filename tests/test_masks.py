@@ -30,7 +30,7 @@ def test_runs_go_down_the_columns() -> None:
 
 def test_round_trip() -> None:
     rng = np.random.default_rng(0)
-    made = np.stack([rng.random((7, 5)) < share for share in (0, 0.1, 0.5, 0.9, 1)])
+    made = np.stack([rng.random((7, 5)) < density for density in (0, 0.1, 0.5, 0.9, 1)])
     made[2, 0, 0], made[3, 0, 0] = True, False  # starts with a one, with a zero
     assert masks.rle_encode(made[0]).tolist() == []  # a mask without a pixel has no runs
     for mask in made[1:]:

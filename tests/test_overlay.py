@@ -303,9 +303,9 @@ def test_labels_never_cover_each_other() -> None:
 
 def test_a_label_keeps_its_position_while_it_is_free() -> None:
     sizes, boxes = np.array([[60, 17]] * 2), np.array([[50, 50, 90, 90]] * 2)
-    places: dict[int, int] = {}
-    first = place_labels([1, 2], sizes, boxes, (320, 240), places)
-    alone = place_labels([2], sizes[:1], boxes[:1], (320, 240), places)
+    positions: dict[int, int] = {}
+    first = place_labels([1, 2], sizes, boxes, (320, 240), positions)
+    alone = place_labels([2], sizes[:1], boxes[:1], (320, 240), positions)
     assert first[0] != first[1] == alone[0]
     assert place_labels([3], sizes[:1], boxes[:1], (320, 240), {})[0] == first[0]
 

@@ -556,7 +556,7 @@ def test_bad_input(
     assert_one_clear_line(capsys, message)
 
 
-PLACES = np.array(
+CENTERS = np.array(
     [[-1.2, 0, 3.0], [-0.5, 0.5, 3.2], [0, -0.4, 3.5], [0.6, 0.2, 3.8], [1.2, -0.2, 4.0]]
 )
 
@@ -565,7 +565,7 @@ def rendered_tracks(folder: Path, poses: str) -> tuple[Path, Path, Path]:
     """Frames, detections and TUM poses of a sideways walk past five balls; `poses`: right or
     inverse.
     """
-    solids = quadrics.Ellipsoids(PLACES, np.full((5, 3), 0.25), np.tile(np.eye(3), (5, 1, 1)))
+    solids = quadrics.Ellipsoids(CENTERS, np.full((5, 3), 0.25), np.tile(np.eye(3), (5, 1, 1)))
     frames = folder / "frames"
     frames.mkdir()
     lines, tum = [], []

@@ -363,7 +363,7 @@ def away_and_back(
 
 
 def test_objects_that_return_elsewhere_get_their_identity_back() -> None:
-    """After 200 frames, at the other side of the image, with another shape: not gated by overlap."""
+    """After 200 frames, at the other side of the image, with another shape: no overlap gate."""
     rng = np.random.default_rng(4)
     views = unit(rng, 4)
     back = views[::-1] + 0.05 * unit(rng, 4)

@@ -145,8 +145,10 @@ def table_path(room: Room, config: RoomConfig) -> Array:
         longer = way(middle)[1][-1] > STEP_M * (config.frames - 1)
         fewest, most = (fewest, middle) if longer else (middle, most)
     points, length = way(fewest)
-    places = np.linspace(0, length[-1], config.frames)
-    centers = np.column_stack([np.interp(places, length, column) for column in points.T])  # (F, 3)
+    distances = np.linspace(0, length[-1], config.frames)
+    centers = np.column_stack(
+        [np.interp(distances, length, column) for column in points.T]
+    )  # (F, 3)
     aim = target + np.random.default_rng([config.seed, 2]).normal(0, 0.05, centers.shape) - centers
     pitch = np.arctan2(aim[:, 2], np.hypot(aim[:, 0], aim[:, 1]))
     return look_along(centers, np.arctan2(aim[:, 1], aim[:, 0]), pitch, np.zeros(config.frames))

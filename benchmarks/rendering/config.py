@@ -48,7 +48,7 @@ PLANS = {
 
 @dataclass(frozen=True, slots=True)
 class RoomConfig:
-    """Everything that decides a clip. Counts are upper limits of what the plan has places for."""
+    """Everything that decides a clip. Counts are limited by the plan."""
 
     seed: int = 0
     width: int = 640  # px

@@ -16,7 +16,7 @@ from rendering.textures import fractal_noise
 
 @dataclass(frozen=True, slots=True)
 class FrameDetections:
-    """What a detector would say about one frame."""
+    """Simulated detections of one frame."""
 
     xyxy: Array  # (D, 4) px, corner convention
     score: Array  # (D,)
@@ -42,7 +42,7 @@ def jitter_mask(
 def simulate_detections(
     room: Room, truth: FrameTruth, instance: npt.NDArray[np.int32], config: DetectorConfig, rng: Rng
 ) -> FrameDetections:
-    """Detector-like boxes and masks: jitter, misses, low scores when hidden, false positives."""
+    """Detector-like boxes and masks: jitter, misses, low scores when occluded, false positives."""
     height, width = instance.shape
     sides = np.nan_to_num(truth.visible_xyxy[:, 2:] - truth.visible_xyxy[:, :2]).min(1)  # (O,)
     clear = sigmoid((truth.visibility - config.min_visibility) / 0.06) * sigmoid(

@@ -19,7 +19,7 @@ class FrameTruth:
 
     visible_px: npt.NDArray[np.int64]  # (O,) pixels of each object in the instance map
     visible_xyxy: Array  # (O, 4) tight box of those pixels
-    amodal_xyxy: Array  # (O, 4) box of the whole object, hidden and cut parts too
+    amodal_xyxy: Array  # (O, 4) box of the whole object, including occluded and truncated parts
     solid_xyxy: Array  # (O, 4) box of the annotated shape (box, cylinder, ellipsoid)
     visibility: Array  # (O,) visible pixels / pixels of the whole silhouette
 

@@ -69,7 +69,7 @@ def light_samples(surfaces: Surfaces) -> tuple[Array, Array, list[slice]]:
 def lamp_light(
     points: Array, normals: Array, lamp: tuple[Array, Array], voxels: Voxels, rays: int, rng: Rng
 ) -> Array:
-    """(N,) share of a rectangular lamp's light that arrives: cosines, distance, shadow.
+    """(N,) fraction of a rectangular lamp's light that arrives: cosines, distance, shadow.
 
     Args:
         lamp: (3, 4) frame of the emitting quad and its (3,) unit direction.
@@ -106,7 +106,7 @@ def lamp_light(
 def ambient_open(
     points: Array, normals: Array, voxels: Voxels, size: tuple[float, float, float], rng: Rng
 ) -> Array:
-    """(N,) share of the near half-space (0.6 m) that is open: contact shadows, dark corners."""
+    """(N,) fraction of the near half-space (0.6 m) that is open: contact shadows, dark corners."""
     opened = np.zeros(len(points))
     rays = 14
     half = np.array([size[0] / 2, size[1] / 2])

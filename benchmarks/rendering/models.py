@@ -42,7 +42,7 @@ class Model:
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class Placement:
     """Where a model stands: its origin in world and its turn about z."""
 
     model: str
@@ -365,7 +365,7 @@ def bear_model() -> Model:
 
 
 def small_models(rng: Rng) -> dict[str, Model]:
-    """Things for desks, shelves and corners."""
+    """Objects for desks, shelves and corners."""
     laptop = box((0, 0, 0.01), (0.34, 0.24, 0.02), "alu", {"top": "keys"})
     laptop += box(
         (0, 0.16, 0.12), (0.34, 0.01, 0.23), "alu", {"front": "screen2"}, rotation_x(-0.3)

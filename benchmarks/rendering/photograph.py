@@ -35,10 +35,10 @@ def blur_motion(
     height, width = image.shape[:2]
     u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     total = np.zeros(image.shape, np.float32)
-    for share in (np.arange(taps) / (taps - 1) - 0.5) * shutter:
+    for fraction in (np.arange(taps) / (taps - 1) - 0.5) * shutter:
         map_u, map_v = (
-            u - (share * flow[..., 0]).astype(np.float32),
-            v - (share * flow[..., 1]).astype(np.float32),
+            u - (fraction * flow[..., 0]).astype(np.float32),
+            v - (fraction * flow[..., 1]).astype(np.float32),
         )
         total += cv2.remap(image, map_u, map_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(total / taps, np.float32)

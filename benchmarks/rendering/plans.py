@@ -11,7 +11,7 @@ from rendering.config import Rng, RoomConfig
 from rendering.models import (
     Model,
     Part,
-    Place,
+    Placement,
     box,
     chair_model,
     disc,
@@ -26,7 +26,7 @@ from rendering.models import (
 )
 
 
-def dining_places(config: RoomConfig, rng: Rng, center: tuple[float, float]) -> list[Place]:
+def dining_placements(config: RoomConfig, rng: Rng, center: tuple[float, float]) -> list[Placement]:
     """Table in the middle, up to four chairs around it, objects on top."""
     x, y = center
     turn = float(rng.uniform(-0.12, 0.12))
@@ -39,90 +39,95 @@ def dining_places(config: RoomConfig, rng: Rng, center: tuple[float, float]) -> 
     ]
     tops += [("bottle1", -0.24, 0.2), ("cup", 0.52, -0.26), ("book0", -0.52, 0.16)]
 
-    def place(model: str, dx: float, dy: float, z: float, yaw: float) -> Place:
+    def place(model: str, dx: float, dy: float, z: float, yaw: float) -> Placement:
         px, py, _ = rotation_z(turn) @ [dx, dy, 0.0]
-        return Place(model, (x + float(px), y + float(py), z), turn + yaw)
+        return Placement(model, (x + float(px), y + float(py), z), turn + yaw)
 
-    places = [place("table", 0, 0, 0, 0)]
+    placements = [place("table", 0, 0, 0, 0)]
     for dx, dy, yaw in seats:
         nudge = rng.normal(0, [0.03, 0.03, 0.1])
-        places.append(place("chair", dx + nudge[0], dy + nudge[1], 0, yaw + nudge[2]))
-    return places + [place(name, dx, dy, 0.74, float(rng.uniform(0, 6))) for name, dx, dy in tops]
+        placements.append(place("chair", dx + nudge[0], dy + nudge[1], 0, yaw + nudge[2]))
+    return placements + [
+        place(name, dx, dy, 0.74, float(rng.uniform(0, 6))) for name, dx, dy in tops
+    ]
 
 
-def desk_places(rng: Rng, size: tuple[float, float, float]) -> list[Place]:
+def desk_placements(rng: Rng, size: tuple[float, float, float]) -> list[Placement]:
     """Desk on the +x wall, screens facing the room, two chairs of the same kind as at the table."""
     x = size[0] / 2 - 0.40
     y = -0.55 + float(rng.uniform(-0.15, 0.15))
     z = 0.73
     face = -np.pi / 2  # the front looks along -x
-    places = [Place("desk", (x, y, 0.0), face)]
-    places += [
-        Place("monitor", (x + 0.1, y + dy, z), face + tilt)
+    placements = [Placement("desk", (x, y, 0.0), face)]
+    placements += [
+        Placement("monitor", (x + 0.1, y + dy, z), face + tilt)
         for dy, tilt in ((0.33, 0.18), (-0.33, -0.18))
     ]
-    places += [
-        Place("keyboard", (x - 0.17, y + 0.1, z), face),
-        Place("mouse", (x - 0.16, y - 0.24, z), face),
+    placements += [
+        Placement("keyboard", (x - 0.17, y + 0.1, z), face),
+        Placement("mouse", (x - 0.16, y - 0.24, z), face),
     ]
-    places += [
-        Place("cup", (x - 0.2, y + 0.55, z), 1.0),
-        Place("bottle1", (x + 0.05, y - 0.72, z), 2.0),
+    placements += [
+        Placement("cup", (x - 0.2, y + 0.55, z), 1.0),
+        Placement("bottle1", (x + 0.05, y - 0.72, z), 2.0),
     ]
-    places += [Place("book1", (x - 0.12, y - 0.58, z), face + 0.4)]
+    placements += [Placement("book1", (x - 0.12, y - 0.58, z), face + 0.4)]
     for dy in (0.42, -0.40):
         nudge = rng.normal(0, [0.04, 0.04, 0.15])
-        places.append(
-            Place(
+        placements.append(
+            Placement(
                 "chair",
                 (x - 0.72 + nudge[0], y + dy + nudge[1], 0.0),
                 face + np.pi + 0.25 * dy + nudge[2],
             )
         )
-    return places
+    return placements
 
 
-def lounge_places(rng: Rng, size: tuple[float, float, float]) -> list[Place]:
+def lounge_placements(rng: Rng, size: tuple[float, float, float]) -> list[Placement]:
     """Couch on the +y wall, coffee table, plants, toys."""
     x = 0.55 + float(rng.uniform(-0.15, 0.15))
     y = size[1] / 2 - 0.5
-    places = [
-        Place("couch", (x, y, 0.0)),
-        Place("coffee", (x + 0.05, y - 1.0, 0.0), float(rng.uniform(-0.1, 0.1))),
+    placements = [
+        Placement("couch", (x, y, 0.0)),
+        Placement("coffee", (x + 0.05, y - 1.0, 0.0), float(rng.uniform(-0.1, 0.1))),
     ]
-    places += [
-        Place("plant", (x + 1.35, y + 0.02, 0.0), 0.4),
-        Place("plant", (-size[0] / 2 + 0.5, y, 0.0), 2.2),
+    placements += [
+        Placement("plant", (x + 1.35, y + 0.02, 0.0), 0.4),
+        Placement("plant", (-size[0] / 2 + 0.5, y, 0.0), 2.2),
     ]
-    places += [
-        Place("bear", (x + 0.42, y - 0.16, 0.435), 0.25),
-        Place("ball", (x - 1.2, y - 0.35, 0.0)),
+    placements += [
+        Placement("bear", (x + 0.42, y - 0.16, 0.435), 0.25),
+        Placement("ball", (x - 1.2, y - 0.35, 0.0)),
     ]
-    places += [
-        Place("laptop", (x - 0.12, y - 1.0, 0.42), 0.2),
-        Place("cup", (x + 0.33, y - 0.92, 0.42), 2.0),
+    placements += [
+        Placement("laptop", (x - 0.12, y - 1.0, 0.42), 0.2),
+        Placement("cup", (x + 0.33, y - 0.92, 0.42), 2.0),
     ]
-    places += [
-        Place("book2", (x + 0.3, y - 1.1, 0.42), 0.8),
-        Place("suitcase", (size[0] / 2 - 0.55, y - 0.1, 0.0), -0.5),
+    placements += [
+        Placement("book2", (x + 0.3, y - 1.1, 0.42), 0.8),
+        Placement("suitcase", (size[0] / 2 - 0.55, y - 0.1, 0.0), -0.5),
     ]
-    return places
+    return placements
 
 
-def shelf_places(size: tuple[float, float, float]) -> list[Place]:
+def shelf_placements(size: tuple[float, float, float]) -> list[Placement]:
     """On the sideboard of the -x wall and on top of the bookcase of the -y wall."""
     x = -size[0] / 2 + 0.26
     y = size[1] / 2 - 1.75
     side = -np.pi / 2 + np.pi  # the front looks along +x
-    places = [Place("vase", (x, y + 0.45, 0.8)), Place("stood0", (x - 0.05, y + 0.05, 0.8), side)]
-    places += [
-        Place("stood1", (x - 0.05, y - 0.2, 0.8), side),
-        Place("bottle0", (x + 0.03, y - 0.48, 0.8), 1.0),
+    placements = [
+        Placement("vase", (x, y + 0.45, 0.8)),
+        Placement("stood0", (x - 0.05, y + 0.05, 0.8), side),
     ]
-    return [*places, Place("clock", (1.9, -size[1] / 2 + 0.03, 1.75), np.pi)]
+    placements += [
+        Placement("stood1", (x - 0.05, y - 0.2, 0.8), side),
+        Placement("bottle0", (x + 0.03, y - 0.48, 0.8), 1.0),
+    ]
+    return [*placements, Placement("clock", (1.9, -size[1] / 2 + 0.03, 1.75), np.pi)]
 
 
-def limit_places(places: list[Place], config: RoomConfig) -> list[Place]:
+def limit_placements(placements: list[Placement], config: RoomConfig) -> list[Placement]:
     """Keep at most the given number of each counted kind."""
     left = {
         "chair": config.chairs,
@@ -133,13 +138,13 @@ def limit_places(places: list[Place], config: RoomConfig) -> list[Place]:
     left |= {"book": config.books, "plant": config.plants, "couch": int(config.couch)}
     extras = {"bowl", "laptop", "keyboard", "mouse", "vase", "clock", "bear", "ball", "suitcase"}
     kept = []
-    for place in places:
-        kind = place.model.rstrip("0123456789").replace("stood", "book")
+    for placement in placements:
+        kind = placement.model.rstrip("0123456789").replace("stood", "book")
         if kind in left:
             left[kind] -= 1
         floats = kind == "bear" and not config.couch  # it sits on the couch
         if left.get(kind, 0) >= 0 and (config.extras or kind not in extras) and not floats:
-            kept.append(place)
+            kept.append(placement)
     return kept
 
 
@@ -173,7 +178,7 @@ def skirting(size: tuple[float, float, float]) -> list[Part]:
 
 
 def wall_pictures(size: tuple[float, float, float], rng: Rng) -> list[Part]:
-    """Framed posters on the four walls, at hand-picked places with seeded shifts."""
+    """Framed posters on the four walls, at fixed positions with seeded shifts."""
     w, d, _ = size
     spots = [
         ("n", -0.2, 1.55, 0.8, 0.6),
@@ -227,8 +232,8 @@ def fixed_furniture(size: tuple[float, float, float]) -> list[Part]:
             "paper",
             {"front": f"spines{row}"},
         )
-    place = np.array([0.35, -d / 2 + 0.17, 0.0])
-    parts = [moved(part, rotation_z(np.pi), place) for part in shelf]
+    position = np.array([0.35, -d / 2 + 0.17, 0.0])
+    parts = [moved(part, rotation_z(np.pi), position) for part in shelf]
     side = box((0, 0, 0.4), (1.4, 0.45, 0.8), "side_wood", {"front": "cabinet"})
     parts += [
         moved(part, rotation_z(np.pi / 2), np.array([0.25 - w / 2, d / 2 - 1.75, 0.0]))
@@ -253,7 +258,7 @@ def fixed_furniture(size: tuple[float, float, float]) -> list[Part]:
 
 
 def clutter(size: tuple[float, float, float]) -> list[Part]:
-    """Curtains, floor lamp, cartons, basket, wall board: they make places differ."""
+    """Curtains, floor lamp, cartons, basket, wall board: they make the room distinctive."""
     w, d, _ = size
     parts: list[Part] = []
     for y in (-1.98, 0.18):
@@ -299,29 +304,31 @@ def clutter(size: tuple[float, float, float]) -> list[Part]:
     return parts
 
 
-def turned(places: Sequence[Place], yaw_rad: float, x: float, y: float) -> list[Place]:
+def turned(placements: Sequence[Placement], yaw_rad: float, x: float, y: float) -> list[Placement]:
     """Turn a group about the origin and move it there."""
     turn = rotation_z(yaw_rad)
     at = np.array([x, y, 0.0])
-    spots = [turn @ np.asarray(place.position) + at for place in places]
+    spots = [turn @ np.asarray(placement.position) + at for placement in placements]
     return [
-        Place(
-            place.model, (float(spot[0]), float(spot[1]), float(spot[2])), place.yaw_rad + yaw_rad
+        Placement(
+            placement.model,
+            (float(spot[0]), float(spot[1]), float(spot[2])),
+            placement.yaw_rad + yaw_rad,
         )
-        for place, spot in zip(places, spots, strict=True)
+        for placement, spot in zip(placements, spots, strict=True)
     ]
 
 
-def varied_group(config: RoomConfig, rng: Rng) -> list[Place]:
+def varied_group(config: RoomConfig, rng: Rng) -> list[Placement]:
     """A table with chairs, a desk or a lounge around the origin; some furniture missing."""
     kind = rng.choice(3, p=[0.4, 0.4, 0.2])
     if kind == 0:
-        group = dining_places(config, rng, (0.0, 0.0))
+        group = dining_placements(config, rng, (0.0, 0.0))
     elif kind == 1:
-        group = turned(desk_places(rng, (0.8, 0.0, 0.0)), 0.0, 0.35, 0.55)
+        group = turned(desk_placements(rng, (0.8, 0.0, 0.0)), 0.0, 0.35, 0.55)
     else:
-        group = turned(lounge_places(rng, (3.4, 1.0, 0.0)), 0.0, -0.55, 0.4)
-        group = [place for place in group if place.position[0] < 1.6]
+        group = turned(lounge_placements(rng, (3.4, 1.0, 0.0)), 0.0, -0.55, 0.4)
+        group = [placement for placement in group if placement.position[0] < 1.6]
     second = rng.random() < 0.3
     names = {"chair": "chair2"} if second else {}
     names |= {
@@ -329,22 +336,22 @@ def varied_group(config: RoomConfig, rng: Rng) -> list[Place]:
     }
     large = ("table", "desk", "couch", "coffee")
     return [
-        replace(place, model=names.get(place.model, place.model))
-        for place in group
-        if place.model in large or rng.random() < 0.8
+        replace(placement, model=names.get(placement.model, placement.model))
+        for placement in group
+        if placement.model in large or rng.random() < 0.8
     ]
 
 
 def varied_plan(
     config: RoomConfig, rng: Rng, size: tuple[float, float, float]
-) -> tuple[list[Place], list[Part]]:
+) -> tuple[list[Placement], list[Part]]:
     """Groups on a jittered grid, each turned by its own right angle; furniture and pictures on
     walls of this seed's choice.
     """
     w, d, h = size
     columns = max(int((w - 0.6) / 2.5), 1)
     rows = max(int((d - 0.6) / 2.3), 1)
-    plan: list[Place] = []
+    plan: list[Placement] = []
     for cell in rng.permutation(columns * rows)[: max(2, columns * rows - int(rng.integers(2)))]:
         x = (cell % columns + 0.5) / columns * (w - 0.8) - (w - 0.8) / 2
         y = (cell // columns + 0.5) / rows * (d - 0.8) - (d - 0.8) / 2
@@ -355,13 +362,13 @@ def varied_plan(
     fixed = fixed_furniture((d, w, h) if quarter % 2 else size)
     parts = [moved(part, rotation_z(quarter * np.pi / 2), np.zeros(3)) for part in fixed]
     inside = np.array([w / 2 - 0.3, d / 2 - 0.3])
-    kept = [place for place in plan if (np.abs(place.position[:2]) < inside).all()]
-    return kept, parts + wall_things(rng, size)
+    kept = [placement for placement in plan if (np.abs(placement.position[:2]) < inside).all()]
+    return kept, parts + wall_objects(rng, size)
 
 
-def wall_things(rng: Rng, size: tuple[float, float, float]) -> list[Part]:
-    """Pictures, boxes, boards and radiators along all walls: background of which no two spots are
-    alike.
+def wall_objects(rng: Rng, size: tuple[float, float, float]) -> list[Part]:
+    """Pictures, boxes, boards and radiators along all walls: background that differs
+    everywhere.
     """
     names = ["carton", "basket", "side_wood", "case_wood", "white_wood", "curtain", "plastic"]
     names += [f"poster{i}" for i in range(12)] + [f"spines{i}" for i in range(5)]

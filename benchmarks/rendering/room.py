@@ -9,15 +9,15 @@ import numpy as np
 
 from rendering.config import PLANS, Rng, RoomConfig
 from rendering.light import bake_light
-from rendering.models import Part, Place, furniture_models
+from rendering.models import Part, Placement, furniture_models
 from rendering.plans import (
-    desk_places,
-    dining_places,
+    desk_placements,
+    dining_placements,
     fixed_furniture,
-    limit_places,
-    lounge_places,
+    limit_placements,
+    lounge_placements,
     room_shell,
-    shelf_places,
+    shelf_placements,
     skirting,
     varied_models,
     varied_plan,
@@ -53,11 +53,11 @@ def make_room(config: RoomConfig) -> Room:
         models = varied_models(rng, models)
         plan, fixed = varied_plan(config, rng, size)
     else:
-        plan = limit_places(home_plan(config, rng, size), config)
+        plan = limit_placements(home_plan(config, rng, size), config)
         fixed = wall_pictures(size, rng) + fixed_furniture(size)
     placed = [
-        place_object(i, place, models[place.model], list(models).index(place.model))
-        for i, place in enumerate(plan)
+        place_object(i, placement, models[placement.model], list(models).index(placement.model))
+        for i, placement in enumerate(plan)
     ]
     parts = room_shell(size) + skirting(size) + fixed
     owners = [-1] * len(parts) + [truth.index for truth, own, _ in placed for _ in own]
@@ -77,21 +77,21 @@ def make_room(config: RoomConfig) -> Room:
     )
 
 
-def home_plan(config: RoomConfig, rng: Rng, size: tuple[float, float, float]) -> list[Place]:
-    """Dining table, desk, lounge and shelves, each at its own place."""
+def home_plan(config: RoomConfig, rng: Rng, size: tuple[float, float, float]) -> list[Placement]:
+    """Dining table, desk, lounge and shelves, each at its own position."""
     center = (
         -size[0] / 2 + 1.65 + float(rng.uniform(-0.1, 0.1)),
         -0.95 + float(rng.uniform(-0.1, 0.1)),
     )
     return (
-        dining_places(config, rng, center)
-        + desk_places(rng, size)
-        + lounge_places(rng, size)
-        + shelf_places(size)
+        dining_placements(config, rng, center)
+        + desk_placements(rng, size)
+        + lounge_placements(rng, size)
+        + shelf_placements(size)
     )
 
 
-CORRIDOR_ROOMS = 3  # chosen: two wrong places for every view
+CORRIDOR_ROOMS = 3  # chosen: two wrong positions for every view
 JOIN_M = 0.2  # what is so close to a wall that is left out goes with it: pictures, curtains
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rendering.config import COCO_NAMES, Array, Image, Rng
-from rendering.models import DISC, FRUSTUM, QUAD, SPHERE, Model, Part, Place, moved, rotation_z
+from rendering.models import DISC, FRUSTUM, QUAD, SPHERE, Model, Part, Placement, moved, rotation_z
 
 MIP_LEVELS = 5
 ATLAS_WIDTH = 4096  # texels; OpenCV's remap refuses images of 32,768 and more
@@ -65,8 +65,8 @@ class Room:
 def pack(
     sizes: Sequence[tuple[int, int]], width: int, grid: int
 ) -> tuple[list[tuple[int, int]], int]:
-    """Place rectangles (w, h) on shelves of an image; positions are multiples of `grid`."""
-    places = [(0, 0)] * len(sizes)
+    """Placement rectangles (w, h) on shelves of an image; positions are multiples of `grid`."""
+    positions = [(0, 0)] * len(sizes)
     x = y = shelf = 0
     for index in sorted(range(len(sizes)), key=lambda i: (-sizes[i][1], i)):
         w, h = (-(-side // grid) * grid for side in sizes[index])
@@ -74,10 +74,10 @@ def pack(
             x = 0
             y = y + shelf
             shelf = 0
-        places[index] = (x, y)
+        positions[index] = (x, y)
         x = x + w
         shelf = max(shelf, h)
-    return places, y + shelf
+    return positions, y + shelf
 
 
 def build_atlas(
@@ -88,10 +88,10 @@ def build_atlas(
     padded = [
         cv2.copyMakeBorder(t, pad, pad, pad, pad, cv2.BORDER_REPLICATE) for t in textures.values()
     ]
-    places, height = pack([(p.shape[1], p.shape[0]) for p in padded], ATLAS_WIDTH, ATLAS_PAD)
+    positions, height = pack([(p.shape[1], p.shape[0]) for p in padded], ATLAS_WIDTH, ATLAS_PAD)
     level = np.zeros((height, ATLAS_WIDTH, 3), np.uint8)
     rects = {}
-    for (name, texture), image, (x, y) in zip(textures.items(), padded, places, strict=True):
+    for (name, texture), image, (x, y) in zip(textures.items(), padded, positions, strict=True):
         level[y : y + image.shape[0], x : x + image.shape[1]] = image
         rects[name] = (x + pad, y + pad, texture.shape[1], texture.shape[0])
     levels = [level]
@@ -166,7 +166,7 @@ def build_surfaces(
         cells.append(
             tuple(int(np.clip(np.ceil(side / step), 3, 160)) for side in patch_extent_m(part))
         )
-    places, height = pack([(w, h) for w, h in cells], 512, 1)
+    positions, height = pack([(w, h) for w, h in cells], 512, 1)
     surfaces = Surfaces(
         kind=np.array([p.kind for p in parts]),
         world_from_patch=np.stack([p.obj_from_patch for p in parts]),
@@ -174,7 +174,7 @@ def build_surfaces(
         radii=np.array([p.radii for p in parts]),
         texture_rect=np.array(windows, float),
         light_rect=np.array(
-            [(*place, *cell) for place, cell in zip(places, cells, strict=True)], float
+            [(*placement, *cell) for placement, cell in zip(positions, cells, strict=True)], float
         ),
         owner=np.array(owners),
         two_sided=np.array([p.two_sided for p in parts]),
@@ -240,13 +240,13 @@ def part_outline(part: Part) -> Array:
 
 
 def place_object(
-    index: int, place: Place, model: Model, twin_group: int
+    index: int, placement: Placement, model: Model, twin_group: int
 ) -> tuple[RoomObject, list[Part], Array]:
     """Move a model into the room: truth, world parts, outline points (parts, 96, 3)."""
-    rotation = rotation_z(place.yaw_rad)
+    rotation = rotation_z(placement.yaw_rad)
     extent = np.concatenate([part_extremes(part) for part in model.parts])
     low, high = extent.min(0), extent.max(0)  # (3,) in the model's frame
-    offset = np.asarray(place.position, float)
+    offset = np.asarray(placement.position, float)
     parts = [moved(part, rotation, offset) for part in model.parts]
     truth = RoomObject(
         index=index,
@@ -256,7 +256,7 @@ def place_object(
         support=model.support,
         center_in_world=rotation @ ((low + high) / 2) + offset,
         size_m=high - low,
-        yaw_rad=float((place.yaw_rad + np.pi) % (2 * np.pi) - np.pi),
+        yaw_rad=float((placement.yaw_rad + np.pi) % (2 * np.pi) - np.pi),
         world_from_obj=rotation,
     )
     return truth, parts, np.stack([part_outline(part) for part in parts])

@@ -48,7 +48,7 @@ def varied_textures(rng: Rng, config: RoomConfig, size: tuple[int, int, int]) ->
         f"wall_{side}": paint(h, w if side in ("north", "south") else d, walls, 0.3)
         for side in ("north", "south", "east", "west")
     }
-    if rng.random() < 0.5:  # as most rooms: all walls alike
+    if rng.random() < 0.5:  # as most rooms: all walls the same
         textures["wall_north"] = textures["wall_south"]
         textures["wall_east"] = textures["wall_west"]
     textures["floor"] = paint(d, w, (planks, planks, plain, fabric, plaster, bricks), 0.6)

@@ -69,7 +69,7 @@ def plaster(rng: Rng, height: int, width: int, base: Color, tone: float = 0.07) 
 
 
 def wallpaper(rng: Rng, height: int, width: int, base: Color) -> Image:
-    """Painted sprigs of leaves on a striped ground, no two alike."""
+    """Painted sprigs of leaves on a striped ground, all different."""
     stripes = 0.03 * np.sign(np.sin(np.arange(width) / 24.0))
     image = shade(base, stripes[None, :] + 0.05 * fractal_noise(rng, height, width, (5, 30, 160)))
     for _ in range(height * width // 2600):
@@ -195,8 +195,8 @@ def stamp(
     thickness = max(1, int(size * 2))
     cv2.putText(ink, text, corner, cv2.FONT_HERSHEY_SIMPLEX, size, (255,), thickness, cv2.LINE_AA)
     where = np.nonzero(ink)
-    share = ink[where][:, None] / np.float32(255)
-    image[where] = image[where] * (1 - share) + np.asarray(color, np.float32) * share
+    opacity = ink[where][:, None] / np.float32(255)
+    image[where] = image[where] * (1 - opacity) + np.asarray(color, np.float32) * opacity
 
 
 def write_words(
@@ -433,7 +433,7 @@ def book_row(rng: Rng, height: int, width: int) -> Image:
 
 
 def rug(rng: Rng, height: int, width: int) -> Image:
-    """A carpet: borders, a field of motifs, worn places."""
+    """A carpet: borders, a field of motifs, worn spots."""
     base = random_color(rng, 70, 140)
     other = random_color(rng, 150, 220)
     image = np.ascontiguousarray(

@@ -16,5 +16,5 @@ from simulated import finished, unlinked
 
 @pytest.fixture(scope="session")
 def parted() -> rt.Result:
-    """Three simulated chairs, of cameras in two parts."""
+    """Three simulated chairs, with a trajectory in two components."""
     return finished(unlinked())

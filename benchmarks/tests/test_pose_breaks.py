@@ -1,4 +1,4 @@
-"""The bench of broken reconstructions: its verdict must be right before its counts are."""
+"""The benchmark of broken reconstructions: its verdicts on known cases."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def poses(cams: np.ndarray, part=None, messages=(), status="keyframe") -> rt.Pos
 
 
 def torn(truth: np.ndarray, scale: float = 1.0) -> np.ndarray:
-    """The second half under a similarity of its own."""
+    """Move the second half by a separate similarity."""
     return np.where(HALF[:, None, None], moved(truth, 8, scale), moved(truth, 7, 3.0))
 
 
@@ -53,7 +53,7 @@ def test_right_poses_are_whole_in_any_world_and_scale(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["orbit", "walk", "pan", "forward"])
-def test_a_torn_part_passes_as_good_unless_messages_name_its_frames(kind: str) -> None:
+def test_a_torn_component_passes_unless_messages_name_its_frames(kind: str) -> None:
     truth = motion(kind, COUNT)
     verdict = pb.judge(poses(torn(truth)), truth, ONE_WORLD)
     assert verdict.outcome == "passed"
@@ -65,14 +65,14 @@ def test_a_torn_part_passes_as_good_unless_messages_name_its_frames(kind: str) -
     assert other.outcome == "passed"
 
 
-def test_the_same_halves_as_two_parts_are_right() -> None:
+def test_the_same_halves_as_two_components_are_right() -> None:
     truth = motion("orbit", COUNT)
     verdict = pb.judge(poses(torn(truth), part=HALF), truth, ONE_WORLD)
     assert (verdict.outcome, verdict.parts) == ("partly", 2)
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.5])
-def test_a_jump_of_scale_alone_is_found(scale: float) -> None:
+def test_a_jump_of_scale_alone_is_detected(scale: float) -> None:
     truth = motion("walk", COUNT)
     centre, turn = pb.world_from_cam(truth)
     seam = centre[COUNT // 2]
@@ -82,7 +82,7 @@ def test_a_jump_of_scale_alone_is_found(scale: float) -> None:
     assert verdict.outcome == "passed"
 
 
-def test_two_worlds_in_one_part_are_wrong_however_they_lie() -> None:
+def test_two_scenes_in_one_component_are_wrong() -> None:
     truth = motion("orbit", COUNT)
     verdict = pb.judge(poses(truth), truth, HALF.astype(np.int64))
     assert verdict.outcome == "passed" and len(verdict.wrong) == COUNT // 2
@@ -97,7 +97,7 @@ def test_frames_without_pose_and_refusals_are_no_failures() -> None:
     assert pb.judge(poses(none), truth, ONE_WORLD).outcome == "refused"
 
 
-def test_a_stray_is_counted_and_many_are_a_break() -> None:
+def test_single_wrong_poses_are_counted_and_many_are_a_break() -> None:
     truth = motion("orbit", COUNT)
     one, many = truth.copy(), truth.copy()
     one[11, :, 3] += 500
@@ -108,7 +108,7 @@ def test_a_stray_is_counted_and_many_are_a_break() -> None:
     assert (verdict.outcome, verdict.wrong) == ("passed", (11, 12, 13, 14, 15))
 
 
-def test_a_wrong_turn_of_cameras_in_their_places_is_found() -> None:
+def test_a_wrong_rotation_at_the_right_centre_is_detected() -> None:
     truth = motion("walk", COUNT)
     centre, turn = pb.world_from_cam(truth)
     rolled = np.where(
@@ -119,7 +119,7 @@ def test_a_wrong_turn_of_cameras_in_their_places_is_found() -> None:
     assert pb.judge(poses(found), truth, ONE_WORLD).outcome == "passed"
 
 
-def test_frames_of_unknown_truth_and_interpolated_ones_are_not_judged() -> None:
+def test_interpolated_frames_and_frames_without_truth_are_not_scored() -> None:
     truth = motion("orbit", COUNT)
     unknown = np.where(HALF[:, None, None], np.nan, truth)
     assert pb.judge(poses(torn(truth)), unknown, ONE_WORLD).outcome == "whole"
@@ -138,7 +138,7 @@ def test_messages_name_frames() -> None:
 
 
 class FakeShelf:
-    """Clips whose pictures tell their number, on an orbit."""
+    """Clips on an orbit whose images encode their number."""
 
     def clip(self, name: str) -> pb.Clip:
         count = 60
@@ -148,7 +148,7 @@ class FakeShelf:
 
 
 @pytest.mark.parametrize("kind", sorted(pb.KINDS))
-def test_breaks_keep_pictures_and_truth_together(kind: str) -> None:
+def test_breaks_keep_images_and_truth_aligned(kind: str) -> None:
     changed, original = set(), motion("orbit", 60)
     for seed in range(6):
         clip, what = pb.KINDS[kind](FakeShelf(), ["room", "tour"], np.random.default_rng(seed))
@@ -166,7 +166,7 @@ def test_breaks_keep_pictures_and_truth_together(kind: str) -> None:
     assert len(changed) == 6
 
 
-def test_two_rooms_are_two_places() -> None:
+def test_two_rooms_are_two_scenes() -> None:
     for seed in range(20):
         names = ["room", "walk", "orbit", "tour"]
         _, what = pb.two_rooms(FakeShelf(), names, np.random.default_rng(seed))
@@ -238,11 +238,11 @@ def verdict_of(clip: pb.Clip, folder: Path) -> pb.Verdict:
     return pb.judge(found, clip.truth, clip.world)
 
 
-def test_a_good_stretch_comes_out_whole(room: pb.Clip, tmp_path: Path) -> None:
+def test_a_good_interval_is_reconstructed_completely(room: pb.Clip, tmp_path: Path) -> None:
     verdict = verdict_of(room, tmp_path)
     assert verdict.outcome == "whole" and verdict.centre < 0.02 and verdict.turn_deg < 2
 
 
-def test_its_mirrored_half_does_not_pass(room: pb.Clip, tmp_path: Path) -> None:
+def test_a_mirrored_half_does_not_pass(room: pb.Clip, tmp_path: Path) -> None:
     broken = pb.mirrored(room, np.arange(15, 30))
     assert verdict_of(broken, tmp_path).outcome in ("partly", "refused", "said")

@@ -40,7 +40,7 @@ def test_rank_and_map_equal_brute_force() -> None:
     assert (np.isnan(rank) == lonely).all()
 
 
-def test_ties_are_shared_not_won() -> None:
+def test_ties_count_half() -> None:
     """A constant similarity must not look perfect."""
     identity = np.repeat([0, 1], 5)
     same = identity[:, None] == identity
@@ -79,9 +79,9 @@ def single(identity: np.ndarray, frame: np.ndarray) -> rk.Pairs:
     return rk.Pairs(zero, frame, zero, zero, identity, np.tile([0.0, 0, 1], (len(zero), 1)))
 
 
-def test_the_single_protocol_has_one_view_of_each_object() -> None:
-    """The gallery of every query is drawn: one view of each object that it may be compared with, of
-    its own object too, and every view has its turn.
+def test_the_single_protocol_draws_one_view_of_each_object() -> None:
+    """The gallery of every query is drawn at random: one view of each allowed object, including its
+    own; all views occur.
     """
     own = single(np.repeat([0, 1, 2], 6), np.tile(10 * np.arange(6), 3))
     allowed, drawn = own.gallery("twins", 0), np.zeros((18, 18))
@@ -95,9 +95,9 @@ def test_the_single_protocol_has_one_view_of_each_object() -> None:
 
 
 def test_single_view_ranks_are_lower_than_those_of_the_whole_gallery() -> None:
-    """Every query has one view of its own object that is alike (1), others that are not (0) and a
-    twin half alike in every view (.5): the whole gallery finds it always, one random view of five
-    only where that is drawn.
+    """Every query has one similar view of its own object (cosine 1), dissimilar others (0) and an
+    identical instance at .5 in every view: the whole gallery always ranks it first, one random
+    view of five only if the similar one is drawn.
     """
     views = 6
     own = single(np.repeat([0, 1], views), np.tile(10 * np.arange(views), 2))
@@ -113,7 +113,7 @@ def test_single_view_ranks_are_lower_than_those_of_the_whole_gallery() -> None:
     assert row["queries"] == len(same) and row["rank1"] == pytest.approx(20, abs=10)
 
 
-def test_one_instance_of_a_class_counts_only_in_the_class_protocol() -> None:
+def test_single_instances_count_in_the_class_protocol_only() -> None:
     one = rk.Pairs(*np.array([[0, 0, 0, 0, 0], [0, 50, 0, 0, 0]]).T, np.zeros((2, 3)))
     allowed = one.gallery("class", 0)
     assert np.isnan(rk.rank_queries(np.ones((2, 2)), one.same(), allowed)[0]).all()
@@ -307,21 +307,21 @@ def test_matterport_without_label_images(matterport: Path) -> None:
         rs.posed_images(matterport, [Path("b.jpg")], 60)
 
 
-def test_scans_that_are_not_exported_say_how(tmp_path: Path) -> None:
+def test_unexported_scans_are_refused_with_instructions(tmp_path: Path) -> None:
     (tmp_path / "scene0000_00.sens").touch()
     (tmp_path / "scene0000_00.aggregation.json").write_text('{"segGroups": []}')
     with pytest.raises(rt.ReobjError, match=r"reader\.py --filename .*--export_color_images"):
         rk.scannet_scene(tmp_path)
 
 
-def test_detections_get_the_identity_of_what_they_show(scannet: Path) -> None:
+def test_detections_get_the_identity_of_their_object(scannet: Path) -> None:
     """By category and overlap, one to one; others are known, and not scored."""
     for path in scannet.glob("*.aggregation.json"):
         path.write_text(path.read_text().replace('"chair"', '"office chair"'))
     boxes = np.array([
         [2, 10, 30, 40],  # chair 1: "office chair" is a chair
-        [4, 10, 30, 40],  # again: the better one has it
-        [40, 10, 70, 40],  # chair 2, but a table is said
+        [4, 10, 30, 40],  # duplicate: assigned to the better one
+        [40, 10, 70, 40],  # chair 2, but with class table
         [42, 10, 74, 42],  # chair 2
         [40, 10, 55, 20],  # a chair that overlaps too little
     ], float)  # fmt: skip
@@ -362,7 +362,7 @@ def test_scannet_faults(scannet: Path) -> None:
 
 
 def recording(folder: Path, textured: bool) -> Path:
-    """Eight frames, two equal objects in fixed places on a wall, far from the borders."""
+    """Eight frames, two identical objects at fixed positions on a wall, far from the borders."""
     (folder / "images").mkdir(parents=True)
     grid = RNG.integers(0, 255, (12, 16, 3), np.uint8)
     wall = cv2.resize(grid, (640, 480)) if textured else np.full((480, 640, 3), 90, np.uint8)
@@ -378,7 +378,7 @@ def recording(folder: Path, textured: bool) -> Path:
 
 
 @pytest.mark.parametrize("textured", [True, False])
-def test_twins_are_told_apart_by_the_background(textured: bool, tmp_path: Path) -> None:
+def test_backgrounds_distinguish_identical_objects(textured: bool, tmp_path: Path) -> None:
     out, clip = tmp_path / "out", recording(tmp_path / "clip", textured)
     words = ["--every", "1", "--no-crops", "--choosing", "-o", str(out)]
     assert rk.main(["--recording", str(clip), *words]) == 0
@@ -407,7 +407,7 @@ def test_tables_and_pictures_of_matches(tmp_path: Path, capsys: pytest.CaptureFi
     assert picture.shape == (2 * 3 * (rk.CELL + rk.CAPTION), 6 * rk.CELL, 3)
 
 
-def test_the_frame_of_a_match_says_whether_it_is_right(tmp_path: Path) -> None:
+def test_the_border_of_a_match_shows_whether_it_is_right(tmp_path: Path) -> None:
     """Best first; right ones of one colour, wrong ones of another, the query of a third."""
     scene = rk.recording_scene(recording(tmp_path / "clip", True))
     pairs = rk.pairs_of([scene])
@@ -452,8 +452,8 @@ def test_bad_input_is_one_line(
     assert not list(tmp_path.glob("out/*"))
 
 
-def test_without_a_query_for_a_picture_there_is_none(scannet, tmp_path, capsys) -> None:
-    """One chair is masked away: nothing beside it could be taken for it."""
+def test_without_a_query_there_is_no_picture(scannet, tmp_path, capsys) -> None:
+    """One chair is removed: no other object is left to confuse it with."""
     (scannet / "scene0000_00.aggregation.json").write_text(
         json.dumps({"segGroups": [{"objectId": 0, "label": "chair"}]})
     )
@@ -496,7 +496,7 @@ def test_calibration_finds_the_true_odds(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_constants_are_those_of_normal_pairs() -> None:
-    """Not fitted to them, the constants still say about the right probability."""
+    """Without a fit to these pairs, the constants still give about the right probability."""
     cases = normal_cases()
     rows = {r["known"]: r for r in rk.reliabilities([cases])}
     assert set(rows) == {"f", "fb", "decision"}

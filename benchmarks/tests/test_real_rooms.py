@@ -1,4 +1,4 @@
-"""benchmarks/real_rooms.py: scores of hand-made results, and a whole run of a simulated walk."""
+"""benchmarks/real_rooms.py: scores of constructed results, and a whole run of a simulated walk."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def boxes(*rows: tuple) -> LabelledBoxes:
     return LabelledBoxes(frame, identity, xyxy, name.astype(str), role)
 
 
-def thing(identity: int, name: str = "chair", **more) -> rt.Object:
+def listed(identity: int, name: str = "chair", **more) -> rt.Object:
     return rt.Object(identity, name, 0.9, more.pop("status", "rejected"), "", **more)
 
 
@@ -50,16 +50,16 @@ def test_identity_f1_of_hand_made_boxes() -> None:
     assert rr.identity_f1(truth, found, 0.7) == 0  # two pixels aside: IoU 2 / 3
 
 
-def test_boxes_on_hidden_truth_alone_are_left_out() -> None:
+def test_boxes_on_occluded_truth_only_are_ignored() -> None:
     seen = [(f, 1, 0, "chair") for f in range(1, 6)]
-    hidden = [(f, 2, 30, "chair", Role.IGNORED) for f in range(1, 6)]
+    occluded = [(f, 2, 30, "chair", Role.IGNORED) for f in range(1, 6)]
     found = [(f, 1, 0, "chair") for f in range(1, 6)]
     on_hidden = [(f, 2, 31, "chair") for f in range(1, 6)]
     of_other_class = [(f, 3, 31, "cup") for f in range(1, 6)]
-    assert rr.identity_f1(boxes(*seen, *hidden), boxes(*found, *on_hidden), 0.3) == 1
-    score = rr.identity_f1(boxes(*seen, *hidden), boxes(*found, *of_other_class), 0.3)
+    assert rr.identity_f1(boxes(*seen, *occluded), boxes(*found, *on_hidden), 0.3) == 1
+    score = rr.identity_f1(boxes(*seen, *occluded), boxes(*found, *of_other_class), 0.3)
     assert score == pytest.approx(2 * 5 / (5 + 10))
-    near = [(f, 2, 2, "chair", Role.IGNORED) for f in range(1, 6)]  # a seen chair is there too
+    near = [(f, 2, 2, "chair", Role.IGNORED) for f in range(1, 6)]  # a visible chair is there too
     assert rr.identity_f1(boxes(*seen, *near), boxes(*found), 0.3) == 1
 
 
@@ -94,42 +94,42 @@ def judged(objects: list[rt.Object], *rows: tuple) -> rr.Verdicts:
     ("name", "left", "shows", "unjudged"),
     [
         ("chair", 21, 1, False),
-        ("bench", 21, 1, False),  # may be taken for it
+        ("bench", 21, 1, False),  # accepted confusion
         ("cup", 21, -1, False),  # of another class
         ("chair", 26, -1, False),  # overlaps too little: IoU .25
         ("book", 62, -1, True),  # in an area that is not annotated
-        ("chair", 62, -1, False),  # there, but chairs are annotated
+        ("chair", 62, -1, False),  # in the area, but chairs are annotated
         ("chair", 0, -1, False),
     ],
 )
 def test_verdict_of_an_object(name: str, left: int, shows: int, unjudged: bool) -> None:
-    verdicts = judged([thing(5, name)], *((f, 5, left, name) for f in range(1, 11)))
+    verdicts = judged([listed(5, name)], *((f, 5, left, name) for f in range(1, 11)))
     assert (verdicts.shows[0], verdicts.unjudged[0]) == (shows, unjudged)
 
 
-def test_half_of_the_frames_decide_and_areas_do_not_count() -> None:
+def test_the_majority_of_frames_outside_areas_decides() -> None:
     def mixed(on_it: int, on_area: int, name: str = "chair") -> rr.Verdicts:
-        place = [21] * on_it + [62] * on_area + [0] * (10 - on_it - on_area)
-        return judged([thing(5, name)], *((f, 5, x, name) for f, x in enumerate(place, 1)))
+        left = [21] * on_it + [62] * on_area + [0] * (10 - on_it - on_area)
+        return judged([listed(5, name)], *((f, 5, x, name) for f, x in enumerate(left, 1)))
 
     assert mixed(5, 0).shows[0] == 1
     assert mixed(4, 0).shows[0] == -1
     truth = [(f, i, 20 * i, "") for f in range(1, 11) for i in (1, 3)]
     any_class = {1: KINDS[1], 3: rr.Kind(frozenset(), ignore=True)}
     rows = [(f, 5, 21 if f < 4 else 62 if f < 8 else 0, "chair") for f in range(1, 11)]
-    verdicts = rr.judge(boxes(*truth), any_class, boxes(*rows), [thing(5)])
+    verdicts = rr.judge(boxes(*truth), any_class, boxes(*rows), [listed(5)])
     assert verdicts.shows[0] == 1  # 3 of the 6 frames outside the area
     rows = [(f, 5, 21 if f < 6 else 62, "chair") for f in range(1, 11)]
-    verdicts = rr.judge(boxes(*truth), any_class, boxes(*rows), [thing(5)])
+    verdicts = rr.judge(boxes(*truth), any_class, boxes(*rows), [listed(5)])
     assert (verdicts.shows[0], verdicts.unjudged[0], verdicts.boxes[0]) == (1, False, 5)
     beside = [*truth, *((f, 3, 20, "") for f in range(1, 11))]  # the area lies around the chair
-    verdicts = rr.judge(boxes(*beside), any_class, boxes(*rows), [thing(5)])
+    verdicts = rr.judge(boxes(*beside), any_class, boxes(*rows), [listed(5)])
     assert verdicts.boxes[0] == 5
 
 
 def test_the_object_with_the_most_frames_is_best() -> None:
     rows = [(f, 5 if f < 5 else 6, 21, "chair") for f in range(1, 11)] + [(1, 7, 0, "chair")]
-    verdicts = judged([thing(5), thing(6), thing(7)], *rows)
+    verdicts = judged([listed(5), listed(6), listed(7)], *rows)
     assert verdicts.best().tolist() == [False, True, False]
     assert verdicts.best(np.array([True, False, True])).tolist() == [True, False, False]
 
@@ -146,13 +146,13 @@ def test_score_of_a_list_without_doubtful_objects(tmp_path: Path) -> None:
     lines = [f"{f},{i},{x},0,10,10,1,{56 if i == 1 else 62},1" for f, i, x in seen]
     (tmp_path / "gt_mot.txt").write_text("\n".join(lines))
     objects = [
-        thing(1, confidence=0.9), thing(2, confidence=0.6), thing(3, "tv", confidence=0.8),
-        thing(4, confidence=0.7), thing(5, "tv", status="doubtful", confidence=0.3),
+        listed(1, confidence=0.9), listed(2, confidence=0.6), listed(3, "tv", confidence=0.8),
+        listed(4, confidence=0.7), listed(5, "tv", status="doubtful", confidence=0.3),
     ]  # fmt: skip
     # 1 and 2: both the chair; 3: a tv where none is; 4: in the area; 5: the true tv, doubtful
-    place = {1: (20, range(7)), 2: (20, range(7, 12)), 3: (0, range(9)), 4: (80, range(4))}
-    place[5] = (60, range(12))
-    rows = sorted((f, i, x) for i, (x, frames) in place.items() for f in frames)
+    seen_at = {1: (20, range(7)), 2: (20, range(7, 12)), 3: (0, range(9)), 4: (80, range(4))}
+    seen_at[5] = (60, range(12))
+    rows = sorted((f, i, x) for i, (x, frames) in seen_at.items() for f in frames)
     frame, identity, left = np.array(rows).T
     xyxy = np.stack([left, 0 * left, left + 10, 0 * left + 10], 1).astype(float)
     n = len(rows)
@@ -174,7 +174,7 @@ def test_score_of_a_list_without_doubtful_objects(tmp_path: Path) -> None:
 # ---- Solids ------
 
 
-TURN = np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]])  # its inverse is another one
+TURN = np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]])  # its inverse differs
 
 
 def row_of_chairs(count: int) -> list[dict]:
@@ -188,17 +188,17 @@ def row_of_chairs(count: int) -> list[dict]:
 
 def placed(*solids: tuple[str, tuple[float, float, float]], turn: np.ndarray) -> rr.Placed:
     """Solids of .55 x .9 x .6 m along the axes of the world."""
-    objects = [thing(i, name, center=np.array(at)) for i, (name, at) in enumerate(solids)]
+    objects = [listed(i, name, center=np.array(at)) for i, (name, at) in enumerate(solids)]
     centers = np.array([at for _, at in solids], float).reshape(-1, 3)
     size = np.abs(turn.T @ [0.55, 0.9, 0.6])
     n = len(solids)
     return rr.Placed(objects, centers, np.tile(turn, (n, 1, 1)), np.tile(size, (n, 1)))
 
 
-def test_solids_are_found_doubled_or_elsewhere() -> None:
+def test_shapes_are_found_duplicated_or_elsewhere() -> None:
     solids = placed(
-        ("chair", (0.1, 0, 0)), ("chair", (0.2, 0, 0)),  # the second is a double
-        ("chair", (2.0, 1.0, 0)),  # too high, which is no matter over ground
+        ("chair", (0.1, 0, 0)), ("chair", (0.2, 0, 0)),  # the second is a duplicate
+        ("chair", (2.0, 1.0, 0)),  # too high, which is ignored
         ("chair", (3.6, 0, 0)),  # .4 m from the third
         ("cup", (4.0, 0, 0)), turn=np.eye(3),
     )  # fmt: skip
@@ -209,7 +209,7 @@ def test_solids_are_found_doubled_or_elsewhere() -> None:
     assert (found.doubles, found.elsewhere) == (1, 1)
 
 
-def test_the_nearest_is_matched_one_to_one_and_large_things_have_a_wide_reach() -> None:
+def test_matching_is_one_to_one_and_the_radius_grows_with_size() -> None:
     sofa = [
         {"coco": "couch", "center": [0, 0, 0], "R": np.eye(3).tolist(), "size": [2.1, 0.7, 0.9]}
     ]
@@ -220,21 +220,21 @@ def test_the_nearest_is_matched_one_to_one_and_large_things_have_a_wide_reach() 
     assert len(none.true) == none.doubles == none.elsewhere == 0
 
 
-def test_the_surest_solid_is_the_real_one() -> None:
-    """A doubtful part of a chair lies nearer to its centre than the chair that is listed."""
+def test_the_most_confident_shape_is_the_real_one() -> None:
+    """A low-confidence part of a chair is nearer to the true centre than the listed chair."""
     solids = placed(
         ("chair", (0.05, 0, 0)), ("chair", (0.2, 0, 0)), ("chair", (2.1, 0, 0)),
         ("chair", (5.0, 0, 0)), turn=np.eye(3),
     )  # fmt: skip
-    sure = (0.1, 0.9, 0.2, 0.8)
+    rated = (0.1, 0.9, 0.2, 0.8)
     objects = [
-        dataclasses.replace(o, confidence=c) for o, c in zip(solids.objects, sure, strict=True)
+        dataclasses.replace(o, confidence=c) for o, c in zip(solids.objects, rated, strict=True)
     ]
     solids = dataclasses.replace(solids, objects=objects)
     chairs = [chair | {"id": k} for k, chair in enumerate(row_of_chairs(3))]
-    # no boxes: of what has no solid nothing is asked here
+    # no boxes: objects without a shape are not scored
     one = boxes((0, 9, 0, "cup"))
-    judged = rr.sure_of_solids(chairs, solids, one, one, objects)
+    judged = rr.rated_shapes(chairs, solids, one, one, objects)
     assert [real for _, real, _ in judged] == [False, True, True, False]
 
 
@@ -242,12 +242,12 @@ def test_the_surest_solid_is_the_real_one() -> None:
 
 
 def test_reliability_has_wilsons_interval() -> None:
-    sure = [(0.85, k < 8, True) for k in range(10)] + [(0.1, False, False), (0.2, True, True)]
-    bins = rr.reliability(sure)
+    rated = [(0.85, k < 8, True) for k in range(10)] + [(0.1, False, False), (0.2, True, True)]
+    bins = rr.reliability(rated)
     assert bins[4] == pytest.approx((10, 0.85, 0.8, 0.4902, 0.9433), abs=1e-4)
     assert [b[0] for b in bins] == [1, 1, 0, 0, 10]
     assert rr.reliability([(0.0, False, True), (1.0, True, True)])[4][0] == 1
-    lines = rr.reliability_table({"all": sure, "bare": sure[10:11]}).splitlines()
+    lines = rr.reliability_table({"all": rated, "bare": rated[10:11]}).splitlines()
     assert lines[0].endswith("| real: all | real: bare |")
     assert lines[2] == "| 0 to 0.2 | .100 | .000 (.000 to .793) | 0 of 1 | 0 of 1 |"
     assert lines[-1].endswith("| 8 of 10 | - |")
@@ -256,17 +256,17 @@ def test_reliability_has_wilsons_interval() -> None:
 def test_objects_are_grouped_by_detector() -> None:
     strong, weak = (next(c for c in rr.CASES if c.boxes == b) for b in (rr.YOLO, rr.FEMTO))
     figures = [{"sure": [(0.9, True, True)]}, {"sure": [(0.3, False, False), (0.5, True, True)]}]
-    groups = rr.sure_by_group([strong, weak], figures)
-    sizes = {name: len(sure) for name, sure in groups.items()}
+    groups = rr.rated_by_group([strong, weak], figures)
+    sizes = {name: len(rated) for name, rated in groups.items()}
     assert sizes == {"all": 3, "other boxes": 1, "deimv2-femto": 2, "without a solid": 1}
 
 
 def test_figures_of_several_noises_are_means() -> None:
-    sure = [(0.9, True, True)], [(0.6, True, True), (0.7, False, True)]
-    runs = [{"found": 3, "o3d": None, "sure": sure[0]}, {"found": 4, "o3d": 0.5, "sure": sure[1]}]
+    rated = [(0.9, True, True)], [(0.6, True, True), (0.7, False, True)]
+    runs = [{"found": 3, "o3d": None, "sure": rated[0]}, {"found": 4, "o3d": 0.5, "sure": rated[1]}]
     same = {"idf1": 0.5, "centre_m": 0.1, "size_error": 0.2}
     mean = rr.mean_of([run | same | {"counts": {"chair": 1}} for run in runs])
-    assert mean == same | {"found": 3.5, "o3d": 0.5, "runs": 2, "sure": sure[0] + sure[1]}
+    assert mean == same | {"found": 3.5, "o3d": 0.5, "runs": 2, "sure": rated[0] + rated[1]}
     line = rr.left_out_table({"": [mean], "merging": [mean]}).splitlines()[-1]
     assert "| merging | .500 | +0.000 to +0.000 | 3.5 |" in line and "| 1 of 1.5 |" in line
 
@@ -288,8 +288,8 @@ def test_picture(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", rr.WITHOUT)
-def test_what_is_left_out_is_still_there(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A mechanism that was renamed or removed must not be measured as if left out."""
+def test_ablated_functions_exist(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A renamed or removed function must not be measured as an ablation."""
     before = {}
     for path in rr.WITHOUT[name]:
         module, _, attribute = path.rpartition(".")
@@ -300,7 +300,7 @@ def test_what_is_left_out_is_still_there(name: str, monkeypatch: pytest.MonkeyPa
     assert all(getattr(owner, name) is not old for owner, name, old in before.values())
 
 
-def test_left_out_under_a_name_that_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_ablation_of_a_missing_name_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(rr.WITHOUT, "gone", {"quadrics.GONE": 0})
     with pytest.raises(SystemExit, match="no longer there"):
         rr.measure(rr.CASES[0], Path(), Path(), "gone")
@@ -387,8 +387,8 @@ def test_tables_of_recordings_are_as_recorded(tmp_path: Path) -> None:
     assert stop.value.code == 2 and not (tmp_path / "out").exists()
 
 
-def test_solids_of_each_part_come_into_the_true_world(parted: rt.Result, tmp_path: Path) -> None:
-    """Two worlds of other units and directions, both of the same three chairs."""
+def test_each_component_is_aligned_with_the_true_world(parted: rt.Result, tmp_path: Path) -> None:
+    """Two components with other units and orientations, both of the same three chairs."""
     true = walk(len(parted.poses.frame), 200.0).cam_from_world
     bottom = [0, 0, 0, 1]
     poses = [np.linalg.inv(np.vstack([c, bottom])).ravel() for c in true]

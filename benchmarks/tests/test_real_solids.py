@@ -1,4 +1,4 @@
-"""benchmarks/real_solids.py: what is counted, a simulated room, and a folder as of ScanNet."""
+"""benchmarks/real_solids.py: matching, a simulated room, and a folder in ScanNet's layout."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def labelled(*rows: tuple) -> LabelledBoxes:
         ([1, 2], ["chair", "chair"], [7, 0]),  # one to one: the nearer one
     ],
 )
-def test_boxes_get_the_identity_of_what_they_show(left, name, identity) -> None:
+def test_boxes_get_the_identity_of_their_object(left, name, identity) -> None:
     truth = labelled((1, 7, 0, "chair"), (1, 8, 20, "cup"), (3, 9, 0, "chair"))
     left = np.array(left, float)
     xyxy = np.stack([left, 0 * left, left + 10, 0 * left + 10], 1)
@@ -122,13 +122,13 @@ def test_boxes_get_the_identity_of_what_they_show(left, name, identity) -> None:
 
 
 def halves(boxes: rs.Boxes, identity: np.ndarray) -> np.ndarray:
-    """Each identity begins anew after six frames."""
+    """Each identity changes after six frames."""
     return np.where(boxes.frame < 6, identity, identity + 10)
 
 
 @pytest.fixture(scope="module")
 def compared(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """`identities` with a tracker that loses everything once in place of SORT."""
+    """`identities` with a tracker that loses all tracks once, instead of SORT."""
     work, name = tmp_path_factory.mktemp("out"), "SORT"
 
     def cut(peer, options, seq, venvs, embedded):
@@ -151,7 +151,7 @@ def table_of(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_duplicates_count_against_a_tracker_that_does_not_recognise(compared: Path) -> None:
+def test_duplicates_count_against_a_tracker_without_reid(compared: Path) -> None:
     rows = {r["by"]: r for r in table_of(compared / "identities.csv")}
     assert list(rows) == ["SORT", rs.PLAIN, rs.ONLINE, rs.CHAIN, rs.TRUTH]
     cut, truth = rows["SORT"], rows[rs.TRUTH]
@@ -181,7 +181,7 @@ def test_pictures_before_and_after(compared: Path, room: Path, tmp_path: Path) -
 
 
 def test_missing_objects_count_as_0(compared: Path, room: Path, tmp_path: Path) -> None:
-    """Of two chairs no identity is given: three found of five, by the same solids as before."""
+    """Of two chairs no identity is given: three found of five, by the same shapes as before."""
     rec = rs.recording(room, tmp_path)
     boxes = rec.boxes()
     identity = rs.true_identities(boxes, rec.truth, 0.5)
@@ -196,7 +196,7 @@ def test_missing_objects_count_as_0(compared: Path, room: Path, tmp_path: Path) 
 
 
 def test_solvers_by_category(room: Path, tmp_path: Path, capsys) -> None:
-    """Exact boxes of boxes: our solids know what they are, an ellipsoid in closed form does not."""
+    """Exact boxes of cuboids: the default solver models them, a closed-form ellipsoid does not."""
     words = ["--choosing", "--boxes", "true"]
     assert rs.main(["solvers", str(room), "-o", str(tmp_path), *words]) == 0
     rows = {r["category"]: r for r in table_of(tmp_path / "solvers.csv")}
@@ -282,7 +282,7 @@ def test_solvers_on_a_scene_of_scannet(scannet: Path, tmp_path: Path) -> None:
         (".aggregation.json", {"segGroups": [{"label": "chair"}]}, "segGroups"),
     ],
 )
-def test_a_scene_that_is_not_whole(scannet: Path, tmp_path, name, content, message, capsys) -> None:
+def test_an_incomplete_scene(scannet: Path, tmp_path, name, content, message, capsys) -> None:
     path = scannet / f"{SCENE}{name}"
     if content is None:
         path.unlink()

@@ -1,4 +1,4 @@
-"""The rendered room: its truth must be exact, since other tests and figures lean on it."""
+"""The rendered room: its ground truth must be exact, as other tests and figures depend on it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def room():
 
 @pytest.fixture(scope="module")
 def view(room):
-    """One clean frame of the first view (all of the dining place) with its truth."""
+    """One clean frame of the first view (the whole dining set) with its truth."""
     K, pose = rr.camera_matrix(SMALL), rr.camera_path(room, SMALL)[4]
     _, instance, depth = rr.render(room, K, pose, (SMALL.width, SMALL.height))
     return K, pose, instance, depth, rr.ground_truth(room, K, pose, instance)
@@ -56,7 +56,7 @@ def test_same_seed_same_bytes(room, view) -> None:
     np.testing.assert_array_equal(frames[0].image, frames[1].image)
 
 
-def test_twins_share_the_look_and_differ_in_place(room) -> None:
+def test_identical_objects_differ_in_position_only(room) -> None:
     chairs = [o for o in room.objects if o.class_name == "chair"]
     assert len(chairs) >= 4 and len({o.twin_group for o in chairs}) == 1
     rects = [room.surfaces.texture_rect[room.surfaces.owner == o.index] for o in chairs]
@@ -100,7 +100,7 @@ def test_amodal_box_is_that_of_the_sampled_surface(room, view) -> None:
     assert checked >= 10
 
 
-def test_solid_holds_the_surface(room) -> None:
+def test_the_shape_contains_the_surface(room) -> None:
     for item in room.objects:
         in_obj = (sampled_surface(room, item.index) - item.center_in_world) @ item.world_from_obj
         reach = np.abs(in_obj).max(0) / (item.size_m / 2)
@@ -121,7 +121,7 @@ def test_every_pixel_is_covered(view) -> None:
     assert view[3].min() > rr.NEAR_M and view[3].max() < 12  # closed room: no holes
 
 
-def test_path_is_smooth_translates_and_comes_back(room) -> None:
+def test_path_is_smooth_translates_and_returns(room) -> None:
     config = rr.RoomConfig(seed=3)
     poses = rr.camera_path(room, config)
     rotation = poses[:, :, :3]
@@ -133,7 +133,7 @@ def test_path_is_smooth_translates_and_comes_back(room) -> None:
     assert steps.max() < 0.12 and np.median(steps) > 0.01
     cosine = np.einsum("fi,fi->f", rotation[1:, 2], rotation[:-1, 2])
     assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 8
-    assert rotation[0, 2] @ rotation[-1, 2] > 0.9  # looks at the first place again
+    assert rotation[0, 2] @ rotation[-1, 2] > 0.9  # looks in the first direction again
     assert (rotation[:, 2] @ rotation[0, 2]).min() < -0.5  # and away from it in between
 
 
@@ -157,7 +157,7 @@ def test_table_is_photographed_once_round_in_steps_of_28_cm(room) -> None:
     assert np.median(steps) == pytest.approx(0.28, abs=0.01) and steps.max() < 0.285
     assert np.all(np.abs(centers[:, :2]) < np.array(room.size_m[:2]) / 2 - 0.3)
     away = centers[:, None] - [t.center_in_world for t in tables]  # (F, T, 3)
-    target = np.linalg.norm(away[..., :2], axis=2).std(0).argmin()  # the one that it goes round
+    target = np.linalg.norm(away[..., :2], axis=2).std(0).argmin()  # the one it goes around
     turn = np.unwrap(np.arctan2(away[:, target, 1], away[:, target, 0]))
     assert np.degrees(turn[-1] - turn[0]) == pytest.approx(360) and np.all(np.diff(turn) > 0)
     to_table = -away[:, target] / np.linalg.norm(away[:, target], axis=1, keepdims=True)
@@ -174,7 +174,7 @@ def test_photos_are_not_blurred_by_their_steps(room) -> None:
     np.testing.assert_array_equal(still, moving)
 
 
-def test_turn_stays_on_the_spot_and_turns_far(room) -> None:
+def test_turn_is_a_pure_rotation(room) -> None:
     centers, forward = viewing(room, path="turn", frames=100, shake_m=0.0)
     still = slice(40, 60)
     assert np.ptp(centers[still], axis=0).max() < 1e-6
@@ -182,7 +182,7 @@ def test_turn_stays_on_the_spot_and_turns_far(room) -> None:
     assert np.degrees(np.arccos(forward[40] @ forward[60])) > 60
 
 
-def test_rooms_of_the_corridor_look_the_same_from_the_same_place(room) -> None:
+def test_rooms_of_the_corridor_look_identical(room) -> None:
     row, (w, d, h) = rr.rooms_in_a_row(room, 3), room.size_m
     assert row.size_m == (3 * w, d, h) and len(row.objects) == 3 * len(room.objects)
     assert [o.index for o in row.objects] == list(range(len(row.objects)))
@@ -226,7 +226,7 @@ def test_quaternion_rebuilds_the_rotation(room) -> None:
         np.testing.assert_allclose(rotation, pose[:, :3], atol=1e-12)
 
 
-def test_detector_errs_as_configured(room, view) -> None:
+def test_detector_noise_is_as_configured(room, view) -> None:
     _, _, instance, _, truth = view
     perfect = rr.DetectorConfig(0.0, 0.0, -9.0, -99.0, 0.0, 0.0, 0.0, 0.0)
     found = rr.simulate_detections(room, truth, instance, perfect, np.random.default_rng(0))
@@ -328,7 +328,7 @@ def test_varied_rooms_differ_and_repeat(varied) -> None:
     assert other.size_m != varied.size_m and len(other.objects) != len(varied.objects)
 
 
-def test_varied_rooms_hold_twins_inside_their_walls(varied) -> None:
+def test_varied_rooms_contain_identical_objects_inside_their_walls(varied) -> None:
     groups = [o.twin_group for o in varied.objects]
     assert sum(groups.count(g) >= 2 for g in set(groups)) >= 2
     limit = np.array(varied.size_m[:2]) / 2
@@ -339,7 +339,7 @@ def test_varied_rooms_hold_twins_inside_their_walls(varied) -> None:
         np.testing.assert_array_equal(rects, varied.surfaces.texture_rect[first])
 
 
-def test_tour_stays_in_the_room_and_sees_things_twice(varied) -> None:
+def test_tour_stays_in_the_room_and_revisits_objects(varied) -> None:
     poses = rr.camera_path(varied, VARIED)
     centers = -np.einsum("fji,fj->fi", poses[:, :, :3], poses[:, :, 3])
     assert (np.abs(centers[:, :2]) < np.array(varied.size_m[:2]) / 2 - 0.2).all()
@@ -362,7 +362,7 @@ def test_stretched_model_keeps_unit_normals() -> None:
         )
 
 
-def test_the_committed_room_is_still_what_its_seed_gives() -> None:
+def test_the_committed_room_equals_that_of_its_seed() -> None:
     config = rr.RoomConfig(seed=0, frames=240, texels_per_m=40, light_rays=1)
     found = rr.objects_json(rr.make_room(config), config)
     golden = json.loads((ROOT / "examples" / "room" / "gt_objects.json").read_text())

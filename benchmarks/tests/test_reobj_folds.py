@@ -45,7 +45,7 @@ def network(path: Path, stride: int, *channels: int) -> Path:
         ((64, 20), 32, "its own spatial output (published: 7x7x512)", (20, 7, 7), 224),
     ],
 )
-def test_the_published_map_or_what_comes_nearest(
+def test_the_published_map_or_the_closest_one(
     folds, tmp_path, channels, stride, taken, shape, crop
 ) -> None:
     path = network(tmp_path / "net.onnx", stride, *channels)
@@ -57,11 +57,11 @@ def test_the_published_map_or_what_comes_nearest(
 
 
 @pytest.mark.parametrize(("side", "sizes"), [(7, [4, 2, 1]), (14, [7, 4, 2, 1]), (1, [1])])
-def test_conv_block_pools_any_map_to_one_place(folds, side: int, sizes: list[int]) -> None:
+def test_conv_block_pools_any_map_to_one_cell(folds, side: int, sizes: list[int]) -> None:
     """As published: convolution, batch norm and max-pooling; widths double; both maps in one."""
     import torch
 
-    torch.manual_seed(1)  # of a map of one place all outputs may be 0 behind the ReLU
+    torch.manual_seed(1)  # of a map of one cell all outputs may be 0 behind the ReLU
     block = folds.ConvBlock(6, side, 4)
     seen, maps = [], torch.rand(2, 6, side, side)
     for stage in block.stages:
@@ -77,7 +77,7 @@ def test_conv_block_pools_any_map_to_one_place(folds, side: int, sizes: list[int
 
 
 def recording(folder: Path) -> Path:
-    """Six grey things before six coloured walls, each seen in eight frames 40 apart."""
+    """Six grey objects in front of six coloured walls, each seen in eight frames 40 apart."""
     (folder / "images").mkdir(parents=True)
     rng, lines = np.random.default_rng(0), []
     walls = np.array([[40, 40, 220], [220, 60, 40], [40, 200, 60],
@@ -102,8 +102,8 @@ def test_objects_are_dealt_into_folds_class_by_class(folds, tmp_path) -> None:
     assert all(len(set(fold[pairs.identity == k])) == 1 for k in np.unique(pairs.identity))
 
 
-def test_four_setups_are_trained_alike_on_a_recording(folds, tmp_path, capsys) -> None:
-    """Things that look the same before different walls: the surroundings tell them apart."""
+def test_four_setups_are_trained_equally_on_a_recording(folds, tmp_path, capsys) -> None:
+    """Identical objects in front of different walls: the surroundings distinguish them."""
     mean_backbone(tmp_path / "net.onnx", channels=8)
     command = [str(recording(tmp_path / "r")), "-o", str(tmp_path / "out"), "--width", "4"]
     command += ["--backbone", str(tmp_path / "net.onnx"), "--every", "1", "--away", "0"]
@@ -123,7 +123,7 @@ def test_four_setups_are_trained_alike_on_a_recording(folds, tmp_path, capsys) -
     assert "r (choosing): net.onnx: its own spatial output" in capsys.readouterr().out
 
 
-def test_queries_are_of_objects_that_the_block_never_saw(folds, tmp_path, monkeypatch) -> None:
+def test_queries_are_objects_not_used_in_training(folds, tmp_path, monkeypatch) -> None:
     mean_backbone(tmp_path / "net.onnx", channels=8)
     scene = folds.recording_scene(recording(tmp_path / "r"))
     pairs, trained = folds.pairs_of([scene]), []

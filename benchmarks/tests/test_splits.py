@@ -1,4 +1,4 @@
-"""benchmarks/splits.json: what may be reported, and that the scripts obey it."""
+"""benchmarks/splits.json: reporting and choosing sets, and their use by the scripts."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ from splits import SPLITS, held_out, marked, room_name, split_name
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def test_nothing_is_for_both() -> None:
+def test_the_sets_are_disjoint() -> None:
     for kind in ("rooms", "recordings", "pedestrians"):
         assert not set(SPLITS["reporting"][kind]) & set(SPLITS["choosing"][kind])
     assert len(SPLITS["reporting"]["rooms"]) >= 8
 
 
-def test_no_room_of_the_reports_was_trained_on_or_named_elsewhere() -> None:
+def test_reported_rooms_are_not_used_in_training() -> None:
     """By the commands in the docs and the scripts: lists and ranges of seeds."""
     pages = [*ROOT.glob("docs/**/*.md"), *ROOT.glob("benchmarks/*.md")]
     texts = [p.read_text() for p in [*pages, *ROOT.glob("benchmarks/*.py")]]
     words = r"--(?:rooms|seeds?|calibrate|val-rooms)((?:[ ,]v?\d+)+)"
     lists = (found for t in texts for found in re.findall(words, t))
     named = {int(n) for found in lists for n in re.findall(r"\d+", found)}
-    ranges = r"(?<!--fine-rooms )\b(\d{3,4}):(\d{3,4})\b"  # that network was thrown away
+    ranges = r"(?<!--fine-rooms )\b(\d{3,4}):(\d{3,4})\b"  # that network was discarded
     for low, high in (r for t in texts for r in re.findall(ranges, t)):
         named |= set(range(int(low), int(high)))
     assert {900, 1008, 1192} <= named
     assert not named & {int(n.lstrip("v")) for n in SPLITS["reporting"]["rooms"]}
 
 
-def test_a_room_is_named_by_what_it_was_made_of(tmp_path: Path) -> None:
+def test_a_room_is_named_by_its_seed_and_options(tmp_path: Path) -> None:
     assert room_name(ROOT / "examples" / "room") == "0" and not held_out("rooms", "0")
     truth = {"config": {"seed": 2006, "plan": "varied"}}
     (tmp_path / "gt_objects.json").write_text(json.dumps(truth))
@@ -58,7 +58,7 @@ def test_a_room_is_named_by_what_it_was_made_of(tmp_path: Path) -> None:
         (["--tune", "--choosing", "--rooms", "2001"], [], ["2001"]),
     ],
 )
-def test_what_may_not_be_used_is_left_out(
+def test_excluded_sequences_are_left_out(
     words: list[str], used: list[str], left_out: list[str],
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
@@ -80,7 +80,7 @@ def test_every_peer_has_a_setting_within_its_sweep() -> None:
             assert value in compare_deepsort.SWEEP[peer][option][1:]
 
 
-def test_the_table_of_real_rooms_marks_what_was_chosen_on() -> None:
+def test_the_table_of_real_rooms_marks_choosing_recordings() -> None:
     rooms = [real_rooms.Case("", "", seed=seed).title[0] for seed in (901, 2006)]
     assert rooms == ["rendered 901 (choosing)", "rendered 2006"]
     assert all(case.title[0].endswith(" (choosing)") for case in real_rooms.CASES)
@@ -103,7 +103,7 @@ RECORDING = "redkitchen_7scenes"
         (pose_accuracy, ["redkitchen", "--data", "FOLDER/..", "-o", "OUT"]),
     ],
 )
-def test_every_script_leaves_out_what_it_may_not_use(
+def test_every_script_leaves_out_excluded_sequences(
     script: Any, words: list[str], tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
@@ -138,7 +138,7 @@ def test_a_folder_is_a_scan_a_room_or_a_recording(tmp_path: Path) -> None:
 def test_the_table_of_scales_has_the_rooms_for_reporting(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    """And with --choosing others besides, apart."""
+    """With --choosing, the others are listed separately."""
     made: list[int] = []
 
     class Pool:

@@ -12,7 +12,7 @@ from types import ModuleType
 import cv2
 import numpy as np
 import pytest
-from test_embedding import boxes, mean_backbone, scene_with_twins
+from test_embedding import boxes, mean_backbone, scene_with_identical_objects
 
 import reobj_track as rt
 from reobj.appearance.embedding import trained_head
@@ -57,7 +57,7 @@ def test_training_logs_resumes_and_draws_curves(trained) -> None:
     assert cv2.imread(str(trained / "curves.png")) is not None
 
 
-def test_exported_models_state_their_layout_by_its_present_names(te, trained) -> None:
+def test_exported_models_state_their_layout_with_current_names(te, trained) -> None:
     facts = onnx_metadata(onnx_session(trained / "reobj.onnx", 1))
     assert set(facts["layout"]) <= set(rt.SamplingLayout.__dataclass_fields__)
     assert {"min_margin", "surround_scale", "surround_cells"} <= set(facts["layout"])
@@ -65,7 +65,7 @@ def test_exported_models_state_their_layout_by_its_present_names(te, trained) ->
 
 
 def test_exported_model_equals_the_trained_network(te, trained) -> None:
-    """Pooling in numpy and the ONNX graphs give what the network gives in PyTorch."""
+    """Pooling in numpy and the ONNX graphs give the outputs of the PyTorch network."""
     import torch
 
     clip = te.room_clip(3, trained / "rooms")
@@ -105,7 +105,7 @@ def colours(image: np.ndarray) -> np.ndarray:
 def test_colour_channels_are_a_soft_histogram_of_lab(te) -> None:
     import torch
 
-    image, _ = scene_with_twins()
+    image, _ = scene_with_identical_objects()
     image = cv2.GaussianBlur(image, (0, 0), 2)[:, :320]
     planes = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None].float()
     own = te.ColourMap()(planes)[0].numpy().transpose(1, 2, 0)  # (60, 80, 17)
@@ -224,7 +224,7 @@ def test_scannet_folders_become_a_clip(te, tmp_path) -> None:
 
 @pytest.mark.parametrize("merge", ["", "maps", "rows"])  # "": not of crops
 def test_head_of_a_frozen_backbone_is_found_beside_it(th, trained, tmp_path, merge: str) -> None:
-    """A step of training; the exported head gives through the tool what it gives in PyTorch."""
+    """A step of training; the exported head gives the same output in the tool as in PyTorch."""
     crops = bool(merge)
     options = ["--crops", "--merge", merge, "--width", "8"] if crops else []
     mean_backbone(tmp_path / "net.onnx", channels=8)
@@ -235,7 +235,7 @@ def test_head_of_a_frozen_backbone_is_found_beside_it(th, trained, tmp_path, mer
     name = "crops_net_head.onnx" if crops else "net_head.onnx"
     assert cv2.imread(str(out / "curves.png")) is not None
     (out / name).replace(tmp_path / name)
-    image, detections = scene_with_twins()
+    image, detections = scene_with_identical_objects()
     kind = rt.CropEmbedder if crops else rt.Embedder
     net, alone = str(tmp_path / "net.onnx"), rt.SamplingLayout(neighbours=0)
     assert trained_head(f"crops:{net}" if crops else net) == tmp_path / name
@@ -249,7 +249,7 @@ def test_head_of_a_frozen_backbone_is_found_beside_it(th, trained, tmp_path, mer
     assert_same_as_in_torch(th, args, see, out / "best.pt", look)
 
 
-def test_fine_rooms_have_pictures_and_a_cache_of_their_own(th, te, tmp_path) -> None:
+def test_fine_rooms_have_separate_images_and_cache(th, te, tmp_path) -> None:
     for name in ("fine_7.npz", "room_8.npz"):
         (tmp_path / name).touch()
     command = ["-o", "x", "--backbone", "x", "--cache", str(tmp_path), "--no-render"]
