@@ -11,7 +11,7 @@ from test_linking import CHAIR, CUP, NAMES, SIZE, chair_solids, table_of, walk
 
 import quadrics
 import reobj_track as rt
-from reobj.objects import association, categories, likelihood
+from reobj.objects import association, categories, component, likelihood
 from reobj.objects.association import Association, Associator
 from reobj.objects.categories import Categories
 from reobj.objects.component import associate_component
@@ -239,6 +239,33 @@ def test_duplicate_detections_give_one_object(off_px: float, name: str) -> None:
     assert np.unique(found).tolist() == [-1, 0, 1, 2]
 
 
+def test_occluded_chairs_get_the_width_of_their_unoccluded_views(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """In three of four frames only the narrow upper half of every chair is visible."""
+    floor = quadrics.Floor(np.array([0, 0, 1.0]), 0.0, 0.01)
+    poses = walk()
+    table = table_of(poses)
+    back = table.frame % 4 != 0
+    x1, y1, x2, y2 = table.xyxy.T
+    half = np.stack([0.75 * x1 + 0.25 * x2, y1, 0.25 * x1 + 0.75 * x2, (y1 + y2) / 2], 1)
+    seen = dataclasses.replace(table, xyxy=np.where(back[:, None], half, table.xyxy))
+    fit, priors = make_fit(rt.ObjectsConfig(), poses, NAMES), quadrics.load_priors()
+    width = {}
+    for standing, rounds in (
+        (True, association.WIDENING_ROUNDS),
+        (True, 0),
+        (False, association.WIDENING_ROUNDS),
+    ):
+        monkeypatch.setattr(association, "WIDENING_ROUNDS", rounds)
+        monkeypatch.setattr(component, "find_floor", Mock(return_value=floor if standing else None))
+        found = associate_component(seen, NAMES, poses, fit, priors)
+        assert (found.label >= 0).mean() > 0.9 and len(found.confidence) == 3
+        width[standing, rounds > 0] = found.ellipsoids.half_axes[:3, :2].mean()
+    assert abs(width[True, True] / 0.29 - 1) < 0.1
+    assert max(width[True, False], width[False, True]) < 0.85 * width[True, True]
+
+
 @pytest.mark.parametrize("metric", [True, False])
 def test_fits_are_not_repeated_and_the_first_scale_is_kept(metric: bool) -> None:
     """The first fit estimates the scale; later fits use new sets of detections only."""
@@ -331,7 +358,7 @@ def test_ambiguous_detections_are_excluded_from_refits() -> None:
     found.label[found.label == 2] = -1
     made.fit_shapes = Mock(return_value=found.shapes)
     made._refit(found)
-    rows, label, classes = made.fit_shapes.call_args.args
+    rows, label, classes, _ = made.fit_shapes.call_args.args
     np.testing.assert_array_equal(rows, np.flatnonzero(found.unambiguous()))
     np.testing.assert_array_equal(label, found.label[rows])
     votes = np.array([[score[(found.label == obj) & (kind.clip(0) == k)].sum() for k in range(4)]
@@ -428,8 +455,10 @@ def test_the_association_stops_at_a_repeated_state(monkeypatch: pytest.MonkeyPat
         return dataclasses.replace(now, label=states[len(rounds) % 2])
 
     for step in ("_refit", "_prune", "_merge"):
-        monkeypatch.setattr(made, step, turned if step == "_merge" else lambda now: now)
-    made.run(chairs())
+        monkeypatch.setattr(
+            made, step, turned if step == "_merge" else lambda now, widen=False: now
+        )
+    made.run(chairs(), False)
     assert len(rounds) == 3
 
 

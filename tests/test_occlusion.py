@@ -1,4 +1,4 @@
-"""Occluded edges of boxes: where a nearer object begins; and the fit with them."""
+"""Occluded edges: at nearer objects, and at boxes that end above the floor; effect on the fit."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from reobj.objects.observations import Views, gather_views
 from reobj.objects.occlusion import occluded_edges, see_through_ratio
 
 LEFT, UPPER, RIGHT, LOWER = range(4)
+ELSEWHERE = np.array([False, False])  # neither stands on the floor
 
 
 def scene(counter: np.ndarray) -> tuple[quadrics.Ellipsoids, Views]:
@@ -37,7 +38,7 @@ def cut_below(views: Views) -> None:
 def test_only_the_edge_at_the_counter_is_occluded() -> None:
     solids, views = scene(np.array([1.5, 0.1, 0.3]))
     cut_below(views)
-    found = occluded_edges(views, solids)
+    found = occluded_edges(views, solids, ELSEWHERE)
     expected = np.zeros((5, 2, 4), bool)
     expected[:, 0, LOWER] = True
     np.testing.assert_array_equal(found, expected)
@@ -48,22 +49,37 @@ def test_farther_objects_occlude_nothing() -> None:
     solids.center_in_world[1, 1] = 0.4
     views.boxes[:] = quadrics.solid_boxes(solids, "box", views.img_from_world)
     cut_below(views)
-    assert not occluded_edges(views, solids)[:, 0].any()
+    assert not occluded_edges(views, solids, ELSEWHERE)[:, 0].any()
     solids.center_in_world[0, 1] = 1.0
-    assert occluded_edges(views, solids)[:, 0, LOWER].all()
+    assert occluded_edges(views, solids, ELSEWHERE)[:, 0, LOWER].all()
 
 
 def test_an_object_covering_the_whole_box_occludes_no_edge() -> None:
     """The chair is detected although an object covers it: that object is not opaque."""
     solids, views = scene(np.array([1.5, 0.1, 0.9]))
-    assert not occluded_edges(views, solids).any()
+    assert not occluded_edges(views, solids, ELSEWHERE).any()
 
 
 def test_an_unknown_object_occludes_nothing() -> None:
     solids, views = scene(np.array([1.5, 0.1, 0.3]))
     cut_below(views)
     solids.center_in_world[1] = solids.half_axes[1] = np.nan
-    assert not occluded_edges(views, solids).any()
+    assert not occluded_edges(views, solids, ELSEWHERE).any()
+
+
+def test_boxes_that_end_above_the_floor_give_a_one_sided_bound() -> None:
+    """Of the two objects on the floor one is unoccluded in the first frame, half occluded later."""
+    solids, views = scene(np.array([0.2, 0.2, 0.4]))
+    solids.center_in_world[1, :2] = [1.5, 0]
+    views.boxes[:] = quadrics.solid_boxes(solids, "box", views.img_from_world)
+    lower, height = views.boxes[..., 3], np.diff(views.boxes[..., [1, 3]])[..., 0]
+    lower[0] -= 0.05 * height[0]
+    lower[1:] -= 0.3 * height[1:]
+    expected = np.zeros((5, 2, 4), bool)
+    expected[1:, 0] = [True, False, True, True]
+    found = occluded_edges(views, solids, np.array([True, False]))
+    np.testing.assert_array_equal(found, expected)
+    assert not occluded_edges(views, solids, ELSEWHERE).any()
 
 
 def test_no_edge_is_occluded_below_the_image() -> None:
@@ -73,7 +89,7 @@ def test_no_edge_is_occluded_below_the_image() -> None:
     whole = quadrics.solid_boxes(solids, "box", views.img_from_world)
     size = (SIZE[0], float(whole[..., 3].min()) - 20.0)
     views = dataclasses.replace(views, boxes=quadrics.clip_boxes(whole, size), image_size=size)
-    assert not occluded_edges(views, solids).any()
+    assert not occluded_edges(views, solids, ~ELSEWHERE).any()
 
 
 @pytest.mark.parametrize("edge", [UPPER, LOWER])

@@ -11,6 +11,7 @@ alternating steps.
  3. refit    each shape to its unambiguous detections
  4. prune    objects with negative marginal gain, as others take over their detections
  5. merge    two objects if one explains the detections of both
+ 6. widen    refit, ignoring the unreliable edges of boxes that end above the floor
 """
 
 from __future__ import annotations
@@ -48,9 +49,11 @@ SAME_POSITION = 0.5
 SIMILAR_SIZE = float(np.log(1.4))  # of mean sizes; then classes may differ (laptop and tv)
 MIN_DETECTIONS = 3  # of an object; fewer do not determine it
 MAX_ROUNDS = 10  # of steps 2 to 5 (chosen)
+WIDENING_ROUNDS = 2  # of step 6 (chosen)
 
-# detections (K,), the object of each (K,), the classes (O,) of the objects -> O shapes
-FitShapes = Callable[[IntArray, IntArray, IntArray], Shapes]
+# detections (K,), the object of each (K,), the classes (O,) of the objects, their current shapes if
+# box edges above the floor are to be ignored (else None) -> O shapes
+FitShapes = Callable[[IntArray, IntArray, IntArray, Shapes | None], Shapes]
 SizeLogOdds = Callable[[Shapes], Array]  # (O,) of the sizes by the categories
 
 
@@ -123,7 +126,7 @@ class Associator:
         self.fit_shapes = fit_shapes
         self.size_log_odds = size_log_odds
 
-    def run(self, hypotheses: Shapes) -> Association:
+    def run(self, hypotheses: Shapes, floor_known: bool) -> Association:
         """Select among hypotheses, then alternate between assignment and shapes."""
         selected = self._select_greedily(self._unassigned(hypotheses, 0.0))
         current = self._assign(hypotheses[selected], np.full(len(self.detections.view), -1))
@@ -134,6 +137,9 @@ class Associator:
             if (state := current.label.tobytes()) in visited:
                 break
             visited.add(state)
+        # last, as wide shapes take over the detections of their neighbours
+        for _ in range(WIDENING_ROUNDS if floor_known else 0):
+            current = self._refit(current, widen=True)
         return current
 
     def _unassigned(self, shapes: Shapes, min_log_odds: float = MIN_LOG_ODDS) -> Association:
@@ -215,15 +221,21 @@ class Associator:
             label[unique_row[j[good]]] = unique_obj[i[good]]
         return Association(shapes, label, evidence, self.size_log_odds(shapes))
 
-    def _refit(self, current: Association) -> Association:
-        """Fit each shape to its unambiguous detections, in the majority class of all of its own."""
+    def _refit(self, current: Association, widen: bool = False) -> Association:
+        """Fit the shapes to their unambiguous detections, in the majority class of all of theirs.
+
+        Args:
+            widen: ignore the unreliable edges of boxes that end above the floor.
+        """
         assigned = np.flatnonzero(current.label >= 0)
         rows = np.flatnonzero(current.unambiguous())
         class_id = self.detections.class_id[assigned].clip(0)
         votes = np.zeros((len(current.shapes), int(class_id.max(initial=0)) + 1))
         np.add.at(votes, (current.label[assigned], class_id), self.detections.score[assigned])
         classes = np.where(votes.any(1), votes.argmax(1), current.shapes.class_id)
-        fitted = self.fit_shapes(rows, current.label[rows], classes)
+        fitted = self.fit_shapes(
+            rows, current.label[rows], classes, current.shapes if widen else None
+        )
         succeeded = np.isfinite(fitted.ellipsoids.center_in_world).all(1)
         both = Shapes.concatenate([current.shapes, fitted])
         pick = np.arange(len(fitted)) + np.where(succeeded, len(fitted), 0)
@@ -276,7 +288,7 @@ class Associator:
         if not len(strong):
             return current
         row, pair = self._joint_rows(current.label, strong, weak)
-        fitted = self.fit_shapes(row, pair, current.shapes.class_id[strong])
+        fitted = self.fit_shapes(row, pair, current.shapes.class_id[strong], None)
         more = self._joint_gains(current.label, strong, weak, fitted) - gain[strong] - gain[weak]
         duplicate = _coincide(current.shapes)[strong, weak]
         more[duplicate & np.isfinite(more)] = np.inf

@@ -22,6 +22,11 @@ def name_of(class_names: Sequence[str], class_id: int) -> str:
     return class_names[class_id] if 0 <= class_id < len(class_names) else "object"
 
 
+def on_floor(priors: quadrics.Priors, names: list[str]) -> BoolArray:
+    """Mark the categories (G,) that stand on the floor."""
+    return np.asarray(_with_unknown(priors.on_floor, False)[priors.index(names)], bool)
+
+
 @dataclass(frozen=True, slots=True)
 class Categories:
     """Size priors of the classes of a detector, in units of the world.
@@ -46,7 +51,7 @@ class Categories:
 
     def on_floor(self, classes: IntArray) -> BoolArray:
         """Mark the classes (G,) that stand on the floor."""
-        return np.asarray(_with_unknown(self.priors.on_floor, False)[self.rows(classes)], bool)
+        return on_floor(self.priors, self._names_of(classes))
 
     def size_log_odds(self, shapes: Shapes) -> Array:
         """Return the log odds (O,) of the sizes, 0 at the usual size, rotated by 90 deg or not."""

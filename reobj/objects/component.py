@@ -22,7 +22,7 @@ from reobj.objects.categories import Categories
 from reobj.objects.hypotheses import propose, propose_along_rays
 from reobj.objects.likelihood import NO_SHAPES, PosedDetections, Shapes
 from reobj.objects.observations import Fit, Scene, Views, gather_views
-from reobj.objects.occlusion import see_through_ratio
+from reobj.objects.occlusion import edges_above_floor, see_through_ratio
 from reobj.poses.floor import floor_of
 from reobj.tracking.linking import cut_at_gaps
 from reobj.types import Array, BoolArray, IntArray, Tracks, box_iou, class_shares, rows_by
@@ -94,9 +94,9 @@ def associate_component(
     ])  # fmt: skip
     detections = _posed_detections(table, poses, views)
     scene = Scene(floor, None, None if poses.metric else fits.scale, trusts_classes=True)
-    fit_shapes = _cached_fit(detections, views, scene, fit)
+    fit_shapes = _cached_fit(detections, views, categories, scene, fit)
     associator = Associator(detections, fit_shapes, categories.size_log_odds)
-    found = associator.run(hypotheses)
+    found = associator.run(hypotheses, floor is not None)
     assigned = np.flatnonzero(found.label >= 0)
     boxes = _project(found.shapes, views)[detections.view[assigned], found.label[assigned]]
     label[used] = found.label
@@ -197,26 +197,40 @@ def _project(shapes: Shapes, views: Views) -> Array:
     return quadrics.clip_boxes(boxes, views.image_size)
 
 
-def _cached_fit(detections: PosedDetections, views: Views, scene: Scene, fit: Fit) -> FitShapes:
+def _cached_fit(
+    detections: PosedDetections, views: Views, categories: Categories, scene: Scene, fit: Fit
+) -> FitShapes:
     """Return the function that fits shapes to detections; it fits each set of them once."""
     cache: dict[tuple[bytes, int], Shapes] = {}
 
-    def fit_shapes(rows: IntArray, label: IntArray, classes: IntArray) -> Shapes:
+    def fit_shapes(
+        rows: IntArray, label: IntArray, classes: IntArray, current: Shapes | None
+    ) -> Shapes:
         order = np.lexsort((rows, label))
         rows = rows[order]
         label = label[order]
+        occluded = np.zeros((len(rows), 4), bool)
+        if current is not None and scene.floor is not None:
+            projected = _project(current, views)[detections.view[rows], label]
+            occluded = edges_above_floor(detections.box[rows], projected)
+            occluded &= categories.on_floor(classes)[label, None]
         start = np.searchsorted(label, np.arange(len(classes) + 1))
         slices = [slice(a, b) for a, b in itertools.pairwise(start)]
-        keys = [(rows[s].tobytes(), c) for s, c in zip(slices, classes.tolist(), strict=True)]
+        keys = [
+            (rows[s].tobytes() + occluded[s].tobytes(), c)
+            for s, c in zip(slices, classes.tolist(), strict=True)
+        ]
         missing = [k for k, key in enumerate(keys) if key not in cache]
         if missing:
             boxes = np.full((len(views.frame), len(missing), 4), np.nan)
             score = np.zeros(boxes.shape[:2])
+            edges = np.zeros(boxes.shape, bool)
             for column, k in enumerate(missing):
                 cell = detections.view[rows[slices[k]]], column
                 boxes[cell] = detections.box[rows[slices[k]]]
                 score[cell] = detections.score[rows[slices[k]]]
-            seen = Views(views.frame, boxes, score, views.img_from_world, views.image_size)
+                edges[cell] = occluded[slices[k]]
+            seen = Views(views.frame, boxes, score, views.img_from_world, views.image_size, edges)
             fits = fit(seen, classes[missing].tolist(), scene)
             shapes = Shapes(fits.ellipsoids, fits.support, classes[missing])
             cache.update((keys[k], shapes[[column]]) for column, k in enumerate(missing))

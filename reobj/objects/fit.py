@@ -18,7 +18,7 @@ import numpy as np
 import quadrics
 from reobj.cameras import Poses, place_of
 from reobj.objects import confidence
-from reobj.objects.categories import name_of
+from reobj.objects.categories import name_of, on_floor
 from reobj.objects.component import ComponentObjects, associate_component, find_floor
 from reobj.objects.config import ObjectsConfig, make_fit
 from reobj.objects.description import describe_objects, describe_world
@@ -428,9 +428,10 @@ def _fit_component(
             label = np.array([linked.label_of.get(identity, -1) for identity in classes])
             floor = objects.floor
             ellipsoids = objects.ellipsoids[label]
+        standing = on_floor(priors, [name_of(class_names, c) for c in categories])
         views = dataclasses.replace(
             views,
-            occluded=occluded_edges(views, ellipsoids),
+            occluded=occluded_edges(views, ellipsoids, standing & (floor is not None)),
             points=points_on(views, poses, ellipsoids),
         )
         fits = fit(views, categories, Scene(floor, None if floor is None else floor.normal))

@@ -1,8 +1,9 @@
 """Occluded edges of boxes, and background points seen through objects.
 
 A box edge caused by an occluder does not bound the object. An edge counts as occluded if a nearer
-object covers the image just outside it but not just inside it. Sparse points seen behind an object,
-on rays through its middle, are evidence that the object does not exist.
+object covers the image just outside it but not just inside it, or if the box of a floor-standing
+object ends above the floor. Sparse points seen behind an object, on rays through its middle, are
+evidence that the object does not exist.
 """
 
 from __future__ import annotations
@@ -20,16 +21,43 @@ EDGE_POINTS = (np.arange(8) + 0.5) / 8  # along an edge (chosen)
 # where none may be (chosen: the outline of the occluder is not known better)
 BESIDE_EDGE = (0.1, -0.2)
 MIN_COVERED = 0.5  # fraction of these points that nearer objects cover (chosen)
+# Fraction of its height that a box may end above the lower edge of its object and still show all of
+# it (chosen on hololens_kitchen, where .05 to .2 are alike)
+ABOVE_FLOOR = 0.1
 
 
-def occluded_edges(views: Views, ellipsoids: quadrics.Ellipsoids) -> BoolArray:
-    """Mark box edges with a nearer object just outside and none just inside.
+def occluded_edges(views: Views, ellipsoids: quadrics.Ellipsoids, on_floor: BoolArray) -> BoolArray:
+    """Mark box edges where the object is occluded rather than ends.
 
     Args:
         ellipsoids: of the G groups of the views, NaN where unknown: they occlude nothing.
+        on_floor: (G,) these stand on a known floor.
     Returns:
         (V, G, 4) left, upper, right and lower edge.
     """
+    projected = quadrics.solid_boxes(ellipsoids, "box", views.img_from_world)
+    above = edges_above_floor(views.boxes, quadrics.clip_boxes(projected, views.image_size))
+    return _occluded_by_nearer(views, ellipsoids) | above & on_floor[:, None]
+
+
+def edges_above_floor(boxes: Array, projected: Array) -> BoolArray:
+    """Mark the unreliable edges of boxes (..., 4) that end above the floor.
+
+    The lower part of a floor-standing object is occluded then. It may be the wider one: of a chair
+    at a table only the back is visible.
+
+    Args:
+        projected: (..., 4) boxes of the projected objects, which extend down to the floor.
+    Returns:
+        (..., 4) left, upper, right and lower edge.
+    """
+    height = projected[..., 3] - projected[..., 1]
+    above = boxes[..., 3] < projected[..., 3] - ABOVE_FLOOR * height
+    return np.asarray(above[..., None] & np.array([True, False, True, True]), bool)
+
+
+def _occluded_by_nearer(views: Views, ellipsoids: quadrics.Ellipsoids) -> BoolArray:
+    """Mark box edges (V, G, 4) with a nearer object just outside and none just inside."""
     occluded = np.zeros(views.boxes.shape, bool)
     known = np.isfinite(ellipsoids.half_axes.sum(1) + ellipsoids.center_in_world.sum(1))
     seen = np.isfinite(views.boxes.sum(2)) & known  # (V, G)
