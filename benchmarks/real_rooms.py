@@ -189,6 +189,7 @@ WITHOUT: dict[str, dict[str, Any]] = {
     "same position": {f"{ASSOCIATION}.SAME_POSITION": 0.0},
     "limit of a proposal's gain": {f"{ASSOCIATION}.MAX_BOX_GAIN": np.inf},
     "boxes at the border": {"reobj.objects.hypotheses.BORDER_WEIGHT": 1.0},
+    "heights of standing objects": {"reobj.objects.hypotheses.STANDING_HEIGHTS": (0.0, 1e6)},
     "quartic size prior": {"quadrics.SIZE_WALL": 1e3},
     "tie of round objects": {"quadrics.ROUND_LOG": 1e3},
     "lower part occluded": {"quadrics.OCCLUDED_BELOW": 1e-12},

@@ -19,6 +19,7 @@ from reobj.types import Array, BoolArray, IntArray
 # 3 m)
 DEPTHS = np.geomspace(0.4, 1.6, 8)
 BORDER_WEIGHT = 0.3  # of the area of a box at the image border, to choose the best view (chosen)
+STANDING_HEIGHTS = (0.3, 1.8)  # of floor-standing objects, over the usual height (chosen)
 
 
 def propose(
@@ -128,7 +129,8 @@ def _along_rays(
         # height of the point above the floor n x = d
         lift = (point @ floor.normal - floor.offset) / (floor.normal @ up)
         whole = top_height - (point @ up - lift)
-        stands = whole > 0
+        low, high = (factor * usual[:, None, 1] for factor in STANDING_HEIGHTS)
+        stands = (whole > low) & (whole < high)
         kinds = [(size[..., 0], whole, None), (narrow, whole, None)]
         good = [stands, stands]
     axes = _upright_axes(up)
