@@ -1,4 +1,4 @@
-"""Evaluation against ground truth: HOTA, CLEAR MOT, IDF1, Rank-k of returns; in 3D: solids.py.
+"""Evaluation against ground truth: HOTA, CLEAR MOT, IDF1, Rank-k of returns (3D: evaluation_3d).
 
 Start at `evaluate`; `score_tracks` compares any two sets of `LabelledBoxes`. Writes no files.
 """

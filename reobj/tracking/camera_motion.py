@@ -17,9 +17,8 @@ from reobj.types import Array, Floats, Frame, Image
 
 FLOW_SIZE_PX = 320  # px, longer side of the image in which corners are followed: for speed
 FLOW_CORNERS = 100  # corners followed: for speed (BoT-SORT: 1000)
-# nearest corners whose median is the parallax of a point. IoU of the true boxes with the
-# moved ones, against the transform alone: rendered room v900 .76 -> .82, room 0 at every 4th frame
-# .65 -> .78 (v900: benchmarks/LOG.md)
+# nearest corners whose median is the parallax of a point (measured, IoU of the true boxes with the
+# moved ones, against the transform alone: rendered room v900 .76 -> .82, benchmarks/LOG.md)
 PARALLAX_CORNERS = 5
 
 

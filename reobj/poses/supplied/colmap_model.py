@@ -34,8 +34,8 @@ def find_models(path: Path) -> list[Path]:
     if path.is_file():
         return [path] if path.name == "images.txt" else _model_in(path.parent)
     models = _model_in(path)
-    places = (("sparse", "sparse/*"), ("*",), ("colmap/sparse", "colmap/sparse/*"))
-    for patterns in places if not models else ():
+    levels = (("sparse", "sparse/*"), ("*",), ("colmap/sparse", "colmap/sparse/*"))
+    for patterns in levels if not models else ():
         folders = [folder for pattern in patterns for folder in sorted(path.glob(pattern))]
         folders = [f for f in folders if f.name.isdecimal() or f.name == "sparse"]
         models = models or [model for folder in folders for model in _model_in(folder)]

@@ -157,7 +157,7 @@ def _by_image_numbers(
         found.append(_assignment(key, rule, np.where(known, frame, -1), source))
     if found[0].outside and not np.isin(images, number[known]).all():  # both have unmatched numbers
         for first in (0, 1):
-            rule = f"{noun} as places in the order of the images, counted from {first}"
+            rule = f"{noun} as positions in the order of the images, counted from {first}"
             found.append(
                 _assignment(f"place{first}", rule, np.where(known, number - first, -1), source)
             )

@@ -75,7 +75,7 @@ function camera(step) {                          // {right, down, forward, at}, 
     forward: level.turn(column(2)), at: level.place(column(3)) };
 }
 
-function pointsOf(part) {                        // level places and colours
+function pointsOf(part) {                        // level positions, colours
   const place = floats(S.parts[part].points), at = new Float32Array(place.length);
   for (let i = 0; i < place.length; i += 3) at.set(level.place([...place.subarray(i, i + 3)]), i);
   return { at, color: bytes(S.parts[part].colors) };

@@ -49,7 +49,7 @@ const KEYS = [
 ];
 const IN_2D = ["Space", "ArrowLeft", "ArrowRight", "Delete", "u", "Escape", "?"];
 
-function leave() {                               // the innermost thing
+function leave() {                               // the innermost mode
   if (state.merging) { state.merging = null; hint(""); }
   else if (state.measuring) setMeasure(false);
   else if (state.ride) setRide(false);
