@@ -44,6 +44,19 @@ MOT = "1,-1,10,20,30,40,.9,-1,-1,-1\n3,-1,50,60,30,40,.5,-1,-1,-1\n1,-1,100,20,3
 CSV = "frame,x1,y1,x2,y2,score,class\n0,10,20,40,60,.9,56\n2,50,60,80,100,.5,41\n"
 
 
+@pytest.mark.parametrize("classes", [("56", "-1", ""), ("sofa", "-1", ""), ("-1", "nan", "")])
+def test_csv_rows_without_a_class_are_counted(
+    tmp_path: Path, video: rt.Video, classes: tuple[str, ...]
+) -> None:
+    """Empty cells and -1 are no class, beside numbers, beside names, and alone."""
+    rows = "".join(f"{k},10,20,40,60,.9,{name}\n" for k, name in enumerate(classes))
+    found = read(tmp_path, "det.csv", CSV.splitlines()[0] + "\n" + rows, video)
+    first = {"56": "chair", "sofa": "sofa"}.get(classes[0], "object")
+    assert [found.class_names[c] for c in found.class_id] == [first, "object", "object"]
+    counted = any("2 boxes without a class" in text for text in found.messages)
+    assert counted == (first != "object")
+
+
 def test_mot(tmp_path: Path, video: rt.Video) -> None:
     found = read(tmp_path, "det.txt", MOT, video)
     assert found.frame.tolist() == [0, 0, 2] and found.class_names == ("object",)
