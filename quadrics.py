@@ -1158,7 +1158,7 @@ def _residuals(
     free = edges.one_sided.reshape(n_prob, flat) & (excess > 0)
     scale[free] = 0.0
     value = scale * excess
-    value[np.repeat(behind, n_edge, 1) & edges.used.reshape(n_prob, flat)] = 12.0  # an outlier's
+    value[np.repeat(behind, n_edge, 1) & edges.used.reshape(n_prob, flat)] = 12.0  # sigma, constant
     if not jacobian:
         return value, np.empty(0)
     jac = np.empty((n_prob, flat, 9))

@@ -8,7 +8,7 @@ the order of what that cost: a removal is kept if the loss of the whole set stay
 three refusals in a row end the search. The loss of a run is that of IDF1, of found objects and of
 false ones (duplicates and elsewhere), each as a fraction of the true ones, and of the overlap in 3D
 where it is measured, all added. The loss of a set is the mean over recordings and box noises; its
-noise is two standard errors of these paired differences against the full set. OUT/elimination.json
+noise is two standard errors of the paired differences against the full set. OUT/elimination.json
 keeps every evaluation, so that an interrupted run resumes; OUT/elimination.md has the tables.
 """
 
@@ -16,17 +16,23 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
 import sys
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from real_rooms import WITH_DOUBTFUL, WITHOUT, add_cases, measure, prepared_cases
+from real_rooms import (
+    WITHOUT,
+    add_cases,
+    fresh_processes,
+    measure,
+    prepared_cases,
+    run_missing,
+)
 
 Figures = dict[str, Any]
+FIGURES = ("idf1", "o3d", "found", "doubles", "elsewhere")  # that make up a loss
 
 
 class Evaluations:
@@ -54,12 +60,9 @@ def losses(full: list[list[Figures]], reduced: list[list[Figures]]) -> np.ndarra
     for before, after in zip(full, reduced, strict=True):
         true = max(before[0].get("true") or before[0].get("found") or 0, 1)
         for a, b in zip(before, after, strict=True):
-            false_a, false_b = (
-                sum(f.get(k) or 0 for k in ("doubles", "elsewhere")) for f in (a, b)
-            )
-            objects = ((a.get("found") or 0) - (b.get("found") or 0) + false_b - false_a) / true
-            others = sum((a.get(k) or 0) - (b.get(k) or 0) for k in ("idf1", "o3d"))
-            found.append(others + objects)
+            lost = {k: (a.get(k) or 0) - (b.get(k) or 0) for k in FIGURES}
+            objects = lost["found"] - lost["doubles"] - lost["elsewhere"]
+            found.append(lost["idf1"] + lost["o3d"] + objects / true)
     return np.array(found)
 
 
@@ -106,9 +109,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     add("--jobs", type=int, default=2, help="processes at once")
     args = parser.parse_args(argv)
     cases = prepared_cases(args)
-    context = multiprocessing.get_context("forkserver")  # memory and patches end with a process
-    context.set_forkserver_preload(["real_rooms"])
-    with ProcessPoolExecutor(args.jobs, context, max_tasks_per_child=1) as pool:
+    with fresh_processes(args.jobs) as pool:
 
         def run(key: str) -> list[list[Figures]]:
             seeds = range(1, args.noises + 1)
@@ -119,13 +120,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(f"evaluated without: {key or 'nothing'}", file=sys.stderr)
             return [[task.result() for task in of_case] for of_case in tasks]
 
-        whole = [
-            pool.submit(measure, case, args.data, args.out)
-            for case in cases
-            if not (args.out / case.name / WITH_DOUBTFUL / "objects.json").exists()
-        ]
-        for task in whole:  # leaves in OUT what the others need
-            task.result()
+        run_missing(pool, cases, args.data, args.out)
         rows = eliminate(Evaluations(args.out / "elimination.json", run), args.candidates)
     head = ["| removed | mechanism | loss of the set | noise |", "|---|---|---|---|"]
     page = "\n".join([*head, *(f"| {a} | {b} | {c:+.4f} | {d:.4f} |" for a, b, c, d in rows)])

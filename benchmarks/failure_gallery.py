@@ -118,7 +118,8 @@ def absence(case: Case, true: int, start: int) -> str:
     if last == start - 1:
         return "switched while in view"
     gap = (mine > last) & (mine < start)
-    away, occluded = start - last - 1 - gap.sum(), int((visible[gap] < 0.5).sum())
+    away = start - last - 1 - gap.sum()
+    occluded = int((visible[gap] < 0.5).sum())
     parts = [f"out of view for {away} frames"] if away else []
     if gap.any():
         parts.append(f"not detected for {gap.sum()} frames ({occluded} of them half hidden)")

@@ -286,7 +286,8 @@ def rank_queries(
         equal = len(wrong) - np.searchsorted(wrong, right, "left") - nearer
         before = nearer + 0.5 * equal  # (P,) wrong ones in front of each right one
         position = np.arange(1, len(right) + 1)
-        rank[i], precision[i] = 1 + before[0], np.mean(position / (position + before))
+        rank[i] = 1 + before[0]
+        precision[i] = np.mean(position / (position + before))
     return rank, precision
 
 
@@ -426,7 +427,8 @@ def cases_of(scene: Scene, parts: Sequence[npt.NDArray[Any]], weight: float, see
     pairs, rng, away = pairs_of([scene]), np.random.default_rng(seed), 30
     cosine = np.stack([p @ p.T for p in parts], -1)  # (N, N, 2)
     fused, angle = cosine @ [weight, 1 - weight], pairs.angle_deg()
-    same_class, same = pairs.name[:, None] == pairs.name[None], pairs.same()
+    same_class = pairs.name[:, None] == pairs.name[None]
+    same = pairs.same()
     gap = (pairs.frame[:, None] - pairs.frame[None]).astype(np.int64)  # (N, N) frames since row j
     begun = np.array([began(pairs.frame[same[q] & (gap[q] >= 0)], away) for q in range(len(gap))])
     rows, shown = [], ([], [])  # type: ignore[var-annotated]

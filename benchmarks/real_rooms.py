@@ -941,8 +941,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error("--results: the tables of recordings have no box noise: leave out --noises")
     left_out = every_without(args.without)
     cases = prepared_cases(args)
-    context = multiprocessing.get_context("spawn")  # memory and patches end with a process
-    with ProcessPoolExecutor(args.jobs, context, max_tasks_per_child=1) as pool:
+    with fresh_processes(args.jobs) as pool:
         made = {"": scores(pool, cases, args.data, args.out)}  # leaves in OUT what the others need
         for without in ["", *left_out] if args.noises else left_out:
             seeds = range(1, args.noises + 1) if args.noises else [0]
@@ -962,6 +961,24 @@ def main(argv: Sequence[str] | None = None) -> int:
             drawn = {k: v for k, v in groups.items() if v and k in ("other boxes", DETECTOR.model)}
             draw_reliability(drawn, args.results / "img" / "confidence.png")
     return 0
+
+
+def run_missing(pool: ProcessPoolExecutor, cases: Sequence[Case], data: Path, out: Path) -> None:
+    """Run the cases that have no finished run in `out`: objects are made again from them."""
+    runs = [
+        pool.submit(measure, case, data, out)
+        for case in cases
+        if not (out / case.name / WITH_DOUBTFUL / "objects.json").exists()
+    ]
+    for run in runs:
+        run.result()
+
+
+def fresh_processes(jobs: int) -> ProcessPoolExecutor:
+    """Make a pool with a process for each task: memory and patches end with it."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["real_rooms"])
+    return ProcessPoolExecutor(jobs, context, max_tasks_per_child=1)
 
 
 def scores(

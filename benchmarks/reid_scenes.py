@@ -239,7 +239,8 @@ def depth_scene(folder: Path, min_score: float = 0.3, reach: float = 0.3) -> Sce
         for rt_depth in [depths[int(f)]]
     ])  # (N, 3)  # fmt: skip
     good = np.isfinite(position).all(1)
-    found, position = found[good], position[good]
+    found = found[good]
+    position = position[good]
     identity, count = np.zeros(len(found), np.int64), 0
     for c in np.unique(found[:, 6]):
         own = np.flatnonzero(found[:, 6] == c)

@@ -16,18 +16,24 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
-import multiprocessing
 import re
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from eliminate import losses
-from real_rooms import WITH_DOUBTFUL, Case, Figures, add_cases, measure, prepared_cases
+from real_rooms import (
+    Case,
+    Figures,
+    add_cases,
+    fresh_processes,
+    measure,
+    prepared_cases,
+    run_missing,
+)
 
 MODULES = (
     "quadrics",
@@ -66,15 +72,14 @@ def measure_changed(
 ) -> Figures:
     """Score a case with one constant scaled, in this process, wherever it was imported to."""
     value = getattr(importlib.import_module(module), name)
-    for other in list(sys.modules.values()):
-        if getattr(other, name, None) is value:
+    for title, other in list(sys.modules.items()):
+        ours = title.partition(".")[0] in ("reobj", "reobj_track", "quadrics")
+        if ours and getattr(other, name, None) is value:
             setattr(other, name, scaled(value, factor))
     own = out / f"{name}-{factor:g}-{case.name}"  # the cases of other processes are not touched
     own.mkdir(parents=True, exist_ok=True)
     shutil.copytree(out / case.name, own / case.name, dirs_exist_ok=True)
-    for folder in out.glob("poses-*"):
-        (own / folder.name).symlink_to(folder.resolve())
-    for folder in out.glob("rendered-*-clip"):
+    for folder in [*out.glob("poses-*"), *out.glob("rendered-*-clip")]:
         (own / folder.name).symlink_to(folder.resolve())
     try:
         return measure(case, data, own, seed=1)
@@ -95,16 +100,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     cases = prepared_cases(args)
     kept = args.out / "sensitivity.json"
     known: dict[str, list[Figures]] = json.loads(kept.read_text()) if kept.exists() else {}
-    context = multiprocessing.get_context("forkserver")  # memory and patches end with a process
-    context.set_forkserver_preload(["real_rooms"])
-    with ProcessPoolExecutor(args.jobs, context, max_tasks_per_child=1) as pool:
-        whole = [
-            pool.submit(measure, case, args.data, args.out)
-            for case in cases
-            if not (args.out / case.name / WITH_DOUBTFUL / "objects.json").exists()
-        ]
-        for task in whole:  # leaves in OUT what the others need
-            task.result()
+    with fresh_processes(args.jobs) as pool:
+        run_missing(pool, cases, args.data, args.out)
 
         def figures(key: str, *change: Any) -> list[list[Figures]]:
             if key not in known:

@@ -353,7 +353,8 @@ def test_ambiguous_detections_are_excluded_from_refits() -> None:
     found.label[slipped] = 1  # four boxes of a chair are given to the next one
     np.testing.assert_array_equal(np.flatnonzero(~found.unambiguous()), slipped)
     rng = np.random.default_rng(0)
-    score, kind = rng.random(len(found.label)), rng.integers(-1, 4, len(found.label))
+    score = rng.random(len(found.label))
+    kind = rng.integers(-1, 4, len(found.label))
     made.detections = dataclasses.replace(made.detections, score=score, class_id=kind)
     found.label[found.label == 2] = -1
     made.fit_shapes = Mock(return_value=found.shapes)
@@ -503,7 +504,8 @@ def test_the_gain_of_a_merge_uses_all_rows_of_both() -> None:
     rng = np.random.default_rng(1)
     label = found.label.copy()
     label[rng.random(len(label)) < 0.3] = 0  # several rows of an object in one frame
-    strong, weak = np.array([0, 1]), np.array([2, 0])
+    strong = np.array([0, 1])
+    weak = np.array([2, 0])
     fitted = three[[0, 1]]
     seen = made._unassigned(fitted).evidence
     view = made.detections.view
@@ -562,7 +564,8 @@ def test_a_size_is_compared_with_the_prior_per_axis() -> None:
 
 
 def test_confidence_rises_with_score_and_hit_rate() -> None:
-    score, hit_rate = np.array([-2.0, 0.0, 2.0]), np.array([0.0, 0.5, 1.0])
+    score = np.array([-2.0, 0.0, 2.0])
+    hit_rate = np.array([0.0, 0.5, 1.0])
     table = existence_probability(score[:, None], hit_rate)
     assert (np.diff(table, axis=0) > 0).all() and (np.diff(table, axis=1) > 0).all()
     assert table[0, 0] < 0.1 and table[2, 2] > 0.9

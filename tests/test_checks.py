@@ -165,7 +165,8 @@ def test_boxes_choose_a_reading_by_the_sides_inside_the_image(seen, noise_px, kn
     boxes = quadrics.solid_boxes(solids, "ellipsoid", PINHOLE.K @ cams).swapaxes(0, 1)
     boxes = boxes + noise_px * np.random.default_rng(0).choice([-1, 1], boxes.shape)
     boxes = boxes.clip(1, np.tile(SIZE, 2) - 1)
-    frame, obj = np.repeat(seen, 2), np.tile([0, 1], len(seen))
+    frame = np.repeat(seen, 2)
+    obj = np.tile([0, 1], len(seen))
     tracks = rt.Tracks(frame, obj, obj, boxes[obj, frame], np.ones(len(obj)), obj, obj)
     right, late = (at(cams, *one) for one in zip((0, -2), known or [range(60)] * 2, strict=True))
     found = by_tracks([reading("right", right), reading("late", late)], tracks)
@@ -223,7 +224,8 @@ class Looked(FakeVideo):
 
 class LookedFrame:
     def __init__(self, video, index):
-        self.video, self.index = video, index
+        self.video = video
+        self.index = index
 
     @property
     def image(self):
@@ -247,7 +249,8 @@ def test_images_are_compared_where_readings_differ_most(kind, count, shift, know
     cams = motion("pan" if kind == "turn" else kind, count)
     if kind == "turn":
         cams[:, :, 3] = 0
-    one, other = at(cams, 0, known), at(cams, shift, known)
+    one = at(cams, 0, known)
+    other = at(cams, shift, known)
     video = Looked(count)
     given = [reading("a", one), reading("b", other)]
     assert by_images(given, video) == given

@@ -619,7 +619,8 @@ def test_true_cameras_may_be_tum_rows(tmp_path: Path) -> None:
     result, solids, path = half_sized(tmp_path)
     c2w = np.loadtxt(path).reshape(-1, 4, 4)
     rows = np.c_[np.arange(12) / 10 + 0.01, c2w[:, :3, 3], np.tile([0, 0, 0, 1], (12, 1))]
-    rows[3, 0], rows[3, 1] = 0.345, 99  # between two frames: unassigned
+    rows[3, 0] = 0.345  # between two frames: unassigned
+    rows[3, 1] = 99
     np.savetxt(tmp_path / "tum.txt", rows[::-1])
     found = score_objects(result, solids, tmp_path / "tum.txt", {4: 9})
     assert found["center_error_median"] == pytest.approx(0, abs=1e-9)

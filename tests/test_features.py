@@ -27,7 +27,7 @@ def brute_force(a, b):
 
 @pytest.mark.parametrize("noise", [0.02, 0.06, 0.12])
 def test_matches_are_those_of_a_loop(noise):
-    """Some rows are common, some of these duplicated, the rest unrelated."""
+    """Some rows are common, a few duplicated, the rest unrelated."""
     rng = np.random.default_rng(0)
     a = unit(rng.uniform(0, 1, (200, 16)) ** 3)
     common = a[rng.permutation(200)[:120]]

@@ -17,7 +17,10 @@ from reobj.tracking.linking import FRAGMENT_GAP, cut_at_gaps, link
 SIZE = (640, 480)
 CAMERA = rt.Camera("PINHOLE", *SIZE, (520.0, 520.0, 320.0, 240.0))
 NAMES = rt.COCO_NAMES
-PERSON, BICYCLE, CHAIR, CUP = 0, 1, 56, 41
+PERSON = 0
+BICYCLE = 1
+CHAIR = 56
+CUP = 41
 
 
 def walk(frames: int = 120, arc_deg: float = 120.0) -> rt.Poses:
@@ -268,17 +271,20 @@ def test_labels_are_propagated_within_fragments() -> None:
     frame, piece = (x.ravel() for x in np.meshgrid(np.arange(30), np.arange(8), indexing="ij"))
     keep = (frame >= 12 - piece) & ((frame < 16) | (frame > 22)) & (rng.random(240) < 0.9)
     keep &= (piece < 7) | (frame < 8)  # the last has three rows at most
-    frame, piece = frame[keep], piece[keep]
+    frame = frame[keep]
+    piece = piece[keep]
     n = len(frame)
     label = np.where(rng.random(n) < 0.3, (piece + (frame > 20) + (rng.random(n) < 0.2)) // 2, -1)
     label[(piece == 2) | (piece == 7)] = -1
     iou = np.where(rng.random(n) < 0.5, rng.random(n), np.nan)
-    ids, kind = 11 - piece // 3, np.full(n, CHAIR)
+    ids = 11 - piece // 3
+    kind = np.full(n, CHAIR)
     table = rt.Tracks(frame, ids, piece + 1, rng.random((n, 4)), np.ones(n), kind, piece)
     found, events = link(table, NAMES, rt.Embeddings.empty(), np.empty(0, np.int64),
                          label=label, iou=iou)  # fmt: skip
 
-    fragment, expected = piece + 10 * (frame > 20), label.tolist()
+    fragment = piece + 10 * (frame > 20)
+    expected = label.tolist()
     taken = {(frame[r], label[r]) for r in range(n) if label[r] >= 0}
     for r in sorted(range(n), key=lambda r: fragment[r]):
         known = [k for k in range(n) if fragment[k] == fragment[r] and label[k] >= 0]

@@ -255,7 +255,8 @@ def test_edges_are_drawn_if_enabled() -> None:
 def test_edges_are_distorted() -> None:
     """The middle of a long edge is distorted, not interpolated between its ends."""
     lens = rt.Camera("OPENCV", 200, 120, (300.0, 300.0, 100.0, 60.0, -0.9, 0.0, 0.0, 0.0))
-    half, center = np.array([[1.2, 0.7, 0.2]]), np.array([[0, 0, 4.0]])
+    half = np.array([[1.2, 0.7, 0.2]])
+    center = np.array([[0, 0, 4.0]])
     frames = wireframes(quadrics.Ellipsoids(center, half, np.eye(3)[None]), ["box"])
     image = drawn(frames, {1}, camera=lens)
     ends = image_points(lens, np.array([[-1.2, 0.7, 3.8], [1.2, 0.7, 3.8]]))
@@ -266,7 +267,8 @@ def test_edges_are_distorted() -> None:
 
 
 def test_nearer_solids_are_drawn_over_farther_ones() -> None:
-    centers, half = np.array([[0, 0, 3.0], [0, 0, 6.0]]), np.full((2, 3), 0.3)
+    centers = np.array([[0, 0, 3.0], [0, 0, 6.0]])
+    half = np.full((2, 3), 0.3)
     for order in ([0, 1], [1, 0]):
         solids = quadrics.Ellipsoids(centers[order], half * centers[order][:, 2:] / 3,
                                      np.tile(np.eye(3), (2, 1, 1)))  # fmt: skip

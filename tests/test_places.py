@@ -62,7 +62,8 @@ def outline(ellipsoid: quadrics.Ellipsoids, view: np.ndarray) -> np.ndarray:
 def mapped(
     objects: list[quadrics.Ellipsoids], views: list[np.ndarray], step: int = 5
 ) -> EllipsoidMap:
-    ellipsoids, identity = EllipsoidMap(), np.arange(len(objects))
+    ellipsoids = EllipsoidMap()
+    identity = np.arange(len(objects))
     for i, view in enumerate(views):
         ellipsoids.add(step * i, identity, np.stack([outline(t, view) for t in objects]), view)
     ellipsoids.refit(SIZE)
@@ -112,7 +113,8 @@ def test_without_parallax_there_is_no_ellipsoid(walked: float, known: bool) -> N
 
 
 def test_random_boxes_give_no_ellipsoid() -> None:
-    ellipsoids, rng = EllipsoidMap(), np.random.default_rng(3)
+    ellipsoids = EllipsoidMap()
+    rng = np.random.default_rng(3)
     for i, view in enumerate(WALK):
         corner, side = rng.uniform(0, 400, 2), rng.uniform(10, 80, 2)
         ellipsoids.add(5 * i, one(), np.concatenate([corner, corner + side])[None], view)
@@ -143,7 +145,8 @@ def test_refits_require_new_views() -> None:
 
 def test_kept_views_are_bounded_and_cover_all_directions() -> None:
     """A thousand frames around a ball, then a hundred from one spot, which add nothing."""
-    ellipsoids, angles = EllipsoidMap(), np.radians(np.linspace(0, 120, 1000))
+    ellipsoids = EllipsoidMap()
+    angles = np.radians(np.linspace(0, 120, 1000))
     for frame in range(1100):
         a = angles[min(frame, 999)]
         eye, turn = np.array([-4 * np.sin(a), 0, 4 - 4 * np.cos(a)]), np.eye(3)
@@ -167,7 +170,8 @@ def test_a_view_without_parallax_is_not_kept() -> None:
 @pytest.mark.parametrize("scale", [1e-3, 0.1, 7.3, 1e3])
 def test_the_unit_of_the_world_does_not_matter(scale: float) -> None:
     objects = [ball(-0.5), ball(0.6, (0.3, 0.2, 0.25))]
-    ellipsoids, own = EllipsoidMap(), mapped(objects, WALK)
+    ellipsoids = EllipsoidMap()
+    own = mapped(objects, WALK)
     for i, view in enumerate(WALK):
         scaled = np.c_[view[:, :3], scale * view[:, 3]]
         ellipsoids.add(5 * i, np.arange(2), np.stack([outline(t, view) for t in objects]), scaled)

@@ -810,7 +810,8 @@ def test_wrong_cameras_affect_only_the_objects_they_observe(way: str) -> None:
     )
     seen = np.isfinite(boxes[..., 0])
     wrong = seen[bad].sum(0) / seen.sum(0)  # (O,) fraction of views with wrong cameras
-    apart, both = wrong == 0, (wrong > 0) & (wrong < 0.4)
+    apart = wrong == 0
+    both = (wrong > 0) & (wrong < 0.4)
     assert apart.sum() > 20 and both.sum() > 3 and (wrong > 0.6).sum() > 8
     assert (good.status != "rejected").all() and (spoilt.status[apart | both] != "rejected").all()
     assert (spoilt.status == good.status)[apart].mean() > 0.95

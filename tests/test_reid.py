@@ -230,7 +230,8 @@ def test_probability_has_a_prior() -> None:
 
 def test_probability_adapts_to_the_video() -> None:
     """If all objects are similar, a cosine is weaker evidence; unknown parts do not calibrate."""
-    plain, similar = SimilarityCalibration(), SimilarityCalibration()
+    plain = SimilarityCalibration()
+    similar = SimilarityCalibration()
     similar.add(np.full(200, 0.95), np.full(200, np.nan), False)
     assert similar.logit(0.92, 0.92) < plain.logit(0.92, 0.92)
     np.testing.assert_array_equal(similar.moments[:, :, 1], plain.moments[:, :, 1])

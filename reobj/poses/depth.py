@@ -425,7 +425,7 @@ def _grid_points(depth: Floats, K: Array) -> Array:
 def _thin(points: Array, depth: Array, component: IntArray) -> IntArray:
     """Choose one point per voxel, that with the least depth; at most 20,000 rows.
 
-    So many has a reconstruction.
+    A reconstruction has about as many points.
     """
     order = np.argsort(depth, kind="stable")
     size = 0.02  # m, a side of a voxel; larger where the points are too many

@@ -351,7 +351,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     and document marks are skipped.
 
     Raises:
-        ReobjError: a line has none of these forms.
+        ReobjError: no form matches a line.
     """
     text = re.sub(r"(^|\s)#.*", r"\1", read_text(path, CAMERA_MAX), flags=re.MULTILINE)
     text = re.sub(r"\[[^\[\]]*\]", lambda m: " ".join(m[0].split()), text)  # lists to one line

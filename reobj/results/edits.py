@@ -26,6 +26,9 @@ from reobj.types import (
     box_iou,
 )
 
+FORMAT = "reobj-edits"
+FORMAT_VERSION = 1
+EDITS = "edits.json"  # in an output folder
 FIELDS = {  # keys of an edit besides `do`
     "merge": ("object", "with"),
     "split": ("object", "visits"),
@@ -94,12 +97,10 @@ def read_edits(path: str | Path) -> Edits:
     """
     path = Path(path)
     data = load_json(path)
-    if not isinstance(data, dict) or data.get("format") != "reobj-edits":
-        raise ReobjError(
-            f'{path}: no edits; expected "format": "reobj-edits", as scene.html saves it'
-        )
-    if data.get("version") != 1 or not isinstance(data.get("edits"), list):
-        expected = '"version": 1 and a list "edits"'
+    if not isinstance(data, dict) or data.get("format") != FORMAT:
+        raise ReobjError(f'{path}: no edits; expected "format": "{FORMAT}", as scene.html saves it')
+    if data.get("version") != FORMAT_VERSION or not isinstance(data.get("edits"), list):
+        expected = f'"version": {FORMAT_VERSION} and a list "edits"'
         raise ReobjError(f"{path}: version {data.get('version')}; expected {expected}")
     edits = []
     for number, entry in enumerate(data["edits"], 1):
@@ -151,14 +152,14 @@ def write_edits(folder: Path, edits: Edits | None) -> None:
     """Write edits into a new folder of results, for later fits; no file for an empty list."""
     if edits is None or not edits.edits:
         return
-    data = {"format": "reobj-edits", "version": 1, "edits": edits.entries}
-    with atomic(folder / "edits.json") as part:
+    data = {"format": FORMAT, "version": FORMAT_VERSION, "edits": edits.entries}
+    with atomic(folder / EDITS) as part:
         part.write_text(json.dumps(data, indent=1) + "\n")
 
 
 def kept_edits(folder: Path) -> Edits | None:
     """Read the edits in an output folder; None if there are none."""
-    path = folder / "edits.json"
+    path = folder / EDITS
     return dataclasses.replace(read_edits(path), kept=True) if path.exists() else None
 
 
@@ -199,7 +200,7 @@ def apply_edits(tracks: Tracks, class_names: tuple[str, ...], edits: Edits) -> E
             raise ReobjError(f"{where}: {error.args[0]}; {hint}") from error
     keep, messages = table.without_duplicates(str(edits.path))
     if (count := len(edits.edits)) > 0:
-        messages.append(f"{count} correction{'s' * (count != 1)} by hand applied (edits.json)")
+        messages.append(f"{count} correction{'s' * (count != 1)} by hand applied ({EDITS})")
     edited = dataclasses.replace(tracks, track_id=table.identity, class_id=table.class_id)
     confirmed = table.confirmed & set(table.identity[keep].tolist())
     return Edited(edited, keep, tuple(table.names), confirmed, messages)

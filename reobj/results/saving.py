@@ -32,7 +32,7 @@ from reobj.files import (
     save_npz,
     staged,
 )
-from reobj.results.edits import write_edits
+from reobj.results.edits import EDITS, write_edits
 from reobj.results.entries import Object, VideoInfo, World, decode
 from reobj.results.ply import write_ply
 from reobj.sources.tables import read_mot_rows
@@ -41,6 +41,8 @@ from reobj.types import Embeddings, ReobjError, Tracks, printable, without_secre
 if TYPE_CHECKING:
     from reobj.results.result import Result
 
+FORMAT = "reobj-objects"
+FORMAT_VERSION = 1  # of objects.json
 LAST_POSES = "cache/last-poses.npz"  # in an output folder
 MODEL = "sparse"  # folder of a COLMAP model
 STALE = (  # files that not every run writes; cameras.csv: before 0.2
@@ -52,7 +54,7 @@ CONFIG_FILE = "config.toml"  # options of the last run
 
 def check_results(out: Path) -> None:
     """Check that results can be written into an output folder, before they are computed."""
-    others = ("tracks.txt", "objects.json", "edits.json", CONFIG_FILE, f"{MODEL}/cameras.txt")
+    others = ("tracks.txt", "objects.json", EDITS, CONFIG_FILE, f"{MODEL}/cameras.txt")
     check_places(out, (*STALE, *others))
 
 
@@ -128,7 +130,7 @@ def save(
     stale: Sequence[str],
 ) -> None:
     """Write the files of a result; for the arguments see `Result.save`."""
-    edited = () if result.edits is None else ("edits.json",)
+    edited = () if result.edits is None else (EDITS,)
     with replaced(out, (*STALE, *edited, *stale)) as new:
         write_mot(new / "tracks.txt", (result if doubtful else result.without_doubtful()).tracks)
         write_objects(result, new / "objects.json")
@@ -223,8 +225,8 @@ def write_objects(result: Result, path: Path) -> None:
             versions[name] = version(name)
     tracked = {"tracked_frames": len(np.unique(result.tracks.frame))}
     data = {
-        "format": "reobj-objects",
-        "version": 1,
+        "format": FORMAT,
+        "version": FORMAT_VERSION,
         "command": " ".join(map(without_secrets, sys.argv)),
         "reobj_track": __version__,
         "versions": versions,
@@ -259,8 +261,8 @@ def read_objects(path: Path) -> ObjectsFile:
 
 def _contradiction(entries: ObjectsFile, poses: Poses | None) -> str:
     """Describe a contradiction between entries of objects.json, or to the poses; "" if none."""
-    if (entries.format, entries.version) != ("reobj-objects", 1):
-        return "expected format reobj-objects, version 1"
+    if (entries.format, entries.version) != (FORMAT, FORMAT_VERSION):
+        return f"expected format {FORMAT}, version {FORMAT_VERSION}"
     ids = [o.id for o in entries.objects]
     if len(set(ids)) != len(ids):
         return "two objects of one id"

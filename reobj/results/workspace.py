@@ -23,6 +23,7 @@ from reobj.files import (
     locked,
     writing,
 )
+from reobj.results.edits import EDITS
 from reobj.results.entries import decode
 from reobj.results.result import Result
 from reobj.results.saving import (
@@ -136,7 +137,7 @@ class Workspace:
                     advice = "choose another -o, or add --overwrite"
                     raise ReobjError(f"{self.out}: holds the results of {found}; {advice}")
                 remove_stale(self.out)
-                for name in ("tracks.txt", "objects.json", "edits.json", LAST_TRACKS, LAST_POSES):
+                for name in ("tracks.txt", "objects.json", EDITS, LAST_TRACKS, LAST_POSES):
                     (self.out / name).unlink(missing_ok=True)
         with atomic(path) as part:
             part.write_text(json.dumps(fingerprint))
@@ -232,7 +233,7 @@ class Workspace:
         """
         warnings = []
         tracked.save_tracked(self.out / LAST_TRACKS)
-        edits = self.out / "edits.json"
+        edits = self.out / EDITS
         if tracked.identities_given and edits.exists():
             edits.unlink()
             warnings.append(f"{edits} removed: the given identities replace it")

@@ -82,7 +82,8 @@ def true_cameras(frames: range) -> scores.Array:
 def overlay_frames(out: Path) -> int:
     """Count the decodable frames of the overlay video in OUT."""
     (path,) = out.glob("overlay.*")
-    video, count = cv2.VideoCapture(str(path)), 0
+    video = cv2.VideoCapture(str(path))
+    count = 0
     while video.read()[0]:
         count += 1
     return count

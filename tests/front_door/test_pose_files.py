@@ -195,7 +195,8 @@ def test_photos_from_0_beside_names_from_1(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("first", "stop"), [(1, 0), (0, 24)])
 def test_boxes_resolve_the_numbering_of_blank_images(tmp_path: Path, first: int, stop: int) -> None:
     """Also for an excerpt of the video: the numbers are those of the source."""
-    source, frames = write_clip(tmp_path, blank=True), ALL[:-1] if first else ALL[1:]
+    source = write_clip(tmp_path, blank=True)
+    frames = ALL[:-1] if first else ALL[1:]
     path = model(tmp_path / "m", frames, [f"{i + first:05d}.jpg" for i in frames])
     assert run(tmp_path, source, path, "--stop", str(stop)) == 0
     assert_chairs_in_place(tmp_path / "out")
