@@ -424,7 +424,6 @@ def triangulate_rays(cam_from_world: Array, rays_in_cam: Array) -> tuple[Array, 
 
 
 CV_FROM_GL = np.diag([1.0, -1.0, -1.0])  # camera axes; OpenGL: y up, z backward
-NO_SCALE = "units: arbitrary"  # in the header of our TUM files, for `reobj.poses.supplied.readers`
 
 
 def write_tum(path: Path, poses: Poses) -> None:
@@ -432,7 +431,7 @@ def write_tum(path: Path, poses: Poses) -> None:
     world_from_cam = invert_rigid(poses.cam_from_world[poses.known])
     xyzw = np.roll(quat_wxyz_from_matrix(world_from_cam[:, :, :3]), -1, 1)
     table = np.column_stack([poses.time_s[poses.known], world_from_cam[:, :, 3], xyzw])  # (N, 8)
-    units = "units: metres" if poses.metric else NO_SCALE
+    units = f"units: {'metres' if poses.metric else 'arbitrary'}"  # `read_tum` reads it
     rows = [" ".join([f"{row[0]:.9f}", *(f"{v:.12g}" for v in row[1:])]) for row in table]
     header = f"# t tx ty tz qx qy qz qw (world_from_cam, seconds, {units})"
     with atomic(path) as part:

@@ -215,19 +215,18 @@ def part_paths(path: Path) -> list[Path]:
     return sorted(path.parent.glob(f"{path.stem}_part[0-9]*{path.suffix}"))
 
 
-TEXT_MAX = 1 << 28  # characters of a file; chosen: a million detections with masks have 2e8
-LINES_MAX = 2_000_000  # of a table; chosen: an hour at 30 Hz with 18 boxes a frame, 2 GB of memory
-LINE_MAX = 1 << 22  # characters; chosen: the observations of 100,000 points in COLMAP's text
-JSON_MAX = 1 << 31  # bytes of memory; chosen: two million detections with masks
-NPZ_MAX = 1 << 30  # bytes, unpacked; chosen: detections with masks of an hour of video have 7e8
+# Bytes of memory that one input file may take; chosen: two million detections with masks in JSON,
+# or those of more than an hour of video in npz
+MEMORY_MAX = 1 << 31
+LINES_MAX = 2_000_000  # of a table; chosen: an hour at 30 Hz with 18 boxes a frame, MEMORY_MAX
 
 
 def read_text(path: Path, most: int | None = None, errors: str = "strict") -> str:
     """Read a UTF-8 file, with or without a byte order mark.
 
-    most: largest number of characters; default: TEXT_MAX. errors: as in `open`.
+    most: largest number of characters; default: as MEMORY_MAX allows. errors: as in `open`.
     """
-    most = most or TEXT_MAX
+    most = most or MEMORY_MAX // 8  # of up to 4 bytes each, held twice while they are split
     try:
         with path.open(encoding="utf-8-sig", errors=errors) as file:
             text = file.read(most + 1)
@@ -248,8 +247,9 @@ def read_lines(path: Path) -> list[str]:
             f"{path}: {count} lines, at most {LINES_MAX} are allowed; cut it into pieces"
         )
     lines = text.splitlines(keepends=True)
-    if lines and (longest := max(map(len, lines))) > LINE_MAX:
-        raise ReobjError(f"{path}: a line of {longest} characters, at most {LINE_MAX} are allowed")
+    most = 1 << 22  # characters of a line: the observations of 100,000 points in COLMAP's text
+    if lines and (longest := max(map(len, lines))) > most:
+        raise ReobjError(f"{path}: a line of {longest} characters, at most {most} are allowed")
     return lines
 
 
@@ -259,10 +259,10 @@ def json_memory(text: str) -> int:
 
 
 def load_json(path: Path) -> Any:
-    """Read a JSON file of at most JSON_MAX bytes in memory; an error names the line."""
+    """Read a JSON file of at most MEMORY_MAX bytes in memory; an error names the line."""
     text = read_text(path)
-    if (size := json_memory(text)) > JSON_MAX:
-        memory = f"would take {size >> 20} MB of memory, at most {JSON_MAX >> 20} MB are allowed"
+    if (size := json_memory(text)) > MEMORY_MAX:
+        memory = f"would take {size >> 20} MB of memory, at most {MEMORY_MAX >> 20} MB are allowed"
         raise ReobjError(f"{path}: {memory}; cut it into pieces")
     if digits := re.search(r"\d{309}", text):
         line = text.count("\n", 0, digits.start()) + 1
@@ -308,11 +308,13 @@ def load_npz(path: Path, sealed: bool = False) -> tuple[dict[str, Any], dict[str
     Returns:
         the arrays, and the metadata ({} if the file has none).
     Raises:
-        ReobjError: damaged, no npz file, or larger than NPZ_MAX bytes.
+        ReobjError: damaged, no npz file, or larger than MEMORY_MAX bytes: arrays are held twice
+            where callers convert them.
     """
     try:
         with zipfile.ZipFile(path) as file:
-            check_unpacked(sum(member.file_size for member in file.infolist()), NPZ_MAX)
+            size = sum(member.file_size for member in file.infolist())
+            check_unpacked(size, MEMORY_MAX // 2)
         with np.load(path, allow_pickle=False) as file:
             arrays: dict[str, Any] = dict(file)
         text = arrays.pop("metadata", arrays.pop("facts", "{}"))  # facts: before 0.2

@@ -373,7 +373,7 @@ def test_frames_are_whole_numbers(tmp_path: Path, video: rt.Video, frame: str) -
 
 @pytest.mark.parametrize(
     ("key", "limit", "size"),
-    [("frame", "LINES_MAX", 1), ("class_names", "CLASS_MAX", 1), ("mask_counts", "NPZ_MAX", 4)],
+    [("frame", "LINES_MAX", 1), ("class_names", "CLASS_MAX", 1), ("mask_counts", "MEMORY_MAX", 8)],
 )
 def test_an_oversized_npz_is_refused(
     tmp_path: Path,
@@ -402,7 +402,7 @@ def test_an_oversized_npz_is_refused(
 def test_a_zip_bomb_is_refused(
     tmp_path: Path, video: rt.Video, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cvat, "XML_MAX", 1 << 20)
+    monkeypatch.setattr(cvat, "MEMORY_MAX", 16 << 20)
     with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as packed:
         packed.writestr("annotations.xml", b" " * (3 << 20))
     (tmp_path / "a.xml").write_bytes(b" " * (3 << 20))

@@ -94,7 +94,7 @@ def test_json_names_the_line(tmp_path: Path) -> None:
 
 
 def test_endless_text_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(files, "TEXT_MAX", 3 << 20)
+    monkeypatch.setattr(files, "MEMORY_MAX", 24 << 20)
     with pytest.raises(rt.ReobjError, match=r"/dev/zero: more than 3 MB of text"):
         files.read_text(Path("/dev/zero"))
     (tmp_path / "a.txt").write_text("x" * (3 << 20))
@@ -111,8 +111,7 @@ def test_endless_text_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
             "a.txt: 4 lines, at most 3 are allowed; cut it into pieces",
         ),
         ("LINES_MAX", 3, "a\x0bb\x1cc\u2028d\x85e", "a.txt: 4 lines, at most 3 are allowed"),
-        ("LINE_MAX", 3, "ab\nabcd\n", "a.txt: a line of 5 characters, at most 3 are allowed"),
-        ("TEXT_MAX", 9, "a\n" * 5, "a.txt: more than 0 MB of text"),
+        ("MEMORY_MAX", 8 * 9, "a\n" * 5, "a.txt: more than 0 MB of text"),
     ],
 )
 def test_tables_have_a_size_limit(
@@ -122,6 +121,16 @@ def test_tables_have_a_size_limit(
     path.write_text(text)
     assert "".join(files.read_lines(path)) == text
     monkeypatch.setattr(files, limit, most)
+    with pytest.raises(rt.ReobjError, match=what):
+        files.read_lines(path)
+
+
+def test_a_line_has_a_size_limit(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    path.write_text("ab\n" + "c" * (4194304 - 1) + "\n")
+    assert list(map(len, files.read_lines(path))) == [3, 4194304]
+    path.write_text("ab\n" + "c" * 4194304 + "\n")
+    what = "a.txt: a line of 4194305 characters, at most 4194304 are allowed"
     with pytest.raises(rt.ReobjError, match=what):
         files.read_lines(path)
 
@@ -142,9 +151,9 @@ def test_json_is_refused_before_it_takes_memory(
     path, taken = tmp_path / "a.json", 64 * (text.count(",") + text.count("["))
     taken += 200 * text.count("{")
     path.write_text(text)
-    monkeypatch.setattr(files, "JSON_MAX", taken)
+    monkeypatch.setattr(files, "MEMORY_MAX", taken)
     files.load_json(path)
-    monkeypatch.setattr(files, "JSON_MAX", taken - 1)
+    monkeypatch.setattr(files, "MEMORY_MAX", taken - 1)
     with pytest.raises(rt.ReobjError, match=r"a.json: would take 0 MB of memory, at most 0 MB"):
         files.load_json(path)
 
@@ -202,7 +211,7 @@ def test_an_npz_bomb_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     """Refused by its directory: nothing is decompressed."""
     files.save_npz(tmp_path / "a.npz", {"a": np.zeros(3 << 20, np.uint8)})
     assert (tmp_path / "a.npz").stat().st_size < 9000
-    monkeypatch.setattr(files, "NPZ_MAX", 2 << 20)
+    monkeypatch.setattr(files, "MEMORY_MAX", 4 << 20)
     monkeypatch.setattr(np, "load", None)
     with pytest.raises(rt.ReobjError, match=r"a\.npz: .*unpacks to 3 MB, at most 2 MB are allowed"):
         files.load_npz(tmp_path / "a.npz")

@@ -36,7 +36,6 @@ from reobj.results.origin import centred, far_origin, shifted
 from reobj.results.ply import write_ply, write_point_ply
 from reobj.results.result import Result, VideoInfo
 from reobj.results.workspace import Workspace
-from reobj.sources.cvat import CVAT_BOX
 from reobj.sources.image_files import IMAGE_FPS
 from reobj.sources.video import Video
 from reobj.types import (
@@ -197,7 +196,7 @@ def _cvat_boxes(track: ET.Element, rows: Tracks, following: dict[int, int]) -> N
     """Add the boxes of a track, and an `outside` box in the frame after each visit."""
     seen = set(rows.frame.tolist())
     for frame, box in zip(rows.frame.tolist(), rows.xyxy, strict=True):
-        corners = {k: f"{v:.2f}" for k, v in zip(CVAT_BOX, box, strict=True)}
+        corners = {k: f"{v:.2f}" for k, v in zip(("xtl", "ytl", "xbr", "ybr"), box, strict=True)}
         ends = following.get(frame, frame) not in seen
         for at, outside in ((frame, "0"), (following.get(frame), "1"))[: 1 + ends]:
             facts = {"frame": str(at), "outside": outside, "occluded": "0", "keyframe": "1"}

@@ -11,16 +11,13 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from reobj.files import check_unpacked
+from reobj.files import MEMORY_MAX, check_unpacked
 from reobj.sources.class_names import check_length
 from reobj.sources.image_frames import frames_of_names
 from reobj.sources.masks import NO_RUNS
 from reobj.sources.recorded import RecordedDetections, scale_to
 from reobj.sources.video import Video
 from reobj.types import Array, ReobjError
-
-XML_MAX = 1 << 27  # bytes; chosen: 800,000 boxes; the parser needs ten times as much memory
-CVAT_BOX = ("xtl", "ytl", "xbr", "ybr")  # attributes of a box
 
 
 def read_cvat(path: Path, video: Video, first: str = "") -> RecordedDetections:
@@ -33,12 +30,13 @@ def read_cvat(path: Path, video: Video, first: str = "") -> RecordedDetections:
     Raises:
         ReobjError: the file is missing, of another format, or has no shapes.
     """
+    most = MEMORY_MAX // 16  # bytes, 800,000 boxes: the parser needs ten times as much memory
     try:
-        check_unpacked(path.stat().st_size, XML_MAX)
+        check_unpacked(path.stat().st_size, most)
         text = path.read_bytes()
         if zipfile.is_zipfile(path):
             with zipfile.ZipFile(path) as packed:
-                check_unpacked(packed.getinfo("annotations.xml").file_size, XML_MAX)
+                check_unpacked(packed.getinfo("annotations.xml").file_size, most)
                 text = packed.read("annotations.xml")
         root = ET.fromstring(text)
         bounded = Counter[str]()  # number of shapes of each kind that became bounding boxes
@@ -107,7 +105,8 @@ def _bounds(shape: ET.Element, bounded: Counter[str]) -> Array:
     """Return the bounding box (4,) of a shape; count shapes other than upright boxes."""
     attributes = shape.attrib
     if shape.tag == "box":
-        low, high = np.array([float(attributes[key]) for key in CVAT_BOX]).reshape(2, 2)
+        sides = [float(attributes[key]) for key in ("xtl", "ytl", "xbr", "ybr")]
+        low, high = np.array(sides).reshape(2, 2)
         angle = float(attributes.get("rotation", "0") or 0)
         if not angle % 180:
             return np.hstack([low, high])

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from reobj.files import LINES_MAX, NPZ_MAX, load_npz, save_npz
+from reobj.files import LINES_MAX, MEMORY_MAX, load_npz, save_npz
 from reobj.sources.masks import NO_RUNS, Counts, rle_decode, rle_encode
 from reobj.types import CLASS_MAX, Array, BoolArray, Detections, IntArray, ReobjError, visible_name
 
@@ -167,7 +167,7 @@ def read_npz(
     """
     data, _ = load_npz(path, sealed)
     sizes = {"frame": LINES_MAX, "done": LINES_MAX, "class_names": CLASS_MAX,
-             "mask_counts": NPZ_MAX // 4}  # fmt: skip  # uint32
+             "mask_counts": MEMORY_MAX // 8}  # fmt: skip  # uint32, held twice
     for key, most in sizes.items():
         if key in data and data[key].size > most:
             raise ReobjError(f"{path}: {data[key].size} {key}, at most {most} are allowed")

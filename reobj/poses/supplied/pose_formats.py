@@ -18,8 +18,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from reobj.cameras import CV_FROM_GL, NO_SCALE, WORLD_MAX, Camera, invert_rigid
-from reobj.files import TEXT_MAX, check_unpacked, load_json, read_lines
+from reobj.cameras import CV_FROM_GL, WORLD_MAX, Camera, invert_rigid
+from reobj.files import MEMORY_MAX, check_unpacked, load_json, read_lines
 from reobj.poses.intrinsics import (
     brown_camera,
     camera_from_json,
@@ -298,7 +298,7 @@ def read_tum(path: Path, size: tuple[int, int]) -> PoseFile:
     is_ours = "(world_from_cam, seconds, units: " in header  # of `cameras.write_tum`
     return PoseFile(
         invert_rigid(world_from_cam)[kept], stamps=rows[kept, 0], is_ours=is_ours,
-        metric=not re.search(f"#.*{NO_SCALE}", header), kind="TUM rows", messages=messages,
+        metric=not re.search("#.*units: arbitrary", header), kind="TUM rows", messages=messages,
     )  # fmt: skip
 
 
@@ -463,7 +463,7 @@ def _metadata_of_r3d(path: Path) -> dict[str, Any]:
     try:
         with zipfile.ZipFile(path) as file:
             name = next(n for n in file.namelist() if n.rpartition("/")[2] == "metadata")
-            check_unpacked(file.getinfo(name).file_size, TEXT_MAX)
+            check_unpacked(file.getinfo(name).file_size, MEMORY_MAX // 8)
             data = json.loads(file.read(name))
     except (zipfile.BadZipFile, StopIteration, OSError, ValueError, RecursionError) as error:
         raise ReobjError(f"{path}: not an .r3d of Record3D: no JSON `metadata` in it") from error
