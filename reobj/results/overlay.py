@@ -521,7 +521,7 @@ def _legend(result: Result, layers: frozenset[str]) -> list[tuple[str, str]]:
         lines.append(("dashed", "not detected: filled in"))
     if _located_by_part(result) and layers & {"solids", "ellipses"}:
         name = "solid" if "solids" in layers else "ellipsoid"
-        lines.append(("solid", f"its {name} in 3D, back-projected"))
+        lines.append(("solid", f"its 3D {name}, projected"))
         lines.append(("thin", f"{name} not detected in this frame"))
     if "trails" in layers:
         lines.append(("trail", "its way in the last 1 s"))
