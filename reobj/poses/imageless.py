@@ -15,7 +15,6 @@ from reobj.frame_lookup import frames_by_name
 from reobj.poses.estimate import PosesConfig
 from reobj.poses.intrinsics import stated_camera
 from reobj.poses.supplied.frame_assignment import (
-    UNITS,
     SourceFrames,
     by_numbers,
     numbers_of_names,
@@ -31,7 +30,7 @@ from reobj.sources.detection_files import (
     read_detections,
     recorded_times,
 )
-from reobj.sources.image_files import sorted_names
+from reobj.sources.image_files import TimeUnit, sorted_names
 from reobj.sources.imageless import ImagelessVideo
 from reobj.sources.video import InputConfig, Video
 from reobj.types import ReobjError
@@ -125,8 +124,8 @@ def _frames_of(
     rows = len(pose_file.cam_from_world)
     stamps = pose_file.stamps
     if stamps is not None:
-        per_s = dict(UNITS)[pose_file.unit] if pose_file.unit else unit_of_stamps(stamps)[1]
-        stamps_s = stamps / per_s
+        unit = TimeUnit[pose_file.unit] if pose_file.unit else unit_of_stamps(stamps)
+        stamps_s = stamps / unit.value
         number = numbers_of_times(stamps_s)
         times_s = np.interp(np.arange(number[-1] + 1), number, stamps_s)
         rows = len(times_s)

@@ -6,6 +6,7 @@ Start at `list_images`.
 from __future__ import annotations
 
 import contextlib
+import enum
 import glob
 import itertools
 import math
@@ -252,15 +253,27 @@ def _decimals(names: Sequence[str]) -> list[float] | None:
     return [float(match[2]) for match in known]
 
 
-# Names that are time stamps (TUM: 1305031102.175304.png)
-STAMPS_PER_S = (1.0, 1e3, 1e6, 1e9)  # units per s: s, ms, us, ns
-EPOCH_S = (946684800.0, 4102444800.0)  # s since 1970 of plausible dates: 2000 to 2100
-FRAME_STEPS_S = (1 / 240, 10.0)  # s, plausible frame intervals: fastest phones to single photos
+class TimeUnit(enum.Enum):
+    """Units of time stamps; the value is the number of units in a second."""
+
+    s = 1.0
+    ms = 1e3
+    us = 1e6
+    ns = 1e9
+
+
 LEAST_STAMP = 1e9  # lower whole numbers are counters; chosen: s since 1970 have ten digits
+
+
+def is_date(time_s: float) -> bool:
+    """Test whether a time in s since 1970 is a plausible date: from 2000 to 2100."""
+    return 946684800 < time_s < 4102444800
 
 
 def times_of_names(names: Sequence[str]) -> Array | None:
     """Read the times of images (F,) in s from names that are time stamps; None for other names.
+
+    Such as TUM's 1305031102.175304.png.
 
     The time stamp is the last number of a name and has a decimal point or at least ten digits. Its
     unit, s, ms, us or ns, is the one that gives a plausible frame rate, if possible with a
@@ -278,13 +291,13 @@ def times_of_names(names: Sequence[str]) -> Array | None:
     if (steps <= 0).any():
         return None
     units = []  # plausible ones: (no date, |log| of the rate over the usual one, units per s)
-    for per_s in STAMPS_PER_S:
-        step_s = float(np.median(steps)) / per_s if len(steps) else 1 / IMAGE_FPS
-        first_s = float(numbers[0]) / per_s
-        dated = EPOCH_S[0] < first_s < EPOCH_S[1]
-        clock = dated or (first_s < EPOCH_S[0] and len(steps) > 0)  # or time since power-on
-        if clock and FRAME_STEPS_S[0] <= step_s <= FRAME_STEPS_S[1]:
-            units.append((not dated, abs(math.log(step_s * IMAGE_FPS)), per_s))
+    for unit in TimeUnit:
+        step_s = float(np.median(steps)) / unit.value if len(steps) else 1 / IMAGE_FPS
+        first_s = float(numbers[0]) / unit.value
+        dated = is_date(first_s)
+        clock = dated or (first_s < 1e9 and len(steps) > 0)  # or since power-on
+        if clock and 1 / 240 <= step_s <= 10:  # s: from the fastest phones to single photos
+            units.append((not dated, abs(math.log(step_s * IMAGE_FPS)), unit.value))
     return numbers / min(units)[2] if units else None
 
 

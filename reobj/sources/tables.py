@@ -19,7 +19,7 @@ import numpy as np
 
 from reobj.files import read_lines, shortened
 from reobj.sources.class_names import check_length
-from reobj.sources.image_files import EPOCH_S, STAMPS_PER_S
+from reobj.sources.image_files import TimeUnit, is_date
 from reobj.sources.image_frames import frames_of_names, frames_of_numbers
 from reobj.sources.masks import NO_RUNS
 from reobj.sources.recorded import RecordedDetections
@@ -404,11 +404,10 @@ def seconds(table: Table) -> Array:
     """
     values = table.numbers("time")
     named = [name for name in ALIASES["time"] if name in table.header]
-    units = {"ns": 1e9, "us": 1e6, "ms": 1e3}
-    per_s = next((units[name[-2:]] for name in named[:1] if name[-3:-2] == "_"
-                  and name[-2:] in units), 0.0)  # fmt: skip
+    per_s = next((TimeUnit[name[-2:]].value for name in named[:1] if name[-3:-2] == "_"
+                  and name[-2:] in TimeUnit.__members__), 0.0)  # fmt: skip
     if not per_s and len(values):
-        dated = [u for u in STAMPS_PER_S if EPOCH_S[0] < values.min() / u < EPOCH_S[1]]
+        dated = [u.value for u in TimeUnit if is_date(float(values.min()) / u.value)]
         per_s = dated[0] if dated else 1.0
     return values / (per_s or 1.0)
 

@@ -30,7 +30,6 @@ from reobj.files import shortened
 from reobj.runtime import check_versions, guard_forks, quiet_opencv
 from reobj.sources.container_files import holds_pictures_only, missing_bytes, settled_times
 from reobj.sources.image_files import (
-    FRAME_STEPS_S,
     IMAGE_FPS,
     PIXELS_MAX,
     ImageList,
@@ -178,7 +177,7 @@ class Video:
     def _assumed_fps(self) -> float:
         """Frame rate without measured times: as announced, unless implausible."""
         announced = self._announced_fps
-        return announced if announced <= 1 / FRAME_STEPS_S[0] else IMAGE_FPS
+        return announced if announced <= 240 else IMAGE_FPS  # Hz, of the fastest phones
 
     @functools.cached_property
     def times_are_known(self) -> bool:

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from reobj.cameras import invert_rigid
 from reobj.frame_lookup import frames_by_name
-from reobj.sources.image_files import EPOCH_S, LEAST_STAMP, STAMPS_PER_S
+from reobj.sources.image_files import LEAST_STAMP, TimeUnit, is_date
 from reobj.types import Array, BoolArray, IntArray, ReobjError
 
 
@@ -237,11 +237,8 @@ def _even_numbers(stamps_s: Array) -> IntArray | None:
     return None
 
 
-UNITS = tuple(zip(("s", "ms", "us", "ns"), STAMPS_PER_S, strict=True))
-
-
-def unit_of_stamps(stamps: Array, end_s: float = 0.0) -> tuple[str, float]:
-    """Infer the unit of ascending stamps (N,), and how many of it are a second.
+def unit_of_stamps(stamps: Array, end_s: float = 0.0) -> TimeUnit:
+    """Infer the unit of ascending stamps (N,).
 
     It is the unit that gives a date after 2000. Else it is s, unless most stamps in s lie after the
     end of the video and those in another unit end with it, or stamps of ten digits have a plausible
@@ -253,17 +250,17 @@ def unit_of_stamps(stamps: Array, end_s: float = 0.0) -> tuple[str, float]:
     step = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
     least_s = 1e-3  # motion capture at 1 kHz
     most_s = 10.0  # photos taken one by one
-    for unit in UNITS:
-        if EPOCH_S[0] < stamps[0] / unit[1] < EPOCH_S[1]:
+    for unit in TimeUnit:
+        if is_date(float(stamps[0]) / unit.value):
             return unit
     if end_s > 0 and np.median(stamps) > end_s:
-        for unit in UNITS:
-            ends = 0.5 < stamps[-1] / unit[1] / end_s < 2
-            if ends and least_s <= step / unit[1] <= most_s:
+        for unit in TimeUnit:
+            ends = 0.5 < stamps[-1] / unit.value / end_s < 2
+            if ends and least_s <= step / unit.value <= most_s:
                 return unit
     if is_whole(stamps) and stamps[-1] >= LEAST_STAMP:
-        return next((unit for unit in UNITS if step / unit[1] <= most_s), UNITS[0])
-    return UNITS[0]
+        return next((unit for unit in TimeUnit if step / unit.value <= most_s), TimeUnit.s)
+    return TimeUnit.s
 
 
 def is_whole(stamps: Array) -> bool:

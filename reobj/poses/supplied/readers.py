@@ -20,7 +20,6 @@ from reobj.poses.intrinsics import CAMERA_FORMS, fitted_camera, parse_camera
 from reobj.poses.supplied import pose_formats as formats
 from reobj.poses.supplied.colmap_model import find_models, read_colmap
 from reobj.poses.supplied.frame_assignment import (
-    UNITS,
     FrameAssignment,
     SourceFrames,
     assignments,
@@ -30,6 +29,7 @@ from reobj.poses.supplied.frame_assignment import (
 )
 from reobj.poses.supplied.interpretation import PoseReading, by_images
 from reobj.poses.supplied.pose_formats import PoseFile, one_camera
+from reobj.sources.image_files import TimeUnit
 from reobj.types import Array, IntArray, ReobjError
 
 
@@ -135,11 +135,11 @@ def _in_seconds(
     if pose_file.stamps is None:
         return None, ()
     if pose_file.unit:
-        return pose_file.stamps / dict(UNITS)[pose_file.unit], ()
+        return pose_file.stamps / TimeUnit[pose_file.unit].value, ()
     end_s = float(source.time_s[-1]) if source.timed else 0.0
-    unit, per_s = unit_of_stamps(pose_file.stamps, end_s)
-    messages = () if unit == "s" else (f"{path}: time stamps taken for {unit}",)
-    return pose_file.stamps / per_s, messages
+    unit = unit_of_stamps(pose_file.stamps, end_s)
+    messages = () if unit is TimeUnit.s else (f"{path}: time stamps taken for {unit.name}",)
+    return pose_file.stamps / unit.value, messages
 
 
 def _intrinsics(pose_file: PoseFile, rows: IntArray, size: tuple[int, int], path: Path) -> Camera:
