@@ -374,15 +374,19 @@ def _(lab: Lab) -> None:
 class Session:
     """An onnxruntime session of the YOLOv8 layout for images of 64 px; it always sees these."""
 
+    SIDE = 64
     BOXES = ((32, 32, 20, 20, 0.9, 1), (35, 32, 20, 20, 0.5, 1), (10, 10, 8, 8, 0.05, 0))
 
     def __init__(self, *_: Any) -> None:
-        self.table = np.zeros((1, 4 + 3, 64 + 16 + 4), np.float32)
+        cells = sum((self.SIDE // stride) ** 2 for stride in (8, 16, 32))
+        self.table = np.zeros((1, 4 + 3, cells), np.float32)
         for i, (*box, score, kind) in enumerate(self.BOXES):
             self.table[0, :4, i], self.table[0, 4 + kind, i] = box, score
 
     def get_inputs(self) -> list[Any]:
-        return [SimpleNamespace(name="images", shape=[1, 3, 64, 64], type="tensor(float)")]
+        return [
+            SimpleNamespace(name="images", shape=[1, 3, self.SIDE, self.SIDE], type="tensor(float)")
+        ]
 
     def get_outputs(self) -> list[Any]:
         return [SimpleNamespace(name="out")]
@@ -480,11 +484,11 @@ def _(lab: Lab) -> None:
 @shows("detect.max_detections")
 def _(lab: Lab) -> None:
     assert by_file(lab, 1)[0].score.tolist() == [0.9]
-    many = tuple((5 + 12 * (i % 5), 9 + 12 * (i // 5), 8, 8, 0.9, 1) for i in range(10))
+    many = tuple((5 + 10 * (i % 12), 9 + 10 * (i // 12), 8, 8, 0.9, 1) for i in range(140))
     lab.patch.setattr(Session, "BOXES", many)
-    lab.patch.setattr(detectors, "MODEL_DETECTIONS", 6)
-    assert [len(by_network(lab, value)[0]) for value in (3, 9, 0)] == [3, 9, 6]
-    assert [len(by_file(lab, value)[0]) for value in (3, 9, 0)] == [3, 9, 10]  # 0: all of a file
+    lab.patch.setattr(Session, "SIDE", 128)
+    assert [len(by_network(lab, value)[0]) for value in (3, 120, 0)] == [3, 120, 100]
+    assert [len(by_file(lab, value)[0]) for value in (3, 120, 0)] == [3, 120, 140]  # 0: all
 
 
 # ---- embed, threads, device, offline: settings of the networks of a run ----

@@ -29,12 +29,10 @@ from reobj.sources.detection_files import (
 )
 from reobj.sources.onnx_layouts import (
     LAYOUTS,
-    MAX_CANDIDATES,
-    PAD_VALUE,
-    YOLO_STRIDES,
     Geometry,
     Layout,
     Trial,
+    best_rows,
     fit_image,
 )
 from reobj.sources.recorded import NORMALISED_MAX, RecordedDetections, pack_detections, read_npz
@@ -55,10 +53,6 @@ from reobj.types import (
     text_labels,
     visible_name,
 )
-
-DYNAMIC_SIDE = 640  # px, longer input side of models with a dynamic size (YOLO11's training size)
-MODEL_DETECTIONS = 100  # most detections of a frame (COCO's maxDets)
-NMS_IOU = 0.6  # IoU above which boxes of a class are duplicates, for models without NMS (NanoDet)
 
 
 class OnnxDetector:
@@ -87,7 +81,7 @@ class OnnxDetector:
     ) -> None:
         self.config = config or DetectConfig()
         name = path_or_name or self.config.model
-        self._most = self.config.max_detections or MODEL_DETECTIONS
+        self._most = self.config.max_detections or 100  # of a frame (COCO's maxDets)
         self._grid = parse_tiles(self.config.tiles)
         weights = known_weights(name)
         self.path = model_path(name, offline)
@@ -161,16 +155,17 @@ class OnnxDetector:
         if self._allowed is not None:
             use &= np.isin(label, self._allowed)
         rows = np.flatnonzero(use)
-        rows = rows[np.argsort(-score[rows], kind="stable")][:MAX_CANDIDATES]
-        if self._layout.nms:
-            rows = rows[nms(boxes[rows], label[rows], NMS_IOU)]
+        rows = rows[best_rows(score[rows])]
+        if self._layout.nms_iou is not None:
+            rows = rows[nms(boxes[rows], label[rows], self._layout.nms_iou)]
         return rows[: self._most]
 
     def _input_size(self, width: int, height: int) -> tuple[int, int]:
-        """Return the input (w, h) for an image: the model's, or the image's at DYNAMIC_SIDE."""
+        """Return the input (w, h) for an image: the model's, or, if dynamic, the image's shape."""
         fixed = self._inputs[0][1][:-3:-1]
-        stride = max(YOLO_STRIDES)  # sides are multiples of it
-        ratio = DYNAMIC_SIDE / max(width, height) / stride
+        longer = 640  # px, longer side (YOLO11's training size)
+        stride = 32  # px, largest cells of YOLO: sides are multiples of it
+        ratio = longer / max(width, height) / stride
         scaled = [max(math.ceil(round(v * ratio, 3)), 1) * stride for v in (width, height)]
         w, h = (a if isinstance(a, int) else b for a, b in zip(fixed, scaled, strict=True))
         return w, h
@@ -186,8 +181,8 @@ class OnnxDetector:
 
     def _trial_run(self) -> Trial:
         """Run the model on a grey image to get the shapes of its outputs."""
-        size = self._input_size(DYNAMIC_SIDE, DYNAMIC_SIDE)
-        grey = np.full((size[1], size[0], 3), PAD_VALUE, np.uint8)
+        size = self._input_size(1, 1)  # of a square image
+        grey = np.full((size[1], size[0], 3), 114, np.uint8)  # as the borders of fitted images
         try:
             outputs = self._session.run(None, self._feeds(grey, size, LAYOUTS[0]))
         except Exception as error:

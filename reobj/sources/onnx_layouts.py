@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,9 +18,6 @@ from reobj.sources.recorded import NORMALISED_MAX
 from reobj.sources.weights import IMAGENET_MEAN, IMAGENET_STD
 from reobj.types import Array, BoolArray, Image, IntArray, xyxy_from_cxcywh
 
-MAX_CANDIDATES = 1000  # detections that are decoded fully and enter NMS, by score (NanoDet: 1000)
-YOLO_STRIDES = (8, 16, 32)  # input px per cell, by level (YOLOX, YOLOv8, YOLO11)
-GFL_STRIDES = (8, 16, 32, 64)  # same of NanoDet-Plus and PicoDet
 GFL_BINS = 8  # bins of a distance, 0 to 7 strides (NanoDet-Plus, PicoDet: reg_max 7)
 
 
@@ -66,9 +63,9 @@ class Trial:
         single = len(first) == 3 and all(len(shape) == 4 for shape in others)
         return (first[1], first[2]) if single else (0, 0)
 
-    def anchors(self, strides: Sequence[int]) -> int:
-        """Count the cells of all levels."""
-        return sum(math.ceil(self.size[0] / s) * math.ceil(self.size[1] / s) for s in strides)
+    def anchors(self, levels: int) -> int:
+        """Count the cells of all levels, of 8, 16, 32, ... px."""
+        return sum(math.prod(math.ceil(v / (8 << k)) for v in self.size) for k in range(levels))
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +76,8 @@ class Layout:
         fit: "stretch" the image to the input, or keep its aspect ratio and pad: "corner" (image at
             the top left) or "centre".
         rgb: channel order of the network. mean, std: of the pixels, 0..255, in that order.
-        nms: its boxes need NMS.
+        nms_iou: IoU above which two boxes of a class are duplicates (NanoDet: .6); None: the model
+            has selected its boxes.
         first: label of the first class. classes: number of classes (0: unknown from the outputs).
     """
 
@@ -90,16 +88,16 @@ class Layout:
     rgb: bool = True
     mean: tuple[float, ...] = (0.0, 0.0, 0.0)
     std: tuple[float, ...] = (255.0, 255.0, 255.0)
-    nms: bool = True
+    nms_iou: float | None = 0.6
     first: int = 0
     classes: Callable[[Trial], int] = lambda trial: 0
 
 
-PAD_VALUE = 114  # grey level of the borders of a padded image (YOLOX, Ultralytics)
-
-
 def fit_image(image: Image, size: tuple[int, int], fit: str) -> tuple[Image, Geometry]:
-    """Resize an image to a network's input of (w, h); fit: see `Layout`."""
+    """Resize an image to a network's input of (w, h); fit: see `Layout`.
+
+    Borders have the grey level of YOLOX and Ultralytics.
+    """
     height, width = image.shape[:2]
     w, h = size
     if fit != "stretch":
@@ -107,20 +105,25 @@ def fit_image(image: Image, size: tuple[int, int], fit: str) -> tuple[Image, Geo
         w = max(round(width * ratio), 1)
         h = max(round(height * ratio), 1)
     left, top = ((size[0] - w) // 2, (size[1] - h) // 2) if fit == "centre" else (0, 0)
-    canvas = np.full((size[1], size[0], 3), PAD_VALUE, np.uint8)
+    canvas = np.full((size[1], size[0], 3), 114, np.uint8)
     canvas[top : top + h, left : left + w] = cv2.resize(image, (w, h))
     return canvas, Geometry((width, height), size, (w / width, h / height), (left, top))
 
 
-def _grid(size: tuple[int, int], strides: Sequence[int]) -> tuple[Array, Array]:
-    """List the cells of all levels, row by row: x, y (A, 2) and stride (A, 1)."""
+def _grid(size: tuple[int, int], levels: int) -> tuple[Array, Array]:
+    """List the cells of all levels, of 8, 16, 32, ... px: x, y (A, 2) and stride (A, 1)."""
     cells = []
     stride = []
-    for s in strides:
+    for s in (8 << k for k in range(levels)):
         y, x = np.mgrid[: math.ceil(size[1] / s), : math.ceil(size[0] / s)]
         cells.append(np.stack([x.ravel(), y.ravel()], 1).astype(np.float64))
         stride.append(np.full((x.size, 1), float(s)))
     return np.concatenate(cells), np.concatenate(stride)
+
+
+def best_rows(score: Array, most: int = 1000) -> IntArray:
+    """Return the rows of the highest of (N,) scores, best first; most: as in NanoDet."""
+    return np.argsort(-score, kind="stable")[:most]
 
 
 def _best_class(scores: Array) -> tuple[Array, IntArray]:
@@ -150,7 +153,7 @@ def _decode_yolox(outs: list[Any], geometry: Geometry) -> Decoded:
     """
     rows = outs[0][0].astype(np.float64)  # (A, 5 + C)
     if np.median(np.abs(rows[:, :2])) < 8:  # raw: below 2; decoded: half of the image, px
-        cells, stride = _grid(geometry.input_size, YOLO_STRIDES)
+        cells, stride = _grid(geometry.input_size, 3)
         rows[:, :2] = (rows[:, :2] + cells) * stride
         rows[:, 2:4] = np.exp(rows[:, 2:4]) * stride
     score, label = _best_class(rows[:, 5:])
@@ -187,7 +190,7 @@ def _decode_gfl(outs: list[Any], geometry: Geometry) -> Decoded:
     then bins by level, distances from the cell's centre.
     """
     if len(outs) == 1:
-        levels = len(GFL_STRIDES)
+        levels = 4
         center = 0.0
         scores, bins = np.split(outs[0][0], [-4 * GFL_BINS], 1)
     else:
@@ -195,8 +198,8 @@ def _decode_gfl(outs: list[Any], geometry: Geometry) -> Decoded:
         center = 0.5
         scores, bins = (np.concatenate(half, 1)[0] for half in (outs[:levels], outs[levels:]))
     score, label = _best_class(scores)
-    keep = np.argsort(-score, kind="stable")[:MAX_CANDIDATES]  # saves the time of the other bins
-    cells, stride = (v[keep] for v in _grid(geometry.input_size, GFL_STRIDES[:levels]))
+    keep = best_rows(score)  # saves the time of the other bins
+    cells, stride = (v[keep] for v in _grid(geometry.input_size, levels))
     logits = bins[keep].reshape(-1, 4, GFL_BINS).astype(np.float64)
     weight = np.exp(logits - logits.max(2, keepdims=True))
     distance = weight @ np.arange(GFL_BINS) / weight.sum(2) * stride  # (K, 4) to the sides
@@ -260,27 +263,27 @@ def _has_nms(trial: Trial) -> bool:
 LAYOUTS: tuple[Layout, ...] = (  # the first that accepts a model is used
     Layout("DEIM, D-FINE, RT-DETR (labels, boxes, scores)",
             lambda t: t.inputs == 2 and _has_nms(t),  # the second is the image size: no scaling
-            lambda outs, geometry: Decoded(*_pick_outputs(outs)), nms=False),
+            lambda outs, geometry: Decoded(*_pick_outputs(outs)), nms_iou=None),
     Layout("PicoDet",
             lambda t: len(t.outputs) in (6, 8) and t.outputs[-1].shape[2:] == (4 * GFL_BINS,),
             _decode_gfl, mean=IMAGENET_MEAN, std=IMAGENET_STD,
             classes=lambda t: int(t.outputs[0].shape[2])),
     Layout("NanoDet-Plus",
-            lambda t: t.rows[0] == t.anchors(GFL_STRIDES) and t.rows[1] > 4 * GFL_BINS,
+            lambda t: t.rows[0] == t.anchors(4) and t.rows[1] > 4 * GFL_BINS,
             _decode_gfl, rgb=False, mean=IMAGENET_MEAN[::-1], std=IMAGENET_STD[::-1],
             classes=lambda t: t.rows[1] - 4 * GFL_BINS),
-    Layout("YOLOX", lambda t: t.rows[0] == t.anchors(YOLO_STRIDES) and t.rows[1] > 5,
+    Layout("YOLOX", lambda t: t.rows[0] == t.anchors(3) and t.rows[1] > 5,
             _decode_yolox, "corner", rgb=False, std=(1.0, 1.0, 1.0),
             classes=lambda t: t.rows[1] - 5),
     Layout("YOLOv8, YOLO11 (and -seg)",
-            lambda t: t.rows[1] == t.anchors(YOLO_STRIDES) and t.rows[0] > 4,
+            lambda t: t.rows[1] == t.anchors(3) and t.rows[0] > 4,
             _decode_yolo, "centre",
             classes=lambda t: t.rows[0] - 4 - sum(o.shape[1] for o in t.outputs[1:])),
     Layout("Mask R-CNN",
             lambda t: _has_nms(t) and any(o.shape[2:] == (28, 28) for o in t.outputs),
             _decode_with_nms, "corner", rgb=False,
             mean=(102.9801, 115.9465, 122.7717), std=(1.0, 1.0, 1.0),  # as maskrcnn-benchmark
-            nms=False, first=1),
+            nms_iou=None, first=1),
     Layout("SSD with built-in NMS", _has_nms, _decode_with_nms, mean=IMAGENET_MEAN,
-            std=IMAGENET_STD, nms=False, first=1),
+            std=IMAGENET_STD, nms_iou=None, first=1),
 )  # fmt: skip
