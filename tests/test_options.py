@@ -31,7 +31,6 @@ import reobj.poses.sfm as sfm
 import reobj.poses.stage as stage
 import reobj.results.scene as scene
 import reobj.sources.detectors as detectors
-import reobj.sources.video as video_room
 import reobj_track as rt
 from reobj.cameras import load_poses, save_poses, write_colmap
 from reobj.options import (
@@ -44,6 +43,7 @@ from reobj.options import (
 )
 from reobj.results.workspace import Workspace
 from reobj.sources.imageless import ImagelessVideo
+from reobj.sources.video import LiveTimes
 from reobj.sources.weights import own_models
 
 CHAIR = 56
@@ -362,9 +362,7 @@ def _(lab: Lab) -> None:
             pass
 
     lab.patch.setattr(cv2, "VideoCapture", Camera)
-    lab.patch.setattr(video_room, "LIVE_TIMEOUT_S", 0.05)
-    lab.patch.setattr(video_room, "RECONNECT_S", (0.0, 0.0))
-    list(rt.Video(0, lab.config("4").input))
+    list(rt.Video(0, lab.config("4").input, LiveTimes(silent_s=0.05, first_wait_s=0.0)))
     assert len(opened) == 1 + 4
 
 

@@ -487,9 +487,7 @@ class FakeCamera:
         return True, np.full((SIZE[1], SIZE[0], 3), (self.n - 1) % 250, np.uint8)
 
 
-@pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(video_room, "LIVE_TIMEOUT_S", 1.0)
+QUICK = video_room.LiveTimes(silent_s=1.0)
 
 
 def opened(monkeypatch: pytest.MonkeyPatch, *cameras: FakeCamera) -> None:
@@ -504,14 +502,12 @@ def wait_until(condition: Any) -> None:
         time.sleep(0.005)
 
 
-def test_a_slow_consumer_sees_the_newest_frames(
-    monkeypatch: pytest.MonkeyPatch, quick: None
-) -> None:
+def test_a_slow_consumer_sees_the_newest_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     """While frame 1 is processed, 2 to 10 arrive: 9 and 10 are next, the others are dropped."""
     gates = {2: threading.Event(), 11: threading.Event()}
     camera = FakeCamera(14, gates)
     opened(monkeypatch, camera)
-    video = rt.Video(0)  # takes frame 0 to know the size
+    video = rt.Video(0, live=QUICK)  # takes frame 0 to know the size
     assert video.is_live and video.size == SIZE and video.frame_count == 0
     frames = iter(video)
     seen = [next(frames)]
@@ -528,11 +524,11 @@ def test_a_slow_consumer_sees_the_newest_frames(
     assert all(a.time_s <= b.time_s for a, b in itertools.pairwise(seen))
 
 
-def test_a_driver_that_hangs_ends_the_video(monkeypatch: pytest.MonkeyPatch, quick: None) -> None:
+def test_a_driver_that_hangs_ends_the_video(monkeypatch: pytest.MonkeyPatch) -> None:
     """A stalled stream blocks OpenCV for half a minute; earlier frames are used."""
     gate = threading.Event()
     opened(monkeypatch, FakeCamera(5, {3: gate}))
-    video = rt.Video(0)
+    video = rt.Video(0, live=QUICK)
     began = time.monotonic()
     assert [f.index for f in video] == [0, 1]
     assert time.monotonic() - began < 10 and "no frame came for 1 s" in video.messages[-1]
@@ -567,11 +563,10 @@ def test_a_lost_source_is_reconnected(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture,
     reconnect: int, there: str, frames: int, attempts: int, waits: list[str],
 ) -> None:  # fmt: skip
-    monkeypatch.setattr(video_room, "LIVE_TIMEOUT_S", 0.2)
-    monkeypatch.setattr(video_room, "RECONNECT_S", (0.01, 0.03))
+    live = video_room.LiveTimes(silent_s=0.2, first_wait_s=0.01, longest_wait_s=0.03)
     flaky = Flaky(there)
     monkeypatch.setattr(cv2, "VideoCapture", flaky)
-    video = rt.Video(0, rt.InputConfig(reconnect=reconnect))
+    video = rt.Video(0, rt.InputConfig(reconnect=reconnect), live)
     seen = [(frame.index, frame.time_s) for frame in video]
     assert video.read == frames and seen[-1][0] == frames - 1  # counted on, whatever was dropped
     assert seen == sorted(seen) and len({index for index, _ in seen}) == len(seen)
@@ -582,29 +577,26 @@ def test_a_lost_source_is_reconnected(
 
 def test_the_reconnection_delay_does_not_overflow(monkeypatch: pytest.MonkeyPatch) -> None:
     """1,100 attempts: doubling the delay each time would overflow."""
-    monkeypatch.setattr(video_room, "LIVE_TIMEOUT_S", 0.1)
-    monkeypatch.setattr(video_room, "RECONNECT_S", (1e-9, 1e-9))
+    live = video_room.LiveTimes(silent_s=0.1, first_wait_s=1e-9, longest_wait_s=1e-9)
     flaky = Flaky("x")
     monkeypatch.setattr(cv2, "VideoCapture", flaky)
-    list(rt.Video(0, rt.InputConfig(reconnect=1100)))
+    list(rt.Video(0, rt.InputConfig(reconnect=1100), live))
     assert len(flaky.cameras) == 1101
 
 
-def test_a_source_at_its_stop_is_not_reconnected(
-    monkeypatch: pytest.MonkeyPatch, quick: None
-) -> None:
+def test_a_source_at_its_stop_is_not_reconnected(monkeypatch: pytest.MonkeyPatch) -> None:
     flaky = Flaky("xxx")
     monkeypatch.setattr(cv2, "VideoCapture", flaky)
-    video = rt.Video(0, rt.InputConfig(stop=2, reconnect=5))
+    video = rt.Video(0, rt.InputConfig(stop=2, reconnect=5), live=QUICK)
     assert [frame.index for frame in video] == [0, 1] and len(flaky.cameras) == 1
 
 
 def test_leaving_early_stops_the_thread_and_frees_the_camera(
-    monkeypatch: pytest.MonkeyPatch, quick: None
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     first, second = FakeCamera(10**6), FakeCamera(10**6)
     opened(monkeypatch, first, second)
-    video = rt.Video("0")
+    video = rt.Video("0", live=QUICK)
     before = threading.active_count()
     for frame in video:
         if frame.index >= 5:
@@ -614,11 +606,9 @@ def test_leaving_early_stops_the_thread_and_frees_the_camera(
     assert again.image[0, 0, 0] == again.index % 250 and second.n > 0  # opened anew
 
 
-def test_every_start_and_stop_count_frames_of_the_source(
-    monkeypatch: pytest.MonkeyPatch, quick: None
-) -> None:
+def test_every_start_and_stop_count_frames_of_the_source(monkeypatch: pytest.MonkeyPatch) -> None:
     opened(monkeypatch, FakeCamera(100))
-    video = rt.Video(0, rt.InputConfig(start=3, every=4, stop=15))
+    video = rt.Video(0, rt.InputConfig(start=3, every=4, stop=15), live=QUICK)
     assert {f.index for f in video} <= {3, 7, 11} and video.read == 3
 
 
@@ -687,9 +677,9 @@ def stream(request: pytest.FixtureRequest) -> Iterator[tuple[Stream, str]]:
 
 
 @pytest.mark.parametrize("stream", [(40, 0.005)], indirect=True)
-def test_a_stream_is_read_to_its_end(stream: tuple[Stream, str], quick: None) -> None:
+def test_a_stream_is_read_to_its_end(stream: tuple[Stream, str]) -> None:
     url = stream[1]
-    video = rt.Video(url)
+    video = rt.Video(url, live=QUICK)
     assert video.is_live and video.size == (320, 240) and "secret" not in video.source
     seen = []
     for frame in video:
@@ -728,22 +718,19 @@ HEAD = b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary=fr
 
 
 @pytest.mark.parametrize("silent", [b"", HEAD, HEAD + b"--frame\r\n"], indirect=True)
-def test_an_unresponsive_camera_times_out(silent: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unresponsive_camera_times_out(silent: str) -> None:
     """OpenCV itself waits for half a minute."""
-    monkeypatch.setattr(video_room, "OPEN_TIMEOUT_S", 0.5)
     began = time.monotonic()
     with pytest.raises(rt.ReobjError, match=r"cannot be opened as a stream \(is it there"):
-        rt.Video(silent)
+        rt.Video(silent, live=video_room.LiveTimes(open_s=0.5))
     assert 0.4 < time.monotonic() - began < 5
 
 
 @pytest.mark.parametrize("stream", [(10, 0.01, 20.0)], indirect=True)
-def test_a_stream_that_stalls_ends_soon(
-    stream: tuple[Stream, str], quick: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stream_that_stalls_ends_soon(stream: tuple[Stream, str]) -> None:
     """Within the documented time plus half a second."""
     url = stream[1]
-    video = rt.Video(url)
+    video = rt.Video(url, live=QUICK)
     last = began = time.monotonic()
     for _ in video:
         last = time.monotonic()
@@ -753,13 +740,10 @@ def test_a_stream_that_stalls_ends_soon(
 
 
 @pytest.mark.parametrize("stream", [(6, 0.02)], indirect=True)
-def test_a_stream_is_reconnected(
-    stream: tuple[Stream, str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stream_is_reconnected(stream: tuple[Stream, str]) -> None:
     """Over real connections: each serves six frames; fourteen frames need three."""
-    monkeypatch.setattr(video_room, "LIVE_TIMEOUT_S", 0.5)
-    monkeypatch.setattr(video_room, "RECONNECT_S", (0.05, 0.1))
-    video = rt.Video(stream[1], rt.InputConfig(reconnect=2, stop=14))
+    live = video_room.LiveTimes(silent_s=0.5, first_wait_s=0.05, longest_wait_s=0.1)
+    video = rt.Video(stream[1], rt.InputConfig(reconnect=2, stop=14), live)
     seen = [frame.index for frame in video]
     assert video.read == 14 and seen == sorted(set(seen))
 

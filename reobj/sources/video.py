@@ -57,9 +57,26 @@ class InputConfig:
 
 
 MAX_UNREADABLE = 64  # consecutive frames after which a video has ended; chosen: 2 s
-LIVE_TIMEOUT_S = 2.0  # s without a frame after which a live source has ended (chosen)
-OPEN_TIMEOUT_S = 5.0  # s; chosen: cameras answer within 2 s; OpenCV's default is 30 s
-RECONNECT_S = (1.0, 30.0)  # s before the first attempt, doubled for each next one; maximum (chosen)
+
+
+@dataclass(frozen=True, slots=True)
+class LiveTimes:
+    """Times of a live source: when it has ended, and when it is opened again.
+
+    Attributes:
+        silent_s: s without a frame after which it has ended. Lower: a short break of the network
+            ends the run; higher: a run waits longer for a camera that was switched off.
+        open_s: s to open a stream, and to read from it. Cameras answer within 2 s; OpenCV's
+            default is 30 s.
+        first_wait_s, longest_wait_s: s before the first attempt to reconnect, doubled for each next
+            one, and its maximum. Lower: more load on a server that is down; higher: more frames are
+            lost after a short break.
+    """
+
+    silent_s: float = 2.0
+    open_s: float = 5.0
+    first_wait_s: float = 1.0
+    longest_wait_s: float = 30.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +103,8 @@ class Video:
     their names, frames of a file as stored. Frames that a live source delivers while the caller is
     busy are counted and dropped, except for the two newest ones.
 
+    Args:
+        live: when a live source has ended; default: `reobj.sources.video.LiveTimes`.
     Attributes:
         source: as given; of a URL only scheme, host and path.
         fingerprint: hash of the source or its files, without the secrets of a URL.
@@ -107,11 +126,17 @@ class Video:
 
     has_images = True
 
-    def __init__(self, source: str | Path | int, config: InputConfig | None = None) -> None:
+    def __init__(
+        self,
+        source: str | Path | int,
+        config: InputConfig | None = None,
+        live: LiveTimes | None = None,
+    ) -> None:
         check_versions()
         guard_forks()
         self._address = str(source)
         self.config = config or InputConfig()
+        self._live = live or LiveTimes()
         self.source = without_secrets(self._address)
         if self.config.every < 1 or min(dataclasses.astuple(self.config)) < 0:
             raise ReobjError("--every must be at least 1; --start, --stop, --max-size at least 0")
@@ -334,7 +359,8 @@ class Video:
             while capture is None and attempts < self.config.reconnect:
                 if 0 < self.config.stop <= self._seen:
                     break
-                wait_s = min(RECONNECT_S[0] * 2.0 ** min(attempts, 9), RECONNECT_S[1])
+                wait_s = self._live.first_wait_s * 2.0 ** min(attempts, 9)
+                wait_s = min(wait_s, self._live.longest_wait_s)
                 attempts += 1
                 log.warning("%s: ended; reconnecting in %g s", self.source, wait_s)
                 time.sleep(wait_s)
@@ -361,8 +387,8 @@ class Video:
                 yield item
         finally:
             stopped.set()
-            hangs = time.monotonic() - self._last_frame_s > LIVE_TIMEOUT_S
-            thread.join(0.0 if hangs else LIVE_TIMEOUT_S / 2)
+            hangs = time.monotonic() - self._last_frame_s > self._live.silent_s
+            thread.join(0.0 if hangs else self._live.silent_s / 2)
             if not thread.is_alive():  # else it hangs in the driver; a daemon thread may be left
                 capture.release()
 
@@ -371,11 +397,11 @@ class Video:
     ) -> tuple[int, float, Image] | None:
         """Wait for a frame of a live source; None at its end, or where the driver hangs."""
         poll_s = 0.5  # longer than the reading thread takes to signal its end
-        timeout_s = LIVE_TIMEOUT_S + poll_s
+        timeout_s = self._live.silent_s + poll_s
         while time.monotonic() - self._last_frame_s < timeout_s or not frames.empty():
             with contextlib.suppress(queue.Empty):
                 return frames.get(timeout=poll_s)
-        self._warn(f"no frame came for {LIVE_TIMEOUT_S:g} s: taken as its end")
+        self._warn(f"no frame came for {self._live.silent_s:g} s: taken as its end")
         return None
 
     def _read_live(
@@ -388,7 +414,7 @@ class Video:
         """Read a live source until it ends or `stopped`; drop the oldest frame of a full queue."""
         last = time.monotonic()
         try:
-            while not stopped.is_set() and time.monotonic() - last < LIVE_TIMEOUT_S:
+            while not stopped.is_set() and time.monotonic() - last < self._live.silent_s:
                 if 0 < self.config.stop <= self._seen:
                     break
                 ok, image = capture.read()
@@ -424,7 +450,7 @@ class Video:
         is_camera = self.is_live and self._address.isdecimal()
         with quiet_opencv():
             if self._is_url:
-                timeout_ms = round(1000 * OPEN_TIMEOUT_S)
+                timeout_ms = round(1000 * self._live.open_s)
                 timeouts = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, timeout_ms]
                 timeouts += [cv2.CAP_PROP_READ_TIMEOUT_MSEC, timeout_ms]
                 capture = cv2.VideoCapture(self._address, cv2.CAP_ANY, [*timeouts, *params])
