@@ -21,9 +21,6 @@ from reobj.options import add_flags, list_options
 from reobj.types import ReobjError, one_line, printable, without_secrets
 
 Command = Callable[[argparse.Namespace], int]
-TRACKS_HELP = (
-    "file of identities, used instead of the tracker: CVAT, COCO, MOT, KITTI, CSV, YOLO labels"
-)
 
 
 class Parser(argparse.ArgumentParser):
@@ -171,7 +168,7 @@ def make_parser(
     add("out", help="output folder of an earlier `run`")
     text = "only validate objects.json against its schema"
     add("--validate", action="store_true", help=text)
-    add("--tracks", help=TRACKS_HELP)
+    _add_tracks(add)
     add("--edits", help="file of corrections, saved by scene.html; later fits apply it too")
     text = "compare with ground truth: HOTA, IDF1, MOTA, O3D ..."
     add = command("eval", text, "out --gt gt.txt")
@@ -217,10 +214,15 @@ def _add_run(command: Any, name: str, text: str) -> None:
     if name != "poses":
         text = "file of detections, used instead of the detector: MOT, KITTI, CSV, COCO JSON, "
         add("--detections", help=text + "folder of YOLO labels, CVAT, npz")
-        add("--tracks", help=TRACKS_HELP)
+        _add_tracks(add)
         add(
             "--show", action="store_true", help="show progress live in rerun's viewer (needs rerun)"
         )
+
+
+def _add_tracks(add: Any) -> None:
+    formats = "CVAT, COCO, MOT, KITTI, CSV, YOLO labels"
+    add("--tracks", help=f"file of identities, used instead of the tracker: {formats}")
 
 
 def add_command(

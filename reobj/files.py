@@ -35,7 +35,7 @@ def atomic(path: Path) -> Iterator[Path]:
     An exception in the block leaves `path` unchanged and removes the temporary file.
 
     Raises:
-        ReobjError: a disk error (DISK_ERRORS): where, why and what to do.
+        ReobjError: a disk error: where, why and what to do.
     """
     part = path.with_name(f".part-{path.name}")
     with writing(path), _folder(path.parent):
@@ -61,27 +61,25 @@ def _folder(path: Path) -> Iterator[None]:
         raise
 
 
-DISK_ERRORS = {  # what to do about each
-    errno.ENOSPC: "make room on this disk",
-    errno.EDQUOT: "make room: your quota is used up",
-    errno.EFBIG: "choose a folder on a file system that takes larger files",
-    errno.EROFS: "choose a folder on a disk that is not read-only",
-    errno.EACCES: "choose a folder that you may write into",
-    errno.EPERM: "choose a folder that you may write into",
-    errno.EEXIST: "a file stands where a folder should be: move it away",
-    errno.ENOTDIR: "a file stands where a folder should be: move it away",
-    errno.EISDIR: "a folder stands where a file should be: move it away",
-    errno.EIO: "disk I/O error: check the disk",
-}
-
-
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
     """Convert disk errors of the block that writes `path` to errors that say what to do.
 
     Raises:
-        ReobjError: for DISK_ERRORS. Other errors, and those of files in other folders, pass.
+        ReobjError: for the errors listed here. Others, and those of files in other folders, pass.
     """
+    advice_of = {
+        errno.ENOSPC: "make room on this disk",
+        errno.EDQUOT: "make room: your quota is used up",
+        errno.EFBIG: "choose a folder on a file system that takes larger files",
+        errno.EROFS: "choose a folder on a disk that is not read-only",
+        errno.EACCES: "choose a folder that you may write into",
+        errno.EPERM: "choose a folder that you may write into",
+        errno.EEXIST: "a file stands where a folder should be: move it away",
+        errno.ENOTDIR: "a file stands where a folder should be: move it away",
+        errno.EISDIR: "a folder stands where a file should be: move it away",
+        errno.EIO: "disk I/O error: check the disk",
+    }
     try:
         yield
     except OSError as error:
@@ -89,10 +87,10 @@ def writing(path: Path) -> Iterator[None]:
         number = errno.ENOSPC if full else error.errno
         named = Path(os.fsdecode(error.filename or path))
         beside = named.is_relative_to(path.parent) or path.is_relative_to(named)
-        if number not in DISK_ERRORS or not beside:
+        if number not in advice_of or not beside:
             raise
         why = os.strerror(number)
-        advice = DISK_ERRORS[number]
+        advice = advice_of[number]
         shown = Path(*(name for name in path.parts if name != PART_RESULTS))
         raise ReobjError(f"{shown}: cannot be written ({why}); {advice}, then run again") from error
 

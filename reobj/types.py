@@ -304,15 +304,10 @@ class LinkEvent:
 
 # ---- Detections of other libraries --------------------------------------------------------------
 
-EXPECTED = (
-    "expected (N, 6) rows x1, y1, x2, y2, confidence, class; ultralytics Results or Boxes; "
-    "supervision Detections; a dict of boxes, scores, labels; or rt.Detections"
-)
 COORDINATE_MAX = 1e7  # px; chosen: a thousand times the widest images; larger ones are errors
 CLASS_MAX = 32_767  # class number; chosen: above ImageNet-21k's 21,841; costs 8 bytes a track each
 CLASS_NAME_MAX = 200  # characters; chosen: arrays of names are as wide as the longest
 DETECTIONS_MAX = 3_000  # of a frame; chosen: a matrix of as many tracks takes 72 MB
-MASK_THRESHOLD = 0.5  # on mask probabilities (torchvision, Mask R-CNN)
 
 
 def as_detections(detections: Any, class_id: Any = None) -> Detections:
@@ -347,6 +342,14 @@ def as_detections(detections: Any, class_id: Any = None) -> Detections:
     if hasattr(detections, "xyxy"):
         return _checked(*_columns_of_boxes(detections))
     return _checked(*_columns_of_rows(detections))
+
+
+def _unusable(fault: str) -> ReobjError:
+    """Make the error about detections of an unknown type."""
+    return ReobjError(
+        f"{fault}; expected (N, 6) rows x1, y1, x2, y2, confidence, class; ultralytics Results or "
+        "Boxes; supervision Detections; a dict of boxes, scores, labels; or rt.Detections"
+    )
 
 
 def _single(detections: Any) -> Any:
@@ -411,7 +414,7 @@ def _columns_of_rows(rows: Any) -> tuple[Any, ...]:
     if rows.ndim == 1 and not rows.size:
         rows = np.empty((0, 6))
     if rows.ndim != 2 or rows.shape[1] != 6:
-        raise ReobjError(f"detections are an array of shape {rows.shape}; {EXPECTED}")
+        raise _unusable(f"detections are an array of shape {rows.shape}")
     return rows[:, :4], rows[:, 4], rows[:, 5], None
 
 
@@ -419,7 +422,7 @@ def _columns_of_mapping(detections: Mapping[str, Any]) -> tuple[Any, ...]:
     """Return boxes, scores, labels and masks, (N, H, W) or (N, 1, H, W), of a dict."""
     missing = [key for key in ("boxes", "scores", "labels") if key not in detections]
     if missing:
-        raise ReobjError(f"detections are a dict without {', '.join(missing)}; {EXPECTED}")
+        raise _unusable(f"detections are a dict without {', '.join(missing)}")
     if _is_text(detections["labels"]):
         raise ReobjError("labels are text; a `Tracker` takes class numbers, functions given to "
                          "`track` and `run` may return text")  # fmt: skip
@@ -436,7 +439,7 @@ def _columns_of_boxes(detections: Any) -> tuple[Any, ...]:
     for names, default in ((("confidence", "conf"), np.ones), (("class_id", "cls"), np.zeros)):
         name = next((name for name in names if hasattr(detections, name)), None)
         if name is None:
-            raise ReobjError(f"detections have xyxy, but no {' or '.join(names)}; {EXPECTED}")
+            raise _unusable(f"detections have xyxy, but no {' or '.join(names)}")
         values = getattr(detections, name)
         columns.append(default(count) if values is None else values)
     return *columns, getattr(detections, "mask", None)
@@ -445,7 +448,7 @@ def _columns_of_boxes(detections: Any) -> tuple[Any, ...]:
 def _columns_of_ultralytics(results: Any) -> tuple[Any, ...]:
     """Return the boxes of ultralytics' `Results`, and its masks at the size of the image."""
     if results.boxes is None:
-        raise ReobjError(f"ultralytics Results without boxes (another task?); {EXPECTED}")
+        raise _unusable("ultralytics Results without boxes (another task?)")
     columns = _columns_of_boxes(results.boxes)
     masks = getattr(results, "masks", None)
     if masks is None:
@@ -462,7 +465,7 @@ def _columns_of_ultralytics(results: Any) -> tuple[Any, ...]:
     maps = maps[:, top : top + h, left : left + w]
     full = np.zeros((len(maps), height, width), bool)  # (N, H, W)
     for mask, small in zip(full, maps, strict=True):
-        mask[:] = cv2.resize(small, (width, height)) > MASK_THRESHOLD
+        mask[:] = cv2.resize(small, (width, height)) > 0.5  # probability
     return *columns[:3], full
 
 
@@ -478,10 +481,10 @@ def as_numbers(values: Any, name: str) -> npt.NDArray[Any]:
             array = array.astype(np.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         reason = str(error).partition("\n")[0]
-        raise ReobjError(f"{name} are no array of numbers ({reason}); {EXPECTED}") from error
+        raise _unusable(f"{name} are no array of numbers ({reason})") from error
     if array.dtype.kind not in "fiub" or array.ndim == 0:
         kind = type(values).__name__ if array.ndim == 0 else array.dtype.name
-        raise ReobjError(f"{name} are {kind}, no array of numbers; {EXPECTED}")
+        raise _unusable(f"{name} are {kind}, no array of numbers")
     return array
 
 
@@ -504,7 +507,7 @@ def _checked(xyxy: Any, score: Any, class_id: Any, masks: Any) -> Detections:
                          "keep those of the highest scores")  # fmt: skip
     if masks is not None:
         masks = as_numbers(masks, "masks")
-        masks = masks if masks.dtype == bool else masks > MASK_THRESHOLD
+        masks = masks if masks.dtype == bool else masks > 0.5  # probability (torchvision)
         if masks.ndim != 3 or len(masks) != count:
             raise ReobjError(f"masks are an array of shape {masks.shape}, expected ({count}, H, W) "
                              "at the size of the frame")  # fmt: skip

@@ -7,7 +7,6 @@ import pytest
 
 import reobj_track as rt
 from reobj.sources.tiles import (
-    TILE_OVERLAP,
     detect_in_tiles,
     parse_tiles,
     tile_boxes,
@@ -41,9 +40,9 @@ def test_tiles_cover_the_image_and_overlap(grid: tuple[int, int]) -> None:
     (across, down), side = grid, tiles[0, 2:] - tiles[0, :2]
     assert tiles[0, :2].tolist() == [0, 0] and tiles[-1, 2:].tolist() == [w, h]
     if across > 1:
-        assert tiles[0, 2] - tiles[1, 0] == pytest.approx(TILE_OVERLAP * side[0], abs=2)
+        assert tiles[0, 2] - tiles[1, 0] == pytest.approx(0.25 * side[0], abs=2)
     if down > 1:
-        assert tiles[0, 3] - tiles[across, 1] == pytest.approx(TILE_OVERLAP * side[1], abs=2)
+        assert tiles[0, 3] - tiles[across, 1] == pytest.approx(0.25 * side[1], abs=2)
 
 
 def painter(min_px: float = 0.0, masks: bool = False) -> tuple[list[tuple[int, ...]], object]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import email.message
+import functools
 import hashlib
 import http.server
 import io
@@ -163,7 +164,8 @@ def test_a_git_blob_id_equals_that_of_git(tmp_path: Path) -> None:
 def test_a_download_of_unknown_size_ends(server: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     toy = dataclasses.replace(weights.WEIGHTS[0], digest=GIT_BLOB, size=0)
     monkeypatch.setattr(weights, "WEIGHTS", (toy,))
-    monkeypatch.setattr(weights, "DOWNLOAD_MAX", 100_000)
+    download = functools.partial(weights._download, most=100_000)
+    monkeypatch.setattr(weights, "_download", download)
     written: list[int] = []
     monkeypatch.setattr(weights.Progress, "step", lambda self, n: written.append(n))
     for server.mode in ("good", "without a length"):
@@ -322,10 +324,17 @@ def test_simultaneous_downloads_are_one(server: Any, caplog: pytest.LogCaptureFi
 def test_a_download_waits_for_another_but_not_for_ever(
     server: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(weights, "DOWNLOAD_WAIT_S", 0.2)
+    waits: list[float] = []
+
+    def impatient(path: Path, wait_s: float = 0.0) -> Any:
+        waits.append(wait_s)
+        return locked(path, wait_s / 3000)  # .2 s
+
+    monkeypatch.setattr(weights, "locked", impatient)
     with locked(server.folder / ".lock"):
         with pytest.raises(rt.ReobjError, match=r"\.lock: locked by another process"):
             rt.model_path("toy")
+    assert waits == [0.0, 600.0]
     assert server.asked == [] and rt.model_path("toy") == server.target
 
 

@@ -23,7 +23,7 @@ import numpy.typing as npt
 from reobj.files import load_json, read_lines, shortened
 from reobj.results.result import Result
 from reobj.sources.cvat import read_cvat
-from reobj.sources.tables import WHOLE_MAX, read_mot_rows
+from reobj.sources.tables import read_mot_rows
 from reobj.types import CLASS_MAX, Array, BoolArray, IntArray, ReobjError
 
 
@@ -300,7 +300,8 @@ def _read_coco_video(path: Path) -> LabelledBoxes:
     except (AttributeError, LookupError, TypeError, ValueError) as error:
         expected = "COCO-VID: images with frame_id, annotations with instance_id and bbox"
         raise ReobjError(f"{path}: {error!r}; expected {expected}") from error
-    if not np.isfinite(table).all() or (np.abs(table) > WHOLE_MAX).any():
+    # Above 2^53 not every integer is a float64
+    if not np.isfinite(table).all() or (np.abs(table) > 2.0**53).any():
         raise ReobjError(f"{path}: a number is not finite; expected COCO-VID")
     return labelled(table, np.array(names, str), np.array(crowd, np.int64))
 

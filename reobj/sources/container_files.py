@@ -10,11 +10,6 @@ import numpy as np
 
 from reobj.types import Array
 
-# Time from a backward step of the clock until it passes its last value, over what these frames take
-# at the usual rate: 1 after one wrong time stamp, less for repeated ones, near 0 where a second
-# recording begins. Below it the clock has restarted. Chosen: reached by five frames
-RESTART_SHARE = 0.25
-
 
 def settled_times(raw_s: Array, step_s: float) -> tuple[Array, int, bool]:
     """Make the times of frames (F,) strictly increasing.
@@ -28,6 +23,10 @@ def settled_times(raw_s: Array, step_s: float) -> tuple[Array, int, bool]:
     Returns:
         times (F,) in s, number of restarts of the clock, and whether the container has times.
     """
+    # Time from a backward step of the clock until it passes its last value, over what these frames
+    # take at the usual rate: 1 after one wrong time stamp, less for repeated ones, near 0 where a
+    # second recording begins. Below it the clock has restarted. Chosen: reached by five frames
+    restart_share = 0.25
     count = len(raw_s)
     known = np.flatnonzero(np.isfinite(raw_s))
     if len(known) < 2 or np.ptp(raw_s[known]) == 0:
@@ -46,11 +45,11 @@ def settled_times(raw_s: Array, step_s: float) -> tuple[Array, int, bool]:
         last = time_s[at - 1]
         later = np.flatnonzero(time_s[at:] > last)
         after = int(later[0]) if len(later) else 0  # number of frames that are not later
-        if after and time_s[at + after] - last > RESTART_SHARE * (after + 1) * step:
+        if after and time_s[at + after] - last > restart_share * (after + 1) * step:
             time_s[at : at + after] = np.linspace(last, time_s[at + after], after + 2)[1:-1]
         else:
             time_s[at:] += last + step - time_s[at]
-            restarts += after != 0 or count - at > 1 / RESTART_SHARE
+            restarts += after != 0 or count - at > 1 / restart_share
 
 
 def missing_bytes(path: Path) -> int:

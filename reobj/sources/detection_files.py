@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -97,7 +97,7 @@ def class_filter(wanted: str, names: Sequence[str]) -> IntArray:
 def read_detections(
     path: str | Path, video: Video, config: DetectConfig | None = None
 ) -> RecordedDetections:
-    """Read recorded detections of a video, in any format of READERS.
+    """Read recorded detections of a video, in any of the formats.
 
     Args:
         path: the file, or a folder of YOLO labels; boxes in px and frame numbers of the source.
@@ -121,7 +121,7 @@ def _read(path: Path, video: Video, config: DetectConfig) -> RecordedDetections:
         raise ReobjError(f"detect.first_frame {config.first_frame}: expected 0 or 1")
     names = load_class_names(config.class_names) if config.class_names else ()
     try:
-        return READERS[_kind(path)](path, names, video, config.first_frame)
+        return _read_kind(path, names, video, config.first_frame)
     except ReobjError:
         raise
     except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
@@ -139,14 +139,19 @@ def _note_looked(recorded: RecordedDetections, frame_count: int) -> None:
         recorded.messages.append(looked_message(recorded.looked, listed))
 
 
-Reader = Callable[[Path, Sequence[str], Video, str], RecordedDetections]
-READERS: dict[str, Reader] = {
-    "npz": lambda path, _, video, __: read_npz(path, video.size, video.working_size)[0],
-    "json": lambda path, names, video, first: _read_json(path, names, video, first),
-    "cvat": lambda path, _, video, first: read_cvat(path, video, first),
-    "folder": read_label_folder,
-    "table": read_table,
-}
+def _read_kind(path: Path, names: Sequence[str], video: Video, first: str) -> RecordedDetections:
+    """Read a file with the reader of its format."""
+    match _kind(path):
+        case "npz":
+            return read_npz(path, video.size, video.working_size)[0]
+        case "json":
+            return _read_json(path, names, video, first)
+        case "cvat":
+            return read_cvat(path, video, first)
+        case "folder":
+            return read_label_folder(path, names, video, first)
+        case _:
+            return read_table(path, names, video, first)
 
 
 def _read_json(path: Path, names: Sequence[str], video: Video, first: str) -> RecordedDetections:
@@ -159,7 +164,7 @@ def _read_json(path: Path, names: Sequence[str], video: Video, first: str) -> Re
 
 
 def _kind(path: Path) -> str:
-    """Return the key of READERS for a file."""
+    """Return the format of a file: npz, json, cvat, folder (of YOLO labels) or table."""
     kinds = {".npz": "npz", ".json": "json", ".xml": "cvat", ".zip": "cvat"}
     return "folder" if path.is_dir() else kinds.get(path.suffix.lower(), "table")
 

@@ -112,14 +112,6 @@ def _sized(
 
 # ---- Which images are frames ---------------------------------------------------------------------
 
-# Words in the names of other images (7-Scenes, ScanNet, 3D Scanner App, NeRFCapture, DAVIS,
-# Replica, Hypersim, Record3D)
-NO_PICTURE = frozenset(
-    "depth depthmap disp disparity conf confidence mask masks matte alpha seg segm segmentation "
-    "semantic semantics label labels instance instances panoptic normal normals thumb thumbs "
-    "thumbnail preview ir infrared flow albedo uncertainty".split()
-)
-
 
 @dataclass(slots=True)
 class _Kind:
@@ -134,6 +126,19 @@ class _Kind:
         """Test whether more than half of the smaller (min) or larger (max) kind shares numbers."""
         count = least(len(self.numbers), len(other.numbers))
         return () not in self.numbers and 2 * len(self.numbers & other.numbers) > count
+
+    @property
+    def is_named_otherwise(self) -> bool:
+        """Test for a word for images that are no pictures.
+
+        Those of 7-Scenes, ScanNet, 3D Scanner App, NeRFCapture, DAVIS, Replica, Hypersim, Record3D.
+        """
+        words = (
+            "depth depthmap disp disparity conf confidence mask masks matte alpha seg segm "
+            "segmentation semantic semantics label labels instance instances panoptic normal "
+            "normals thumb thumbs thumbnail preview ir infrared flow albedo uncertainty"
+        )
+        return not self.words.isdisjoint(words.split())
 
     def is_named_picture(self, other: _Kind) -> bool:
         """Test whether these names have a word for pictures that the other names lack."""
@@ -164,12 +169,12 @@ def _only_pictures(
     for kind in list(kinds):
         others = [k for k in kinds if k is not kind]
         gray = any_color and not kind.color
-        named = bool(kind.words & NO_PICTURE)
+        named = kind.is_named_otherwise
         beside = [k for k in others if kind.shares(k, min)]
         if gray and (named or any(k.color for k in beside)):
             messages.append(_left_out(kind.files, "one channel, beside images in colour"))
             kinds.remove(kind)
-        elif named and any(not k.words & NO_PICTURE for k in beside):
+        elif named and any(not k.is_named_otherwise for k in beside):
             messages.append(_left_out(kind.files, "by its name; others have the same numbers"))
             kinds.remove(kind)
     least = 3  # images of each of two kinds: the numbers of fewer may agree by chance

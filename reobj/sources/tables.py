@@ -37,9 +37,6 @@ from reobj.types import (
     xyxy_from_cxcywh,
 )
 
-MOT_COLUMNS = ("frame", "id", "x1", "y1", "w", "h", "score", "class", "extra", "z")
-KITTI_COLUMNS = ("frame", "id", "class", "truncated", "occluded", "alpha", "x1", "y1", "x2", "y2",
-                 "3d h", "3d w", "3d l", "3d x", "3d y", "3d z", "yaw", "score")  # fmt: skip
 ALIASES: dict[str, tuple[str, ...]] = {  # names of columns; the first one with values is used
     "frame": ("frame", "frame_id", "frame_index", "frame_number", "frame_idx", "frame_no",
               "frame_num", "frame_nr", "frameid", "framenumber"),
@@ -65,7 +62,6 @@ ALIASES: dict[str, tuple[str, ...]] = {  # names of columns; the first one with 
     "class": ("class_name", "category_name", "class_label", "label", "name", "category", "type",
               "class", "class_id", "cls", "category_id", "label_id", "coco80_class"),
 }  # fmt: skip
-WHOLE_MAX = 2.0**53  # largest frame and identity; above it not every integer is a float64
 
 
 @dataclass(slots=True)
@@ -74,7 +70,7 @@ class Table:
 
     Attributes:
         path: of the file. kind: "MOT", "KITTI" or "CSV".
-        cells: N texts by role: a key of ALIASES, or a name of MOT_COLUMNS or KITTI_COLUMNS.
+        cells: N texts by role: a key of ALIASES, or a column of MOT or KITTI in `read_cells`.
         line: (N,) position of each row, in `unit`s. header: names of the columns, () without.
         comma: may be the decimal point. messages: for the user.
     """
@@ -118,7 +114,8 @@ class Table:
     def whole(self, role: str) -> IntArray:
         """Convert a column to whole numbers (N,)."""
         values = self.numbers(role)
-        bad = (np.abs(values) > WHOLE_MAX) | (values % 1 != 0)
+        # Above 2^53 not every integer is a float64
+        bad = (np.abs(values) > 2.0**53) | (values % 1 != 0)
         if bad.any():
             row = int(bad.argmax())
             text = f"{role} {self.cells[role][row]}, expected a whole number"
@@ -186,13 +183,16 @@ def read_cells(path: Path) -> Table:
     Raises:
         ReobjError: a row has another length than the first one, or a header has no box columns.
     """
+    mot = ("frame", "id", "x1", "y1", "w", "h", "score", "class", "extra", "z")
+    kitti = ("frame", "id", "class", "truncated", "occluded", "alpha", "x1", "y1", "x2", "y2",
+             "3d h", "3d w", "3d l", "3d x", "3d y", "3d z", "yaw", "score")  # fmt: skip
     rows, lines, separator = _rows(path)
     first = rows[0] if rows else []
     table = Table(path, "MOT", {}, np.array(lines, np.int64), comma=separator != ",")
     if not first:
-        table.cells = {role: [] for role in MOT_COLUMNS}
+        table.cells = {role: [] for role in mot}
         return table
-    columns: Sequence[str] = MOT_COLUMNS
+    columns: Sequence[str] = mot
     expected = "6 to 10 (frame, id, left, top, w, h, score)"
     count = len(first)
     if not _is_number(first[0]):
@@ -207,12 +207,12 @@ def read_cells(path: Path) -> Table:
     elif count > 1 and not any(cells[-1] for cells in rows):  # each line ends in a separator
         rows = [cells[:-1] for cells in rows]
         count = count - 1
-        expected = str(count) if 6 <= count <= len(MOT_COLUMNS) else expected
+        expected = str(count) if 6 <= count <= len(mot) else expected
     elif len(first) in (17, 18) and not _is_number(first[2]):
         table.kind = "KITTI"
-        columns = KITTI_COLUMNS
+        columns = kitti
         expected = str(count)
-    elif 6 <= count <= len(MOT_COLUMNS):
+    elif 6 <= count <= len(mot):
         expected = str(count)
     for cells, line in zip(rows, lines, strict=True):
         if str(len(cells)) != expected:

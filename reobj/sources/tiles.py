@@ -14,10 +14,6 @@ import numpy as np
 
 from reobj.types import Array, Detections, Image, IntArray, ReobjError, box_iou
 
-# Overlap of neighbouring tiles over their side: smaller objects are complete in one tile (SAHI: .2)
-TILE_OVERLAP = 0.25
-FUSION_IOU = 0.55  # IoU above which boxes of a class are fused (Solovyev et al.)
-
 
 def parse_tiles(text: str) -> tuple[int, int]:
     """Parse COLUMNSxROWS; "" is 1x1, the whole image.
@@ -33,11 +29,15 @@ def parse_tiles(text: str) -> tuple[int, int]:
     return columns, rows
 
 
-def tile_boxes(size: tuple[int, int], grid: tuple[int, int]) -> IntArray:
-    """Cut an image of (w, h) into overlapping tiles, (columns * rows, 4) x1, y1, x2, y2."""
+def tile_boxes(size: tuple[int, int], grid: tuple[int, int], overlap: float = 0.25) -> IntArray:
+    """Cut an image of (w, h) into overlapping tiles, (columns * rows, 4) x1, y1, x2, y2.
+
+    overlap: of neighbouring tiles, over their side: smaller objects are complete in one of them
+    (SAHI: .2).
+    """
     spans = []
     for length, count in zip(size, grid, strict=True):
-        side = length / (count - (count - 1) * TILE_OVERLAP)
+        side = length / (count - (count - 1) * overlap)
         start = np.linspace(0, length - side, count)
         spans.append(np.stack([np.floor(start), np.ceil(start + side)], 1).clip(0, length))
     (x, y) = spans
@@ -46,7 +46,9 @@ def tile_boxes(size: tuple[int, int], grid: tuple[int, int]) -> IntArray:
     return corners[:, [0, 2, 1, 3]].astype(np.int64)
 
 
-def weighted_box_fusion(xyxy: Array, score: Array, class_id: IntArray) -> tuple[Array, IntArray]:
+def weighted_box_fusion(
+    xyxy: Array, score: Array, class_id: IntArray, min_iou: float = 0.55
+) -> tuple[Array, IntArray]:
     """Fuse boxes of a class that overlap into their mean, weighted by the scores.
 
     Ref: Solovyev et al., Image and Vision Computing 2021. The score of a fused box is the highest,
@@ -54,6 +56,7 @@ def weighted_box_fusion(xyxy: Array, score: Array, class_id: IntArray) -> tuple[
 
     Args:
         xyxy: (N, 4). score, class_id: (N,).
+        min_iou: IoU above which boxes of a class are fused (.55 in the paper).
     Returns:
         boxes (K, 4), by descending score; row (K,) of the best box of each.
     """
@@ -62,7 +65,7 @@ def weighted_box_fusion(xyxy: Array, score: Array, class_id: IntArray) -> tuple[
     for row in np.argsort(-score, kind="stable").tolist():
         best = np.array([group[0] for group in groups], np.int64)  # (K,)
         iou = box_iou(xyxy[[row]], fused[: len(groups)])[0] * (class_id[best] == class_id[row])
-        if iou.max(initial=0) > FUSION_IOU:
+        if iou.max(initial=0) > min_iou:
             groups[k := int(iou.argmax())].append(row)
         else:
             k = len(groups)

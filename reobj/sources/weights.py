@@ -69,25 +69,24 @@ class Weights:
         return "; or take the small detector: --detector fast" if other else ""
 
 
-_DEIM = ("https://github.com/Kazuhito00/DEIMv2-ONNX-Sample/raw/"
-         "f88d4382abca74edb26ed4c7f46190ac40da0ea5/model/")  # fmt: skip
+def _deimv2(name: str, digest: str, size: int, note: str, alias: str = "") -> Weights:
+    """Describe one size of DEIMv2."""
+    file = f"deimv2_hgnetv2_{name}_coco.onnx"
+    source = "https://github.com/Kazuhito00/DEIMv2-ONNX-Sample/raw/"
+    url = f"{source}f88d4382abca74edb26ed4c7f46190ac40da0ea5/model/{file}"
+    return Weights(f"deimv2-{name}", "detector", file, url, digest, size, "Apache-2.0", note,
+                   "DEIM", alias)  # fmt: skip
+
+
 WEIGHTS: tuple[Weights, ...] = (
-    Weights("deimv2-n", "detector", "deimv2_hgnetv2_n_coco.onnx",
-            _DEIM + "deimv2_hgnetv2_n_coco.onnx",
-            "facaa27741d600e993b80f981b86997adbf7d556", 0,
-            "Apache-2.0", "default; COCO, AP 43.0 by its authors, not run by us", "DEIM"),
-    Weights("deimv2-pico", "detector", "deimv2_hgnetv2_pico_coco.onnx",
-            _DEIM + "deimv2_hgnetv2_pico_coco.onnx",
-            "e049f81944cdb9a4e0fd07de741abadcce9de516", 0,
-            "Apache-2.0", "COCO, AP 38.5 by its authors, not run by us", "DEIM"),
-    Weights("deimv2-femto", "detector", "deimv2_hgnetv2_femto_coco.onnx",
-            _DEIM + "deimv2_hgnetv2_femto_coco.onnx",
-            "c6ad358f750132b891165e034c2ba507abefc5ebe1c1d2732a0acbcacc47e52c", 4116144,
-            "Apache-2.0", "`--detector fast`; COCO, AP 33.2, 39 ms", "DEIM", "fast"),
-    Weights("deimv2-atto", "detector", "deimv2_hgnetv2_atto_coco.onnx",
-            _DEIM + "deimv2_hgnetv2_atto_coco.onnx",
-            "b114aa6610ac7c2bd9b3186ffb001afa872430db957407ef2473f7148d00646e", 2248408,
-            "Apache-2.0", "smallest; COCO, AP 25.5, 21 ms", "DEIM"),
+    _deimv2("n", "facaa27741d600e993b80f981b86997adbf7d556", 0,
+            "default; COCO, AP 43.0 by its authors, not run by us"),
+    _deimv2("pico", "e049f81944cdb9a4e0fd07de741abadcce9de516", 0,
+            "COCO, AP 38.5 by its authors, not run by us"),
+    _deimv2("femto", "c6ad358f750132b891165e034c2ba507abefc5ebe1c1d2732a0acbcacc47e52c", 4116144,
+            "`--detector fast`; COCO, AP 33.2, 39 ms", "fast"),
+    _deimv2("atto", "b114aa6610ac7c2bd9b3186ffb001afa872430db957407ef2473f7148d00646e", 2248408,
+            "smallest; COCO, AP 25.5, 21 ms"),
     Weights("yolox-nano", "detector", "yolox_nano_416.onnx",
             "https://github.com/Kazuhito00/YOLOX-ONNX-TFLite-Sample/raw/"
             "3d4f1119d0694200671c08069ecb847aa0d8495a/model/yolox_nano.onnx",
@@ -199,11 +198,8 @@ def _fetch(weights: Weights, offline: bool) -> Path:
     with contextlib.suppress(LockedError), locked(lock):
         return _fetch_alone(weights, target, missing, by_hand)
     log.warning("another process is fetching weights into %s: waiting for it", target.parent)
-    with locked(lock, DOWNLOAD_WAIT_S):
+    with locked(lock, wait_s=600.0):  # 100 MB at 1.3 Mbit/s
         return _fetch_alone(weights, target, missing, by_hand)
-
-
-DOWNLOAD_WAIT_S = 600.0  # s, longest wait for another process; chosen: 100 MB at 1.3 Mbit/s
 
 
 def _fetch_alone(weights: Weights, target: Path, missing: str, by_hand: str) -> Path:
@@ -245,9 +241,6 @@ def _writable_folder() -> Path:
     raise ReobjError(f"cannot write to {tried}: set REOBJ_MODELS to a writable folder")
 
 
-DOWNLOAD_MAX = 100_000_000  # bytes of a file of unknown size; chosen: several times the largest
-
-
 class StaysEncrypted(urllib.request.HTTPRedirectHandler):
     """Follow redirects, but not from an encrypted to an unencrypted connection."""
 
@@ -260,8 +253,11 @@ class StaysEncrypted(urllib.request.HTTPRedirectHandler):
         return super().redirect_request(req, fp, code, msg, headers, to)
 
 
-def _download(weights: Weights, part: Path) -> None:
-    """Download the file to `part`; an incomplete download is an error."""
+def _download(weights: Weights, part: Path, most: int = 100_000_000) -> None:
+    """Download the file to `part`; an incomplete download is an error.
+
+    most: bytes of a file of unknown size; several times the largest.
+    """
     request = urllib.request.Request(weights.url, headers={"User-Agent": "reobj_track"})
     opener = urllib.request.build_opener(StaysEncrypted)
     with (
@@ -270,10 +266,10 @@ def _download(weights: Weights, part: Path) -> None:
     ):
         if response.headers.get_content_type() in ("text/html", "application/xhtml+xml"):
             raise ConnectionError("a web page came instead: must you log in to this network first?")
-        size = weights.size or min(response.length or 0, DOWNLOAD_MAX)
+        size = weights.size or min(response.length or 0, most)
         done = 0
         with Progress("fetch kB", size // 1000) as progress:
-            while done < (size or DOWNLOAD_MAX) and (chunk := response.read(1 << 16)):
+            while done < (size or most) and (chunk := response.read(1 << 16)):
                 file.write(chunk)
                 done += len(chunk)
                 progress.step(done // 1000 - progress.done)
@@ -281,32 +277,30 @@ def _download(weights: Weights, part: Path) -> None:
                 raise ConnectionError(f"connection cut after {done} of {size} bytes")
 
 
-DEVICES = {  # onnxruntime's provider of each device, and the package that has it
-    "cpu": ("CPUExecutionProvider", "onnxruntime"),
-    "cuda": ("CUDAExecutionProvider", "onnxruntime-gpu"),
-    "tensorrt": ("TensorrtExecutionProvider", "onnxruntime-gpu"),
-    "coreml": ("CoreMLExecutionProvider", "onnxruntime, on a Mac"),
-    "directml": ("DmlExecutionProvider", "onnxruntime-directml"),
-    "openvino": ("OpenVINOExecutionProvider", "onnxruntime-openvino"),
-    "migraphx": ("MIGraphXExecutionProvider", "onnxruntime-migraphx"),
-}
-
-
 def onnx_session(path: Path, threads: int = 0, device: str = "cpu") -> Any:
-    """Make an onnxruntime session on a device of DEVICES (threads 0: all cores).
+    """Make an onnxruntime session on a device (threads 0: all cores).
 
     Raises:
         ReobjError: the device is unknown or not supported by this onnxruntime; or no ONNX model.
     """
-    if device not in DEVICES:
-        raise ReobjError(f"--device {device}: unknown; known are {', '.join(DEVICES)}")
+    devices = {  # onnxruntime's provider of each, and the package that has it
+        "cpu": ("CPUExecutionProvider", "onnxruntime"),
+        "cuda": ("CUDAExecutionProvider", "onnxruntime-gpu"),
+        "tensorrt": ("TensorrtExecutionProvider", "onnxruntime-gpu"),
+        "coreml": ("CoreMLExecutionProvider", "onnxruntime, on a Mac"),
+        "directml": ("DmlExecutionProvider", "onnxruntime-directml"),
+        "openvino": ("OpenVINOExecutionProvider", "onnxruntime-openvino"),
+        "migraphx": ("MIGraphXExecutionProvider", "onnxruntime-migraphx"),
+    }
+    if device not in devices:
+        raise ReobjError(f"--device {device}: unknown; known are {', '.join(devices)}")
     try:
         import onnxruntime
     except ImportError as error:
         raise ReobjError("ONNX models need onnxruntime: pip install onnxruntime") from error
-    provider, package = DEVICES[device]
+    provider, package = devices[device]
     if provider not in (available := onnxruntime.get_available_providers()):
-        have = ", ".join(name for name, (known, _) in DEVICES.items() if known in available)
+        have = ", ".join(name for name, (known, _) in devices.items() if known in available)
         raise ReobjError(f"--device {device}: this onnxruntime has {have} only; {provider} comes "
                          f"with {package} (in place of onnxruntime)")  # fmt: skip
     options = onnxruntime.SessionOptions()
@@ -314,7 +308,7 @@ def onnx_session(path: Path, threads: int = 0, device: str = "cpu") -> Any:
     options.log_severity_level = 3  # errors only: warnings concern the export of the model
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # no busy waiting
     try:
-        providers = list(dict.fromkeys([provider, DEVICES["cpu"][0]]))  # CPU for missing operators
+        providers = list(dict.fromkeys([provider, devices["cpu"][0]]))  # CPU for missing operators
         session = onnxruntime.InferenceSession(str(path), options, providers=providers)
     except Exception as error:
         reason = str(error).partition("\n")[0]
