@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from reobj.poses.bundle import read_arrays
-from reobj.poses.features import MIN_FOCAL_PAIRS, MIN_MATCHES, MatchedPairs, focal_from_pairs
+from reobj.poses.features import MIN_MATCHES, MatchedPairs, focal_from_pairs
 from reobj.poses.verification import consistent_groups, count_explained
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -62,7 +62,7 @@ def test_nearly_half_of_the_pairs_may_be_outliers():
 
 
 def test_few_pairs_or_few_matches_give_no_focal_length():
-    F = fundamental(0.8, MIN_FOCAL_PAIRS)
+    F = fundamental(0.8, 10)  # the least number
     assert focal_from_pairs(pairs_of(F), SIZE) is not None
     assert focal_from_pairs(pairs_of(F[1:]), SIZE) is None
     assert focal_from_pairs(pairs_of(F, matches=29), SIZE) is None
