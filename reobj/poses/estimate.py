@@ -273,7 +273,7 @@ def _enough_keyframes(video: ResizedVideo, most: int, line: Progress) -> list[Re
     return keys
 
 
-MAX_EXTRA = 8  # keyframes added between two at a break (chosen)
+MAX_EXTRA = 8  # keyframes added between two at a break (chosen; more take longer)
 
 
 def rows_around_breaks(key_rows: list[int], component_rows: list[IntArray]) -> list[int]:

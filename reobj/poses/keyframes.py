@@ -220,7 +220,7 @@ def pick_keyframes(
 # ---- Keyframes of supplied poses -----------------------------------------------------------------
 
 
-MIN_KEYFRAMES = 40  # with fewer the steps between them are halved (chosen)
+MIN_KEYFRAMES = 40  # with fewer the steps are halved (chosen; lower: too wide to be matched)
 
 
 def path_steps(poses: Poses, turn_deg: float = 8.0, spread_step: float = 1 / 8) -> Array:

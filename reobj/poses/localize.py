@@ -196,7 +196,8 @@ def _detours(cam_from_world: Array, most: float = 5.0) -> BoolArray:
     return detour
 
 
-NEAR_GAPS = 2.0  # gap lengths, before and after it, in which the error is measured (chosen)
+# Gap lengths, before and after it, in which the error is measured (chosen; higher: other motion)
+NEAR_GAPS = 2.0
 
 
 def fill_gaps(

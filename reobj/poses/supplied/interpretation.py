@@ -34,8 +34,6 @@ from reobj.poses.features import MAX_RATIO
 from reobj.sources.video import shrunk
 from reobj.types import Array, Image, IntArray, Tracks, rows_by
 
-MIN_LOG_RATIO = math.log(1000)  # log likelihood ratio over every other reading (chosen)
-
 
 @dataclass(frozen=True, slots=True)
 class PoseReading:
@@ -64,11 +62,14 @@ class PoseReading:
 Compare = Callable[[Poses, Poses], tuple[Array, Array]]
 
 
-def likeliest(readings: Sequence[PoseReading], compare: Compare, data: str) -> list[PoseReading]:
+def likeliest(
+    readings: Sequence[PoseReading], compare: Compare, data: str, min_ratio: float = 1000.0
+) -> list[PoseReading]:
     """Return the one reading that is likelier than every other, else all of them.
 
     Args:
         data: that give the residuals, for the message.
+        min_ratio: of its likelihood over that of every other (chosen; lower: chance may decide).
     """
     least_px = 1e-3  # residuals are not smaller: rounding of poses in text files
     for one in readings:
@@ -84,7 +85,7 @@ def likeliest(readings: Sequence[PoseReading], compare: Compare, data: str) -> l
                 break
             size = float(np.exp(np.log(residuals.clip(least_px)).mean()))
             other_size = float(np.exp(np.log(other_residuals.clip(least_px)).mean()))
-            is_likeliest &= count * math.log(other_size / size) > MIN_LOG_RATIO
+            is_likeliest &= count * math.log(other_size / size) > math.log(min_ratio)
             sizes.append(f"{size:.2g} px, by {other.rule} {other_size:.2g} px")
         if is_likeliest and sizes:
             measured = f"it fits {data} within {'; '.join(sizes)}"
@@ -95,7 +96,7 @@ def likeliest(readings: Sequence[PoseReading], compare: Compare, data: str) -> l
 # ---- By images -----------------------------------------------------------------------------------
 
 
-MIN_PAIRS = 3  # with fewer there is no decision (chosen)
+MIN_PAIRS = 3  # with fewer there is no decision (chosen; lower: one wrong pair decides)
 
 
 def by_images(readings: Sequence[PoseReading], video: Any) -> list[PoseReading]:
