@@ -87,7 +87,6 @@ from reobj.options import (
     write_config,
 )
 from reobj.poses.estimate import PosesConfig, estimate_poses
-from reobj.poses.imageless import open_video
 from reobj.poses.stage import (
     poses_key,
     reconstruct_cached,
@@ -95,6 +94,7 @@ from reobj.poses.stage import (
     supplied_poses,
     write_supplied_model,
 )
+from reobj.poses.supplied.imageless import open_video
 from reobj.poses.supplied.interpretation import PoseReading
 from reobj.poses.supplied.readers import read_poses
 from reobj.results.edits import kept_edits, read_edits

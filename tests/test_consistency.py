@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from reobj.poses.bundle import read_arrays
-from reobj.poses.features import MIN_FOCAL_PAIRS, MatchedPairs, focal_from_pairs
-from reobj.poses.verification import MIN_BRIDGE, consistent_groups, count_explained
+from reobj.poses.features import MIN_MATCHES, MatchedPairs, focal_from_pairs
+from reobj.poses.verification import consistent_groups, count_explained
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -62,7 +62,7 @@ def test_nearly_half_of_the_pairs_may_be_outliers():
 
 
 def test_few_pairs_or_few_matches_give_no_focal_length():
-    F = fundamental(0.8, MIN_FOCAL_PAIRS)
+    F = fundamental(0.8, 10)  # the least number
     assert focal_from_pairs(pairs_of(F), SIZE) is not None
     assert focal_from_pairs(pairs_of(F[1:]), SIZE) is None
     assert focal_from_pairs(pairs_of(F, matches=29), SIZE) is None
@@ -158,7 +158,7 @@ def test_a_good_model_stays_whole():
     assert Scene().groups() == numbers((1, 13))
 
 
-@pytest.mark.parametrize("ties", [MIN_BRIDGE - 1, 0])
+@pytest.mark.parametrize("ties", [MIN_MATCHES - 1, 0])
 def test_groups_connected_by_too_few_points_are_separated(ties):
     scene = Scene()
     scene.untie(7, ties)
@@ -179,13 +179,13 @@ def test_points_common_to_distant_views_only_connect_nothing(back, found):
     scene = Scene()
     scene.poses[7:, 2, 3] += back
     scene.xy[7:] = [scene.project(pose)[0] for pose in scene.poses[7:]]
-    scene.untie(7, 2 * MIN_BRIDGE)
+    scene.untie(7, 2 * MIN_MATCHES)
     assert scene.groups() == numbers(*found)
 
 
 def test_fewer_than_three_loosely_connected_images_form_no_group():
     scene = Scene()
-    scene.untie(10, MIN_BRIDGE - 1)
+    scene.untie(10, MIN_MATCHES - 1)
     assert scene.groups() == numbers((1, 11))
 
 

@@ -14,7 +14,7 @@ from pose_worlds import FakeVideo, motion, supplied
 import reobj_track as rt
 from reobj.cameras import invert_rigid, read_sparse_model, write_colmap
 from reobj.poses import stage
-from reobj.poses.depth import add_depth, depth_scale, find_depth_maps
+from reobj.poses.supplied.depth import add_depth, depth_scale, find_depth_maps
 from reobj.results.workspace import Workspace
 
 SIZE = (320, 240)

@@ -124,7 +124,7 @@ def test_the_seed_reaches_pnp(reconstructed, tmp_path, monkeypatch):
 def test_gaps_are_filled_up_to_max_gap(reconstructed, tmp_path, monkeypatch, max_gap, filled):
     """Where the error is small enough; frames without a camera are named."""
     monkeypatch.setattr("reobj.poses.estimate.MAX_GAP", max_gap)
-    monkeypatch.setattr("reobj.poses.localize.PNP_ERROR_PX", 1000.0)  # camera shake
+    monkeypatch.setattr("reobj.poses.localize.INLIER_PX", 1000.0)  # camera shake
     video, _, _, poses = reconstructed
     video = FakeVideo(video.images, [f"{k:03d}.jpg" for k in range(30)])
     cams, status = poses.cam_from_world.copy(), poses.status.copy()

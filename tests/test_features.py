@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reobj.poses.features import MAX_ANGLE, MAX_RATIO, _matches
+from reobj.poses.features import MAX_RATIO, _matches
 
 
 def unit(rows):
@@ -20,7 +20,7 @@ def brute_force(a, b):
         j = int(row.argmin())
         column = angle[:, j]
         rivals = np.delete(row, j).min(), np.delete(column, i).min()
-        if row[j] < MAX_ANGLE and all(row[j] < MAX_RATIO * rival for rival in rivals):
+        if row[j] < 0.7 and all(row[j] < MAX_RATIO * rival for rival in rivals):
             found.append((i, j))
     return found
 

@@ -8,12 +8,15 @@ import pytest
 from pose_worlds import FakeVideo, textured_room
 
 from reobj.files import Progress
-from reobj.poses.keyframes import ResizedVideo, follow_points, pick_keyframes
+from reobj.poses.keyframes import FlowOptions, ResizedVideo, follow_points, pick_keyframes
 
 
 def rows(images, most=150, size_px=640, **options):
     return [
-        k.row for k in pick_keyframes(ResizedVideo(FakeVideo(images), size_px), most, **options)
+        k.row
+        for k in pick_keyframes(
+            ResizedVideo(FakeVideo(images), size_px), most, FlowOptions(**options)
+        )
     ]
 
 

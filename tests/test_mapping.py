@@ -133,7 +133,7 @@ def search(monkeypatch):
         return search.made
 
     monkeypatch.setattr(mapping, "_set_focal", lambda *_: None)
-    monkeypatch.setattr(mapping, "constant_focal", lambda _: (np.empty(0), []))
+    monkeypatch.setattr(mapping, "constant_focal", lambda *_: (np.empty(0), []))
     monkeypatch.setattr(search, "_components", components)
     monkeypatch.setattr(mapping, "models_of_one_camera", lambda sound: [c.model for c in sound])
     return search
@@ -157,7 +157,7 @@ def test_an_undetermined_focal_length_is_kept_and_reported(search):
 
 
 def test_a_refused_component_is_reported_with_the_reason(search, monkeypatch):
-    monkeypatch.setattr(mapping, "confirmed", lambda components, others, source: components)
+    monkeypatch.setattr(mapping, "confirmed", lambda components, *_: components)
     still = component(16, 27, problem="the camera hardly moved")
     search.made = [component(1, 15), still, component(28, 30)]
     search.focal = MATCHES
@@ -183,7 +183,7 @@ def test_a_complete_global_model_needs_no_confirmation(search, monkeypatch):
 )
 def test_weak_geometry_needs_matches_or_another_mapper(search, monkeypatch, focal, sigma, count):
     """The matches determine the focal length without any model."""
-    monkeypatch.setattr(mapping, "confirmed", lambda components, others, source: components)
+    monkeypatch.setattr(mapping, "confirmed", lambda components, *_: components)
     search.made = [component(sigma=sigma, focal=focal)]
     search.focal = MATCHES
     search.run()
@@ -205,8 +205,10 @@ def test_a_second_mapper_with_a_fixed_focal_length_does_not_confirm_it(search, m
 def test_a_zoom_in_a_refused_component_removes_no_images(search, monkeypatch):
     """Its points have too little parallax; it is checked only if no other component is sound."""
     asked = []
-    monkeypatch.setattr(mapping, "confirmed", lambda components, others, source: components)
-    monkeypatch.setattr(mapping, "constant_focal", lambda a: (asked.append(a) or np.empty(0), []))
+    monkeypatch.setattr(mapping, "confirmed", lambda components, *_: components)
+    monkeypatch.setattr(
+        mapping, "constant_focal", lambda a, _: (asked.append(a) or np.empty(0), [])
+    )
     good, bad = component(1, 15), component(16, 30, problem="the camera hardly moved")
     search.focal = MATCHES
     for made in ([good, bad], [bad]):
@@ -218,7 +220,7 @@ def test_a_zoom_in_a_refused_component_removes_no_images(search, monkeypatch):
 def test_a_focal_length_that_keeps_changing_is_refused(search, monkeypatch):
     found = iter([[1], [2], [3], [4]])
     changes = [(4, 5, 1.3)]
-    monkeypatch.setattr(mapping, "constant_focal", lambda _: (np.array(next(found)), changes))
+    monkeypatch.setattr(mapping, "constant_focal", lambda *_: (np.array(next(found)), changes))
     search.made = [component()]
     search.focal = MATCHES
     models, (message,) = search.run()
@@ -233,7 +235,7 @@ def test_after_a_zoom_the_kept_images_determine_the_focal_length(search, monkeyp
     keypoints = dict.fromkeys(range(1, 31))
     search.pairs = MatchedPairs(ids, matches, keypoints, fundamental(1.1, 40))
     found = iter([(np.array([22, 23]), [(21, 22, 1.4)]), (np.empty(0), [])])
-    monkeypatch.setattr(mapping, "constant_focal", lambda _: next(found))
+    monkeypatch.setattr(mapping, "constant_focal", lambda *_: next(found))
     search.made = [component(1, 21)]
     search.focal = Focal(0.9, FocalSource.MATCHES)
     search.run()
@@ -251,7 +253,7 @@ def test_a_zoom_with_a_given_camera_keeps_its_focal_length(
     found = iter([(np.array([22, 23]), [(21, 22, 1.4)]), (np.empty(0), [])])
     arrays = SimpleNamespace(focal_over_size=focal)
     freed = SimpleNamespace(arrays=arrays, calibrated=calibrated)
-    monkeypatch.setattr(mapping, "constant_focal", lambda _: next(found))
+    monkeypatch.setattr(mapping, "constant_focal", lambda *_: next(found))
     monkeypatch.setattr(mapping, "adjusted", lambda model, calibrate: freed)
     search.focal, search.made = Focal(0.8, FocalSource.GIVEN), [component(1, 21)]
     models, messages = search.run()

@@ -10,9 +10,10 @@ from test_consistency import Scene
 from reobj.poses import bundle
 from reobj.poses.bundle import adjusted, read_arrays, refine, relative_sigmas, submodel
 from reobj.poses.mapping import models_of_one_camera
-from reobj.poses.verification import MIN_JOINT, Component, FocalSource, confirmed
+from reobj.poses.verification import Component, ConfirmationOptions, FocalSource, confirmed
 
 pycolmap = pytest.importorskip("pycolmap")
+JOINT = ConfirmationOptions().joint_points
 
 
 def centres_of(model):
@@ -184,8 +185,8 @@ def piece(first, last):
     [
         ([(1, 7), (7, 13)], None, True),  # two pieces, by all common points
         ([(7, 13), (1, 4), (4, 7)], None, True),  # in any order
-        ([(1, 7), (7, 13)], MIN_JOINT, True),
-        ([(1, 7), (7, 13)], MIN_JOINT - 1, False),
+        ([(1, 7), (7, 13)], JOINT, True),
+        ([(1, 7), (7, 13)], JOINT - 1, False),
         ([(1, 7), (8, 13)], None, True),  # without an image
         ([(1, 5), (9, 13)], None, False),  # without a third of them
         ([(1, 9), (9, 11)], None, False),  # the scale of a pair is arbitrary

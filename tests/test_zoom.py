@@ -8,7 +8,7 @@ from test_consistency import CAMERA, Scene
 
 from reobj.poses import verification
 from reobj.poses.bundle import read_arrays
-from reobj.poses.verification import constant_focal
+from reobj.poses.verification import ZoomOptions, constant_focal
 
 
 def zoomed_scene(zoomed, ratio, seed=0, noise_px=0.3):
@@ -53,7 +53,9 @@ def test_evidence_of_one_side_must_be_stronger(monkeypatch, log, sigma, found):
 
     monkeypatch.setattr(verification, "_triangulate", lambda arrays, terms, side: side)
     monkeypatch.setattr(verification, "_log_focal", log_focal)
-    assert [(a, b) for a, b, _ in verification._changes(views, 1)] == [(13, 14)] * found
+    assert [(a, b) for a, b, _ in verification._changes(views, ZoomOptions(resected=1))] == [
+        (13, 14)
+    ] * found
 
 
 def test_the_focal_length_of_most_images_is_kept():
@@ -68,12 +70,12 @@ def test_one_focal_length_is_no_zoom(ratio):
     assert len(others) == 0 and changes == []
 
 
-def test_a_short_zoom_separates_its_two_sides(monkeypatch):
+def test_a_short_zoom_separates_its_two_sides():
     """Between two near changes no focal length can be measured from one side alone."""
     views = views_of(range(7, 13), 1.3)
     assert constant_focal([views])[0].tolist() == list(range(8, 21))  # the first of equal sides
-    monkeypatch.setattr(verification, "WINDOW", 6)  # both sides of it are measured separately
-    assert constant_focal([views])[0].tolist() == list(range(8, 14))
+    narrow = ZoomOptions(window=6)  # both sides of it are measured separately
+    assert constant_focal([views], narrow)[0].tolist() == list(range(8, 14))
 
 
 def test_models_are_checked_individually():

@@ -18,11 +18,20 @@ from reobj.cameras import import_pycolmap
 from reobj.types import Array, BoolArray, IntArray
 
 MIN_TRI_ANGLE_DEG = 1.5  # between rays that triangulate a point (COLMAP's min_tri_angle)
-# Least n - |sum of u|^2 / n of the unit rays u to a point that triangulate it: it is
-# 1 - cos(angle) for two rays
-MIN_RAY_SPREAD = 1 - np.cos(np.radians(MIN_TRI_ANGLE_DEG))
-
+INLIER_PX = 4.0  # largest error of an inlier, resized images (COLMAP's filter_max_reproj_error)
 FOCAL_RANGE = (0.4, 2.0)  # plausible focal length over the longer side (chosen: 28-103 deg wide)
+
+
+def triangulates(count: Array, squared_sum: Array) -> BoolArray:
+    """True (N,) where the rays to a point spread enough to triangulate it.
+
+    Of n unit rays u, n - |sum of u|^2 / n is 1 - cos(angle) for two.
+
+    Args:
+        count: (N,) n. squared_sum: (N,) |sum of u|^2.
+    """
+    spread = count - squared_sum / np.maximum(count, 1)
+    return np.asarray(spread >= 1 - np.cos(np.radians(MIN_TRI_ANGLE_DEG)), bool)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +75,7 @@ class ModelArrays:
         return observed
 
     def triangulated_by(self, rows: IntArray) -> BoolArray:
-        """Mark the points (N,) that some images alone triangulate, by `MIN_RAY_SPREAD`."""
+        """Mark the points (N,) that some images alone triangulate, by `triangulates`."""
         mine = np.isin(self.image, rows)
         image = self.image[mine]
         count = len(self.xyz)
@@ -74,8 +83,7 @@ class ModelArrays:
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
         entries = (np.ones(len(image)), (self.point[mine], np.arange(len(image))))
         sums = sparse.csr_matrix(entries, (count, len(image))) @ np.insert(ray, 3, 1, 1)  # (N, 4)
-        spread = sums[:, 3] - (sums[:, :3] ** 2).sum(1) / np.maximum(sums[:, 3], 1)
-        return np.asarray(spread >= MIN_RAY_SPREAD, bool)
+        return triangulates(sums[:, 3], (sums[:, :3] ** 2).sum(1))
 
     def points_in_cam(self) -> Array:
         """Return the observed points (M, 3) in the frames of their images."""

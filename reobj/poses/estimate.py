@@ -21,9 +21,8 @@ from reobj.cameras import Camera, Poses, SparseModel, import_pycolmap, read_spar
 from reobj.files import Progress, spans
 from reobj.poses.intrinsics import parse_camera
 from reobj.poses.keyframes import (
-    MAX_FLOW,
-    MIN_FLOW,
     MIN_KEYFRAMES,
+    FlowOptions,
     ResizedFrame,
     ResizedVideo,
     pick_keyframes,
@@ -262,19 +261,19 @@ def _enough_keyframes(video: ResizedVideo, most: int, line: Progress) -> list[Re
     Of so few images all are keyframes: they are photos, with wide steps.
     """
     keys = pick_keyframes(video.first_pass(line), most)
-    max_flow = MAX_FLOW
+    options = FlowOptions()
     if not video.frames:
         raise ReobjError("no readable frame in the video: nothing to reconstruct")
     if len(video.frames) <= MIN_KEYFRAMES:
         return list(video)
     wanted = min(MIN_KEYFRAMES, most // 2)  # thinning leaves half of them
-    while len(keys) < wanted and max_flow > 2 * MIN_FLOW:
-        max_flow /= 2
-        keys = pick_keyframes(video, most, max_flow)
+    while len(keys) < wanted and options.max_flow > 2 * options.min_flow:
+        options = dataclasses.replace(options, max_flow=options.max_flow / 2)
+        keys = pick_keyframes(video, most, options)
     return keys
 
 
-MAX_EXTRA = 8  # keyframes added between two at a break (chosen)
+MAX_EXTRA = 8  # keyframes added between two at a break (chosen; more take longer)
 
 
 def rows_around_breaks(key_rows: list[int], component_rows: list[IntArray]) -> list[int]:

@@ -60,9 +60,6 @@ def extract_features(
         cv2.setNumThreads(threads)
 
 
-SIFT_FEATURES = 1200  # a keyframe, the strongest (measured: 2000 are slower and no better)
-
-
 def _root_sift(bgr: Image, boxes: Array) -> tuple[npt.NDArray[np.float32], Image]:
     """Detect features outside the boxes and describe them by RootSIFT.
 
@@ -77,7 +74,8 @@ def _root_sift(bgr: Image, boxes: Array) -> tuple[npt.NDArray[np.float32], Image
     for x1, y1, x2, y2 in np.maximum(boxes.reshape(-1, 4), 0):
         mask[math.floor(y1) : math.ceil(y2), math.floor(x1) : math.ceil(x2)] = 0
     for contrast in (0.02, 0.007):  # OpenCV's default: .04; the second for plain walls
-        sift: Any = cv2.SIFT.create(nfeatures=SIFT_FEATURES, contrastThreshold=contrast)
+        # the 1200 strongest: 2000 are slower and no better (measured)
+        sift: Any = cv2.SIFT.create(nfeatures=1200, contrastThreshold=contrast)
         keypoints, descriptors = sift.detectAndCompute(gray, mask)
         if len(keypoints) >= 500:
             break
@@ -90,7 +88,6 @@ def _root_sift(bgr: Image, boxes: Array) -> tuple[npt.NDArray[np.float32], Image
 
 
 MAX_RATIO = 0.8  # of angles or distances to the best and the second best (Lowe, IJCV 2004; COLMAP)
-MAX_ANGLE = 0.7  # between matching descriptors, radians (COLMAP)
 MIN_MATCHES = 30  # verified matches of a pair that count as evidence (COLMAP registers from 30 on)
 
 
@@ -172,17 +169,17 @@ def _matches(a: Floats, b: Floats) -> npt.NDArray[np.uint32]:
 def _distinct(top: Floats, second: Floats) -> BoolArray:
     """Apply the ratio test to cosines of the best and of the second best."""
     angle, rival = (np.arccos(np.clip(cosine, -1, 1)) for cosine in (top, second))
-    return np.asarray((angle < MAX_RATIO * rival) & (angle < MAX_ANGLE), bool)
+    most = 0.7  # radians (COLMAP's max_distance)
+    return np.asarray((angle < MAX_RATIO * rival) & (angle < most), bool)
 
 
-RETRIEVED_PAIRS = 6  # with the most similar keyframes, to close loops (chosen)
-
-
-def _pairs_from_retrieval(descriptors: list[Image], seed: int) -> list[tuple[int, int]]:
-    """Find the pairs of keyframes with the most similar VLAD vectors.
+def _pairs_from_retrieval(
+    descriptors: list[Image], seed: int, count: int = 6
+) -> list[tuple[int, int]]:
+    """Find the pairs of keyframes with the most similar VLAD vectors, to close loops.
 
     Args:
-        descriptors: (n, 128) of each keyframe.
+        descriptors: (n, 128) of each keyframe. count: pairs of each (chosen; more take longer).
     Ref: Jegou et al., CVPR 2010.
     """
     features = np.concatenate(descriptors).astype(np.float32)  # (N, 128)
@@ -204,7 +201,7 @@ def _pairs_from_retrieval(descriptors: list[Image], seed: int) -> list[tuple[int
     similarity = flat @ flat.T  # (K, K)
     order = np.arange(len(flat))
     similarity[np.abs(order[:, None] - order) <= 2] = -np.inf  # matched already
-    best = np.argsort(-similarity, axis=1, kind="stable")[:, :RETRIEVED_PAIRS]
+    best = np.argsort(-similarity, axis=1, kind="stable")[:, :count]
     return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(best) for j in row})
 
 
@@ -287,22 +284,23 @@ def read_pairs(database: Path) -> MatchedPairs:
     )
 
 
-MIN_FOCAL_PAIRS = 10  # pairs whose epipolar geometry is trusted together (chosen)
-
-
-def focal_from_pairs(pairs: MatchedPairs, size: tuple[int, int]) -> float | None:
+def focal_from_pairs(
+    pairs: MatchedPairs, size: tuple[int, int], min_pairs: int = 10
+) -> float | None:
     """Estimate the focal length that turns fundamental matrices into essential ones.
 
     E = K' F K has two equal singular values for the true K. The cost of each focal length on a grid
     is the median over pairs of 1 - s2 / s1: half of the pairs may be wrong, and there is no start
     value and no local minimum.
 
+    Args:
+        min_pairs: whose median is trusted (chosen; lower: a few wrong pairs decide).
     Returns:
         focal length over the longer side; None with too few pairs.
     Ref: Mendonca and Cipolla, CVPR 1999.
     """
     F = pairs.fundamental[pairs.enough & np.isfinite(pairs.fundamental[:, 0, 0])]  # (P, 3, 3)
-    if len(F) < MIN_FOCAL_PAIRS:
+    if len(F) < min_pairs:
         return None
     tried = np.geomspace(*FOCAL_RANGE, 161)  # (S,) 1 % apart
     K = np.zeros((len(tried), 3, 3))

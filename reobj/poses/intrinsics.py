@@ -204,16 +204,6 @@ def _focal_and_centre(matrix: Any) -> tuple[float, float, float, float]:
     return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
 
 
-# Names and keys in the wild, also below: COLMAP, nerfstudio and instant-ngp, OpenCV and ROS,
-# Open3D, Record3D, RealSense
-BROWN_MODELS = (
-    "", "NONE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV",
-    "PERSPECTIVE", "PLUMB_BOB", "RATIONAL_POLYNOMIAL", "RADTAN", "RADIAL-TANGENTIAL",
-    "RADIAL_TANGENTIAL",
-)  # fmt: skip
-FISHEYE_MODELS = ("OPENCV_FISHEYE", "FISHEYE", "EQUIDISTANT", "KANNALA_BRANDT4")
-
-
 def camera_from_json(data: Any, size: tuple[int, int] | None) -> Camera | None:
     """Make a camera from the keys of JSON files of various tools.
 
@@ -227,6 +217,14 @@ def camera_from_json(data: Any, size: tuple[int, int] | None) -> Camera | None:
     Returns:
         the camera at the size of the data; None without a focal length.
     """
+    # names and keys, also below, of COLMAP, nerfstudio and instant-ngp, OpenCV and ROS, Open3D,
+    # Record3D, RealSense
+    fisheye = ("OPENCV_FISHEYE", "FISHEYE", "EQUIDISTANT", "KANNALA_BRANDT4")
+    brown = (
+        "", "NONE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV",
+        "PERSPECTIVE", "PLUMB_BOB", "RATIONAL_POLYNOMIAL", "RADTAN", "RADIAL-TANGENTIAL",
+        "RADIAL_TANGENTIAL",
+    )  # fmt: skip
     data = data | next((data[k] for k in ("camera", "intrinsics") if _is_object(data.get(k))), {})
     sides = (("w", "h"), ("width", "height"), ("image_width", "image_height"))
     size = next(
@@ -241,10 +239,10 @@ def camera_from_json(data: Any, size: tuple[int, int] | None) -> Camera | None:
     pinhole = _pinhole_of_json(data, size)
     if pinhole is None:
         return None
-    if data.get("is_fisheye") or model in FISHEYE_MODELS:
+    if data.get("is_fisheye") or model in fisheye:
         width, height = _sized(size)
         return Camera("OPENCV_FISHEYE", width, height, (*pinhole, *_terms(data, "k1 k2 k3 k4")))
-    if model in BROWN_MODELS:
+    if model in brown:
         return brown_camera(size, *pinhole, *_terms(data, "k1 k2 p1 p2 k3 k4 k5 k6"))
     return _camera_of_names(model, data, pinhole, _sized(size))
 

@@ -126,8 +126,9 @@ def _corners(gray: Image) -> Array:
 class _KeyframeFlow:
     """Optical flow since a keyframe: its corners, tracked from frame to frame."""
 
-    def __init__(self, key: ResizedFrame) -> None:
+    def __init__(self, key: ResizedFrame, min_left: float) -> None:
         self.row = key.row
+        self.min_left = min_left
         self.gray = key.gray
         self.start = self.corners = _corners(key.gray)  # (N, 2) in the keyframe, the last frame
         self.count = max(len(self.start), 1)
@@ -141,7 +142,7 @@ class _KeyframeFlow:
             the last that had some.
         """
         ahead, kept = follow_points(self.gray, frame.gray, self.corners)
-        if kept.sum() < MIN_CORNERS_LEFT * self.count and not frame.has_texture:
+        if kept.sum() < self.min_left * self.count and not frame.has_texture:
             return None
         self.start = self.start[kept]
         self.corners = ahead[kept]
@@ -151,23 +152,33 @@ class _KeyframeFlow:
         return float(np.median(flow)) / frame.gray.shape[1] if kept.any() else 0.0, left
 
 
-MAX_FLOW = 0.12  # median flow that makes a keyframe, over the width (chosen)
-MIN_FLOW = 0.015  # flow that counts as motion, over the width (chosen: 10 px of 640)
-MIN_CORNERS_LEFT = 0.55  # fraction of the corners below which a keyframe is added (chosen)
-MAX_INTERVAL = 60  # frames after which any motion makes a keyframe (chosen: 2 s)
+@dataclass(frozen=True, slots=True)
+class FlowOptions:
+    """What makes a frame the next keyframe.
+
+    Attributes:
+        max_flow: median flow since the last keyframe, over the width (chosen; lower: more
+            keyframes, which take longer).
+        min_flow: flow that counts as motion, over the width (chosen: 10 px of 640).
+        min_left: fraction of the last keyframe's corners that can still be tracked (chosen; higher:
+            more keyframes where the scene changes quickly).
+        max_interval: frames after which any motion makes a keyframe (chosen: 2 s at 30 Hz).
+    """
+
+    max_flow: float = 0.12
+    min_flow: float = 0.015
+    min_left: float = 0.55
+    max_interval: int = 60
 
 
 def pick_keyframes(
-    frames: Iterable[ResizedFrame], max_keyframes: int, max_flow: float = MAX_FLOW
+    frames: Iterable[ResizedFrame], max_keyframes: int, options: FlowOptions = FlowOptions()
 ) -> list[ResizedFrame]:
     """Choose keyframes by optical flow, the sharpest near the threshold, with the first and last.
 
     When there are more than `max_keyframes`, every second one is dropped and the thresholds double:
     one pass, bounded memory, reproducible. An image without texture (black, white) is no keyframe:
     nothing in it can be matched.
-
-    Args:
-        max_flow: median flow since the last keyframe, over the width, that makes the next one.
     """
     keys: list[ResizedFrame] = []
     replay: deque[ResizedFrame] = deque()  # frames after a keyframe that were read already
@@ -181,17 +192,17 @@ def pick_keyframes(
         if track is None:
             if frame.has_texture:
                 keys = [frame]
-                track = _KeyframeFlow(frame)
+                track = _KeyframeFlow(frame, options.min_left)
                 last = frame
             continue
         if (update := track.update(frame)) is None:
             continue
         last = frame
         flow, left = update
-        if flow >= 0.7 * wider * max_flow:  # near the threshold: the sharpest is chosen
+        if flow >= 0.7 * wider * options.max_flow:  # near the threshold: the sharpest is chosen
             window.append(frame)
-        late = frame.row - track.row >= wider * MAX_INTERVAL and flow > MIN_FLOW
-        if late or flow > wider * max_flow or left < MIN_CORNERS_LEFT**wider:
+        late = frame.row - track.row >= wider * options.max_interval and flow > options.min_flow
+        if late or flow > wider * options.max_flow or left < options.min_left**wider:
             best = max(window or [frame], key=lambda f: cv2.Laplacian(f.gray, cv2.CV_32F).var())
             replay.extendleft(f for f in reversed(window) if f.row > best.row)
             keys.append(best)
@@ -199,8 +210,8 @@ def pick_keyframes(
                 keys = keys[::2]
                 wider *= 2
             window = []
-            track = _KeyframeFlow(best)
-    moved = flow > MIN_FLOW or len(keys) == 1
+            track = _KeyframeFlow(best, options.min_left)
+    moved = flow > options.min_flow or len(keys) == 1
     if last is None or last.row == keys[-1].row or not moved:
         return keys
     return [*keys[: max(max_keyframes - 1, 1)], last]
@@ -209,23 +220,25 @@ def pick_keyframes(
 # ---- Keyframes of supplied poses -----------------------------------------------------------------
 
 
-MIN_KEYFRAMES = 40  # with fewer the steps between them are halved (chosen)
-TURN_STEP_DEG = 8.0  # rotation between keyframes (chosen: an eighth of a usual field of view)
-SPREAD_STEP = 1 / 8  # translation between them, over the rms spread of the path: an orbit's 7 deg
+MIN_KEYFRAMES = 40  # with fewer the steps are halved (chosen; lower: too wide to be matched)
 
 
-def path_steps(poses: Poses) -> Array:
+def path_steps(poses: Poses, turn_deg: float = 8.0, spread_step: float = 1 / 8) -> Array:
     """Express poses as coordinates (F, 6) in which keyframes are 1 apart; NaN: no pose.
 
-    The first three are the viewing direction over TURN_STEP_DEG, the others the camera's centre
-    over SPREAD_STEP of the path's rms spread: distances are relative, whatever the scale.
+    The first three are the viewing direction, the others the camera's centre. Translations are
+    relative to the path's rms spread, whatever the scale.
+
+    Args:
+        turn_deg: rotation between keyframes (chosen: an eighth of a usual field of view).
+        spread_step: translation between them, over the spread (chosen: 7 deg of an orbit).
     """
     world_from_cam = invert_rigid(poses.cam_from_world)  # (F, 3, 4)
     centre = world_from_cam[:, :, 3]
     spread = np.sqrt(np.nanvar(centre, axis=0).sum()) if poses.known.any() else 0.0
     # for small angles the distance on the unit sphere is the angle
-    turn = world_from_cam[:, :, 2] / np.radians(TURN_STEP_DEG)
-    return np.column_stack([turn, centre / max(SPREAD_STEP * spread, 1e-12)])
+    turn = world_from_cam[:, :, 2] / np.radians(turn_deg)
+    return np.column_stack([turn, centre / max(spread_step * spread, 1e-12)])
 
 
 def choose_posed_keyframes(steps: Array) -> IntArray:

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from reobj.cameras import Camera, SparseModel, import_pycolmap, invert_rigid
 from reobj.files import Progress
+from reobj.poses.bundle import INLIER_PX
 from reobj.poses.keyframes import ResizedVideo, follow_points
 from reobj.types import Array, BoolArray, Image, IntArray
 
@@ -142,44 +143,47 @@ def _track_model_points(
     return tracked
 
 
-PNP_MIN_INLIERS = 15  # of an accepted pose (chosen; COLMAP registers images from 30 on)
-PNP_MIN_RATIO = 0.5  # of inliers among the tracked points (chosen; COLMAP: .25 of raw matches)
-PNP_ERROR_PX = 4.0  # of an inlier, pixels of the resized image (chosen; COLMAP: 12)
-
-
 def absolute_pose(
-    xy: Array, points: Array, camera: Camera, resized_width: int, seed: int
+    xy: Array,
+    points: Array,
+    camera: Camera,
+    resized_width: int,
+    seed: int,
+    min_inliers: int = 15,
+    min_ratio: float = 0.5,
 ) -> Array | None:
     """Estimate the pose of a frame from 3D points and their pixels (PnP, RANSAC, refinement).
 
     Args:
         xy: (n, 2) native pixels, COLMAP's. points: (n, 3) in world. resized_width: pixels of the
-            image in which the points were tracked; PNP_ERROR_PX is in its pixels.
+            image in which the points were tracked; INLIER_PX is in its pixels.
+        min_inliers: of an accepted pose (chosen; COLMAP registers images from 30 on).
+        min_ratio: of inliers among the tracked points (chosen; COLMAP: .25 of raw matches).
     Returns:
         cam_from_world (3, 4); None with too few inliers or an inlier behind the camera.
     """
-    if len(xy) < PNP_MIN_INLIERS:
+    if len(xy) < min_inliers:
         return None
-    error_px = PNP_ERROR_PX * camera.width / resized_width
+    error_px = INLIER_PX * camera.width / resized_width
     ransac = {"max_error": error_px, "confidence": 0.999, "random_seed": seed}
     estimate = import_pycolmap().estimate_and_refine_absolute_pose(
         xy, points, camera.to_pycolmap(), estimation_options={"ransac": ransac}
     )
-    if estimate is None or estimate["num_inliers"] < max(PNP_MIN_INLIERS, PNP_MIN_RATIO * len(xy)):
+    if estimate is None or estimate["num_inliers"] < max(min_inliers, min_ratio * len(xy)):
         return None
     pose: Array = estimate["cam_from_world"].matrix()
     depth = points[estimate["inlier_mask"]] @ pose[2, :3] + pose[2, 3]
     return pose if np.isfinite(pose).all() and (depth > 0).all() else None
 
 
-MAX_DETOUR_STEPS = 5.0  # of a PnP pose (chosen)
-
-
-def _detours(cam_from_world: Array) -> BoolArray:
+def _detours(cam_from_world: Array, most: float = 5.0) -> BoolArray:
     """Mark frames (F,) whose centre is far from both neighbours, while these are near each other.
 
     The unit of the detour is the distance of the neighbours or the median step of the trajectory,
     whichever is longer.
+
+    Args:
+        most: units of a detour that is none (chosen; lower: frames of a shaking camera are lost).
     """
     known = np.flatnonzero(np.isfinite(cam_from_world).all((1, 2)))
     detour = np.zeros(len(cam_from_world), bool)
@@ -188,11 +192,12 @@ def _detours(cam_from_world: Array) -> BoolArray:
         step = np.linalg.norm(np.diff(centre, axis=0), axis=1)  # (N-1,)
         direct = np.linalg.norm(centre[2:] - centre[:-2], axis=1)  # (N-2,)
         usual = np.maximum(direct, np.median(step))
-        detour[known[1:-1]] = step[1:] + step[:-1] - direct > MAX_DETOUR_STEPS * usual
+        detour[known[1:-1]] = step[1:] + step[:-1] - direct > most * usual
     return detour
 
 
-NEAR_GAPS = 2.0  # gap lengths, before and after it, in which the error is measured (chosen)
+# Gap lengths, before and after it, in which the error is measured (chosen; higher: other motion)
+NEAR_GAPS = 2.0
 
 
 def fill_gaps(
@@ -208,7 +213,7 @@ def fill_gaps(
 ) -> tuple[Array, npt.NDArray[np.str_]]:
     """Interpolate the poses of at most `max_gap` consecutive lost frames where the error is small.
 
-    It must be below `PNP_ERROR_PX`, as that of PnP (`_interpolation_px`). There is no
+    It must be below `INLIER_PX`, as that of PnP (`_interpolation_px`). There is no
     extrapolation, and no interpolation past a row of `unmapped`, a keyframe that mapping rejected.
     The rotation is interpolated by slerp and the camera's centre linearly.
 
@@ -233,7 +238,7 @@ def fill_gaps(
         sides = known[: k + 1], known[k + 1 :]
         focal = float(shrink * camera.K[0, 0])
         error = _interpolation_px(sides, time_s, cam_from_world, points, focal, size)
-        if error <= PNP_ERROR_PX:
+        if error <= INLIER_PX:
             inner = np.arange(a + 1, b, dtype=np.int64)
             filled[inner] = _interpolated(cam_from_world[[a, b]], time_s[[a, b]], time_s[inner])
             status[inner] = "interpolated"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +20,12 @@ from reobj.poses.bundle import SAME_FOCAL, Adjusted, adjusted, refine, submodel
 from reobj.poses.child_job import send_progress
 from reobj.poses.features import MIN_MATCHES, MatchedPairs, focal_from_pairs
 from reobj.poses.verification import (
-    MIN_COMPONENT_IMAGES,
-    MIN_ZOOM,
-    SIGMA_LIMITS,
-    SURE_CENTRE_SIGMA,
     Component,
+    ConfirmationOptions,
+    ConsistencyOptions,
     FocalSource,
+    SoundnessOptions,
+    ZoomOptions,
     confirmed,
     consistent_groups,
     constant_focal,
@@ -40,9 +40,6 @@ ADVICE = (  # where no cause is established
 )
 
 FOCAL_GUESS = 0.8  # over the longer side, where it cannot be estimated (phones: .72-.85)
-GOOD_REGISTERED = 0.9  # fraction of the keyframes in sound components that ends the search (chosen)
-GOOD_EXPLAINED = 0.9  # and of the verified matches (measured: right .91-1, wrong up to .89)
-PREFERRED = 1.1  # weight of what the global mapper explains (chosen)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +67,30 @@ def without_poses(problem: str, advice: str = ADVICE) -> str:
     return f"no camera poses: {problem}; {advice}; or give --poses; 2D identities need no poses"
 
 
+@dataclass(frozen=True, slots=True)
+class SearchOptions:
+    """Thresholds of `MapperSearch`: of its checks of models, and of the choice between mappers.
+
+    Attributes:
+        consistency, soundness, confirmation, zoom: of the checks (`verification`).
+        nearly_all: fraction of the keyframes and of the verified matches in sound components that
+            ends the search (matches, measured: right .91-1, wrong up to .89; keyframes: chosen).
+        accepted_sigma: largest centre_sigma of a component of the incremental mapper that needs no
+            second mapper, where a focal length that does not come from the model agrees: it is
+            evidence of its own (chosen: time).
+        preferred: weight of the verified matches that the global mapper explains (chosen: it is
+            right more often where the parallax is weak; higher: it is kept with fewer matches).
+    """
+
+    consistency: ConsistencyOptions = field(default_factory=ConsistencyOptions)
+    soundness: SoundnessOptions = field(default_factory=SoundnessOptions)
+    confirmation: ConfirmationOptions = field(default_factory=ConfirmationOptions)
+    zoom: ZoomOptions = field(default_factory=ZoomOptions)
+    nearly_all: float = 0.9
+    accepted_sigma: float = 0.0012
+    preferred: float = 1.1
+
+
 class MapperSearch:
     """Search for the mapper whose model is the most consistent.
 
@@ -77,7 +98,7 @@ class MapperSearch:
         ids: of the keyframes in the order of time. frames: their numbers in the video, for
             messages. pairs: their verified matches.
         focal: of all images, as far as it is known before mapping. guess: used in its place where
-            the matches no longer determine it.
+            the matches no longer determine it. options: of the checks and of the choice.
     """
 
     def __init__(
@@ -88,7 +109,9 @@ class MapperSearch:
         focal: Focal,
         guess: float,
         seed: int,
+        options: SearchOptions = SearchOptions(),
     ) -> None:
+        self.options = options
         self.database = database
         self.ids = list(frames)
         self.frames = frames
@@ -111,7 +134,9 @@ class MapperSearch:
             known = [c for c in best if c.focal_source is not FocalSource.GUESS]
             # with little parallax a zoom cannot be observed
             known = [c for c in known if not c.problem] or known
-            others, changes = constant_focal([component.arrays for component in known])
+            others, changes = constant_focal(
+                [component.arrays for component in known], self.options.zoom
+            )
             if not len(others):
                 break
             zooms += changes
@@ -125,7 +150,7 @@ class MapperSearch:
             best = [replace(c, problem="the focal length keeps changing") for c in best]
         if self.focal.source is FocalSource.GIVEN and zooms:  # which of them is the camera's?
             why = "its images were taken at another focal length than that of the given camera"
-            best = [c if _has_its_focal(c) else replace(c, problem=why) for c in best]
+            best = [c if self._has_its_focal(c) else replace(c, problem=why) for c in best]
         sound = [component for component in best if not component.problem]
         if not sound:
             problem = best[0].problem if best else "no pair of keyframes initialises a model"
@@ -146,7 +171,7 @@ class MapperSearch:
                 )
         for component in best:
             ids = component.arrays.ids.tolist()
-            if component.problem and len(ids) >= MIN_COMPONENT_IMAGES:
+            if component.problem and len(ids) >= self.options.soundness.images:
                 messages.append(
                     f"frames {self.frames[ids[0]]}-{self.frames[ids[-1]]} have no poses: "
                     f"{component.problem}"
@@ -173,28 +198,27 @@ class MapperSearch:
         """
         source = self.focal.source
         start = self.focal.value
+        limits = self.options.confirmation
         if source is FocalSource.GUESS:
             _set_focal(self.database, start, False)
-            best = confirmed(self._components("incremental", False), [], source)
+            best = confirmed(self._components("incremental", False), [], source, limits)
             if best and best[0].focal_source is FocalSource.MODEL:
-                if self._is_sure(best, SURE_CENTRE_SIGMA):
+                if self._is_sure(best, limits.sure_sigma):
                     return best, []
                 start = best[0].focal
         if source is not FocalSource.GIVEN:
             _set_focal(self.database, start, True)
         best = self._components("incremental", True)
-        if not self._is_sure(best, SIGMA_LIMITS[source].accepted):
+        if not self._is_sure(best, self.options.accepted_sigma):
             other = self._components("global", True)
             # its focal length was held: that it agrees with the matches proves nothing
-            if self._is_sure(other, SURE_CENTRE_SIGMA):
+            if self._is_sure(other, limits.sure_sigma):
                 best = other
             else:
-                best, other = confirmed(best, other, source), confirmed(other, best, source)
-                best = max(
-                    other,
-                    best,
-                    key=lambda found: _explained(found) * (PREFERRED if found is other else 1),
-                )
+                by_incremental = confirmed(best, other, source, limits)
+                by_global = confirmed(other, best, source, limits)
+                weighted = self.options.preferred * _explained(by_global)
+                best = by_global if weighted >= _explained(by_incremental) else by_incremental
         given = source is FocalSource.GIVEN
         if given or not best or best[0].problem or best[0].focal_source is FocalSource.MODEL:
             return best, []
@@ -218,12 +242,13 @@ class MapperSearch:
                 self.focal.source is FocalSource.MATCHES
                 and abs(np.log(self.focal.value / component.focal)) < SAME_FOCAL
             )
-            most = limit if agrees else SURE_CENTRE_SIGMA
+            most = limit if agrees else self.options.confirmation.sure_sigma
             if not component.problem and component.centre_sigma <= most:
                 accepted.append(component)
         registered = sum(component.registered for component in accepted)
         matched = sum(map(len, self.pairs.inliers))
-        return registered >= GOOD_REGISTERED and _explained(accepted) >= GOOD_EXPLAINED * matched
+        least = self.options.nearly_all
+        return registered >= least and _explained(accepted) >= least * matched
 
     def _components(self, mapper: str, keep_intrinsics: bool) -> list[Component]:
         """Run a mapper and measure the consistent components of its models, largest first.
@@ -234,7 +259,8 @@ class MapperSearch:
         groups = list[tuple[IntArray, Adjusted]]()
         for model in _run_mapper(self.database, mapper, keep_intrinsics, self.ids, self.seed):
             whole = adjusted(model, not given)
-            groups += [(group, whole) for group in consistent_groups(whole.arrays, self.pairs)]
+            found = consistent_groups(whole.arrays, self.pairs, self.options.consistency)
+            groups += [(group, whole) for group in found]
         taken = set[int]()
         components = list[Component]()
         for group, whole in sorted(groups, key=lambda found: -len(found[0])):
@@ -249,10 +275,17 @@ class MapperSearch:
                 count=len(self.ids),
                 explained=int(count_explained(own.arrays, self.pairs).sum()),
                 focal_source=FocalSource.MODEL if own.calibrated else self.focal.source,
+                options=self.options.soundness,
             )
             components.append(component)
             taken |= set() if component.problem else kept
         return sorted(components, key=lambda c: (bool(c.problem), -c.registered))
+
+    def _has_its_focal(self, component: Component) -> bool:
+        """True if the focal length of a component, when freed, comes out as the given one."""
+        free = adjusted(component.model, True)
+        log = np.log(free.arrays.focal_over_size / component.focal)
+        return free.calibrated and bool(abs(log) < self.options.zoom.log)
 
 
 def models_of_one_camera(sound: list[Component]) -> list[Any]:
@@ -275,13 +308,6 @@ def models_of_one_camera(sound: list[Component]) -> list[Any]:
             refine(model)
         models.append(model)
     return models
-
-
-def _has_its_focal(component: Component) -> bool:
-    """True if the focal length of a component, when freed, comes out as the given one."""
-    free = adjusted(component.model, True)
-    log = np.log(free.arrays.focal_over_size / component.focal)
-    return free.calibrated and bool(abs(log) < MIN_ZOOM)
 
 
 def _explained(components: list[Component]) -> int:

@@ -12,10 +12,10 @@ import numpy as np
 
 from reobj.cameras import Poses, import_pycolmap, load_poses, save_poses, write_colmap
 from reobj.files import load_cached, load_npz, part_path
-from reobj.poses.depth import add_depth
 from reobj.poses.estimate import PosesConfig, estimate_poses
 from reobj.poses.intrinsics import camera_line, parse_camera
 from reobj.poses.sfm import triangulate
+from reobj.poses.supplied.depth import add_depth
 from reobj.poses.supplied.interpretation import PoseReading, by_images, by_tracks, check_poses
 from reobj.poses.supplied.readers import pose_readings, the_reading
 from reobj.sources.video import Video, source_fingerprint

@@ -27,26 +27,45 @@ from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.spatial.transform import Rotation
 
 from reobj.cameras import import_pycolmap
-from reobj.poses.bundle import FOCAL_RANGE, MIN_RAY_SPREAD, MIN_TRI_ANGLE_DEG, ModelArrays
+from reobj.poses.bundle import (
+    FOCAL_RANGE,
+    INLIER_PX,
+    MIN_TRI_ANGLE_DEG,
+    ModelArrays,
+    triangulates,
+)
 from reobj.poses.features import MIN_MATCHES, MatchedPairs
 from reobj.types import Array, BoolArray, IntArray
 
 # ---- Consistency ---------------------------------------------------------------------------------
 
 
-EXPLAINED_PX = 4.0  # largest distance from the epipolar line (COLMAP's filter_max_reproj_error)
-# Fraction of the matches that must be one point of the model (measured: right .38-.98, wrong 0)
-MIN_TIED = 0.1
-MIN_BRIDGE = 30  # points that connect two groups (COLMAP registers one image from 30 on)
-MIN_GROUP = 3  # images; fewer with a weak connection are left to be located by PnP
-# Fraction of the points that near views must observe again, and least number: what only farther
-# views share is matched by chance. Measured: right .065-.5, wrong 0-.007; right 31 and more, the
-# last 30 frames of the example mirrored 0.
-MIN_REOBSERVED = 0.03
-MIN_REOBSERVED_COUNT = 10
+@dataclass(frozen=True, slots=True)
+class ConsistencyOptions:
+    """What connects the images of a model; connections with less are cut.
+
+    Attributes:
+        tied: fraction of the matches of two consecutive images that must be one point of the model
+            (measured: right .38-.98, wrong 0).
+        bridge: points, and matches of one pair of images, that connect two groups (COLMAP registers
+            one image from 30 on).
+        group: images; fewer with a weak connection are left to be located by PnP.
+        reobserved, reobserved_count: fraction of the points of one group, and number, that near
+            views of the other must observe again: what only farther views share is matched by
+            chance (measured: right .065-.5, wrong 0-.007; right 31 and more, the last 30 frames of
+            the example mirrored 0).
+    """
+
+    tied: float = 0.1
+    bridge: int = MIN_MATCHES
+    group: int = 3
+    reobserved: float = 0.03
+    reobserved_count: int = 10
 
 
-def consistent_groups(arrays: ModelArrays, pairs: MatchedPairs) -> list[IntArray]:
+def consistent_groups(
+    arrays: ModelArrays, pairs: MatchedPairs, options: ConsistencyOptions = ConsistencyOptions()
+) -> list[IntArray]:
     """Split the images of a model into consistent groups.
 
     Args:
@@ -57,14 +76,14 @@ def consistent_groups(arrays: ModelArrays, pairs: MatchedPairs) -> list[IntArray
     """
     explained = count_explained(arrays, pairs)
     groups = list[IntArray]()
-    todo = _runs_of_tied_neighbours(arrays, pairs, explained)
+    todo = _runs_of_tied_neighbours(arrays, pairs, explained, options.tied)
     while todo:
         rows = todo.pop()
-        side = _weak_cut(arrays, rows, pairs, explained)
+        side = _weak_cut(arrays, rows, pairs, explained, options)
         if side is None:
             groups.append(arrays.ids[rows])
             continue
-        todo += [rows[s] for s in (side, ~side) if s.sum() >= MIN_GROUP]
+        todo += [rows[s] for s in (side, ~side) if s.sum() >= options.group]
     return sorted(groups, key=lambda g: (-len(g), int(g[0])))
 
 
@@ -100,12 +119,12 @@ def count_explained(arrays: ModelArrays, pairs: MatchedPairs) -> IntArray:
         line_a = other @ E[k]
         slope = (line_a[:, :2] ** 2).sum(1) + (line_b[:, :2] ** 2).sum(1)
         distance = np.abs((other * line_b).sum(1)) / np.sqrt(slope + 1e-18) * arrays.focal
-        count[row] = (distance < EXPLAINED_PX).sum()
+        count[row] = (distance < INLIER_PX).sum()
     return count
 
 
 def _runs_of_tied_neighbours(
-    arrays: ModelArrays, pairs: MatchedPairs, explained: IntArray
+    arrays: ModelArrays, pairs: MatchedPairs, explained: IntArray, least: float
 ) -> list[IntArray]:
     """Split rows of images where matches of neighbours in time are not triangulated in the model.
 
@@ -114,11 +133,13 @@ def _runs_of_tied_neighbours(
     look-alike position, at another scale, or not at all. An image that is tied to neither neighbour
     is left out; it splits the rest unless the images before and after it are tied to each other.
 
+    Args:
+        least: `ConsistencyOptions.tied`.
     Returns:
         rows (n,) of each run, ascending.
     """
     every = sorted(pairs.keypoints)  # keyframes in the order of time, registered or not
-    tied = _ties(arrays, pairs, explained, every)
+    tied = _ties(arrays, pairs, explained, every, least)
     links = [tied.get(pair) for pair in itertools.pairwise(every)]
     around = zip([None, *links], [*links, None], strict=True)
     inside = set(arrays.ids.tolist())
@@ -133,11 +154,11 @@ def _runs_of_tied_neighbours(
 
 
 def _ties(
-    arrays: ModelArrays, pairs: MatchedPairs, explained: IntArray, every: list[int]
+    arrays: ModelArrays, pairs: MatchedPairs, explained: IntArray, every: list[int], least: float
 ) -> dict[tuple[int, int], bool]:
     """Check for each pair of images with enough matches that they are triangulated in the model.
 
-    A fraction MIN_TIED of the matches must be one point of the model; and an essential matrix of
+    A fraction `least` of the matches must be one point of the model; and an essential matrix of
     the pair alone must not explain many more of them than the model does.
 
     Args:
@@ -160,7 +181,7 @@ def _ties(
             other = point_of[b][matches[:, 1]]
             tied = np.mean((one == other) & (one >= 0))
             contradicted = _contradicted(arrays, pairs, row, int(explained[row]))
-            ties[a, b] = bool(tied >= MIN_TIED and not contradicted)
+            ties[a, b] = bool(tied >= least and not contradicted)
     return ties
 
 
@@ -171,7 +192,7 @@ def _contradicted(arrays: ModelArrays, pairs: MatchedPairs, row: int, explained:
     if len(matches) - explained < MIN_MATCHES:
         return False
     camera = arrays.camera
-    ransac = {"max_error": EXPLAINED_PX, "random_seed": 0}
+    ransac = {"max_error": INLIER_PX, "random_seed": 0}
     xy = pairs.keypoints[a][matches[:, 0]], pairs.keypoints[b][matches[:, 1]]
     estimate = import_pycolmap().estimate_essential_matrix(*xy, camera, camera, ransac)
     return bool(estimate is not None and estimate["num_inliers"] - explained >= MIN_MATCHES)
@@ -185,7 +206,11 @@ def _shared_points(covisibility: Any) -> Array:
 
 
 def _weak_cut(
-    arrays: ModelArrays, rows: IntArray, pairs: MatchedPairs, explained: IntArray
+    arrays: ModelArrays,
+    rows: IntArray,
+    pairs: MatchedPairs,
+    explained: IntArray,
+    options: ConsistencyOptions,
 ) -> BoolArray | None:
     """Find a cut of the images into two groups whose connection is too weak.
 
@@ -215,13 +240,13 @@ def _weak_cut(
     across = np.where(cuts[:, one] != cuts[:, other], explained[inside], 0)  # (R - 1, p)
     bridge = np.minimum(_bridges(arrays, rows, cuts), across.max(1, initial=0))
     for cut in np.argsort(bridge, kind="stable"):
-        if bridge[cut] < MIN_BRIDGE:
+        if bridge[cut] < options.bridge:
             return np.asarray(cuts[cut])
     smaller = np.minimum(cuts.sum(1), (~cuts).sum(1))
-    groups = np.flatnonzero(smaller >= MIN_GROUP)
+    groups = np.flatnonzero(smaller >= options.group)
     for cut in groups[np.argsort(bridge[groups], kind="stable")[:3]]:  # all would take long
         expected, reobserved = _count_reobserved(arrays, rows, np.asarray(cuts[cut]))
-        if reobserved < max(MIN_REOBSERVED * expected, MIN_REOBSERVED_COUNT):
+        if reobserved < max(options.reobserved * expected, options.reobserved_count):
             return np.asarray(cuts[cut])
     return None
 
@@ -229,7 +254,7 @@ def _weak_cut(
 def _bridges(arrays: ModelArrays, rows: IntArray, cuts: BoolArray) -> IntArray:
     """Count the points (C,) that connect the two sides of each cut (C, R) of `rows`.
 
-    One side must triangulate the point, by `MIN_RAY_SPREAD`, and the other observe it.
+    One side must triangulate the point, by `triangulates`, and the other observe it.
     """
     centre = arrays.centre[rows]
     covisibility = arrays.covisibility()[rows].tocsc()
@@ -244,8 +269,8 @@ def _bridges(arrays: ModelArrays, rows: IntArray, cuts: BoolArray) -> IntArray:
         sides = []
         for side in (chunk, 1 - chunk):
             n = np.asarray(side @ covisibility)  # (c, N)
-            length2 = sum(np.asarray(side @ u) ** 2 for u in rays)
-            sides.append((n > 0, n - length2 / np.maximum(n, 1) >= MIN_RAY_SPREAD))
+            squared_sum = np.asarray(sum(np.asarray(side @ u) ** 2 for u in rays))
+            sides.append((n > 0, triangulates(n, squared_sum)))
         (one, one_deep), (two, two_deep) = sides
         count[start : start + step] = ((one & two_deep) | (two & one_deep)).sum(1)
     return count
@@ -311,44 +336,53 @@ class FocalSource(enum.Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class SigmaLimits:
-    """Largest centre_sigma of a component, by how its focal length is known.
+class SoundnessOptions:
+    """What a model has at least; one with less is refused.
 
     Attributes:
-        accepted: of components of the incremental mapper that need no second mapper to agree.
-        confirmed: of components that a second mapper can confirm.
+        images, registered: number of images (COLMAP's min_model_size), or this fraction of the
+            keyframes of a short video.
+        points: of a model (chosen; higher: short walks are refused).
+        points_per_image: that its median image observes (as COLMAP registers an image from 30 on).
+        parallax_px: that rotations of the camera alone cannot explain; walks have more than 4
+            (chosen; lower: rotation alone at a wrong focal length is accepted).
     """
 
-    accepted: float
-    confirmed: float
+    images: int = 10
+    registered: float = 0.5
+    points: int = 100
+    points_per_image: int = MIN_MATCHES
+    parallax_px: float = 3.0
 
 
-# Up to here all centres of a component are certain. Above, it may be one of many nearly equal
-# solutions, and another mapper must find the same (measured: right models of 40 keyframes and more
-# .0001 to .0025, wrong ones of short stretches from .0011 on).
-SURE_CENTRE_SIGMA = 0.001
-# A focal length that does not come from the model is evidence of its own: it saves the second
-# mapper at .0012 (chosen: time). Without it a second mapper proves nothing above .004: where the
-# camera zoomed, both came to the same wrong scale (measured: one of .0045).
-SIGMA_LIMITS = {
-    FocalSource.GIVEN: SigmaLimits(accepted=0.0012, confirmed=np.inf),
-    FocalSource.MATCHES: SigmaLimits(accepted=0.0012, confirmed=np.inf),
-    FocalSource.MODEL: SigmaLimits(accepted=SURE_CENTRE_SIGMA, confirmed=0.004),
-    FocalSource.GUESS: SigmaLimits(accepted=SURE_CENTRE_SIGMA, confirmed=0.004),
-}
-MIN_PARALLAX_PX = 3.0  # refuse a model with less (chosen; walks have more than 4)
-MIN_POINTS = 100  # refuse a model with fewer (chosen)
-MIN_POINTS_PER_IMAGE = 30  # of the median image; refuse a model with fewer (chosen)
-MIN_REGISTERED = 0.5  # fraction of the keyframes that makes a model worth keeping ...
-MIN_COMPONENT_IMAGES = 10  # ... or as many images of a larger video (COLMAP's min_model_size)
-# Two mappers agree if no centre differs by more, over the extent, and no camera by more in
-# orientation: half of what the benchmark of broken trajectories calls wrong
-SAME_CENTRE = 0.05
-SAME_TURN_DEG = 5.0
-SAME_IMAGES = 0.75  # fraction of the component that the other mapper must have (chosen)
-# Points that each of two pieces triangulates and that prove how they are joined: they fix rotation,
-# shift and scale (measured: right joins 191 to 386, a mirrored stretch 24, a free scale 0 to 3)
-MIN_JOINT = 100
+@dataclass(frozen=True, slots=True)
+class ConfirmationOptions:
+    """When the cameras of a component are certain, and when a second mapper confirms them.
+
+    Attributes:
+        sure_sigma: `Component.centre_sigma` up to which all centres are certain. Above, it may be
+            one of many nearly equal solutions, and another mapper must find the same (measured:
+            right models of 40 keyframes and more .0001 to .0025, wrong ones of short stretches from
+            .0011 on).
+        guess_sigma: the largest that a second mapper can confirm where the focal length was guessed
+            before mapping: where the camera zoomed, both came to the same wrong scale (measured:
+            one of .0045). Another focal length is evidence of its own: no limit.
+        centre, turn_deg: two mappers agree if no centre differs by more, over the extent, and no
+            camera by more in orientation: half of what the benchmark of broken trajectories calls
+            wrong.
+        images: fraction of the component that the other mapper must have (chosen; lower: components
+            are kept of which most images are not confirmed).
+        joint_points: that each of two pieces triangulates and that prove how they are joined: they
+            fix rotation, shift and scale (measured: right joins 191 to 386, a mirrored stretch 24,
+            a free scale 0 to 3).
+    """
+
+    sure_sigma: float = 0.001
+    guess_sigma: float = 0.004
+    centre: float = 0.05
+    turn_deg: float = 5.0
+    images: float = 0.75
+    joint_points: int = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -381,6 +415,7 @@ def measured(
     count: int,
     explained: int,
     focal_source: FocalSource,
+    options: SoundnessOptions = SoundnessOptions(),
 ) -> Component:
     """Measure an adjusted model of some of `count` keyframes and name its first problem.
 
@@ -402,12 +437,12 @@ def measured(
         no_depth = "so depth cannot be estimated"
     lens = "give measured intrinsics (--camera); pixels must be square"
     checks = (
-        (images < min(MIN_REGISTERED * count, MIN_COMPONENT_IMAGES),
+        (images < min(options.registered * count, options.images),
          f"only {images} of {count} keyframes connect", ""),
-        (points < MIN_POINTS, f"only {points} points could be triangulated", ""),
-        (seen < MIN_POINTS_PER_IMAGE,
+        (points < options.points, f"only {points} points could be triangulated", ""),
+        (seen < options.points_per_image,
          f"half of the keyframes see {seen:.0f} points or fewer", ""),
-        (parallax_px < MIN_PARALLAX_PX,
+        (parallax_px < options.parallax_px,
          f"the camera only rotates (to {parallax_px:.1f} px), {no_depth}", advice),
         (angle_deg < MIN_TRI_ANGLE_DEG,
          f"half of the points are seen from directions within {angle_deg:.1f} deg", advice),
@@ -422,7 +457,10 @@ def measured(
 
 
 def confirmed(
-    components: list[Component], others: list[Component], focal_source: FocalSource
+    components: list[Component],
+    others: list[Component],
+    focal_source: FocalSource,
+    options: ConfirmationOptions = ConfirmationOptions(),
 ) -> list[Component]:
     """Reject components of uncertain cameras unless a second mapper reproduces them.
 
@@ -433,13 +471,13 @@ def confirmed(
     """
     checked = list[Component]()
     for component in components:
-        if not component.problem and component.centre_sigma > SURE_CENTRE_SIGMA:
-            can_confirm = component.centre_sigma <= SIGMA_LIMITS[focal_source].confirmed
-            rows = _reproduced_by(
-                component.arrays, [other.arrays for other in others if can_confirm]
-            )
+        if not component.problem and component.centre_sigma > options.sure_sigma:
+            is_guess = focal_source is FocalSource.GUESS
+            can_confirm = not is_guess or component.centre_sigma <= options.guess_sigma
+            found = [other.arrays for other in others if can_confirm]
+            rows = _reproduced_by(component.arrays, found, options)
             component = replace(component, kept=component.arrays.ids[rows])
-            if len(rows) < SAME_IMAGES * len(component.arrays.ids):
+            if len(rows) < options.images * len(component.arrays.ids):
                 problem = (
                     "the camera positions are uncertain, and no second mapper confirms them "
                     f"(largest sigma {100 * component.centre_sigma:.2g} % of the trajectory, "
@@ -451,27 +489,29 @@ def confirmed(
     return sorted(checked, key=lambda c: (bool(c.problem), -c.registered))
 
 
-def _reproduced_by(one: ModelArrays, others: Sequence[ModelArrays]) -> IntArray:
+def _reproduced_by(
+    one: ModelArrays, others: Sequence[ModelArrays], options: ConfirmationOptions
+) -> IntArray:
     """Return the images (rows of one) with the same poses in another mapper's models.
 
     Those may be pieces. A piece only proves the relative poses of its own cameras. What joins it to
     the others are points that both triangulate: of two scenes that look alike there are few, and
     none where a single image, or a pair without a third, connects two scales.
     """
-    pieces = sorted((_same(one, other) for other in others), key=len, reverse=True)
+    pieces = sorted((_same(one, other, options) for other in others), key=len, reverse=True)
     rows = pieces[0] if pieces else np.empty(0, np.int64)
     todo = pieces[1:]
     while joined := [
         piece
         for piece in todo
-        if (one.triangulated_by(rows) & one.triangulated_by(piece)).sum() >= MIN_JOINT
+        if (one.triangulated_by(rows) & one.triangulated_by(piece)).sum() >= options.joint_points
     ]:
         rows = np.union1d(rows, joined[0])
         todo = [piece for piece in todo if piece is not joined[0]]
     return np.sort(rows)
 
 
-def _same(one: ModelArrays, other: ModelArrays) -> IntArray:
+def _same(one: ModelArrays, other: ModelArrays, options: ConfirmationOptions) -> IntArray:
     """Return the images that another model has, rows (n,) of one; none unless all poses agree.
 
     One is aligned to the other by the mean of the relative orientations, then scale and shift.
@@ -492,7 +532,8 @@ def _same(one: ModelArrays, other: ModelArrays) -> IntArray:
     end = end - end.mean(0)
     moved *= (moved * end).sum() / max((moved**2).sum(), 1e-12)
     offset = np.linalg.norm(moved - end, axis=1).max() / np.linalg.norm(np.ptp(end, axis=0))
-    return rows[: len(ids) if offset <= SAME_CENTRE and turn_deg.max() <= SAME_TURN_DEG else 0]
+    agrees = offset <= options.centre and turn_deg.max() <= options.turn_deg
+    return rows[: len(ids) if agrees else 0]
 
 
 def _median_tri_angle_deg(arrays: ModelArrays) -> float:
@@ -535,15 +576,30 @@ def _parallax_px(arrays: ModelArrays) -> float:
 # ---- Zoom ----------------------------------------------------------------------------------------
 
 
-WINDOW = 10  # images on one side whose points are used (chosen: a zoom bends those further off)
-# Log of the focal length's change that is a zoom (measured, mean of both sides: zoomed by 1.25 to
-# 1.5 .15-.30, right models below .03; one side alone .34-.39, right models up to .12)
-MIN_ZOOM = 0.12
-MIN_ZOOM_ONE_SIDE = 0.24
-MIN_SIGMAS = 5.0  # of that change over its sigma (chosen)
+@dataclass(frozen=True, slots=True)
+class ZoomOptions:
+    """When the focal length changes between two consecutive images.
+
+    Attributes:
+        window: images on one side whose points are used (chosen: a zoom bends those further off).
+        resected: images next to a gap whose focal length is measured, on each side.
+        log: least log of the change (measured, mean of both sides: zoomed by 1.25 to 1.5 .15-.30,
+            right models below .03).
+        log_one_side: the same where only one side can be measured: the noise of its depths biases
+            it (measured: zooms .34-.39, right models up to .12).
+        sigmas: of that change over its sigma (chosen; lower: noise of few points counts as a zoom).
+    """
+
+    window: int = 10
+    resected: int = 2
+    log: float = 0.12
+    log_one_side: float = 0.24
+    sigmas: float = 5.0
 
 
-def constant_focal(models: list[ModelArrays]) -> tuple[IntArray, list[tuple[int, int, float]]]:
+def constant_focal(
+    models: list[ModelArrays], options: ZoomOptions = ZoomOptions()
+) -> tuple[IntArray, list[tuple[int, int, float]]]:
     """Find the images that were not taken at the most frequent focal length.
 
     A mapper assumes one focal length: it shifts images of a zoomed stretch towards the scene.
@@ -554,15 +610,16 @@ def constant_focal(models: list[ModelArrays]) -> tuple[IntArray, list[tuple[int,
         ids of the images of other focal lengths, or of one that cannot be compared; of each change
         the ids of the images before and after it and the ratio of their focal lengths.
     """
-    changes = sorted(change for arrays in models for change in _changes(arrays))
+    changes = sorted(change for arrays in models for change in _changes(arrays, options))
     changes = [c for c in changes if not any(_is_side_effect(c, other) for other in changes)]
     ids = np.array(sorted({int(i) for arrays in models for i in arrays.ids}), np.int64)
     starts = np.searchsorted(ids, [after for _, after, _ in changes])
     log = np.zeros(len(ids))
     for k, (start, (_, _, ratio)) in enumerate(zip(starts, changes, strict=True)):
-        is_measured = not k or start - starts[k - 1] >= WINDOW  # else each bends the other's images
+        # else each bends the other's images
+        is_measured = not k or start - starts[k - 1] >= options.window
         log[start:] += np.log(ratio) if is_measured else 10  # as of another camera
-    same = np.abs(log[:, None] - log) < MIN_ZOOM  # (R, R)
+    same = np.abs(log[:, None] - log) < options.log  # (R, R)
     return ids[~same[same.sum(1).argmax()]] if len(ids) else ids, changes
 
 
@@ -577,15 +634,13 @@ def _is_side_effect(one: tuple[int, int, float], other: tuple[int, int, float]) 
     return bool(adjacent and log * other_log > 0 and abs(log) < abs(other_log))
 
 
-def _changes(arrays: ModelArrays, resected: int = 2) -> list[tuple[int, int, float]]:
+def _changes(arrays: ModelArrays, options: ZoomOptions) -> list[tuple[int, int, float]]:
     """List the changes of the focal length between consecutive images.
 
-    The images next to each gap are resected from points of the other side. Where only one side can
-    be measured, a larger change is required: the noise of its depths biases it.
-
-    Args:
-        resected: images next to a gap, on each side.
+    The images next to each gap are resected from points of the other side.
     """
+    window = options.window
+    resected = options.resected
     count = len(arrays.ids)
     changes = list[tuple[int, int, float]]()
     ray = np.insert(arrays.ideal, 2, 1, 1)[:, None] @ arrays.cam_from_world[arrays.image][:, :, :3]
@@ -594,8 +649,8 @@ def _changes(arrays: ModelArrays, resected: int = 2) -> list[tuple[int, int, flo
     start = (across @ arrays.centre[arrays.image][:, :, None])[:, :, 0]
     terms = np.hstack([across.reshape(-1, 9), start, ray, np.ones((len(ray), 1))])  # (M, 16)
     for k in range(1, count):
-        before = range(max(0, k - WINDOW), k)
-        after = range(k, min(k + WINDOW, count))
+        before = range(max(0, k - window), k)
+        after = range(k, min(k + window, count))
         sides = list[list[list[float]]]()
         for side, images, sign in ((before, after[:resected], 1), (after, before[-resected:], -1)):
             points = _triangulate(arrays, terms, side)
@@ -604,8 +659,8 @@ def _changes(arrays: ModelArrays, resected: int = 2) -> list[tuple[int, int, flo
             sides.append(values[np.isfinite(values[:, 0])].tolist())
         if any(sides):
             log, sigma = np.median(list(itertools.chain(*sides)), axis=0)
-            least = MIN_ZOOM if all(sides) else MIN_ZOOM_ONE_SIDE
-            if abs(log) > max(least, MIN_SIGMAS * sigma):
+            least = options.log if all(sides) else options.log_one_side
+            if abs(log) > max(least, options.sigmas * sigma):
                 ids = int(arrays.ids[k - 1]), int(arrays.ids[k])
                 changes.append((*ids, float(np.exp(log))))
     return changes
@@ -624,8 +679,7 @@ def _triangulate(arrays: ModelArrays, terms: Array, side: range) -> Array:
     points, row = np.unique(arrays.point[first:last], return_inverse=True)
     entries = (np.ones(len(row)), (row, np.arange(len(row))))
     sums = sparse.csr_matrix(entries, (len(points), len(row))) @ terms[first:last]
-    n = sums[:, 15]
-    good = n - (sums[:, 12:15] ** 2).sum(1) / np.maximum(n, 1) >= MIN_RAY_SPREAD
+    good = triangulates(sums[:, 15], (sums[:, 12:15] ** 2).sum(1))
     xyz = np.full((len(arrays.xyz), 3), np.nan)
     A = sums[good, :9].reshape(-1, 3, 3)
     b = sums[good, 9:12, None]

@@ -1,1 +1,1 @@
-"""Camera poses made by other tools: readers, frame assignment, choice between readings."""
+"""Camera poses and depth maps from the user: readers, assignment to frames, choice of a reading."""

@@ -269,7 +269,6 @@ def is_whole(stamps: Array) -> bool:
 
 
 STAMP_TOLERANCE_S = 0.02  # of a frame and its pose or depth map (default of TUM's associate.py)
-STAMP_STEP_S = 0.11  # largest step over which poses are interpolated: 10 Hz, with jitter
 
 
 def _by_stamps(stamps_s: Array, source: SourceFrames, is_ours: bool) -> list[FrameAssignment]:
@@ -330,11 +329,15 @@ def rows_by_time(stamps_s: Array, frame: IntArray, time_s: Array) -> IntArray:
     return np.where(offset.min(1) <= tolerance, nearest, -1)
 
 
-def interpolated(cam_from_world: Array, stamps_s: Array, time_s: Array) -> tuple[Array, BoolArray]:
-    """Interpolate poses at times (F,) between those at most `STAMP_STEP_S` apart.
+def interpolated(
+    cam_from_world: Array, stamps_s: Array, time_s: Array, max_step_s: float = 0.11
+) -> tuple[Array, BoolArray]:
+    """Interpolate poses at times (F,) between those at most `max_step_s` apart.
 
     Rotations by slerp, centres linearly.
 
+    Args:
+        max_step_s: chosen: poses at 10 Hz, with jitter.
     Returns:
         cam_from_world (n, 3, 4), and the mask (F,) of the times that are interpolated: between two
         such poses and at the time of neither.
@@ -344,7 +347,7 @@ def interpolated(cam_from_world: Array, stamps_s: Array, time_s: Array) -> tuple
     b = after
     same_s = 5e-4  # times in files and containers are rounded to a ms
     use = (time_s - stamps_s[a] > same_s) & (stamps_s[b] - time_s > same_s)
-    use &= stamps_s[b] - stamps_s[a] <= STAMP_STEP_S
+    use &= stamps_s[b] - stamps_s[a] <= max_step_s
     use &= np.isfinite(cam_from_world[a] + cam_from_world[b]).all((1, 2))
     a = a[use]
     b = b[use]

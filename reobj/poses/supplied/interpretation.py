@@ -34,8 +34,6 @@ from reobj.poses.features import MAX_RATIO
 from reobj.sources.video import shrunk
 from reobj.types import Array, Image, IntArray, Tracks, rows_by
 
-MIN_LOG_RATIO = math.log(1000)  # log likelihood ratio over every other reading (chosen)
-
 
 @dataclass(frozen=True, slots=True)
 class PoseReading:
@@ -64,11 +62,14 @@ class PoseReading:
 Compare = Callable[[Poses, Poses], tuple[Array, Array]]
 
 
-def likeliest(readings: Sequence[PoseReading], compare: Compare, data: str) -> list[PoseReading]:
+def likeliest(
+    readings: Sequence[PoseReading], compare: Compare, data: str, min_ratio: float = 1000.0
+) -> list[PoseReading]:
     """Return the one reading that is likelier than every other, else all of them.
 
     Args:
         data: that give the residuals, for the message.
+        min_ratio: of its likelihood over that of every other (chosen; lower: chance may decide).
     """
     least_px = 1e-3  # residuals are not smaller: rounding of poses in text files
     for one in readings:
@@ -84,7 +85,7 @@ def likeliest(readings: Sequence[PoseReading], compare: Compare, data: str) -> l
                 break
             size = float(np.exp(np.log(residuals.clip(least_px)).mean()))
             other_size = float(np.exp(np.log(other_residuals.clip(least_px)).mean()))
-            is_likeliest &= count * math.log(other_size / size) > MIN_LOG_RATIO
+            is_likeliest &= count * math.log(other_size / size) > math.log(min_ratio)
             sizes.append(f"{size:.2g} px, by {other.rule} {other_size:.2g} px")
         if is_likeliest and sizes:
             measured = f"it fits {data} within {'; '.join(sizes)}"
@@ -95,7 +96,7 @@ def likeliest(readings: Sequence[PoseReading], compare: Compare, data: str) -> l
 # ---- By images -----------------------------------------------------------------------------------
 
 
-MIN_PAIRS = 3  # with fewer there is no decision (chosen)
+MIN_PAIRS = 3  # with fewer there is no decision (chosen; lower: one wrong pair decides)
 
 
 def by_images(readings: Sequence[PoseReading], video: Any) -> list[PoseReading]:
@@ -238,13 +239,11 @@ def _epipolar_px(poses: Poses, pair: tuple[int, int], first: Array, second: Arra
 # ---- By tracks -----------------------------------------------------------------------------------
 
 
-CORRELATED = 5  # consecutive boxes that count as one: a detector repeats its errors (chosen)
-
-
 def by_tracks(readings: Sequence[PoseReading], tracks: Tracks) -> list[PoseReading]:
     """Choose a reading by boxes: in the right one each tracklet shows one object.
 
-    Objects are fitted to the 30 longest tracklets of at least 8 boxes.
+    Objects are fitted to the 30 longest tracklets of at least 8 boxes. Five consecutive boxes count
+    as one (chosen): a detector repeats its errors.
     """
     groups = sorted(rows_by(tracks.tracklet_id), key=len, reverse=True)[:30]
     least = 8
@@ -261,7 +260,7 @@ def by_tracks(readings: Sequence[PoseReading], tracks: Tracks) -> list[PoseReadi
                 _object_px(poses, pose_rows[use], tracks.xyxy[rows[use]])
                 for poses, pose_rows, use in zip((one, other), (a, b), uses, strict=True)
             ]
-            count = min(int(use.sum()) for use in uses) // CORRELATED
+            count = min(int(use.sum()) for use in uses) // 5
             for size, values in zip(pair, sizes, strict=True):
                 values += [size] * count
         return np.array(sizes[0]), np.array(sizes[1])
@@ -288,12 +287,13 @@ def _object_px(poses: Poses, rows: IntArray, xyxy: Array) -> float:
 # ---- Direction and axes --------------------------------------------------------------------------
 
 
-MIN_CHECKED_TRACKS = 4  # (chosen: three triangulate by chance in a trajectory read backwards)
-GOOD_DEG = 1.0  # residual of poses that are certainly right (chosen: 9 px at 500 px focal length)
-MAX_RESIDUAL_RATIO = 0.3  # of a clearly better convention (chosen)
-
-
-def check_poses(poses: Poses, tracks: Sequence[tuple[IntArray, Array]]) -> str | None:
+def check_poses(
+    poses: Poses,
+    tracks: Sequence[tuple[IntArray, Array]],
+    min_tracks: int = 4,
+    good_deg: float = 1.0,
+    max_ratio: float = 0.3,
+) -> str | None:
     """Detect poses that are given in the wrong direction or with the wrong axes.
 
     Triangulates the box centres of each track with the poses as they are, inverted, with OpenGL
@@ -303,6 +303,11 @@ def check_poses(poses: Poses, tracks: Sequence[tuple[IntArray, Array]]) -> str |
 
     Args:
         tracks: per track frame numbers (n,) and centres (n, 2), native pixels.
+        min_tracks: with fewer nothing is detected (chosen: three triangulate by chance in a
+            trajectory read backwards).
+        good_deg: residual of poses that are certainly right (chosen: 9 px at 500 px focal length).
+        max_ratio: residual of a clearly better convention, over that of the given one (chosen;
+            higher: right poses of inaccurate tracks are refused).
     Returns:
         a message that names the likely mistake if another convention explains the tracks clearly
         better, else None.
@@ -319,7 +324,7 @@ def check_poses(poses: Poses, tracks: Sequence[tuple[IntArray, Array]]) -> str |
     }  # fmt: skip
     views = [view for track in tracks if (view := _rays_of_track(poses, *track)) is not None]
     views = sorted(views, key=lambda v: -len(v[0]))[:200]  # the longest: all take long
-    if len(views) < MIN_CHECKED_TRACKS:
+    if len(views) < min_tracks:
         return None
     residual_deg = {
         text: float(np.median([_residual_deg(converted[rows], rays) for rows, rays in views]))
@@ -327,7 +332,7 @@ def check_poses(poses: Poses, tracks: Sequence[tuple[IntArray, Array]]) -> str |
     }
     as_given = residual_deg.pop("as they are")
     best = min(residual_deg.values())
-    if as_given < GOOD_DEG or best > min(MAX_RESIDUAL_RATIO * as_given, GOOD_DEG):
+    if as_given < good_deg or best > min(max_ratio * as_given, good_deg):
         return None  # a better but still bad fit is wrong too, as with poses of other frames
     likely = " or ".join(text for text, value in residual_deg.items() if value <= 1.5 * best)
     return (

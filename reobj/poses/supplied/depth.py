@@ -238,12 +238,16 @@ def add_depth(poses: Poses, text: str, video: Any) -> Poses:
 # Systematic relative sigma: of the depth camera itself (Khoshelham and Elberink 2012: ~1 %), of its
 # extrinsics and the colour camera's focal length (chosen: redkitchen, 1 to 3 %).
 SENSOR_SIGMA = 0.02
-MAX_SCALE_SPREAD = 0.2  # relative, between maps; more is a contradiction of the poses (chosen)
 
 
-def depth_scale(poses: Poses, maps: DepthMaps) -> tuple[Array, Array, int] | str:
+def depth_scale(
+    poses: Poses, maps: DepthMaps, max_spread: float = 0.2
+) -> tuple[Array, Array, int] | str:
     """Estimate metres per unit of each component: depth of the maps over that of sparse points.
 
+    Args:
+        max_spread: relative, between maps; more contradicts the poses (chosen; higher: a wrong
+            scale is taken).
     Returns:
         scale and relative sigma of each component, and the number of maps; or a message why not.
     """
@@ -262,7 +266,7 @@ def depth_scale(poses: Poses, maps: DepthMaps) -> tuple[Array, Array, int] | str
                 f"{len(logs)} of {len(rows)} maps show enough sparse points, 3 are needed"
             )
         spread = 1.4826 * float(np.median(np.abs(logs - np.median(logs))))
-        if spread > MAX_SCALE_SPREAD:
+        if spread > max_spread:
             return (
                 f"--depth: the ratio of depth to the poses{where} varies by {100 * spread:.0f} % "
                 "between maps: depth or poses are wrong; the scale stays unknown"
