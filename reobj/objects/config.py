@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import quadrics
 from reobj.cameras import Poses
-from reobj.objects.observations import UNKNOWN_SCENE, Fit, Scene, Views
+from reobj.objects.observations import Fit, Scene, Views
 from reobj.options import load_size_priors, parse_known_size, parse_up
 from reobj.types import ReobjError, option
 
@@ -65,7 +65,7 @@ def make_fit(config: ObjectsConfig, poses: Poses, class_names: Sequence[str]) ->
     up = parse_up(config.up) if config.up else poses.up_in_world
     support = None if config.support == "auto" else config.support
 
-    def fit(views: Views, classes: list[int], scene: Scene = UNKNOWN_SCENE) -> quadrics.ObjectFits:
+    def fit(views: Views, classes: list[int], scene: Scene) -> quadrics.ObjectFits:
         names = [class_names[c] if c < len(class_names) else "" for c in classes]
         fits = quadrics.fit_objects(
             views.boxes, views.img_from_world, views.image_size, names, priors,
