@@ -52,7 +52,8 @@ class AssociationOptions:
         similar_log_size: largest difference of mean log sizes to merge objects of different classes
             (laptop and tv).
         min_detections: of an object; fewer do not determine it.
-        max_rounds: of steps 2 to 5. widening_rounds: of step 6. Both chosen.
+        max_rounds: of steps 2 to 5, if no state is repeated before; bounds the time.
+        widening_rounds: of step 6: more, and wide shapes take over neighbours (benchmarks/LOG.md).
     """
 
     missed: float = 0.5

@@ -86,7 +86,9 @@ def gather_views(
     return Views(frame, boxes, score, img_from_world, size)
 
 
-INSIDE_FRACTION = 0.8  # of the views that observe a point (chosen; .95 is alike: benchmarks/LOG.md)
+# Least fraction of the views that observe a point in which it is inside the box: boxes are cut off
+# where the object is occluded (.95 is alike: benchmarks/LOG.md)
+INSIDE_FRACTION = 0.8
 MIN_POINTS = 5  # per object (chosen: fewer may all belong to another object)
 
 

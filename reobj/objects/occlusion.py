@@ -114,11 +114,14 @@ def _entry_depths(points: Array, camera: Array, boxes: quadrics.Ellipsoids) -> A
     return np.where((enter < leave) & (leave > 0), np.maximum(enter, 0), np.inf)
 
 
-MIDDLE = 0.6  # largest distance of a ray from the centre, over the half axes (chosen)
-BEHIND = 0.05  # least distance behind the object, over that from the camera (chosen)
+# Largest distance of a ray from the centre, over the half axes (larger: more points, but also rays
+# beside an object that fills its ellipsoid poorly)
+MIDDLE = 0.6
+# Least distance behind the object, over that from the camera (smaller: errors of depth count)
+BEHIND = 0.05
 # Ratio of points behind to points on an object that exists (measured: chairs, tables 1.8)
 HOLES = 2.0
-PRIOR_POINTS = 10.0  # added to both counts (chosen: 5 and 10 are alike)
+PRIOR_POINTS = 10.0  # added to both counts: few points are no evidence (5 and 10 are alike)
 
 
 def see_through_ratio(
