@@ -100,12 +100,11 @@ from reobj.poses.supplied.readers import read_poses
 from reobj.results.edits import kept_edits, read_edits
 from reobj.results.evaluation import evaluate, score_report
 from reobj.results.export import EXPORTS, Viewer, export
+from reobj.results.names import OutputFile
 from reobj.results.overlay import film_layers
 from reobj.results.plausibility import implausible
 from reobj.results.result import Object, Part, Result, VideoInfo, World
 from reobj.results.saving import (
-    CONFIG_FILE,
-    MODEL,
     copy_models,
     replaced,
     validate_objects,
@@ -1248,7 +1247,7 @@ def refit(
 
 def _last_config(out: str | Path) -> Config:
     """Read the options of the last run in an output folder; the defaults if it has none."""
-    path = Path(out) / CONFIG_FILE
+    path = Path(out) / OutputFile.CONFIG
     return read_config(Config(), path) if path.is_file() else Config()
 
 
@@ -1421,18 +1420,18 @@ def _write(job: _Job, result: Result) -> Result:
     models = workspace.last_models()
 
     def write_more(folder: Path) -> None:
-        write_config(job.config, folder / CONFIG_FILE)
+        write_config(job.config, folder / OutputFile.CONFIG)
         if models is not None:
             copy_models(models, folder)
             write_supplied_model(result.poses, job.video, folder)
 
-    stale = (MODEL,) if models is not None or result.poses is None else ()
+    stale = (OutputFile.MODEL,) if models is not None or result.poses is None else ()
     result.save(workspace.out, output.doubtful, write_more, stale)
     shown = (output.overlay, output.scene, output.doubtful)
     failures = write_pictures(result, workspace.out, job.video, *shown)
     if failures:
         result = dataclasses.replace(result, warnings=[*result.warnings, *failures])
-        result.write_objects(workspace.out / "objects.json")
+        result.write_objects(workspace.out / OutputFile.OBJECTS)
     return result
 
 
@@ -1464,7 +1463,7 @@ def _cmd_poses(args: argparse.Namespace) -> int:
             poses = settled_poses(readings, Tracks.empty(), video, config.poses, workspace)
         else:
             poses, model = reconstruct_cached(video, config.poses, workspace)
-        with replaced(workspace.out, ("poses.txt", MODEL)) as new:
+        with replaced(workspace.out, (OutputFile.POSES, OutputFile.MODEL)) as new:
             copy_models(model or (), new)
             write_trajectories(new, poses)
             write_supplied_model(poses, video, new)

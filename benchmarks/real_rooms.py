@@ -40,9 +40,9 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import importlib
 import json
 import multiprocessing
+import pkgutil
 import resource
 import shutil
 import sys
@@ -153,9 +153,9 @@ def untracked(rows: rt.Tracks) -> BoolArray:
     return np.asarray(rows.tracklet_id == 0)
 
 
-# Ablations by name: replacements of values and functions.
+# Ablations by name: replacements of values and functions of modules, and of defaults of options.
 LIKELIHOOD = "reobj.objects.likelihood"
-ASSOCIATION = "reobj.objects.association"
+ASSOCIATION = "reobj.objects.association.AssociationOptions"
 COMPONENT = "reobj.objects.component"
 WITHOUT: dict[str, dict[str, Any]] = {
     "hidden edges": {f"{LIKELIHOOD}.OCCLUDED_EDGES": 0.0},
@@ -166,16 +166,16 @@ WITHOUT: dict[str, dict[str, Any]] = {
     },
     "edges behind nearer objects": {"reobj.objects.occlusion._occluded_by_nearer": all_visible},
     "edges above the floor": {"reobj.objects.occlusion.ABOVE_FLOOR": np.inf},
-    "widening": {f"{ASSOCIATION}.WIDENING_ROUNDS": 0},
+    "widening": {f"{ASSOCIATION}.widening_rounds": 0},
     "limit of a box": {f"{LIKELIHOOD}.MAX_BOX_EXISTENCE": 8.0},
     "classes": {f"{LIKELIHOOD}.CLASS_KEPT": 0.0},
     "sizes": {"reobj.objects.categories.SIZE_SIGMAS": 0.0},
-    "missed frames": {f"{ASSOCIATION}.MISSED": 0.0},
-    "tracklets": {f"{ASSOCIATION}.SAME_TRACKLET": 0.0},
+    "missed frames": {f"{ASSOCIATION}.missed": 0.0},
+    "tracklets": {f"{ASSOCIATION}.same_tracklet": 0.0},
     "untracked detections": {f"{COMPONENT}._duplicates": untracked},
-    "clear detections in refits": {f"{ASSOCIATION}.UNAMBIGUOUS_MARGIN": -1e3},
-    "alternation": {f"{ASSOCIATION}.MAX_ROUNDS": 0},
-    "merging": {f"{ASSOCIATION}.MERGE_DISTANCE": 0.0},
+    "clear detections in refits": {f"{ASSOCIATION}.unambiguous_margin": -1e3},
+    "alternation": {f"{ASSOCIATION}.max_rounds": 0},
+    "merging": {f"{ASSOCIATION}.merge_distance": 0.0},
     "distances along rays": {"reobj.objects.hypotheses.DEPTHS": np.empty(0)},
     "floor": {
         f"{COMPONENT}.find_floor": nothing,
@@ -185,9 +185,9 @@ WITHOUT: dict[str, dict[str, Any]] = {
     "points in the fit": {"reobj.objects.fit.points_on": nothing},
     "seen through": {f"{COMPONENT}.see_through_ratio": never_seen_through},
     "duplicate boxes": {f"{COMPONENT}.DUPLICATE_IOU": 2.0},
-    "classes that differ": {f"{ASSOCIATION}.SIMILAR_SIZE": 0.0},
-    "same position": {f"{ASSOCIATION}.SAME_POSITION": 0.0},
-    "limit of a proposal's gain": {f"{ASSOCIATION}.MAX_BOX_GAIN": np.inf},
+    "classes that differ": {f"{ASSOCIATION}.similar_log_size": 0.0},
+    "same position": {f"{ASSOCIATION}.same_position": 0.0},
+    "limit of a proposal's gain": {f"{ASSOCIATION}.max_box_gain": np.inf},
     "boxes at the border": {"reobj.objects.hypotheses.BORDER_WEIGHT": 1.0},
     "heights of standing objects": {"reobj.objects.hypotheses.STANDING_HEIGHTS": (0.0, 1e6)},
     "quartic size prior": {"quadrics.SIZE_WALL": 1e3},
@@ -203,11 +203,19 @@ WITHOUT: dict[str, dict[str, Any]] = {
 def leave_out(name: str) -> None:
     """Switch a mechanism off, in this process."""
     for path, value in WITHOUT[name].items():
-        module, _, attribute = path.rpartition(".")
-        owner = importlib.import_module(module)
-        if not hasattr(owner, attribute):
+        place, _, attribute = path.rpartition(".")
+        values = values_of(pkgutil.resolve_name(place))
+        if attribute not in values:
             raise SystemExit(f"error: --without {name}: {path} is no longer there")
-        setattr(owner, attribute, value)
+        values[attribute] = value
+
+
+def values_of(owner: Any) -> dict[str, Any]:
+    """Return the values of a module, or the defaults of an options class: both can be replaced."""
+    names: dict[str, Any] = vars(owner)
+    if isinstance(owner, type):  # keyword-only fields of a dataclass
+        names = names["__init__"].__kwdefaults__ or {}
+    return names
 
 
 # ---- Runs --------------------------------------------------------------------------------------

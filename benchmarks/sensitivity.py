@@ -1,21 +1,24 @@
 #!/usr/bin/env python3
-"""Halve and double each numeric module constant of the object stage: which ones matter?
+"""Halve and double each numeric constant and option of the object stage: which ones matter?
 
     python benchmarks/sensitivity.py DATA -o OUT --choosing [--module NAME ...] [--only CASE ...]
 
-The objects of each recording are made again with one constant halved, then doubled, from boxes with
-half a pixel of noise; the losses are those of `eliminate.py`, against the same boxes with all
-constants as they are. OUT/sensitivity.json keeps every evaluation, so that an interrupted run
-resumes; OUT/sensitivity.md has a row for each constant: mean and largest absolute loss. Constants
-that are copied when a module is imported (defaults of arguments, values computed from others) do
-not change; whole numbers do not go below 1.
+Options are the keyword-only fields of dataclasses, of which the defaults change. The objects of
+each recording are made again with one constant halved, then doubled, from boxes with half a pixel
+of noise; the losses are those of `eliminate.py`, against the same boxes with all constants as they
+are. OUT/sensitivity.json keeps every evaluation, so that an interrupted run resumes;
+OUT/sensitivity.md has a row for each constant: mean and largest absolute loss. Constants that are
+copied when a module is imported (defaults of arguments, values computed from others) do not change;
+whole numbers do not go below 1.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import importlib
 import json
+import pkgutil
 import re
 import shutil
 import sys
@@ -33,6 +36,7 @@ from real_rooms import (
     measure,
     prepared_cases,
     run_missing,
+    values_of,
 )
 
 MODULES = (
@@ -50,11 +54,21 @@ CODES = ("BOX", "CYLINDER", "AXIS_GROUPS", "AXIS_ORDERS", "UPRIGHT_ORDERS")  # n
 
 
 def constants(module: str) -> Iterator[str]:
-    """Yield the names of the numbers, or tuples and arrays of numbers, of a module."""
-    source = Path(importlib.import_module(module).__file__ or "").read_text()
+    """Yield the names of the numbers, or tuples and arrays of numbers, of a module.
+
+    These are constants, and options as `CLASS.field`.
+    """
+    own = importlib.import_module(module)
+    source = Path(own.__file__ or "").read_text()
+    values = {}
     for name in re.findall(r"^([A-Z][A-Z0-9_]+)(?:: \w+)? = ", source, re.MULTILINE):
-        value = np.asarray(getattr(importlib.import_module(module), name))
-        if name not in CODES and value.dtype.kind in "if" and np.any(value):
+        values[name] = getattr(own, name)
+    for kind in filter(dataclasses.is_dataclass, vars(own).values()):
+        if isinstance(kind, type) and kind.__module__ == module:
+            values |= {f"{kind.__name__}.{name}": v for name, v in values_of(kind).items()}
+    for name, value in values.items():
+        array = np.asarray(value)
+        if name not in CODES and array.dtype.kind in "if" and np.any(array):
             yield name
 
 
@@ -71,11 +85,15 @@ def measure_changed(
     case: Case, data: Path, out: Path, module: str, name: str, factor: float
 ) -> Figures:
     """Score a case with one constant scaled, in this process, wherever it was imported to."""
-    value = getattr(importlib.import_module(module), name)
-    for title, other in list(sys.modules.items()):
-        ours = title.partition(".")[0] in ("reobj", "reobj_track", "quadrics")
-        if ours and getattr(other, name, None) is value:
-            setattr(other, name, scaled(value, factor))
+    place, _, name = f"{module}.{name}".rpartition(".")
+    places = [values_of(pkgutil.resolve_name(place))]
+    if place == module:
+        ours = ("reobj", "reobj_track", "quadrics")
+        places += [vars(m) for k, m in list(sys.modules.items()) if k.partition(".")[0] in ours]
+    value = places[0][name]
+    for values in places:
+        if values.get(name) is value:
+            values[name] = scaled(value, factor)
     own = out / f"{name}-{factor:g}-{case.name}"  # the cases of other processes are not touched
     own.mkdir(parents=True, exist_ok=True)
     shutil.copytree(out / case.name, own / case.name, dirs_exist_ok=True)

@@ -13,7 +13,7 @@ import reobj_track as rt
 from reobj.objects.config import make_fit
 from reobj.objects.description import describe_objects, describe_world
 from reobj.objects.fit import link_and_fit
-from reobj.objects.observations import MIN_SCORE, gather_views
+from reobj.objects.observations import MIN_SCORE, Scene, gather_views
 from reobj.results.result import VideoInfo
 from reobj.types import object_classes
 
@@ -72,7 +72,7 @@ def fitted(
         classes = object_classes(tracks)
         group = np.searchsorted(list(classes), tracks.track_id)
         views = gather_views(tracks, poses, group, len(classes), MIN_SCORE)
-        fits = make_fit(config, poses, names)(views, list(classes.values()))
+        fits = make_fit(config, poses, names)(views, list(classes.values()), Scene())
     objects = describe_objects(tracks, names, fits, views, config)
     video = VideoInfo("walk.mp4", *SIZE, 30.0)
     world = describe_world(poses, [fits], [])

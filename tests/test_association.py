@@ -12,7 +12,7 @@ from test_linking import CHAIR, CUP, NAMES, SIZE, chair_solids, table_of, walk
 import quadrics
 import reobj_track as rt
 from reobj.objects import association, categories, component, likelihood
-from reobj.objects.association import Association, Associator
+from reobj.objects.association import Association, AssociationOptions, Associator
 from reobj.objects.categories import Categories
 from reobj.objects.component import associate_component
 from reobj.objects.confidence import USUAL_HIT_RATE, existence_probability, log_best_odds
@@ -46,7 +46,7 @@ def shifted(table: rt.Tracks, by: np.ndarray) -> rt.Tracks:
 def odds_of(table: rt.Tracks, poses: rt.Poses, solid: int = 0) -> float:
     """Median log odds that the boxes of the first chair belong to an object; -inf: to none."""
     own = table[table.detection_index == 0]
-    found = gather_evidence(chairs(), detected_in(own, poses))
+    found = gather_evidence(chairs(), detected_in(own, poses), AssociationOptions().min_log_odds)
     odds = np.full(len(own), -np.inf)
     pairs = found.obj == solid
     odds[found.row[pairs]] = found.assignment[pairs]
@@ -113,16 +113,14 @@ def test_a_detection_is_expected_if_most_of_the_object_is_in_the_image() -> None
     whole = quadrics.solid_boxes(chair_solids(), "box", cams)
     cut = quadrics.clip_boxes(whole, SIZE)
     visible = ((cut[..., 2:] - cut[..., :2]) / (whole[..., 2:] - whole[..., :2])).prod(-1)
-    found = gather_evidence(chairs(), detected_in(table_of(poses), poses))
+    found = gather_evidence(chairs(), detected_in(table_of(poses), poses), 0.0)
     np.testing.assert_array_equal(found.expected, np.nan_to_num(visible) > EXPECTED)
 
 
-def test_many_objects_are_evaluated_in_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_objects_are_evaluated_in_batches() -> None:
     detected = detected_in(table_of(walk(10)), walk(10))
     five = Shapes.concatenate([chairs(), chairs()[[2, 0]]])
-    whole = gather_evidence(five, detected)
-    monkeypatch.setattr(likelihood, "OBJECTS_AT_ONCE", 2)
-    turns = gather_evidence(five, detected)
+    whole, turns = (gather_evidence(five, detected, -6.0, count) for count in (500, 2))
     for name in ("obj", "row", "existence", "assignment", "expected"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(turns, name))
     assert len(np.unique(whole.obj)) == 5
@@ -135,7 +133,7 @@ def proposed_for(table: rt.Tracks, poses: rt.Poses, floor: quadrics.Floor | None
     group = table.detection_index
     views = gather_views(table, poses, group, 3, 0.0)
     classes = class_shares(table, group, 3).argmax(1)
-    fits = make_fit(rt.ObjectsConfig(), poses, NAMES)(views, classes.tolist())
+    fits = make_fit(rt.ObjectsConfig(), poses, NAMES)(views, classes.tolist(), Scene())
     usual = np.tile([0.56, 0.6, 0.835], (3, 1))
     return propose(fits, views, classes, usual, floor, np.full(3, True))
 
@@ -252,14 +250,10 @@ def test_occluded_chairs_get_the_width_of_their_unoccluded_views(
     seen = dataclasses.replace(table, xyxy=np.where(back[:, None], half, table.xyxy))
     fit, priors = make_fit(rt.ObjectsConfig(), poses, NAMES), quadrics.load_priors()
     width = {}
-    for standing, rounds in (
-        (True, association.WIDENING_ROUNDS),
-        (True, 0),
-        (False, association.WIDENING_ROUNDS),
-    ):
-        monkeypatch.setattr(association, "WIDENING_ROUNDS", rounds)
+    for standing, rounds in ((True, 2), (True, 0), (False, 2)):
+        options = AssociationOptions(widening_rounds=rounds)
         monkeypatch.setattr(component, "find_floor", Mock(return_value=floor if standing else None))
-        found = associate_component(seen, NAMES, poses, fit, priors)
+        found = associate_component(seen, NAMES, poses, fit, priors, options=options)
         assert (found.label >= 0).mean() > 0.9 and len(found.confidence) == 3
         width[standing, rounds > 0] = found.ellipsoids.half_axes[:3, :2].mean()
     assert abs(width[True, True] / 0.29 - 1) < 0.1
@@ -418,7 +412,7 @@ def test_a_part_of_an_object_is_no_separate_object(
     )
     other = dataclasses.replace(solid, ellipsoids=moved)
     for pair in ([solid, other], [other, solid]):
-        found = association._coincide(Shapes.concatenate(pair))
+        found = association._coincide(Shapes.concatenate(pair), 0.5)
         assert found[0, 1] == found[1, 0] == one
 
 
@@ -480,12 +474,12 @@ def test_greedy_selection_adds_the_largest_marginal_gain() -> None:
     made.size_log_odds = lambda s: 1.25 + np.arange(len(s))
     of = made._unassigned(many)
     seen, cost, view = of.evidence, of.costs(), made.detections.view
-    value = np.minimum(seen.assignment, seen.existence + association.MAX_BOX_GAIN)
+    value = np.minimum(seen.assignment, seen.existence + made.options.max_box_gain)
     explained, expected = np.zeros(len(view)), list[int]()
     while True:
         gain, tops = -cost, np.zeros((len(many), len(seen.expected)))
         np.maximum.at(tops, (seen.obj, view[seen.row]), value - explained[seen.row])
-        gain += (tops + association.MISSED * (seen.expected.T & (tops > 0))).sum(1)
+        gain += (tops + made.options.missed * (seen.expected.T & (tops > 0))).sum(1)
         gain[expected] = -np.inf
         if gain.max() <= 0:
             break
@@ -519,7 +513,7 @@ def test_the_gain_of_a_merge_uses_all_rows_of_both() -> None:
             best[frame] = max(best.get(frame, (-np.inf, -n)), (float(seen.existence[n]), -n))
         for n in rows:
             frame = int(view[seen.row[n]])
-            hit = association.MISSED * seen.expected[frame, k] * (best[frame][1] == -n)
+            hit = made.options.missed * seen.expected[frame, k] * (best[frame][1] == -n)
             expected[k] += max(seen.existence[n] + hit, 0.0)
     assert any(np.bincount(view[label == 0]) > 1)
     np.testing.assert_allclose(made._joint_gains(label, strong, weak, fitted), expected)
@@ -536,14 +530,15 @@ def test_greedy_selection_finds_the_true_objects() -> None:
     assert sorted(made._select_greedily(made._unassigned(many)).tolist()) == [3, 4, 5]
 
 
-def test_missed_frames_lower_the_evidence_of_an_object(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missed_frames_lower_the_evidence_of_an_object() -> None:
     made, found = association_of(chairs(), walk(30))
     gain = found.gains(made.detections)
-    monkeypatch.setattr(association, "MISSED", association.MISSED + 1)
+    missed = made.options.missed + 1
+    found = dataclasses.replace(found, options=AssociationOptions(missed=missed))
     np.testing.assert_allclose(found.gains(made.detections), gain)  # none was missed
     found.label[made.detections.view < 10] = -1
     lost = gain - found.gains(made.detections)
-    assert (lost > 10 * (association.MISSED - 1e-9)).all()
+    assert (lost > 10 * (missed - 1e-9)).all()
 
 
 def test_a_size_is_compared_with_the_prior_per_axis() -> None:

@@ -15,7 +15,7 @@ import quadrics
 import reobj_track as rt
 from reobj.objects.config import make_fit
 from reobj.objects.description import describe_objects, describe_world
-from reobj.objects.observations import Views, gather_views
+from reobj.objects.observations import Scene, Views, gather_views
 from reobj.options import parse_known_size, parse_up
 
 
@@ -200,7 +200,7 @@ def test_the_fitter_accepts_classes_without_a_name() -> None:
     poses = walk(10)
     tracks = with_columns(tracks_of(poses), class_id=7)
     views = gather_views(tracks, poses, tracks.track_id - 1, 3, 0.3)
-    assert len(make_fit(rt.ObjectsConfig(), poses, ("cup",))(views, [7, 7, 7])) == 3
+    assert len(make_fit(rt.ObjectsConfig(), poses, ("cup",))(views, [7, 7, 7], Scene())) == 3
     assert {o.class_name for o in describe_objects(tracks, (), None, None, rt.ObjectsConfig())} == {
         "object"
     }

@@ -11,7 +11,7 @@ from test_linking import CHAIR, NAMES, SIZE, chair_solids, table_of, walk
 import quadrics
 import reobj_track as rt
 from reobj.objects.config import make_fit
-from reobj.objects.observations import Views, gather_views
+from reobj.objects.observations import Scene, Views, gather_views
 from reobj.objects.occlusion import occluded_edges, see_through_ratio
 
 LEFT, UPPER, RIGHT, LOWER = range(4)
@@ -104,7 +104,8 @@ def test_the_fit_extends_behind_an_occluded_edge(edge: int) -> None:
     occluded[..., edge] = True
     fit = make_fit(rt.ObjectsConfig(), poses, NAMES)
     cut, whole = (
-        fit(dataclasses.replace(views, occluded=mask), [CHAIR] * 3) for mask in (None, occluded)
+        fit(dataclasses.replace(views, occluded=mask), [CHAIR] * 3, Scene())
+        for mask in (None, occluded)
     )
     true = 2 * chair_solids().half_axes[:, 2]
     assert (cut.size[:, 2] < 0.8 * true).all()

@@ -60,3 +60,4 @@ def test_constants_are_scaled_by_kind() -> None:
     names = set(se.constants("quadrics"))
     assert {"HUBER", "UNKNOWN_SIZE_M"} <= names and not names & {"BOX", "SUPPORTS"}
     assert quadrics.HUBER == 3.0
+    assert "AssociationOptions.new_object" in set(se.constants("reobj.objects.association"))

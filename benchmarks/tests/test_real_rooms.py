@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import json
+import pkgutil
 from pathlib import Path
 
 import cv2
@@ -15,6 +15,7 @@ from simulated import CAMERA, SIZE, chair_solids, walk
 
 import quadrics
 import reobj_track as rt
+from reobj.objects.association import AssociationOptions
 from reobj.results.evaluation import score_tracks
 from reobj.results.result import VideoInfo
 from reobj.results.truth import LabelledBoxes, Role
@@ -290,14 +291,21 @@ def test_picture(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", rr.WITHOUT)
 def test_ablated_functions_exist(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A renamed or removed function must not be measured as an ablation."""
-    before = {}
+    before = []
     for path in rr.WITHOUT[name]:
-        module, _, attribute = path.rpartition(".")
-        owner = importlib.import_module(module)
-        before[path] = owner, attribute, getattr(owner, attribute)
-        monkeypatch.setattr(owner, attribute, before[path][2])  # put back afterwards
+        place, _, attribute = path.rpartition(".")
+        values = rr.values_of(pkgutil.resolve_name(place))
+        before.append((values, attribute, values[attribute]))
+        monkeypatch.setitem(values, attribute, values[attribute])  # put back afterwards
     rr.leave_out(name)
-    assert all(getattr(owner, name) is not old for owner, name, old in before.values())
+    assert all(values[attribute] is not old for values, attribute, old in before)
+
+
+def test_an_ablation_of_an_option_changes_its_default(monkeypatch: pytest.MonkeyPatch) -> None:
+    values = rr.values_of(AssociationOptions)
+    monkeypatch.setitem(values, "same_tracklet", values["same_tracklet"])
+    rr.leave_out("tracklets")
+    assert AssociationOptions().same_tracklet == 0.0 < AssociationOptions().missed
 
 
 def test_an_ablation_of_a_missing_name_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 import quadrics
 from reobj.cameras import Poses, undistort_boxes
 from reobj.objects import confidence
-from reobj.objects.association import Associator, FitShapes
+from reobj.objects.association import AssociationOptions, Associator, FitShapes
 from reobj.objects.categories import Categories
 from reobj.objects.hypotheses import propose, propose_along_rays
 from reobj.objects.likelihood import NO_SHAPES, PosedDetections, Shapes
@@ -50,10 +50,6 @@ class ComponentObjects:
     ellipsoids: quadrics.Ellipsoids
 
 
-_UNKNOWN = quadrics.Ellipsoids(*(np.full(s, np.nan) for s in ((1, 3), (1, 3), (1, 3, 3))))
-_NO_SHAPE = Shapes(_UNKNOWN, np.array([""]), np.array([-1]))
-
-
 def associate_component(
     rows: Tracks,
     class_names: Sequence[str],
@@ -62,13 +58,14 @@ def associate_component(
     priors: quadrics.Priors,
     moving: Collection[str] = (),
     looked: IntArray | None = None,
+    options: AssociationOptions | None = None,
 ) -> ComponentObjects:
     """Associate the detections of a component with 3D objects.
 
     Args:
         rows: all detections by frame; tracklet 0: untracked. moving: names of classes that move.
         looked: frames that the detector was run on, the only ones in which a detection can be
-            missed; None: all.
+            missed; None: all. options: None: the defaults.
     """
     names = np.array([*class_names, ""])
     used = np.flatnonzero(_is_static_and_posed(rows, names, poses, moving) & ~_duplicates(rows))
@@ -76,8 +73,9 @@ def associate_component(
     tracked = table[table.tracklet_id > 0]
     label = np.full(len(rows), -1)
     iou = np.full(len(rows), np.nan)
+    unknown = quadrics.Ellipsoids(*(np.full(s, np.nan) for s in ((1, 3), (1, 3), (1, 3, 3))))
     if not len(tracked):
-        return ComponentObjects(label, iou, np.empty(0), None, _UNKNOWN)
+        return ComponentObjects(label, iou, np.empty(0), None, unknown)
     fragment = cut_at_gaps(tracked, looked)
     count = int(fragment.max()) + 1
     observing = _without_unprocessed(poses, looked)
@@ -95,7 +93,7 @@ def associate_component(
     detections = _posed_detections(table, poses, views)
     scene = Scene(floor, None, None if poses.metric else fits.scale, trusts_classes=True)
     fit_shapes = _cached_fit(detections, views, categories, scene, fit)
-    associator = Associator(detections, fit_shapes, categories.size_log_odds)
+    associator = Associator(detections, fit_shapes, categories.size_log_odds, options)
     found = associator.run(hypotheses, floor is not None)
     assigned = np.flatnonzero(found.label >= 0)
     boxes = _project(found.shapes, views)[detections.view[assigned], found.label[assigned]]
@@ -104,12 +102,13 @@ def associate_component(
     see_through = see_through_ratio(
         found.shapes.ellipsoids, found.evidence.expected, poses, views.frame
     )
+    none = Shapes(unknown, np.array([""]), np.array([-1]))
     return ComponentObjects(
         label,
         iou,
         confidence.of_objects(found, detections, see_through),
         floor,
-        Shapes.concatenate([found.shapes, _NO_SHAPE]).ellipsoids,
+        Shapes.concatenate([found.shapes, none]).ellipsoids,
     )
 
 

@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
+import enum
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import quadrics
 from reobj.cameras import Poses
-from reobj.objects.observations import UNKNOWN_SCENE, Fit, Scene, Views
+from reobj.objects.observations import Fit, Scene, Views
 from reobj.options import load_size_priors, parse_known_size, parse_up
 from reobj.types import ReobjError, option
 
-DEFAULT_SOLVER = "solids"
-PUBLISHED_SOLVERS = ("lfd", "sfmo", "psfmo")
+
+class Solver(enum.StrEnum):
+    """What fits the ellipsoids: `quadrics.fit_objects`, or a published closed-form solver."""
+
+    SOLIDS = "solids"
+    LFD = "lfd"
+    SFMO = "sfmo"
+    PSFMO = "psfmo"
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +39,7 @@ class ObjectsConfig:
         "--support",
     )
     solver: str = option(
-        DEFAULT_SOLVER,
+        Solver.SOLIDS.value,
         "solids (default), or a published closed-form solver: lfd, sfmo, psfmo",
         "--solver",
     )
@@ -58,14 +65,14 @@ def make_fit(config: ObjectsConfig, poses: Poses, class_names: Sequence[str]) ->
     """
     priors = load_size_priors(config.priors)
     known_size = parse_known_size(config.known_size)
-    solvers = (DEFAULT_SOLVER, *PUBLISHED_SOLVERS)
-    if config.solver not in solvers:
-        expected = f"{DEFAULT_SOLVER} or {', '.join(PUBLISHED_SOLVERS)}"
+    if config.solver not in list(Solver):
+        default, *published = Solver
+        expected = f"{default} or {', '.join(published)}"
         raise ReobjError(f"--solver {config.solver}: expected {expected}")
     up = parse_up(config.up) if config.up else poses.up_in_world
     support = None if config.support == "auto" else config.support
 
-    def fit(views: Views, classes: list[int], scene: Scene = UNKNOWN_SCENE) -> quadrics.ObjectFits:
+    def fit(views: Views, classes: list[int], scene: Scene) -> quadrics.ObjectFits:
         names = [class_names[c] if c < len(class_names) else "" for c in classes]
         fits = quadrics.fit_objects(
             views.boxes, views.img_from_world, views.image_size, names, priors,

@@ -22,14 +22,7 @@ from reobj.objects.categories import name_of, on_floor
 from reobj.objects.component import ComponentObjects, associate_component, find_floor
 from reobj.objects.config import ObjectsConfig, make_fit
 from reobj.objects.description import describe_objects, describe_world
-from reobj.objects.observations import (
-    MIN_SCORE,
-    UNKNOWN_SCENE,
-    Fit,
-    Scene,
-    gather_views,
-    points_on,
-)
+from reobj.objects.observations import MIN_SCORE, Fit, Scene, gather_views, points_on
 from reobj.objects.occlusion import occluded_edges
 from reobj.results.edits import Edits, apply_edits
 from reobj.results.result import Object, Result
@@ -421,7 +414,7 @@ def _fit_component(
         views = gather_views(tracks, poses, group, len(classes), MIN_SCORE)
         objects = linked.objects[number]
         if objects is None:
-            first = fit(views, categories, UNKNOWN_SCENE)
+            first = fit(views, categories, Scene())
             floor = find_floor(poses, first)
             ellipsoids = first.ellipsoids
         else:

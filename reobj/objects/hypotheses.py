@@ -18,8 +18,12 @@ from reobj.types import Array, BoolArray, IntArray
 # class: smaller if a part is occluded (chosen; a step of a fifth is less than a chair's depth at
 # 3 m)
 DEPTHS = np.geomspace(0.4, 1.6, 8)
-BORDER_WEIGHT = 0.3  # of the area of a box at the image border, to choose the best view (chosen)
-STANDING_HEIGHTS = (0.3, 1.8)  # of floor-standing objects, over the usual height (chosen)
+# Weight of the area of a box at the image border, to choose the best view: it may be truncated, but
+# a much larger one still shows the object better (1: within the noise, benchmarks/RESULTS.md)
+BORDER_WEIGHT = 0.3
+# Heights of floor-standing objects, over the usual height (without: .7 more false chairs a run of
+# the kitchen, benchmarks/RESULTS.md)
+STANDING_HEIGHTS = (0.3, 1.8)
 
 
 def propose(

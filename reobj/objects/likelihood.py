@@ -32,8 +32,6 @@ MAX_BOX_ASSIGNMENT = 8.0
 CLASS_KEPT = 0.85  # of an object's detections have its class; the others have any class
 MIN_VISIBLE = 0.05  # least fraction of a projected box in the image to compare it with detections
 EXPECTED = 0.6  # and to expect a detection
-MIN_OVERLAP = 0.25  # of the smaller box, for a pair to be compared (chosen: speed)
-MIN_LOG_ODDS = -6.0  # of a pair that is kept (chosen: a tracklet is worth less)
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,24 +114,21 @@ class Evidence:
     expected: BoolArray
 
 
-OBJECTS_AT_ONCE = 500  # that are projected together (chosen: memory)
-
-
 def gather_evidence(
-    shapes: Shapes, detections: PosedDetections, min_log_odds: float = MIN_LOG_ODDS
+    shapes: Shapes, detections: PosedDetections, min_log_odds: float, at_once: int = 500
 ) -> Evidence:
     """Compare the projections of objects with the detections of all frames.
 
     Args:
         min_log_odds: pairs of a lower `assignment` are dropped.
+        at_once: objects that are projected together, to bound the memory.
     """
     votes = np.bincount(detections.class_id.clip(0), detections.score) + 0.5
     frequency: Array = np.asarray(votes, np.float64)
     frequency /= frequency.sum()
-    starts = range(0, max(len(shapes), 1), OBJECTS_AT_ONCE)
+    starts = range(0, max(len(shapes), 1), at_once)
     batches = [
-        _gather(shapes[k : k + OBJECTS_AT_ONCE], detections, frequency, min_log_odds)
-        for k in starts
+        _gather(shapes[k : k + at_once], detections, frequency, min_log_odds) for k in starts
     ]
     return Evidence(
         np.concatenate([batch.obj + k for k, batch in zip(starts, batches, strict=True)]),
@@ -194,12 +189,15 @@ def logit(score: Array) -> Array:
 
 
 def _overlapping(a: Array, b: Array) -> BoolArray:
-    """Mark pairs (A, B) of boxes whose overlap is more than MIN_OVERLAP of the smaller one."""
+    """Mark pairs (A, B) of boxes whose overlap is more than a quarter of the smaller one.
+
+    (The least overlap saves the time of comparing the others; chosen.)
+    """
     (ax, ay, ax2, ay2), (bx, by, bx2, by2) = a.T[..., None], b.T  # (A, 1), (B,) each
     width = np.minimum(ax2, bx2) - np.maximum(ax, bx)  # (A, B)
     height = np.minimum(ay2, by2) - np.maximum(ay, by)
     smaller = np.minimum(box_area(a)[:, None], box_area(b))
-    return np.asarray(width.clip(0) * height.clip(0) > MIN_OVERLAP * smaller)
+    return np.asarray(width.clip(0) * height.clip(0) > smaller / 4)
 
 
 def _box_log_odds(projected: Array, box: Array, image_size: tuple[int, int]) -> Array:

@@ -59,7 +59,6 @@ class Scene(NamedTuple):
     trusts_classes: bool = False
 
 
-UNKNOWN_SCENE = Scene()
 # views of G groups, their classes, facts about the scene -> G fits
 Fit = Callable[[Views, list[int], Scene], quadrics.ObjectFits]
 
@@ -87,12 +86,15 @@ def gather_views(
     return Views(frame, boxes, score, img_from_world, size)
 
 
-INSIDE_FRACTION = 0.8  # of the views that observe a point (chosen; .95 is alike: benchmarks/LOG.md)
+# Least fraction of the views that observe a point in which it is inside the box: boxes are cut off
+# where the object is occluded (.95 is alike: benchmarks/LOG.md)
+INSIDE_FRACTION = 0.8
 MIN_POINTS = 5  # per object (chosen: fewer may all belong to another object)
-MAX_POINTS = 100  # per object (chosen: time)
 
 
-def points_on(views: Views, poses: Poses, ellipsoids: quadrics.Ellipsoids) -> Array:
+def points_on(
+    views: Views, poses: Poses, ellipsoids: quadrics.Ellipsoids, max_points: int = 100
+) -> Array:
     """Find the sparse points that may lie on the object of each group: inside most of its boxes.
 
     A point inside the boxes of several groups is assigned to the nearest ellipsoid, and of several
@@ -100,6 +102,7 @@ def points_on(views: Views, poses: Poses, ellipsoids: quadrics.Ellipsoids) -> Ar
 
     Args:
         ellipsoids: of the G groups, NaN where unknown.
+        max_points: per object; more take more time.
     Returns:
         (G, P, 3), spread over the points of each group, padded with NaN.
     """
@@ -114,10 +117,10 @@ def points_on(views: Views, poses: Poses, ellipsoids: quadrics.Ellipsoids) -> Ar
     distance = np.linalg.norm((np.abs(in_obj) - half).clip(0), axis=1) / width
     order = np.lexsort((width, np.nan_to_num(distance, nan=np.inf), point))
     order = order[np.append(True, np.diff(point[order]) != 0)[: len(order)]]  # nearest group
-    found = np.full((views.boxes.shape[1], MAX_POINTS, 3), np.nan)
+    found = np.full((views.boxes.shape[1], max_points, 3), np.nan)
     for pairs in rows_by(group[order]):
         if len(pairs) >= MIN_POINTS:
-            pairs = order[pairs[:: -(-len(pairs) // MAX_POINTS)]]
+            pairs = order[pairs[:: -(-len(pairs) // max_points)]]
             found[group[pairs[0]], : len(pairs)] = poses.points[point[pairs]]
     return found
 

@@ -16,11 +16,9 @@ from reobj.objects.observations import Views
 from reobj.types import Array, BoolArray, IntArray
 from reobj.visible_points import VisiblePoints
 
-EDGE_POINTS = (np.arange(8) + 0.5) / 8  # along an edge (chosen)
 # Offsets from the edge, over the size of the box: outside, where an occluder must be, and inside,
 # where none may be (chosen: the outline of the occluder is not known better)
 BESIDE_EDGE = (0.1, -0.2)
-MIN_COVERED = 0.5  # fraction of these points that nearer objects cover (chosen)
 # Fraction of its height that a box may end above the lower edge of its object and still show all of
 # it (chosen on hololens_kitchen, where .05 to .2 are alike)
 ABOVE_FLOOR = 0.1
@@ -57,7 +55,10 @@ def edges_above_floor(boxes: Array, projected: Array) -> BoolArray:
 
 
 def _occluded_by_nearer(views: Views, ellipsoids: quadrics.Ellipsoids) -> BoolArray:
-    """Mark box edges (V, G, 4) with a nearer object just outside and none just inside."""
+    """Mark box edges (V, G, 4) with a nearer object just outside and none just inside.
+
+    A nearer object is there if it covers half of the points beside the edge or more.
+    """
     occluded = np.zeros(views.boxes.shape, bool)
     known = np.isfinite(ellipsoids.half_axes.sum(1) + ellipsoids.center_in_world.sum(1))
     seen = np.isfinite(views.boxes.sum(2)) & known  # (V, G)
@@ -77,7 +78,7 @@ def _occluded_by_nearer(views: Views, ellipsoids: quadrics.Ellipsoids) -> BoolAr
         itself = candidates == column[groups, None]  # (D, N)
         entry = np.where(itself[:, None, None], np.inf, entry)
         nearest = entry.min(4, initial=np.inf)
-        covered = (nearest < depth[column[groups], None, None]).mean(3) >= MIN_COVERED  # (2, D, 4)
+        covered = (nearest < depth[column[groups], None, None]).mean(3) >= 0.5  # (2, D, 4)
         occluded[v, groups] = covered[0] & ~covered[1]
     return occluded
 
@@ -86,7 +87,8 @@ def _beside_edges(box: Array) -> Array:
     """Return points (2, D, 4, P, 2) along the edges of boxes (D, 4), for each `BESIDE_EDGE`."""
     low = box[:, None, :2]  # (D, 1, 2)
     high = box[:, None, 2:]
-    along = low + (high - low) * EDGE_POINTS[:, None]  # (D, P, 2)
+    point = (np.arange(8) + 0.5) / 8  # (P,) of the length of an edge; more take more time
+    along = low + (high - low) * point[:, None]  # (D, P, 2)
     found = []
     for beyond in BESIDE_EDGE:
         off = beyond * (high - low)
@@ -112,22 +114,29 @@ def _entry_depths(points: Array, camera: Array, boxes: quadrics.Ellipsoids) -> A
     return np.where((enter < leave) & (leave > 0), np.maximum(enter, 0), np.inf)
 
 
-MIDDLE = 0.6  # largest distance of a ray from the centre, over the half axes (chosen)
-BEHIND = 0.05  # least distance behind the object, over that from the camera (chosen)
+# Largest distance of a ray from the centre, over the half axes (larger: more points, but also rays
+# beside an object that fills its ellipsoid poorly)
+MIDDLE = 0.6
+# Least distance behind the object, over that from the camera (smaller: errors of depth count)
+BEHIND = 0.05
 # Ratio of points behind to points on an object that exists (measured: chairs, tables 1.8)
 HOLES = 2.0
-PRIOR_POINTS = 10.0  # added to both counts (chosen: 5 and 10 are alike)
-MOST_POINTS = 500  # of a frame that are tested (chosen: time)
+PRIOR_POINTS = 10.0  # added to both counts: few points are no evidence (5 and 10 are alike)
 
 
 def see_through_ratio(
-    ellipsoids: quadrics.Ellipsoids, expected: BoolArray, poses: Poses, frame: IntArray
+    ellipsoids: quadrics.Ellipsoids,
+    expected: BoolArray,
+    poses: Poses,
+    frame: IntArray,
+    most_points: int = 500,
 ) -> Array:
     """Measure how many sparse points are seen behind objects, compared with on or before them.
 
     Args:
         ellipsoids: O. expected: (V, O) frames in which the objects should be visible.
         poses: with points and their visibility. frame: (V,) numbers.
+        most_points: of a frame that are tested; more take more time.
     Returns:
         (O,) log ratio of points behind to the others on rays through the middle, at least 0.
     """
@@ -138,7 +147,7 @@ def see_through_ratio(
     for v in np.flatnonzero(expected.any(1)):
         points = visible.observed(row[v])
         objects = np.flatnonzero(expected[v])
-        ray = poses.points[points[:: len(points) // MOST_POINTS + 1]] - camera[v]  # (N, 3)
+        ray = poses.points[points[:: len(points) // most_points + 1]] - camera[v]  # (N, 3)
         scaled = ellipsoids.world_from_obj[objects] / ellipsoids.half_axes[objects][:, None]
         start = np.einsum("si,sij->sj", camera[v] - ellipsoids.center_in_world[objects], scaled)
         along = np.einsum("ni,sij->nsj", ray, scaled)  # in units of the half axes: unit spheres

@@ -14,16 +14,15 @@ import numpy as np
 import quadrics
 from reobj.cameras import Poses, import_pycolmap, triangulate_rays
 from reobj.objects.categories import name_of
-from reobj.objects.config import DEFAULT_SOLVER, ObjectsConfig
+from reobj.objects.config import ObjectsConfig, Solver
 from reobj.objects.description import describe_objects
 from reobj.objects.observations import MIN_SCORE, Views, gather_views
 from reobj.results.result import Object, Result
 from reobj.types import Array, BoolArray, object_classes
 
-NO_SCALE = quadrics.Scale(1.0, 0.0, "none")
 # views, their cameras, categories -> ellipsoids of the G groups (NaN: none), why others have none
 Solved = tuple[quadrics.Ellipsoids, str]
-Solver = Callable[[Views, Poses, Sequence[str], quadrics.Priors], Solved]
+Solve = Callable[[Views, Poses, Sequence[str], quadrics.Priors], Solved]
 
 
 def solve_again(result: Result, config: ObjectsConfig) -> Result:
@@ -34,7 +33,7 @@ def solve_again(result: Result, config: ObjectsConfig) -> Result:
         and with a warning of the solver's limitations; unchanged for the default solver or without
         cameras.
     """
-    if config.solver == DEFAULT_SOLVER or result.poses is None or result.fits is None:
+    if config.solver == Solver.SOLIDS or result.poses is None or result.fits is None:
         return result
     solve, text = SOLVERS[config.solver]
     priors = quadrics.load_priors(config.priors or None)
@@ -52,8 +51,9 @@ def solve_again(result: Result, config: ObjectsConfig) -> Result:
         names = [name_of(result.class_names, c) for c in classes.values()]
         ellipsoids, reason = solve(views, poses, names, priors)
         ellipsoids = _vertical_axis_last(ellipsoids, component.up_in_world)
-        has_scale = config.solver != "sfmo" and component.scale is not None
-        scale = component.scale if has_scale and component.scale is not None else NO_SCALE
+        scale = quadrics.Scale(1.0, 0.0, "none")
+        if config.solver != Solver.SFMO and component.scale is not None:
+            scale = component.scale
         parallax = [before[i].parallax_deg for i in classes]
         fits = _as_fits(ellipsoids, views, np.array(parallax, np.float64), scale, reason)
         confidence = {i: o.confidence for i, o in before.items() if o.confidence is not None}
@@ -180,18 +180,18 @@ def _as_fits(
     )
 
 
-SOLVERS: dict[str, tuple[Solver, str]] = {
-    "lfd": (
+SOLVERS: dict[str, tuple[Solve, str]] = {
+    Solver.LFD: (
         _lfd,
         "ellipsoids in closed form, in the units of the cameras; "
         "no priors, no outlier rejection, no uncertainty",
     ),
-    "sfmo": (
+    Solver.SFMO: (
         _sfmo,
         "shapes from boxes alone, with affine cameras, without metric meaning (size_m is null); "
         "the similarity transform and reflection are those that fit the cameras best",
     ),
-    "psfmo": (
+    Solver.PSFMO: (
         _psfmo,
         "axis ratios from the category, cameras linearised at each object, in the units of the "
         "cameras; no size priors, no outlier rejection, no uncertainty",

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from reobj.files import atomic, load_json, shortened
+from reobj.results.names import OutputFile
 from reobj.types import (
     CLASS_NAME_MAX,
     COORDINATE_MAX,
@@ -26,9 +27,7 @@ from reobj.types import (
     box_iou,
 )
 
-FORMAT = "reobj-edits"
-FORMAT_VERSION = 1
-EDITS = "edits.json"  # in an output folder
+HEADER = {"format": "reobj-edits", "version": 1}
 FIELDS = {  # keys of an edit besides `do`
     "merge": ("object", "with"),
     "split": ("object", "visits"),
@@ -97,10 +96,11 @@ def read_edits(path: str | Path) -> Edits:
     """
     path = Path(path)
     data = load_json(path)
-    if not isinstance(data, dict) or data.get("format") != FORMAT:
-        raise ReobjError(f'{path}: no edits; expected "format": "{FORMAT}", as scene.html saves it')
-    if data.get("version") != FORMAT_VERSION or not isinstance(data.get("edits"), list):
-        expected = f'"version": {FORMAT_VERSION} and a list "edits"'
+    form, version = HEADER.values()
+    if not isinstance(data, dict) or data.get("format") != form:
+        raise ReobjError(f'{path}: no edits; expected "format": "{form}", as scene.html saves it')
+    if data.get("version") != version or not isinstance(data.get("edits"), list):
+        expected = f'"version": {version} and a list "edits"'
         raise ReobjError(f"{path}: version {data.get('version')}; expected {expected}")
     edits = []
     for number, entry in enumerate(data["edits"], 1):
@@ -152,14 +152,14 @@ def write_edits(folder: Path, edits: Edits | None) -> None:
     """Write edits into a new folder of results, for later fits; no file for an empty list."""
     if edits is None or not edits.edits:
         return
-    data = {"format": FORMAT, "version": FORMAT_VERSION, "edits": edits.entries}
-    with atomic(folder / EDITS) as part:
+    data = HEADER | {"edits": edits.entries}
+    with atomic(folder / OutputFile.EDITS) as part:
         part.write_text(json.dumps(data, indent=1) + "\n")
 
 
 def kept_edits(folder: Path) -> Edits | None:
     """Read the edits in an output folder; None if there are none."""
-    path = folder / EDITS
+    path = folder / OutputFile.EDITS
     return dataclasses.replace(read_edits(path), kept=True) if path.exists() else None
 
 
@@ -200,7 +200,8 @@ def apply_edits(tracks: Tracks, class_names: tuple[str, ...], edits: Edits) -> E
             raise ReobjError(f"{where}: {error.args[0]}; {hint}") from error
     keep, messages = table.without_duplicates(str(edits.path))
     if (count := len(edits.edits)) > 0:
-        messages.append(f"{count} correction{'s' * (count != 1)} by hand applied ({EDITS})")
+        corrections = f"{count} correction{'s' * (count != 1)}"
+        messages.append(f"{corrections} by hand applied ({OutputFile.EDITS})")
     edited = dataclasses.replace(tracks, track_id=table.identity, class_id=table.class_id)
     confirmed = table.confirmed & set(table.identity[keep].tolist())
     return Edited(edited, keep, tuple(table.names), confirmed, messages)

@@ -18,6 +18,7 @@ from scipy.optimize import linear_sum_assignment
 from reobj import __version__
 from reobj.files import wrapped
 from reobj.results.evaluation_3d import score_objects
+from reobj.results.names import OutputFile
 from reobj.results.result import Result
 from reobj.results.truth import (
     LabelledBoxes,
@@ -27,7 +28,7 @@ from reobj.results.truth import (
     read_truth,
     with_common_names,
 )
-from reobj.results.workspace import LAST_TRACKS, Workspace
+from reobj.results.workspace import Workspace
 from reobj.sources.video import InputConfig
 from reobj.types import (
     COCO_NAMES,
@@ -358,11 +359,11 @@ def evaluate(
     out = Path(out)
     names = COCO_NAMES
     tracked = None
-    if out.name == "tracks.txt" and (out.parent / LAST_TRACKS).exists():
+    if out.name == OutputFile.TRACKS and (out.parent / OutputFile.LAST_TRACKS).exists():
         out = out.parent
     notes: list[str] = []
     predicted = read_result(out, notes)
-    if (out / LAST_TRACKS).exists():
+    if (out / OutputFile.LAST_TRACKS).exists():
         workspace = Workspace.open(out)
         tracked = workspace.load_last()
         names = tracked.class_names

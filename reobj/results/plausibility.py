@@ -14,12 +14,6 @@ from reobj.results.result import Object, Result
 from reobj.types import BoolArray, IntArray, Tracks, box_iou, rows_by
 
 OTHER_BOXES = "another detector (--detector, or other boxes with --detections)"
-# Objects of a class from which it may be a mistake: six chairs at a table and seven plants in a
-# living room are normal; partitions taken for refrigerators were 8 of 10 and more (office_loop)
-SAME_CLASS_MIN = 8
-# deg, parallax of an object seen from around: if its size still rests on the prior, the boxes are
-# inaccurate, and more parallax does not help (redkitchen)
-AROUND_DEG = 10.0
 
 
 def implausible(
@@ -56,7 +50,9 @@ def _few_cameras(result: Result) -> str:
 def _nothing_measured(result: Result, still: Sequence[Object]) -> str:
     """Warn if there are cameras and objects, but no object is measured or has a large parallax."""
     poses = result.poses
-    measured = any(o.status == "ok" or (o.parallax_deg or 0.0) >= AROUND_DEG for o in still)
+    # With 10 deg of parallax an object is seen from around: if its size still rests on the prior,
+    # the boxes are inaccurate, and more parallax does not help (redkitchen).
+    measured = any(o.status == "ok" or (o.parallax_deg or 0.0) >= 10.0 for o in still)
     if poses is None or not poses.known.any() or measured:
         return ""
     if len(still) < 3:  # one or two objects without parallax are normal
@@ -73,7 +69,9 @@ def _one_class(result: Result, still: Sequence[Object]) -> str:
     """Warn if most listed objects are of one class, unless all detections are."""
     name, count = next(iter(Counter(o.class_name for o in still).most_common(1)), ("", 0))
     boxes = np.append(result.tracks.class_id, result.untracked.class_id)
-    if count < SAME_CLASS_MIN or 2 * count <= len(still) or len(np.unique(boxes)) == 1:
+    # Six chairs at a table and seven plants in a living room are normal; partitions taken for
+    # refrigerators were 8 of 10 and more (office_loop).
+    if count < 8 or 2 * count <= len(still) or len(np.unique(boxes)) == 1:
         return ""
     return (
         f"{count} of {len(still)} listed objects are of the class {name}: check that there are so "

@@ -32,8 +32,9 @@ from reobj.files import (
     save_npz,
     staged,
 )
-from reobj.results.edits import EDITS, write_edits
+from reobj.results.edits import write_edits
 from reobj.results.entries import Object, VideoInfo, World, decode
+from reobj.results.names import OutputFile
 from reobj.results.ply import write_ply
 from reobj.sources.tables import read_mot_rows
 from reobj.types import Embeddings, ReobjError, Tracks, printable, without_secrets
@@ -41,21 +42,17 @@ from reobj.types import Embeddings, ReobjError, Tracks, printable, without_secre
 if TYPE_CHECKING:
     from reobj.results.result import Result
 
-FORMAT = "reobj-objects"
-FORMAT_VERSION = 1  # of objects.json
-LAST_POSES = "cache/last-poses.npz"  # in an output folder
-MODEL = "sparse"  # folder of a COLMAP model
+HEADER = {"format": "reobj-objects", "version": 1}  # of objects.json
 STALE = (  # files that not every run writes; cameras.csv: before 0.2
-    "poses.txt", "cameras.csv", "objects.ply", "overlay.mp4", "overlay.webm", "scene.html",
-    LAST_POSES,
+    OutputFile.POSES, OutputFile.MESH, OutputFile.LAST_POSES,
+    "cameras.csv", "overlay.mp4", "overlay.webm", "scene.html",
 )  # fmt: skip
-CONFIG_FILE = "config.toml"  # options of the last run
 
 
 def check_results(out: Path) -> None:
     """Check that results can be written into an output folder, before they are computed."""
-    others = ("tracks.txt", "objects.json", EDITS, CONFIG_FILE, f"{MODEL}/cameras.txt")
-    check_places(out, (*STALE, *others))
+    others = (OutputFile.TRACKS, OutputFile.OBJECTS, OutputFile.EDITS, OutputFile.CONFIG)
+    check_places(out, (*STALE, *others, f"{OutputFile.MODEL}/cameras.txt"))
 
 
 @contextlib.contextmanager
@@ -85,7 +82,7 @@ def remove_stale(
     for name in stale:
         for found in (out / name, *part_paths(out / name)):
             found.with_name(f".part-{found.name}").unlink(missing_ok=True)  # of a killed run
-            if name == MODEL and found.is_dir() and not found.is_symlink():
+            if name == OutputFile.MODEL and found.is_dir() and not found.is_symlink():
                 for old in set(found.iterdir()) - kept:
                     shutil.rmtree(old) if old.is_dir() else old.unlink()
                 if found not in kept:
@@ -98,17 +95,17 @@ def copy_models(models: Sequence[Path], folder: Path) -> None:
     """Copy the existing COLMAP models, one a component, to sparse/, sparse_part1/, ..."""
     for k, model in enumerate(models):
         if model.is_dir():
-            shutil.copytree(model, part_path(folder / MODEL, k))
+            shutil.copytree(model, part_path(folder / OutputFile.MODEL, k))
 
 
 def write_trajectories(out: Path, poses: Poses) -> None:
     """Write poses.txt, and poses_part1.txt, ... of further components: a TUM file has one world."""
     if not poses.known.any():
         return
-    for old in part_paths(out / "poses.txt"):
+    for old in part_paths(out / OutputFile.POSES):
         old.unlink()
     for k in range(poses.part_count):
-        write_tum(part_path(out / "poses.txt", k), poses.of_part(k))
+        write_tum(part_path(out / OutputFile.POSES, k), poses.of_part(k))
 
 
 def write_mot(path: Path, tracks: Tracks) -> None:
@@ -130,18 +127,19 @@ def save(
     stale: Sequence[str],
 ) -> None:
     """Write the files of a result; for the arguments see `Result.save`."""
-    edited = () if result.edits is None else (EDITS,)
+    edited = () if result.edits is None else (OutputFile.EDITS,)
     with replaced(out, (*STALE, *edited, *stale)) as new:
-        write_mot(new / "tracks.txt", (result if doubtful else result.without_doubtful()).tracks)
-        write_objects(result, new / "objects.json")
+        shown = result if doubtful else result.without_doubtful()
+        write_mot(new / OutputFile.TRACKS, shown.tracks)
+        write_objects(result, new / OutputFile.OBJECTS)
         write_edits(new, result.edits)
         if result.poses is not None:
-            save_poses(new / LAST_POSES, result.poses)
+            save_poses(new / OutputFile.LAST_POSES, result.poses)
             write_trajectories(new, result.poses)
         if result.fits is not None or result.located:
             for k, component in enumerate(result.parts()):
                 ids = [o.id for o in component.located]
-                write_ply(part_path(new / "objects.ply", k), component.ellipsoids(), ids)
+                write_ply(part_path(new / OutputFile.MESH, k), component.ellipsoids(), ids)
         if write_more is not None:
             write_more(new)
 
@@ -152,8 +150,8 @@ def load(kind: type[Result], out: Path) -> Result:
     Args:
         kind: `Result`, whose module imports this one.
     """
-    path = out / "objects.json"
-    if not path.is_file() or not (out / "tracks.txt").is_file():
+    path = out / OutputFile.OBJECTS
+    if not path.is_file() or not (out / OutputFile.TRACKS).is_file():
         raise ReobjError(f"{out}: no objects.json and tracks.txt; make them first with `run`")
     poses = load_last_poses(out)
     entries = read_objects(path)
@@ -161,7 +159,7 @@ def load(kind: type[Result], out: Path) -> Result:
         raise ReobjError(f"{path}: {fault}; {written_by(out)}")
     class_names = tuple(dict.fromkeys(o.class_name for o in entries.objects))
     class_of = {o.id: class_names.index(o.class_name) for o in entries.objects}
-    rows = read_mot_rows(out / "tracks.txt")
+    rows = read_mot_rows(out / OutputFile.TRACKS)
     frame = rows[:, 0].astype(np.int64) - 1
     ids = rows[:, 1].astype(np.int64)
     corners = np.concatenate([rows[:, 2:4], rows[:, 2:4] + rows[:, 4:6]], 1)  # (N, 4)
@@ -181,7 +179,7 @@ def load(kind: type[Result], out: Path) -> Result:
 
 def load_last_poses(out: Path) -> Poses | None:
     """Read the latest poses of an output folder, None if it has none."""
-    path = out / LAST_POSES
+    path = out / OutputFile.LAST_POSES
     if not path.is_file():
         return None
     try:
@@ -194,7 +192,7 @@ def written_by(out: Path) -> str:
     """Explain why a file of an output folder is unreadable: damaged, or of another version."""
     data: dict[str, Any] = {}
     with contextlib.suppress(ReobjError):
-        data = load_json(out / "objects.json")
+        data = load_json(out / OutputFile.OBJECTS)
     wrote = data.get("reobj_track") if isinstance(data, dict) else None
     if wrote == __version__:
         return "is damaged: run the video again"
@@ -225,8 +223,7 @@ def write_objects(result: Result, path: Path) -> None:
             versions[name] = version(name)
     tracked = {"tracked_frames": len(np.unique(result.tracks.frame))}
     data = {
-        "format": FORMAT,
-        "version": FORMAT_VERSION,
+        **HEADER,
         "command": " ".join(map(without_secrets, sys.argv)),
         "reobj_track": __version__,
         "versions": versions,
@@ -261,8 +258,9 @@ def read_objects(path: Path) -> ObjectsFile:
 
 def _contradiction(entries: ObjectsFile, poses: Poses | None) -> str:
     """Describe a contradiction between entries of objects.json, or to the poses; "" if none."""
-    if (entries.format, entries.version) != (FORMAT, FORMAT_VERSION):
-        return f"expected format {FORMAT}, version {FORMAT_VERSION}"
+    form, number = HEADER.values()
+    if (entries.format, entries.version) != (form, number):
+        return f"expected format {form}, version {number}"
     ids = [o.id for o in entries.objects]
     if len(set(ids)) != len(ids):
         return "two objects of one id"
@@ -299,7 +297,7 @@ def validate_objects(path: Path) -> list[str]:
     except ImportError as error:
         advice = "jsonschema is not installed: pip install 'reobj-track[validate]'"
         raise ReobjError(advice) from error
-    path = path / "objects.json" if path.is_dir() else path
+    path = path / OutputFile.OBJECTS if path.is_dir() else path
     types = Draft202012Validator.TYPE_CHECKER.redefine("number", _is_finite)
     validator = validators.extend(Draft202012Validator, type_checker=types)(objects_schema())
     lines = []

@@ -128,10 +128,18 @@ def read_result(out: Path, notes: list[str] | None = None) -> LabelledBoxes:
     return predicted
 
 
-MOT_PEDESTRIAN = 1  # class of MOTChallenge that counts
-# Person on vehicle, static person, distractor, reflection; MOT20 also: vehicle that is not
-# motorised (TrackEval 1.3.0, mot_challenge_2d_box.py)
-MOT_DISTRACTORS = {"MOT16": (2, 7, 8, 12), "MOT17": (2, 7, 8, 12), "MOT20": (2, 6, 7, 8, 12)}
+class MotClass(enum.IntEnum):
+    """Classes of MOTChallenge: the one that counts, and those that do not count if matched.
+
+    The latter in TrackEval 1.3.0, mot_challenge_2d_box.py.
+    """
+
+    PEDESTRIAN = 1
+    PERSON_ON_VEHICLE = 2
+    NON_MOTORISED_VEHICLE = 6  # of MOT20 only
+    STATIC_PERSON = 7
+    DISTRACTOR = 8
+    REFLECTION = 12
 
 
 def _read_mot(
@@ -162,10 +170,13 @@ def _read_mot(
         )
     if benchmark := _benchmark(sequence.get("name", ""), path, number, flagged):
         notes.append(f"classes are {benchmark}'s: pedestrians count, boxes on distractors do not")
-        role = np.where(flagged | (number != MOT_PEDESTRIAN), Role.ABSENT, hidden * Role.IGNORED)
-        role[np.isin(number, MOT_DISTRACTORS[benchmark])] = Role.IGNORED
+        pedestrian = number == MotClass.PEDESTRIAN
+        role = np.where(flagged | ~pedestrian, Role.ABSENT, hidden * Role.IGNORED)
+        only_mot20 = {MotClass.NON_MOTORISED_VEHICLE} if benchmark != "MOT20" else set()
+        distractors = set(MotClass) - {MotClass.PEDESTRIAN} - only_mot20
+        role[np.isin(number, list(distractors))] = Role.IGNORED
         return labelled(rows, "", role)
-    if (number < 0).all() or (sequence and (number == MOT_PEDESTRIAN).all()):
+    if (number < 0).all() or (sequence and (number == MotClass.PEDESTRIAN).all()):
         notes.append("the truth has one class without a name: classes do not count")
         return labelled(rows, "", np.where(flagged, Role.ABSENT, hidden * Role.IGNORED))
     notes.append("class numbers of the truth are those of the detector (COCO's), from 0")
@@ -220,7 +231,7 @@ def _benchmark(name: str, path: Path, number: IntArray, flagged: BoolArray) -> s
     for text in (name, path.resolve().parent.parent.name):
         if match := re.match(r"(MOT16|MOT17|MOT20)-\d+", text):
             return match[1]
-    other = number != MOT_PEDESTRIAN
+    other = number != MotClass.PEDESTRIAN
     known = ((number >= 1) & (number <= 13)).all()
     return "MOT17" if known and other.any() and (flagged == other).all() else ""
 

@@ -23,11 +23,10 @@ from reobj.files import (
     locked,
     writing,
 )
-from reobj.results.edits import EDITS
 from reobj.results.entries import decode
+from reobj.results.names import OutputFile
 from reobj.results.result import Result
 from reobj.results.saving import (
-    LAST_POSES,
     check_results,
     load_last_poses,
     remove_stale,
@@ -36,8 +35,6 @@ from reobj.results.saving import (
 from reobj.sources.imageless import ImagelessVideo
 from reobj.sources.video import InputConfig, Video
 from reobj.types import COORDINATE_MAX, ReobjError
-
-LAST_TRACKS = "cache/last-tracks.npz"  # in an output folder
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +81,7 @@ class Workspace:
         if foreign and not overwrite:
             what = "is not empty and not made by reobj_track"
             raise ReobjError(f"{out}: {what}; choose another -o, or add --overwrite")
-        if foreign and (out / "sparse").exists():
+        if foreign and (out / OutputFile.MODEL).exists():
             raise ReobjError(f"{out}: a sparse/ of its own would be lost; choose another -o")
         self._held = contextlib.ExitStack()
         with writing(self.cache):
@@ -137,7 +134,8 @@ class Workspace:
                     advice = "choose another -o, or add --overwrite"
                     raise ReobjError(f"{self.out}: holds the results of {found}; {advice}")
                 remove_stale(self.out)
-                for name in ("tracks.txt", "objects.json", EDITS, LAST_TRACKS, LAST_POSES):
+                others = (OutputFile.TRACKS, OutputFile.OBJECTS, OutputFile.EDITS)
+                for name in (*others, OutputFile.LAST_TRACKS, OutputFile.LAST_POSES):
                     (self.out / name).unlink(missing_ok=True)
         with atomic(path) as part:
             part.write_text(json.dumps(fingerprint))
@@ -145,7 +143,8 @@ class Workspace:
     def _has_results(self) -> bool:
         """Check for results of a run; cached stages are keyed by their video and do not count."""
         shown = [p for p in self.out.iterdir() if p != self.cache and p.name != PART_RESULTS]
-        return bool(shown) or any((self.out / name).exists() for name in (LAST_TRACKS, LAST_POSES))
+        last = (OutputFile.LAST_TRACKS, OutputFile.LAST_POSES)
+        return bool(shown) or any((self.out / name).exists() for name in last)
 
     @property
     def source(self) -> tuple[str, InputConfig]:
@@ -232,28 +231,28 @@ class Workspace:
             warnings.
         """
         warnings = []
-        tracked.save_tracked(self.out / LAST_TRACKS)
-        edits = self.out / EDITS
+        tracked.save_tracked(self.out / OutputFile.LAST_TRACKS)
+        edits = self.out / OutputFile.EDITS
         if tracked.identities_given and edits.exists():
             edits.unlink()
             warnings.append(f"{edits} removed: the given identities replace it")
         if poses is None:
-            (self.out / LAST_POSES).unlink(missing_ok=True)
+            (self.out / OutputFile.LAST_POSES).unlink(missing_ok=True)
         else:
             names = None if models is None else [path.name for path in models]
-            save_poses(self.out / LAST_POSES, poses, models=names)
+            save_poses(self.out / OutputFile.LAST_POSES, poses, models=names)
         return warnings
 
     def last_models(self) -> list[Path] | None:
         """Return the COLMAP models to copy to the folder; None if they were copied already."""
-        path = self.out / LAST_POSES
+        path = self.out / OutputFile.LAST_POSES
         names = load_npz(path)[1].get("models") if path.is_file() else None
         return None if names is None else [self.cache / Path(name).name for name in names]
 
     @property
     def last_tracks(self) -> Result | None:
         """The latest tracks of the tracker, before linking; None if there are none."""
-        path = self.out / LAST_TRACKS
+        path = self.out / OutputFile.LAST_TRACKS
         return Result.load_tracked(path) if path.exists() else None
 
     def load_last(self) -> Result:
