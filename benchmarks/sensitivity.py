@@ -95,8 +95,9 @@ def measure_changed(
         if values.get(name) is value:
             values[name] = scaled(value, factor)
     own = out / f"{name}-{factor:g}-{case.name}"  # the cases of other processes are not touched
-    own.mkdir(parents=True, exist_ok=True)
-    shutil.copytree(out / case.name, own / case.name, dirs_exist_ok=True)
+    shutil.rmtree(own, ignore_errors=True)  # of an interrupted run
+    own.mkdir()
+    shutil.copytree(out / case.name, own / case.name)
     for folder in [*out.glob("poses-*"), *out.glob("rendered-*-clip")]:
         (own / folder.name).symlink_to(folder.resolve())
     try:
