@@ -14,6 +14,7 @@ not change; whole numbers do not go below 1.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import importlib
 import json
 import re
@@ -46,20 +47,33 @@ MODULES = (
     ),
 )  # fmt: skip
 
-CODES = ("BOX", "CYLINDER", "AXIS_GROUPS", "AXIS_ORDERS", "UPRIGHT_ORDERS")  # not quantities
+CODES = ("AXIS_GROUPS", "AXIS_ORDERS")  # not quantities
 
 
 def constants(module: str) -> Iterator[str]:
-    """Yield the names of the numbers, or tuples and arrays of numbers, of a module."""
+    """Yield the names of the numbers, or tuples and arrays of numbers, of a module.
+
+    Of an object of options the fields: `ROBUST.huber`.
+    """
     source = Path(importlib.import_module(module).__file__ or "").read_text()
     for name in re.findall(r"^([A-Z][A-Z0-9_]+)(?:: \w+)? = ", source, re.MULTILINE):
-        value = np.asarray(getattr(importlib.import_module(module), name))
-        if name not in CODES and value.dtype.kind in "if" and np.any(value):
+        value = getattr(importlib.import_module(module), name)
+        if dataclasses.is_dataclass(value):
+            yield from (f"{name}.{field.name}" for field in dataclasses.fields(value))
+            continue
+        numbers = np.asarray(value)
+        if name not in CODES and numbers.dtype.kind in "if" and np.any(numbers):
             yield name
 
 
-def scaled(value: Any, factor: float) -> Any:
-    """Scale a number, or all numbers of a tuple or array; integers stay integers, at least 1."""
+def scaled(value: Any, factor: float, field: str = "") -> Any:
+    """Scale a number, all numbers of a tuple or array, or a field of an object of options.
+
+    Integers stay integers, at least 1.
+    """
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        number = scaled(getattr(value, field), factor)
+        return dataclasses.replace(value, **{field: number})
     if isinstance(value, tuple):
         return tuple(scaled(v, factor) for v in value)
     if isinstance(value, int):
@@ -71,11 +85,12 @@ def measure_changed(
     case: Case, data: Path, out: Path, module: str, name: str, factor: float
 ) -> Figures:
     """Score a case with one constant scaled, in this process, wherever it was imported to."""
-    value = getattr(importlib.import_module(module), name)
+    constant, _, field = name.partition(".")
+    value = getattr(importlib.import_module(module), constant)
     for title, other in list(sys.modules.items()):
         ours = title.partition(".")[0] in ("reobj", "reobj_track", "quadrics")
-        if ours and getattr(other, name, None) is value:
-            setattr(other, name, scaled(value, factor))
+        if ours and getattr(other, constant, None) is value:
+            setattr(other, constant, scaled(value, factor, field))
     own = out / f"{name}-{factor:g}-{case.name}"  # the cases of other processes are not touched
     own.mkdir(parents=True, exist_ok=True)
     shutil.copytree(out / case.name, own / case.name, dirs_exist_ok=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -58,5 +59,8 @@ def test_constants_are_scaled_by_kind() -> None:
     assert se.scaled((1.0, 4), 2.0) == (2.0, 8)
     np.testing.assert_array_equal(se.scaled(np.array([1.0, 2]), 0.5), [0.5, 1])
     names = set(se.constants("quadrics"))
-    assert {"HUBER", "UNKNOWN_SIZE_M"} <= names and not names & {"BOX", "SUPPORTS"}
-    assert quadrics.HUBER == 3.0
+    assert {"SMOOTH", "ROBUST.huber", "UNKNOWN_SIZE.mean_m"} <= names
+    assert not names & {"ROBUST", "AXIS_ORDERS", "SUPPORTS"}
+    assert quadrics.ROBUST.huber == 3.0
+    robust = se.scaled(quadrics.ROBUST, 2.0, "huber")
+    assert robust == dataclasses.replace(quadrics.ROBUST, huber=6.0)

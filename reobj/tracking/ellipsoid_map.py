@@ -37,7 +37,7 @@ def quick_fit(
         usual_size: of the scene's objects in the unit of the world (`usual_size`): the world may
             have any unit, but the prior of the fit is in metres.
     """
-    ratio = float(np.exp(np.log(quadrics.UNKNOWN_SIZE_M).mean())) / usual_size
+    ratio = float(np.exp(np.log(quadrics.UNKNOWN_SIZE.mean_m).mean())) / usual_size
     cameras = img_from_world.copy()
     cameras[..., 3] *= ratio
     config = quadrics.FitConfig(iterations=10, start_views=4, start_iterations=4)
