@@ -43,8 +43,8 @@ GROUPS = {
         "read_tracks write_detections_npz list_models model_path COCO_NAMES",
         "Appearance": "Embedder CropEmbedder SamplingLayout",
         "Cameras": "Camera Poses estimate_poses read_poses",
-        "Options": "Config InputConfig DetectConfig EmbedConfig TrackerConfig PosesConfig "
-        "ObjectsConfig OutputConfig",
+        "Options": "Config InputConfig DetectConfig EmbedConfig TrackerConfig MatchingOptions "
+        "PosesConfig ObjectsConfig OutputConfig",
         "Errors, command line": "ReobjError main",
     },
     "quadrics": {
