@@ -49,10 +49,10 @@ import numpy.typing as npt
 
 __all__ = [
     "SUPPORTS", "Array", "BoolArray", "Ellipsoids", "FitConfig", "IntArray", "ObjectFits", "Priors",
-    "PsfmoResult", "QuadricsError", "RobustOptions", "Scale", "SfmoResult", "box_iou",
-    "boxes_from_dual_conics", "camera_up", "clip_boxes", "fit_lfd", "fit_objects", "fit_psfmo",
-    "fit_sfmo", "load_priors", "project", "reprojection_iou", "rotation_vectors", "rotations",
-    "solid_boxes", "volume_overlap",
+    "PsfmoResult", "QuadricsError", "RobustOptions", "Scale", "SfmoResult", "StatusLimits",
+    "box_iou", "boxes_from_dual_conics", "camera_up", "clip_boxes", "fit_lfd", "fit_objects",
+    "fit_psfmo", "fit_sfmo", "load_priors", "project", "reprojection_iou", "rotation_vectors",
+    "rotations", "solid_boxes", "volume_overlap",
 ]  # fmt: skip
 
 Array = npt.NDArray[np.float64]
@@ -132,6 +132,32 @@ ROBUST = RobustOptions()
 
 
 @dataclass(frozen=True, slots=True)
+class StatusLimits:
+    """Limits of the status of a fit: "rejected", "prior_dominated" or "ok".
+
+    Attributes:
+        max_noise: Noise factor above which a fit is rejected: the errors of its boxes are about a
+            third of its size, more than those of one object.
+        min_inlier_share: Fraction of inlier views below which it is rejected.
+        absurd_size: Growth over the size prior (sigma) above which it is rejected.
+        odd_size: Distance from the size prior (sigma) above which `reason` reports the size.
+        loose_size: Sigma of a log axis above which its size counts as not measured: the status is
+            "prior_dominated", and the category is not overruled.
+        min_parallax_deg: Parallax (deg) below which the depth rests on the size prior.
+    """
+
+    max_noise: float = 18.0
+    min_inlier_share: float = 0.4
+    absurd_size: float = 6.0
+    odd_size: float = 3.5
+    loose_size: float = 0.35
+    min_parallax_deg: float = 1.0
+
+
+LIMITS = StatusLimits()
+
+
+@dataclass(frozen=True, slots=True)
 class FitConfig:
     """Options of `fit_objects`.
 
@@ -150,6 +176,7 @@ class FitConfig:
         iterations: Most optimisation steps on all views; a fit that has converged stops earlier.
         wrong_class: Probability that an object's category is wrong; 0: no category is overruled.
         robust: Losses and outlier tests.
+        limits: Limits of the status.
     """
 
     edge_noise_px: float = 1.0
@@ -162,6 +189,7 @@ class FitConfig:
     iterations: int = 40
     wrong_class: float = 0.05  # measured: .03 to .25 give nearly the same results
     robust: RobustOptions = field(default_factory=lambda: ROBUST)
+    limits: StatusLimits = field(default_factory=lambda: LIMITS)
 
 
 # ---- Ellipsoids and dual quadrics -----------------------------------------------------------
@@ -2035,7 +2063,7 @@ def _fit_all(data: _Data, spec: _Spec, cfg: FitConfig) -> _Fit:
     fit.evidence = _log_evidence(fit, _all_residuals(fit, data), spec, data, robust)
     sigma = np.sqrt(_safe_inverse(fit.hessian + ROTATION_CAP)[:, [3, 4, 5], [3, 4, 5]])  # (B, 3)
     # a category is overruled only by a size that the boxes determine
-    fit.evidence[(fit.hyp != fit.obj) & (sigma > LOOSE_LOG).any(1)] = -np.inf
+    fit.evidence[(fit.hyp != fit.obj) & (sigma > cfg.limits.loose_size).any(1)] = -np.inf
     order = np.lexsort((-fit.evidence, fit.obj))
     return fit[order[_group_starts(fit.obj[order])]]
 
@@ -2264,18 +2292,9 @@ def _inlier_table(
     return inlier
 
 
-MAX_NOISE = 18.0  # noise factor, about a third of the size: larger errors are not of one object
-# sigma of an edge, margin of the image border: of the edges that the border cuts a third lie more
-# than 3 px inside it, a tenth more than this (two recordings, two detectors: docs/quadrics.md)
-BORDER_SIGMAS = 2.0
-MIN_INLIER_SHARE = 0.4  # fraction of inlier views below which the object is rejected
-ABSURD_SIZE = 6.0  # sigma of growth over the prior above which the object is rejected
-ODD_SIZE = 3.5  # sigma from the prior above which `reason` reports the size
-LOOSE_LOG = 0.35  # log, sigma above which the size of an axis counts as not measured
-MIN_PARALLAX_DEG = 1.0  # deg, parallax below which the depth rests on the size prior
-
-
-def _rejection_reasons(fit: _Fit, size_sigma: Array, seen: IntArray, growth: Array) -> list[str]:
+def _rejection_reasons(
+    fit: _Fit, size_sigma: Array, seen: IntArray, growth: Array, limits: StatusLimits
+) -> list[str]:
     """Give the reason to reject each of B fits; empty where it is accepted."""
     finite = _finite(fit.state.center, 1) & _finite(size_sigma, 1)
     reasons = []
@@ -2283,11 +2302,11 @@ def _rejection_reasons(fit: _Fit, size_sigma: Array, seen: IntArray, growth: Arr
         why = ""
         if not finite[b]:
             why = "no finite solution"
-        elif noise > MAX_NOISE:
+        elif noise > limits.max_noise:
             why = f"the boxes fit no solid: errors {noise:.1f} times the usual"
-        elif growth[b] > ABSURD_SIZE:
+        elif growth[b] > limits.absurd_size:
             why = f"size is {growth[b]:.1f} sigma above its category's"
-        elif inside < max(1.0, MIN_INLIER_SHARE * seen[b]):
+        elif inside < max(1.0, limits.min_inlier_share * seen[b]):
             why = f"only {inside} of {seen[b]} boxes agree on one solid"
         reasons.append(why)
     return reasons
@@ -2311,8 +2330,9 @@ def _overruled(fit: _Fit, spec: _Spec) -> list[str]:
 
 
 def _status(
-    fit: _Fit, spec: _Spec, posterior: _Posterior, parallax: Array, seen: IntArray
-) -> tuple[list[str], list[str]]:
+    fit: _Fit, spec: _Spec, posterior: _Posterior, parallax: Array, seen: IntArray,
+    limits: StatusLimits,
+) -> tuple[list[str], list[str]]:  # fmt: skip
     """Classify each of B fits and give the reason.
 
     Args:
@@ -2320,8 +2340,8 @@ def _status(
     Returns:
         "ok", "prior_dominated" or "rejected", and the reason (empty: none), B each.
     """
-    # sqrt(.5): prior and data have equal information
-    weak = (posterior.prior_share > np.sqrt(0.5)) | (posterior.size_sigma > LOOSE_LOG)
+    weak = posterior.prior_share > np.sqrt(0.5)  # more information from the prior than from data
+    weak |= posterior.size_sigma > limits.loose_size
     prob = _problems(spec, fit.hyp, fit.code, fit.axis)
     error = fit.state.log_half - prob.size_mean
     deviation = np.sqrt(np.einsum("bi,bij,bj->b", error, prob.size_info, error))  # (B,) sigma
@@ -2329,16 +2349,16 @@ def _status(
     overruled = _overruled(fit, spec)
     status = []
     reason = []
-    rejections = _rejection_reasons(fit, posterior.size_sigma, seen, growth)
+    rejections = _rejection_reasons(fit, posterior.size_sigma, seen, growth, limits)
     for b, rejection in enumerate(rejections):
         doubt = []
         if weak[b].any():
             axes = ", ".join("xyz"[k] for k in np.flatnonzero(weak[b]))
             doubt.append(f"size along {axes} rests on the prior")
-        if parallax[b] < MIN_PARALLAX_DEG:
+        if parallax[b] < limits.min_parallax_deg:
             doubt.append(f"parallax {parallax[b]:.1f} deg: depth rests on the prior")
         status.append("rejected" if rejection else "prior_dominated" if doubt else "ok")
-        if deviation[b] > ODD_SIZE:
+        if deviation[b] > limits.odd_size:
             why = "another object?" if growth[b] > 0.7 * deviation[b] else "partly occluded?"
             doubt.append(f"size is {deviation[b]:.1f} sigma from its category's: {why}")
         if overruled[b]:
@@ -2401,6 +2421,11 @@ def _check_input(
     if points.ndim != 3 or points.shape[::2] != (boxes.shape[1], 3):
         expected = f"({boxes.shape[1]}, points, 3)"
         raise QuadricsError(f"points has shape {points.shape}, expected {expected}")
+
+
+# sigma of an edge, margin of the image border: of the edges that the border cuts a third lie more
+# than 3 px inside it, a tenth more than this (two recordings, two detectors: docs/quadrics.md)
+BORDER_SIGMAS = 2.0
 
 
 @np.errstate(all="ignore")
@@ -2473,7 +2498,7 @@ def fit_objects(
     fit, spec, world = _solve_passes(data, given, world, cfg)
     posterior = _posterior(fit, spec, data, measured.boxes, cfg)
     inlier = _inlier_table(posterior.solids, fit.code, fit.noise, measured, cfg)
-    live_fits = _live_fits(fit, spec, data, posterior, inlier, world)
+    live_fits = _live_fits(fit, spec, data, posterior, inlier, world, cfg.limits)
     return _with_live(_none_fitted(usable.shape, world), live, live_fits)
 
 
@@ -2556,12 +2581,13 @@ def _scale_of(world: _World) -> Scale:
 
 
 def _live_fits(
-    fit: _Fit, spec: _Spec, data: _Data, posterior: _Posterior, inlier: BoolArray, world: _World
-) -> ObjectFits:
+    fit: _Fit, spec: _Spec, data: _Data, posterior: _Posterior, inlier: BoolArray, world: _World,
+    limits: StatusLimits,
+) -> ObjectFits:  # fmt: skip
     """Make the result of the L live objects; inlier: (F, L)."""
     square = (_all_residuals(fit, data) * data.edges.sigma_px) ** 2 * fit.inlier
     parallax = _parallax(fit, data)
-    status, reason = _status(fit, spec, posterior, parallax, (data.index >= 0).sum(1))
+    status, reason = _status(fit, spec, posterior, parallax, (data.index >= 0).sum(1), limits)
     return ObjectFits(
         ellipsoids=posterior.solids,
         size=2.0 * posterior.solids.half_axes,

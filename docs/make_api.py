@@ -48,7 +48,8 @@ GROUPS = {
         "Errors, command line": "ReobjError main",
     },
     "quadrics": {
-        "Objects from boxes": "fit_objects ObjectFits Ellipsoids Scale FitConfig RobustOptions",
+        "Objects from boxes": "fit_objects ObjectFits Ellipsoids Scale FitConfig RobustOptions "
+        "StatusLimits",
         "Size priors": "Priors load_priors SUPPORTS",
         "Published methods": "fit_lfd fit_sfmo SfmoResult fit_psfmo PsfmoResult",
         "Projection and overlap": "project boxes_from_dual_conics solid_boxes clip_boxes box_iou "
