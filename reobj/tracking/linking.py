@@ -28,7 +28,7 @@ from reobj.types import (
 # frames between views of a fragment that show how the appearance of one object varies (lower:
 # nearly equal views, which are more alike than those of an object that was out of view)
 VIEW_GAP = 30
-DUPLICATE_IOU = 0.5  # boxes that overlap more may be two boxes of one object
+DUPLICATE_IOU = 0.6  # boxes that overlap more may be two boxes of one object (NMS: .5 to .7)
 FRAGMENT_GAP = 5  # frames without a detection after which a tracklet may be another object
 
 
