@@ -39,7 +39,8 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from enum import IntEnum
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -48,20 +49,28 @@ import numpy.typing as npt
 
 __all__ = [
     "SUPPORTS", "Array", "BoolArray", "Ellipsoids", "FitConfig", "IntArray", "ObjectFits", "Priors",
-    "PsfmoResult", "QuadricsError", "Scale", "SfmoResult", "box_iou", "boxes_from_dual_conics",
-    "camera_up", "clip_boxes", "fit_lfd", "fit_objects", "fit_psfmo", "fit_sfmo", "load_priors",
-    "project", "reprojection_iou", "rotation_vectors", "rotations", "solid_boxes", "volume_overlap",
+    "PsfmoResult", "QuadricsError", "RobustOptions", "Scale", "SfmoResult", "StatusLimits",
+    "box_iou", "boxes_from_dual_conics", "camera_up", "clip_boxes", "fit_lfd", "fit_objects",
+    "fit_psfmo", "fit_sfmo", "load_priors", "project", "reprojection_iou", "rotation_vectors",
+    "rotations", "solid_boxes", "volume_overlap",
 ]  # fmt: skip
 
 Array = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
-ELLIPSOID = 0
-BOX = 1
-CYLINDER = 2
-BY_CATEGORY, BY_EVIDENCE = -1, -2  # codes of a shape that the caller leaves open
-SUPPORTS = ("ellipsoid", "box", "cylinder")  # names of the shapes, index = code
+
+class Shape(IntEnum):
+    """Codes of the shapes; negative: the caller leaves the shape open."""
+
+    ELLIPSOID = 0
+    BOX = 1
+    CYLINDER = 2
+    BY_CATEGORY = -1
+    BY_EVIDENCE = -2
+
+
+SUPPORTS = tuple(shape.name.lower() for shape in Shape if shape >= 0)  # names, index = code
 # Row k marks the axes under the same root as axis k in the support function
 # h = sum over groups of sqrt(sum a_k^2 m_k^2)
 AXIS_GROUPS: Array = np.array(
@@ -75,6 +84,71 @@ class QuadricsError(ValueError):
 
 
 # ---- Configuration --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RobustOptions:
+    """Losses and outlier tests of the residuals of box edges.
+
+    Positive residuals (the solid extends beyond the box) also arise from occlusion: their losses
+    have a smaller scale than those of negative ones, and they cost less in the evidence.
+
+    Attributes:
+        cauchy, cauchy_hidden: Scale (sigma) of the loss before the inlier test, of negative and of
+            positive residuals.
+        huber, huber_hidden: Scale (sigma) of the loss after the inlier test, likewise.
+        edge_outlier: Residual (sigma) beyond which an edge is an outlier (occlusion).
+        view_outlier: Largest mean square (sigma^2) of an inlier view (chi2 .9999 of four edges is
+            23.5 / 4).
+        outlier_cap, hidden_cap: Largest cost (sigma^2) of an edge in the evidence, likewise:
+            -2 log(p / 20 sigma / .4), the probability p of an outlier .02, or .2 if hidden.
+    """
+
+    cauchy: float = 3.0
+    cauchy_hidden: float = 2.0
+    huber: float = 3.0
+    huber_hidden: float = 2.5
+    edge_outlier: float = 5.0
+    view_outlier: float = 6.0
+    outlier_cap: float = 12.0
+    hidden_cap: float = 7.4
+
+    def cauchy_loss(self, value: Array) -> tuple[Array, Array]:
+        """Return the loss rho(r^2) of residuals in sigma and its weight drho/dr^2."""
+        square = value * value
+        c2 = np.where(value > 0, self.cauchy_hidden, self.cauchy) ** 2
+        return c2 * np.log1p(square / c2), 1.0 / (1.0 + square / c2)
+
+    def huber_loss(self, value: Array) -> tuple[Array, Array]:
+        """Return the same as `cauchy_loss` for the loss after the inlier test."""
+        size = np.abs(value)
+        k = np.where(value > 0, self.huber_hidden, self.huber)
+        outer = size > k
+        rho = np.where(outer, 2.0 * k * size - k**2, value * value)
+        return rho, np.where(outer, k / np.maximum(size, k), 1.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StatusLimits:
+    """Limits of the status of a fit: "rejected", "prior_dominated" or "ok".
+
+    Attributes:
+        max_noise: Noise factor above which a fit is rejected: the errors of its boxes are about a
+            third of its size, more than those of one object.
+        min_inlier_share: Fraction of inlier views below which it is rejected.
+        absurd_size: Growth over the size prior (sigma) above which it is rejected.
+        odd_size: Distance from the size prior (sigma) above which `reason` reports the size.
+        loose_size: Sigma of a log axis above which its size counts as not measured: the status is
+            "prior_dominated", and the category is not overruled.
+        min_parallax_deg: Parallax (deg) below which the depth rests on the size prior.
+    """
+
+    max_noise: float = 18.0
+    min_inlier_share: float = 0.4
+    absurd_size: float = 6.0
+    odd_size: float = 3.5
+    loose_size: float = 0.35
+    min_parallax_deg: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +169,8 @@ class FitConfig:
         start_iterations: Optimisation steps of each candidate on those views.
         iterations: Most optimisation steps on all views; a fit that has converged stops earlier.
         wrong_class: Probability that an object's category is wrong; 0: no category is overruled.
+        robust: Losses and outlier tests.
+        limits: Limits of the status.
     """
 
     edge_noise_px: float = 1.0
@@ -106,6 +182,8 @@ class FitConfig:
     start_iterations: int = 7
     iterations: int = 40
     wrong_class: float = 0.05  # measured: .03 to .25 give nearly the same results
+    robust: RobustOptions = field(default_factory=RobustOptions)
+    limits: StatusLimits = field(default_factory=StatusLimits)
 
 
 # ---- Ellipsoids and dual quadrics -----------------------------------------------------------
@@ -163,8 +241,11 @@ def _dual_quadrics(center: Array, block: Array) -> Array:
     return dual_q
 
 
-def _chunks(n: int, size: int) -> Iterator[IntArray]:
-    """Split the indices 0 to n - 1 into consecutive chunks of at most `size`."""
+def _chunks(n: int, size: int = 384) -> Iterator[IntArray]:
+    """Split the indices 0 to n - 1 into consecutive chunks of at most `size`.
+
+    384 problems of `_minimise` fit the second-level cache of a core.
+    """
     for lo in range(0, n, size):
         yield np.arange(lo, min(lo + size, n))
 
@@ -241,14 +322,14 @@ def _with_positive_depth(img_from_world: Array) -> Array:
 
 
 def _support_codes(support: str | Sequence[str | None] | None, n: int) -> IntArray:
-    """Convert shape names to codes (n,); None: BY_CATEGORY, "evidence": BY_EVIDENCE."""
+    """Convert shape names to codes (n,); None: by category, "evidence": by evidence."""
     names = [support] * n if support is None or isinstance(support, str) else list(support)
     if len(names) != n:
         raise QuadricsError(
             f"support: {len(names)} shapes for {n} objects; give one for all or one for each"
         )
     codes: dict[str | None, int] = {name: k for k, name in enumerate(SUPPORTS)}
-    codes.update({None: BY_CATEGORY, "evidence": BY_EVIDENCE})
+    codes.update({None: Shape.BY_CATEGORY, "evidence": Shape.BY_EVIDENCE})
     unknown = {str(name) for name in names if name not in codes}
     if unknown:
         raise QuadricsError(
@@ -305,9 +386,9 @@ def solid_boxes(
     for code in np.unique(codes):
         row = np.flatnonzero(codes == code)
         same_shape = solids[row]
-        if code == BOX:
+        if code == Shape.BOX:
             boxes[:, row] = _corner_bounds(same_shape, cams, near)
-        elif code == CYLINDER:
+        elif code == Shape.CYLINDER:
             boxes[:, row] = _rim_bounds(same_shape, cams)
         else:
             dual_c, visible = project(same_shape.dual_quadrics(), cams)
@@ -374,7 +455,7 @@ class Priors:
     log_cov: Array  # (C, 3, 3)
     ratio_mean: Array  # (C, 2) mean of log(w/h), log(d/h)
     ratio_cov: Array  # (C, 2, 2)
-    support: IntArray  # (C,) codes of SUPPORTS
+    support: IntArray  # (C,) `Shape`
     yaw_symmetric: BoolArray  # (C,)
     upright: BoolArray  # (C,)
     on_floor: BoolArray  # (C,) objects of the category stand on the floor
@@ -1022,12 +1103,6 @@ def _known_camera_start(
 SMOOTH = 1e-3  # smooths the kink of |m| in the support function of box and cylinder
 SIZE_WALL = 2.5  # sigma of growth beyond which the size prior is quartic
 SIZE_WALL_RISE = 16.0  # factor of the extra cost: rise * (s^2 - wall^2)^2 / wall^2
-# Positive residuals (the solid extends beyond the box) also arise from occlusion: their loss has a
-# smaller scale than that of negative ones.
-CAUCHY = 3.0  # sigma, scale of the loss before the inlier test
-CAUCHY_HIDDEN = 2.0  # sigma, same for positive residuals
-HUBER = 3.0  # sigma, scale of the loss after the inlier test
-HUBER_HIDDEN = 2.5  # sigma, same for positive residuals
 
 
 @dataclass(slots=True)
@@ -1105,7 +1180,7 @@ def _state_difference(a: _State, b: _State, code: IntArray) -> Array:
     turned = a.rot[:, None] @ group  # (B, 24, 3, 3)
     trace = np.einsum("bij,bgij->bg", b.rot, turned)
     keeps_axis = np.abs(group[:, 2, 2]) > 0.5
-    trace = np.where((code == CYLINDER)[:, None] & ~keeps_axis, -9.0, trace)
+    trace = np.where((code == Shape.CYLINDER)[:, None] & ~keeps_axis, -9.0, trace)
     best = np.argmax(trace, 1)  # (B,)
     row = np.arange(len(best))
     rotvec = rotation_vectors(b.rot.transpose(0, 2, 1) @ turned[row, best])
@@ -1179,17 +1254,7 @@ def _depth(state: _State, edges: _Edges) -> Array:
     return np.asarray(ahead[..., 0] + edges.depth_row[..., 3])
 
 
-def _robust(value: Array, loss: str) -> tuple[Array, Array]:
-    """Return the loss rho(r^2) of residuals in sigma and its weight drho/dr^2."""
-    square = value * value
-    if loss == "cauchy":
-        c2 = np.where(value > 0, CAUCHY_HIDDEN, CAUCHY) ** 2
-        return c2 * np.log1p(square / c2), 1.0 / (1.0 + square / c2)
-    size = np.abs(value)
-    k = np.where(value > 0, HUBER_HIDDEN, HUBER)
-    outer = size > k
-    rho = np.where(outer, 2.0 * k * size - k**2, square)
-    return rho, np.where(outer, k / np.maximum(size, k), 1.0)
+_Loss = Callable[[Array], tuple[Array, Array]]  # a method of `RobustOptions`
 
 
 class _Normal(NamedTuple):
@@ -1201,11 +1266,11 @@ class _Normal(NamedTuple):
 
 
 def _normal_equations(
-    state: _State, edges: _Edges, prob: _Problem, loss: str, smooth: float = SMOOTH
+    state: _State, edges: _Edges, prob: _Problem, loss: _Loss, smooth: float = SMOOTH
 ) -> _Normal:
     """Sum cost, gradient and Gauss-Newton Hessian of edges, points, size, tilt and floor."""
     value, jacobian = _residuals(state, edges, prob.groups, True, smooth)
-    rho, weight = _robust(value, loss)
+    rho, weight = loss(value)
     weighted = (jacobian * weight[..., None]).transpose(0, 2, 1)  # (B, 9, M)
     cost, hessian, gradient = _prior_terms(state, prob)
     hessian += weighted @ jacobian
@@ -1295,7 +1360,7 @@ def _step(normal: _Normal, damping: Array, reach: Array) -> Array:
 
 
 def _minimise(
-    state: _State, edges: _Edges, prob: _Problem, loss: str, iterations: int
+    state: _State, edges: _Edges, prob: _Problem, loss: _Loss, iterations: int
 ) -> tuple[_State, Array, Array]:
     """Run Levenberg-Marquardt on a batch of B problems; converged ones leave the batch.
 
@@ -1346,10 +1411,25 @@ POINT_REL = 0.08  # sigma of a point's distance, over the usual half width of th
 POINT_ELSEWHERE = 0.1  # prior odds of a point on another object, uniform in space
 POINTS_WORTH = 20.0  # total weight of an object's points: the errors of neighbours correlate
 STANDING_REL = 0.012  # sigma of the lower side's height over the floor, over the object's height
-# Size of an unknown category: distribution of the 110 indoor categories of priors.json.
-UNKNOWN_SIZE_M = (0.29, 0.25, 0.25)  # m, geometric mean
-UNKNOWN_SIZE_LOG = 0.9  # log, standard deviation of the common size
-UNKNOWN_ASPECT_LOG = 0.6  # log, standard deviation of each axis about the common size
+
+
+@dataclass(frozen=True, slots=True)
+class SizePrior:
+    """Log-normal prior of the size of an object.
+
+    Attributes:
+        mean_m: m, geometric mean of width, depth and height.
+        size_log: log, standard deviation of the common size.
+        aspect_log: log, standard deviation of each axis about the common size.
+    """
+
+    mean_m: tuple[float, float, float]
+    size_log: float
+    aspect_log: float
+
+
+# of a category that is unknown: the distribution of the 110 indoor categories of priors.json
+UNKNOWN_SIZE = SizePrior(mean_m=(0.29, 0.25, 0.25), size_log=0.9, aspect_log=0.6)
 
 
 @dataclass(frozen=True, slots=True)
@@ -1416,7 +1496,7 @@ class _Given:
 
     categories: list[str | None]  # (L,)
     priors: Priors | None
-    codes: IntArray  # (L,) shapes, BY_CATEGORY or BY_EVIDENCE
+    codes: IntArray  # (L,) `Shape`
     points: Array  # (L, P, 3), NaN: no point
     sizes: list[tuple[int, int, float]]  # row, axis of the prior, metres
     wrong_class: float  # probability that a category is wrong
@@ -1467,8 +1547,9 @@ def _prior_spec(given: _Given, world: _World) -> _Spec:
         log_odds[n_obj:] = np.log(given.wrong_class / len(SUPPORTS))
     codes = given.codes[obj]
     points = given.points[obj]
-    mean = np.tile(np.log(UNKNOWN_SIZE_M), (n, 1))  # (O, 3)
-    cov = np.tile(UNKNOWN_ASPECT_LOG**2 * np.eye(3) + UNKNOWN_SIZE_LOG**2, (n, 1, 1))  # (O, 3, 3)
+    unknown = UNKNOWN_SIZE.aspect_log**2 * np.eye(3) + UNKNOWN_SIZE.size_log**2
+    mean = np.tile(np.log(UNKNOWN_SIZE.mean_m), (n, 1))  # (O, 3)
+    cov = np.tile(unknown, (n, 1, 1))  # (O, 3, 3)
     natural = np.full(n, -1)
     round_ = np.zeros(n, bool)
     upright = np.ones(n, bool)
@@ -1480,7 +1561,7 @@ def _prior_spec(given: _Given, world: _World) -> _Spec:
         round_[known] = priors.yaw_symmetric[pick]
         upright[known] = priors.upright[pick]
     cov = cov + world.scale_sigma**2
-    code = np.where(codes == BY_EVIDENCE, -1, np.where(codes >= 0, codes, natural))  # (O,)
+    code = np.where(codes == Shape.BY_EVIDENCE, -1, np.where(codes >= 0, codes, natural))  # (O,)
     allowed = (code[:, None] == np.arange(3)) | (code < 0)[:, None]
     size_mean = mean - np.log(2.0) - world.log_scale
     plane = np.zeros(4)
@@ -1510,8 +1591,8 @@ def _shape_shift(log_half: Array, natural: IntArray, code: IntArray) -> Array:
     half = np.exp(log_half - log_half.max(1, keepdims=True))
     factor = 0.5 * half.sum(1) / np.sqrt((half**2).sum(1) / 3.0)
     shift = np.log(np.clip(factor, 1.0, 1.5))
-    swapped = np.where((natural == BOX) & (code == ELLIPSOID), shift, 0.0)
-    return swapped - np.where((natural == ELLIPSOID) & (code == BOX), shift, 0.0)
+    swapped = np.where((natural == Shape.BOX) & (code == Shape.ELLIPSOID), shift, 0.0)
+    return swapped - np.where((natural == Shape.ELLIPSOID) & (code == Shape.BOX), shift, 0.0)
 
 
 def _start_rotations(up: Array) -> Array:
@@ -1532,8 +1613,11 @@ def _start_table(spec: _Spec) -> tuple[IntArray, IntArray, IntArray, IntArray]:
     n = len(spec.size_mean)
     use = np.ones((n, 3, 3, 4), bool) & spec.allowed[:, :, None, None]  # H, shape, axis, yaw
     use[spec.upright & bool(np.any(spec.up)), :, :2] = False  # up unknown: any axis is vertical
-    use[:, CYLINDER, 1] = False  # a lying cylinder: axes 0 and 1 are equivalent
-    round_ = spec.round_[:, None] | (np.arange(3) == CYLINDER) & (spec.natural != CYLINDER)[:, None]
+    use[:, Shape.CYLINDER, 1] = False  # a lying cylinder: axes 0 and 1 are equivalent
+    round_ = (
+        spec.round_[:, None]
+        | (np.arange(3) == Shape.CYLINDER) & (spec.natural != Shape.CYLINDER)[:, None]
+    )
     use[:, :, 2, 1:] &= ~round_[:, :, None]
     use[spec.natural < 0, :, 2, 2:] = False  # same prior of width and depth: symmetric by 90 deg
     hyp, code, axis, yaw = np.nonzero(use)
@@ -1640,16 +1724,10 @@ def _refine_start(
 
 # ---- fit_objects: starts, inliers, evidence -------------------------------------------------
 
-CHUNK = 384  # problems of a batch: they fit the second-level cache of a core
 ROUND_LOG = 0.05  # log, sigma of width / depth of yaw-symmetric categories
 SIZE_WALL_LOG = 0.25  # log, least sigma of which SIZE_WALL is a multiple: a category may be wrong
 NOISE_PRIOR_DOF = 12.0  # residuals, weight of the nominal noise level
 OBJECT_NOISE_DOF = 20.0  # residuals, weight of the pooled noise level in that of one object
-VIEW_OUTLIER = 6.0  # sigma^2, largest mean square of a view (chi2 .9999, 4 dof, is 23.5 / 4)
-EDGE_OUTLIER = 5.0  # sigma, residual beyond which an edge is an outlier (occlusion)
-# sigma^2, largest costs of an edge: -2 log(p / 20 sigma / .4), p the probability of an outlier
-HIDDEN_CAP = 7.4  # p = .2: an edge that may be occluded
-OUTLIER_CAP = 12.0  # p = .02: any other edge
 # Fraction of the objects on the floor whose lower part is occluded in all views
 OCCLUDED_BELOW = 0.25
 # (9, 9) information that keeps unobservable rotations finite: sigma .9 rad, that of a uniform angle
@@ -1682,7 +1760,7 @@ def _problems(spec: _Spec, hyp: IntArray, code: IntArray, axis: IntArray) -> _Pr
     tilt[np.arange(len(hyp)), axis] = 0.0
     floor = np.broadcast_to(spec.floor, (len(hyp), 4))
     up = np.broadcast_to(spec.up, (len(hyp), 3))
-    round_ = spec.round_[hyp] | ((code == CYLINDER) & (spec.natural[hyp] != CYLINDER))
+    round_ = spec.round_[hyp] | ((code == Shape.CYLINDER) & (spec.natural[hyp] != Shape.CYLINDER))
     tie = np.array([[1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, 0.0]]) / ROUND_LOG**2
     info = np.linalg.inv(spec.size_cov)[hyp] + round_[:, None, None] * tie
     level = 0.5 * (mean[:, [0, 0, 2]] + mean[:, [1, 1, 2]])
@@ -1698,14 +1776,14 @@ def _problems(spec: _Spec, hyp: IntArray, code: IntArray, axis: IntArray) -> _Pr
 
 
 def _minimise_all(
-    state: _State, edges_of: Callable[[IntArray], _Edges], prob: _Problem, loss: str, steps: int
+    state: _State, edges_of: Callable[[IntArray], _Edges], prob: _Problem, loss: _Loss, steps: int
 ) -> tuple[_State, Array, Array]:
     """Run `_minimise` in chunks of problems; `edges_of` gathers the edges of a chunk."""
     n = len(state.center)
     final = state[np.arange(n)]
     cost = np.zeros(n)
     hessian = np.zeros((n, 9, 9))
-    for chunk in _chunks(n, CHUNK):
+    for chunk in _chunks(n):
         solved = _minimise(state[chunk], edges_of(chunk), prob[chunk], loss, steps)
         final.put(chunk, solved[0])
         cost[chunk] = solved[1]
@@ -1725,7 +1803,7 @@ def _best_starts(few: _Data, spec: _Spec, cfg: FitConfig) -> _Fit:
     rot = _start_rotations(spec.up)[axis, yaw]
     start = _State(center[hyp], log_half[hyp] + shift[:, None], rot)
     state, cost, hessian = _minimise_all(
-        start, lambda chunk: edges[hyp[chunk]], prob, "cauchy", cfg.start_iterations
+        start, lambda chunk: edges[hyp[chunk]], prob, cfg.robust.cauchy_loss, cfg.start_iterations
     )
     # noise level integrated out (Student t): an absurd size must not win by a slightly better fit
     pull = _size_prior(state, prob)[0]
@@ -1768,7 +1846,7 @@ def _inlier_edges(fit: _Fit, data: _Data, rows: IntArray) -> _Edges:
     return replace(edges, gain=edges.gain * inlier / fit.noise[rows, None, None], used=inlier)
 
 
-def _refit(fit: _Fit, data: _Data, spec: _Spec, cfg: FitConfig, loss: str) -> None:
+def _refit(fit: _Fit, data: _Data, spec: _Spec, cfg: FitConfig, loss: _Loss) -> None:
     """Minimise over all views with the fit's inlier edges and noise level, in place."""
     prob = _problems(spec, fit.hyp, fit.code, fit.axis)
     fit.state, _, fit.hessian = _minimise_all(
@@ -1779,7 +1857,7 @@ def _refit(fit: _Fit, data: _Data, spec: _Spec, cfg: FitConfig, loss: str) -> No
 def _all_residuals(fit: _Fit, data: _Data) -> Array:
     """Compute residuals (B, V, E) in nominal sigma of all edges, outliers included."""
     residuals = np.zeros(fit.inlier.shape)
-    for rows in _chunks(len(fit.obj), CHUNK):
+    for rows in _chunks(len(fit.obj)):
         edges = data.edges[fit.obj[rows]]
         value, _ = _residuals(fit.state[rows], edges, AXIS_GROUPS[fit.code[rows]], jacobian=False)
         residuals[rows] = value.reshape(residuals[rows].shape) * np.sqrt(edges.redundancy)
@@ -1808,21 +1886,25 @@ def _least(values: Array, obj: IntArray) -> Array:
     return np.asarray(best[obj])
 
 
-def _update_noise(fit: _Fit, value: Array, spec: _Spec, data: _Data, robust: bool) -> None:
+def _update_noise(fit: _Fit, value: Array, spec: _Spec, data: _Data, largest: float | None) -> None:
     """Estimate the noise factor: pooled over all objects, then per object with shrinkage.
 
     Inverse-gamma posteriors: prior weights NOISE_PRIOR_DOF of the nominal and OBJECT_NOISE_DOF of
     the pooled level. The pooled level is the median over the objects, so that objects in a segment
-    of bad poses do not affect the others. Robust: from the median residual, not the mean square.
+    of bad poses do not affect the others.
+
+    Args:
+        largest: residual (sigma) above which residuals count as this large; None: the median
+            residual is used, not the mean square.
     """
     n = np.maximum(_count(fit.inlier, data, fit.obj), 1.0)
     dof = _free_dof(fit, spec, data)
-    if robust:
+    if largest is None:
         size = np.where(fit.inlier, np.abs(value), np.nan).reshape(len(n), -1)
         size[~fit.inlier.any((1, 2))] = 0.0
         square = (np.nanmedian(size, 1) / 0.6745) ** 2 * n  # .6745: median of |N(0, 1)|
     else:
-        capped = np.minimum(value**2, (HUBER * fit.noise[:, None, None]) ** 2)
+        capped = np.minimum(value**2, (largest * fit.noise[:, None, None]) ** 2)
         square = (capped * fit.inlier / data.edges.redundancy[fit.obj]).sum((1, 2))
     level = square / dof
     best = level <= _least(level, fit.obj)  # the hypothesis and shape of each object that fits best
@@ -1846,7 +1928,7 @@ def _weighted_median(values: Array, weight: Array) -> float:
     return float(values[order][np.searchsorted(total, 0.5 * total[-1])])
 
 
-def _inlier_views(standard: Array, used: BoolArray) -> BoolArray:
+def _inlier_views(standard: Array, used: BoolArray, robust: RobustOptions) -> BoolArray:
     """Classify views (...) as inliers of the solid by their residuals (..., E) in sigma.
 
     An inlier has a small mean square; or inliers among three quarters of its edges; or among half
@@ -1854,14 +1936,16 @@ def _inlier_views(standard: Array, used: BoolArray) -> BoolArray:
     """
     count = np.maximum((used & (standard != 0.0)).sum(-1), 1)
     mean = (np.minimum(standard**2, 1e6) * used).sum(-1) / count
-    close = used & (np.abs(standard) <= EDGE_OUTLIER)
+    close = used & (np.abs(standard) <= robust.edge_outlier)
     fraction = close.sum(-1) / np.maximum(used.sum(-1), 1)
-    occluded = ~(used & (standard < -EDGE_OUTLIER)).any(-1)
-    inlier = (mean <= VIEW_OUTLIER) | (fraction >= 0.75) | ((fraction >= 0.5) & occluded)
+    occluded = ~(used & (standard < -robust.edge_outlier)).any(-1)
+    inlier = (mean <= robust.view_outlier) | (fraction >= 0.75) | ((fraction >= 0.5) & occluded)
     return np.asarray(used.any(-1) & inlier)
 
 
-def _log_evidence(fit: _Fit, value: Array, spec: _Spec, data: _Data) -> Array:
+def _log_evidence(
+    fit: _Fit, value: Array, spec: _Spec, data: _Data, robust: RobustOptions
+) -> Array:
     """Compute the Laplace evidence (B,) of each fit, noise integrated out (Student t).
 
     -2 log p = (v + n) log(1 + S / v) + priors of size, tilt, floor + log det(H)
@@ -1874,12 +1958,12 @@ def _log_evidence(fit: _Fit, value: Array, spec: _Spec, data: _Data) -> Array:
     pull = _prior_terms(fit.state, prob).cost
     noise = _least(fit.noise, fit.obj)
     standard = value / noise[:, None, None]  # (B, V, E)
-    cap = np.where(value > 0, HIDDEN_CAP, OUTLIER_CAP)
+    cap = np.where(value > 0, robust.hidden_cap, robust.outlier_cap)
     cost = np.minimum(standard**2, cap) * used / data.edges.redundancy[fit.obj]
     dof = NOISE_PRIOR_DOF + _count(used, data, fit.obj)
     misfit = dof * np.log1p(cost.sum((1, 2)) / NOISE_PRIOR_DOF)
     stands = np.isfinite(spec.floor_sigma[fit.hyp])
-    above = stands[:, None] & (standard[..., 3] > EDGE_OUTLIER)  # (B, V), lower edge
+    above = stands[:, None] & (standard[..., 3] > robust.edge_outlier)  # (B, V), lower edge
     free = above[..., None] & (value > 0)
     free[..., 1] = False  # upper edge
     occluded = dof * np.log1p(np.where(free, 0.0, cost).sum((1, 2)) / NOISE_PRIOR_DOF)
@@ -1900,7 +1984,7 @@ def _safe_inverse(hessian: Array) -> Array:
     return np.asarray(inverse * scale[:, :, None] * scale[:, None, :])
 
 
-def _curved_covariance(fit: _Fit, data: _Data, spec: _Spec) -> Array:
+def _curved_covariance(fit: _Fit, data: _Data, spec: _Spec, loss: _Loss) -> Array:
     """Compute the covariance (B, 9, 9) of a bent posterior, to second order around its mode.
 
     Along each principal axis v of the Laplace covariance the mode is displaced by +-k sigma and the
@@ -1913,27 +1997,27 @@ def _curved_covariance(fit: _Fit, data: _Data, spec: _Spec) -> Array:
     prob = _problems(spec, fit.hyp, fit.code, fit.axis)
     prob = replace(prob, points=prob.points[:, :0])
     cov = np.empty_like(fit.hessian)
-    for rows in _chunks(len(cov), CHUNK // 36):  # 18 displacements of each (size measured)
+    for rows in _chunks(len(cov), 10):  # 18 displacements of each (size measured)
         batch = (fit.state[rows], _inlier_edges(fit, data, rows), prob[rows])
         # the support function is smoothed over about the variation of m near its kink
-        info = _normal_equations(*batch, "huber", 0.05).hessian + ROTATION_CAP
+        info = _normal_equations(*batch, loss, 0.05).hessian + ROTATION_CAP
         scale = 1.0 / np.sqrt(np.maximum(np.einsum("bii->bi", info), 1e-30))  # (B, 9)
         value, vector = _eigh(info * scale[:, :, None] * scale[:, None, :])
         axes = scale[:, :, None] * vector / np.sqrt(np.maximum(value, 1e-10))[:, None]  # (B, 9, 9)
-        cov[rows] = _second_moment(*batch, axes)
+        cov[rows] = _second_moment(*batch, loss, axes)
     return cov
 
 
-def _second_moment(state: _State, edges: _Edges, prob: _Problem, axes: Array) -> Array:
+def _second_moment(state: _State, edges: _Edges, prob: _Problem, loss: _Loss, axes: Array) -> Array:
     """Sum stretched v v' + 4 q q' over the principal axes v (B, 9, 9 as columns)."""
     probe = 1.5  # sigma, displacement at which the cost is evaluated
     bend_weight = 4.0  # 3/4 is the second moment; the 95 % region of nine parameters needs more
-    base = _normal_equations(state, edges, prob, "huber").cost
+    base = _normal_equations(state, edges, prob, loss).cost
     row = np.arange(18 * len(axes))
     side, i, b = np.unravel_index(row, (2, 9, len(axes)))  # of R = 18 B displaced solids
     basis = axes[b]  # (R, 9, 9)
     moved = state[b].moved(np.array([-probe, probe])[side, None] * basis[row, :, i])
-    normal = _normal_equations(moved, edges[b], prob[b], "huber")
+    normal = _normal_equations(moved, edges[b], prob[b], loss)
     hess = basis.transpose(0, 2, 1) @ normal.hessian @ basis + 1e-3 * np.eye(9)  # whitened
     grad = (basis.transpose(0, 2, 1) @ normal.gradient[..., None])[..., 0]
     hess[row, i] = 0.0
@@ -1955,24 +2039,25 @@ def _fit_all(data: _Data, spec: _Spec, cfg: FitConfig) -> _Fit:
     """Fit every object: starts, robust fit, noise level, inliers, final fit, model selection."""
     few = data.take_views(cfg.start_views)
     fit = _best_starts(few, spec, cfg)
-    _refit(fit, few, spec, cfg, "cauchy")
-    fit.evidence = _log_evidence(fit, _all_residuals(fit, few), spec, few)
+    robust = cfg.robust
+    _refit(fit, few, spec, cfg, robust.cauchy_loss)
+    fit.evidence = _log_evidence(fit, _all_residuals(fit, few), spec, few, robust)
     # 3 in 1,000 of the winners on all views are lower than this on the first (simulated boxes)
     fit = fit[fit.evidence >= -6.0 - _least(-fit.evidence, fit.obj)]
     fit.inlier = data.edges.used[fit.obj]
-    _refit(fit, data, spec, cfg, "cauchy")
-    for robust in (True, False):
+    _refit(fit, data, spec, cfg, robust.cauchy_loss)
+    for largest in (None, robust.huber):
         value = _all_residuals(fit, data)
-        _update_noise(fit, value, spec, data, robust)
+        _update_noise(fit, value, spec, data, largest)
         used = data.edges.used[fit.obj]
         standard = value / fit.noise[:, None, None]  # (B, V, E)
-        fit.views = _inlier_views(standard, used)
-        fit.inlier = used & (np.abs(standard) <= EDGE_OUTLIER) & fit.views[..., None]
-        _refit(fit, data, spec, cfg, "huber")
-    fit.evidence = _log_evidence(fit, _all_residuals(fit, data), spec, data)
+        fit.views = _inlier_views(standard, used, robust)
+        fit.inlier = used & (np.abs(standard) <= robust.edge_outlier) & fit.views[..., None]
+        _refit(fit, data, spec, cfg, robust.huber_loss)
+    fit.evidence = _log_evidence(fit, _all_residuals(fit, data), spec, data, robust)
     sigma = np.sqrt(_safe_inverse(fit.hessian + ROTATION_CAP)[:, [3, 4, 5], [3, 4, 5]])  # (B, 3)
     # a category is overruled only by a size that the boxes determine
-    fit.evidence[(fit.hyp != fit.obj) & (sigma > LOOSE_LOG).any(1)] = -np.inf
+    fit.evidence[(fit.hyp != fit.obj) & (sigma > cfg.limits.loose_size).any(1)] = -np.inf
     order = np.lexsort((-fit.evidence, fit.obj))
     return fit[order[_group_starts(fit.obj[order])]]
 
@@ -1989,7 +2074,7 @@ SCENE_LOG = 0.5
 # whose size at least half is visible.
 VOTES = (
     (0.5, 0.0, 0.0),
-    (0.25, 0.0, UNKNOWN_SIZE_LOG),
+    (0.25, 0.0, UNKNOWN_SIZE.size_log),
     *((0.25 / 3.0, float(-np.log(seen)), 0.0) for seen in (0.58, 0.75, 0.92)),
 )
 
@@ -2138,7 +2223,7 @@ def _scale_from_known(
     if not sizes:
         return None
     row, axis, metres = (np.array(column) for column in zip(*sizes, strict=True))
-    axis = UPRIGHT_ORDERS[np.where(fit.code[row] == CYLINDER, 2, fit.axis[row]), axis]
+    axis = _vertical_last(fit)[row, axis]
     cov = _safe_inverse(fit.hessian + ROTATION_CAP)
     vote = np.log(metres) - fit.state.log_half[row, axis] - np.log(2.0)
     info = 1.0 / (cov[row, 3 + axis, 3 + axis] + 1e-6)
@@ -2147,8 +2232,13 @@ def _scale_from_known(
     return _weighted_median(vote, info), float(np.sqrt(1.0 / info.sum() + common))
 
 
-# Row k: cyclic order of the axes that puts the vertical axis k last
-UPRIGHT_ORDERS: IntArray = np.array([[1, 2, 0], [2, 0, 1], [0, 1, 2]])
+def _vertical_last(fit: _Fit) -> IntArray:
+    """Return the cyclic order (B, 3) of the axes that puts the vertical one last.
+
+    The axis of a cylinder is its third one, also where it lies.
+    """
+    vertical = np.where(fit.code == Shape.CYLINDER, 2, fit.axis)
+    return np.asarray((vertical[:, None] + [1, 2, 3]) % 3)
 
 
 def _parallax(fit: _Fit, data: _Data) -> Array:
@@ -2167,7 +2257,7 @@ def _vertical_axis_last(fit: _Fit, cov: Array) -> tuple[Ellipsoids, Array, IntAr
     Returns:
         solids, their covariance (B, 9, 9), and order (B, 3): the prior's axis of each new one.
     """
-    order = UPRIGHT_ORDERS[np.where(fit.code == CYLINDER, 2, fit.axis)]
+    order = _vertical_last(fit)
     row = np.arange(len(fit.obj))[:, None]
     half = np.exp(fit.state.log_half)[row, order]
     rot = np.take_along_axis(fit.state.rot, order[:, None, :], 2)
@@ -2191,24 +2281,14 @@ def _inlier_table(
         solid = solids[o]
         state = _State(solid.center_in_world, np.log(solid.half_axes), solid.world_from_obj)
         value = _residuals(state, edges, AXIS_GROUPS[codes[o]], jacobian=False)[0]
-        inlier[f, o] = _inlier_views(value / noise[o, None], edges.used[:, 0])
+        standard = value / noise[o, None]
+        inlier[f, o] = _inlier_views(standard, edges.used[:, 0], cfg.robust)
     return inlier
 
 
-MAX_NOISE = 18.0  # noise factor, about a third of the size: larger errors are not of one object
-# sigma of an edge, margin of the image border: of the edges that the border cuts a third lie more
-# than 3 px inside it, a tenth more than this (two recordings, two detectors: docs/quadrics.md)
-BORDER_SIGMAS = 2.0
-MIN_INLIER_SHARE = 0.4  # fraction of inlier views below which the object is rejected
-ABSURD_SIZE = 6.0  # sigma of growth over the prior above which the object is rejected
-ODD_SIZE = 3.5  # sigma from the prior above which `reason` reports the size
-ODD_FACTOR = 1.25  # of the usual size (geometric mean of the axes): not a reason to overrule below
-PRIOR_DOMINATED = 0.7071  # prior_share of equal information of prior and data: 1 / sqrt(2)
-LOOSE_LOG = 0.35  # log, sigma above which the size of an axis counts as not measured
-MIN_PARALLAX_DEG = 1.0  # deg, parallax below which the depth rests on the size prior
-
-
-def _rejection_reasons(fit: _Fit, size_sigma: Array, seen: IntArray, growth: Array) -> list[str]:
+def _rejection_reasons(
+    fit: _Fit, size_sigma: Array, seen: IntArray, growth: Array, limits: StatusLimits
+) -> list[str]:
     """Give the reason to reject each of B fits; empty where it is accepted."""
     finite = _finite(fit.state.center, 1) & _finite(size_sigma, 1)
     reasons = []
@@ -2216,11 +2296,11 @@ def _rejection_reasons(fit: _Fit, size_sigma: Array, seen: IntArray, growth: Arr
         why = ""
         if not finite[b]:
             why = "no finite solution"
-        elif noise > MAX_NOISE:
+        elif noise > limits.max_noise:
             why = f"the boxes fit no solid: errors {noise:.1f} times the usual"
-        elif growth[b] > ABSURD_SIZE:
+        elif growth[b] > limits.absurd_size:
             why = f"size is {growth[b]:.1f} sigma above its category's"
-        elif inside < max(1.0, MIN_INLIER_SHARE * seen[b]):
+        elif inside < max(1.0, limits.min_inlier_share * seen[b]):
             why = f"only {inside} of {seen[b]} boxes agree on one solid"
         reasons.append(why)
     return reasons
@@ -2236,7 +2316,7 @@ def _overruled(fit: _Fit, spec: _Spec) -> list[str]:
     reasons = []
     for b in range(len(size)):
         why = f"size is {size[b]:.2g} times the usual"
-        if max(size[b], 1.0 / size[b]) < ODD_FACTOR:
+        if max(size[b], 1.0 / size[b]) < 1.25:  # the size itself is no reason to overrule
             on_side = AXIS_ORDERS[turned[b], 2] != 2
             why = "it lies on its side" if on_side else "its proportions are not the usual ones"
         reasons.append(why if fit.hyp[b] != fit.obj[b] else "")
@@ -2244,8 +2324,9 @@ def _overruled(fit: _Fit, spec: _Spec) -> list[str]:
 
 
 def _status(
-    fit: _Fit, spec: _Spec, posterior: _Posterior, parallax: Array, seen: IntArray
-) -> tuple[list[str], list[str]]:
+    fit: _Fit, spec: _Spec, posterior: _Posterior, parallax: Array, seen: IntArray,
+    limits: StatusLimits,
+) -> tuple[list[str], list[str]]:  # fmt: skip
     """Classify each of B fits and give the reason.
 
     Args:
@@ -2253,7 +2334,8 @@ def _status(
     Returns:
         "ok", "prior_dominated" or "rejected", and the reason (empty: none), B each.
     """
-    weak = (posterior.prior_share > PRIOR_DOMINATED) | (posterior.size_sigma > LOOSE_LOG)
+    weak = posterior.prior_share > np.sqrt(0.5)  # more information from the prior than from data
+    weak |= posterior.size_sigma > limits.loose_size
     prob = _problems(spec, fit.hyp, fit.code, fit.axis)
     error = fit.state.log_half - prob.size_mean
     deviation = np.sqrt(np.einsum("bi,bij,bj->b", error, prob.size_info, error))  # (B,) sigma
@@ -2261,16 +2343,16 @@ def _status(
     overruled = _overruled(fit, spec)
     status = []
     reason = []
-    rejections = _rejection_reasons(fit, posterior.size_sigma, seen, growth)
+    rejections = _rejection_reasons(fit, posterior.size_sigma, seen, growth, limits)
     for b, rejection in enumerate(rejections):
         doubt = []
         if weak[b].any():
             axes = ", ".join("xyz"[k] for k in np.flatnonzero(weak[b]))
             doubt.append(f"size along {axes} rests on the prior")
-        if parallax[b] < MIN_PARALLAX_DEG:
+        if parallax[b] < limits.min_parallax_deg:
             doubt.append(f"parallax {parallax[b]:.1f} deg: depth rests on the prior")
         status.append("rejected" if rejection else "prior_dominated" if doubt else "ok")
-        if deviation[b] > ODD_SIZE:
+        if deviation[b] > limits.odd_size:
             why = "another object?" if growth[b] > 0.7 * deviation[b] else "partly occluded?"
             doubt.append(f"size is {deviation[b]:.1f} sigma from its category's: {why}")
         if overruled[b]:
@@ -2333,6 +2415,11 @@ def _check_input(
     if points.ndim != 3 or points.shape[::2] != (boxes.shape[1], 3):
         expected = f"({boxes.shape[1]}, points, 3)"
         raise QuadricsError(f"points has shape {points.shape}, expected {expected}")
+
+
+# sigma of an edge, margin of the image border: of the edges that the border cuts a third lie more
+# than 3 px inside it, a tenth more than this (two recordings, two detectors: docs/quadrics.md)
+BORDER_SIGMAS = 2.0
 
 
 @np.errstate(all="ignore")
@@ -2405,7 +2492,7 @@ def fit_objects(
     fit, spec, world = _solve_passes(data, given, world, cfg)
     posterior = _posterior(fit, spec, data, measured.boxes, cfg)
     inlier = _inlier_table(posterior.solids, fit.code, fit.noise, measured, cfg)
-    live_fits = _live_fits(fit, spec, data, posterior, inlier, world)
+    live_fits = _live_fits(fit, spec, data, posterior, inlier, world, cfg.limits)
     return _with_live(_none_fitted(usable.shape, world), live, live_fits)
 
 
@@ -2442,7 +2529,7 @@ class _Posterior:
 
 def _posterior(fit: _Fit, spec: _Spec, data: _Data, boxes: Array, cfg: FitConfig) -> _Posterior:
     """Compute the covariance of the fits to `boxes` (F, L, 4), and the prior's weight in it."""
-    wide = _curved_covariance(fit, data, spec) + fit.spread
+    wide = _curved_covariance(fit, data, spec, cfg.robust.huber_loss) + fit.spread
     # the noise level is itself estimated: Student's 95 % region for three parameters
     wide *= (1.0 + 3.5 / (OBJECT_NOISE_DOF + _free_dof(fit, spec, data)))[:, None, None]
     if cfg.correlation_deg > 0:  # error common to all boxes of an object, as large as that of one
@@ -2488,12 +2575,13 @@ def _scale_of(world: _World) -> Scale:
 
 
 def _live_fits(
-    fit: _Fit, spec: _Spec, data: _Data, posterior: _Posterior, inlier: BoolArray, world: _World
-) -> ObjectFits:
+    fit: _Fit, spec: _Spec, data: _Data, posterior: _Posterior, inlier: BoolArray, world: _World,
+    limits: StatusLimits,
+) -> ObjectFits:  # fmt: skip
     """Make the result of the L live objects; inlier: (F, L)."""
     square = (_all_residuals(fit, data) * data.edges.sigma_px) ** 2 * fit.inlier
     parallax = _parallax(fit, data)
-    status, reason = _status(fit, spec, posterior, parallax, (data.index >= 0).sum(1))
+    status, reason = _status(fit, spec, posterior, parallax, (data.index >= 0).sum(1), limits)
     return ObjectFits(
         ellipsoids=posterior.solids,
         size=2.0 * posterior.solids.half_axes,

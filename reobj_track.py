@@ -121,9 +121,10 @@ from reobj.sources.video import InputConfig, Video
 from reobj.sources.weights import list_models, model_path
 from reobj.state import restore_state, state_arrays
 from reobj.tracking.assignment import Pairs, ambiguous_pairs, assign, touching
-from reobj.tracking.box_noise import STD_MEASURE, STD_POSITION, STD_START, STD_VELOCITY
+from reobj.tracking.box_noise import STD_POSITION, STD_START, STD_VELOCITY
 from reobj.tracking.camera_motion import CameraMotion
 from reobj.tracking.ellipsoid_map import (
+    EXPECTED_IN_VIEW,
     CameraInputs,
     EllipsoidMap,
     depth_intervals,
@@ -159,11 +160,11 @@ from reobj.types import (
 __all__ = [
     "COCO_NAMES", "Camera", "Config", "CropEmbedder", "DetectConfig", "DetectionSource",
     "Detections", "EmbedConfig", "Embedder", "Embeddings", "Frame", "InputConfig", "LinkEvent",
-    "Object", "ObjectsConfig", "OnnxDetector", "OutputConfig", "Part", "Poses", "PosesConfig",
-    "ReobjError", "Result", "SamplingLayout", "Tracker", "TrackerConfig", "Tracks", "Video",
-    "World", "__version__", "estimate_poses", "evaluate", "export", "list_models", "main",
-    "model_path", "open_detections", "read_detections", "read_poses", "read_tracks", "refit",
-    "run", "track", "write_detections_npz",
+    "MatchingOptions", "Object", "ObjectsConfig", "OnnxDetector", "OutputConfig", "Part", "Poses",
+    "PosesConfig", "ReobjError", "Result", "SamplingLayout", "Tracker", "TrackerConfig", "Tracks",
+    "Video", "World", "__version__", "estimate_poses", "evaluate", "export", "list_models", "main",
+    "model_path", "open_detections", "read_detections", "read_poses", "read_tracks", "refit", "run",
+    "track", "write_detections_npz",
 ]  # fmt: skip
 
 # ---- Configuration -----------------------------------------------------------------------------
@@ -249,7 +250,7 @@ class Config:
 # ---- Kalman filter -----------------------------------------------------------------------------
 
 # Noise is relative to the box, as in DeepSORT: its mean side for x and y, its own side for w and h
-# (`STD_MEASURE` of `reobj.tracking.box_noise` holds at score .8).
+# (a measurement has `STD_POSITION` of `reobj.tracking.box_noise` at score .8).
 SCORE_NOISE = 0.25  # it grows with (1 - score) to this power (StrongSORT: 1)
 
 
@@ -301,7 +302,7 @@ def kalman_update(mean: Array, cov: Array, box: Array, noise: Array) -> tuple[Ar
 
 def center_variance(mean: Array, cov: Array) -> Array:
     """Return the variances (T, 2) of a measured centre: S = H P H' + R, R at score .8."""
-    return np.asarray(cov[:, :2, 0] + (STD_MEASURE * _noise_scale(mean)[:, :2]) ** 2)
+    return np.asarray(cov[:, :2, 0] + (STD_POSITION * _noise_scale(mean)[:, :2]) ** 2)
 
 
 def squared_mahalanobis(residual: Array, variance: Array) -> Array:
@@ -383,31 +384,56 @@ class TrackState:
 # ---- Tracker -----------------------------------------------------------------------------------
 
 STATE_VERSION = 8  # of the files of Tracker.save
-
-# Association. Costs lie in [0, 1]; those without a source were chosen on the rendered rooms and
-# redkitchen (benchmarks/RESULTS.md).
-GATE_CHI2 = 9.2103  # gate on the centre's squared Mahalanobis distance: chi2 .99, 2 dof
-GATE_IOU = 0.2  # IoU that passes the gate whatever the distance
-MOTION_ONLY_IOU = 0.1  # minimum IoU of every match without embeddings
-MOTION_ONLY_SIZE = 2.0  # maximum ratio of widths or heights without embeddings
-LOW_IOU = 0.3  # minimum IoU for low scores and for a change of class (ByteTrack: .5)
-MAX_COST = 0.9  # of an accepted match
-DISTANCE_WEIGHT = 0.2  # weight of the gated distance in the cost; the rest is 1 - IoU
-AGE_COST = 0.2  # of tracks not detected for AGE_FRAMES; linear before
-AGE_FRAMES = 10
-UNCONFIRMED_COST = 0.2  # of tentative tracks
-CLASS_COST = 0.2  # where track and detection differ in class; taken off the overlap as evidence
-WEAK_MATCH_COST = 0.5  # a match of at least this cost may be an object without a track
-IOU_ODDS = 20.0  # log odds for the same object per unit of IoU ...
-NO_OVERLAP_ODDS = 6.0  # ... and log odds against it at IoU 0
 EMBEDDING_MOMENTUM = 0.8  # of a track's mean embedding (StrongSORT: .9 every frame)
-# Re-identification
-JUMP_ODDS = 2.0  # log odds against a return far from the object's own coasting track
-JUMP_GATE = 9.0  # squared distance over the gate's: three times its radius
 # With poses
 MAP_REFIT = 10  # frames between two fits of the ellipsoids that have new views
 OUT_OF_VIEW = -1e6  # px, position of tracks whose ellipsoid is out of view
-EXPECTED_IN_VIEW = 0.5  # fraction of a projected box in the image above which it is expected
+
+
+@dataclass(frozen=True, slots=True)
+class MatchingOptions:
+    """Gates, costs and odds of matching detections to tracks, and of re-identification.
+
+    Costs lie in [0, 1]. Values without a source were chosen on the rendered rooms and redkitchen
+    (benchmarks/RESULTS.md).
+
+    Attributes:
+        gate_chi2: gate on the squared Mahalanobis distance of the centres (chi2 .99, 2 dof).
+        gate_iou: IoU that passes the gate whatever the distance.
+        motion_only_iou, motion_only_size: without embeddings: least IoU of every match, largest
+            ratio of widths or heights.
+        low_iou: least IoU for low scores and for a change of class (ByteTrack: .5), and with the
+            projected ellipsoid of a known identity.
+        max_cost: of an accepted match.
+        distance_weight: of the gated distance in the cost; the rest is 1 - IoU.
+        penalty: cost of each kind of weak evidence: a track not detected for age_frames frames
+            (linear before), a tentative track, track and detection of different classes (then also
+            taken off the overlap as evidence).
+        weak_cost: a match of at least this cost may be an object without a track.
+        ambiguity_margin: cost above that of the best pair up to which pairs are rivals.
+        iou_odds, no_overlap_odds: log odds for the same object per unit of IoU, and log odds
+            against it at IoU 0 (of 12 pairs none has .8 more IDF1 at any step of the camera:
+            benchmarks/LOG.md).
+        jump_odds: log odds against a return far from the object's own coasting track.
+        jump_gate: squared distance over that of the gate from which it is far: three times its
+            radius.
+    """
+
+    gate_chi2: float = 9.2103
+    gate_iou: float = 0.2
+    motion_only_iou: float = 0.1
+    motion_only_size: float = 2.0
+    low_iou: float = 0.3
+    max_cost: float = 0.9
+    distance_weight: float = 0.2
+    penalty: float = 0.2
+    age_frames: int = 10
+    weak_cost: float = 0.5
+    ambiguity_margin: float = 0.3
+    iou_odds: float = 20.0
+    no_overlap_odds: float = 6.0
+    jump_odds: float = 2.0
+    jump_gate: float = 9.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -490,6 +516,7 @@ class Tracker:
         config: thresholds; the defaults suit video of static scenes at 5 to 60 frames per second.
         embedder: computes embeddings of ambiguous matches; without one, pass `embeddings=` or
             track by motion alone.
+        matching: gates, costs and odds.
 
     >>> tracker = Tracker(TrackerConfig(n_init=1))
     >>> tracker.update(Detections.from_array([[10, 10, 50, 90, 0.9, 56]])).track_id
@@ -497,10 +524,14 @@ class Tracker:
     """
 
     def __init__(
-        self, config: TrackerConfig | None = None, embedder: Embedder | None = None
+        self,
+        config: TrackerConfig | None = None,
+        embedder: Embedder | None = None,
+        matching: MatchingOptions | None = None,
     ) -> None:
         self.config = config or TrackerConfig()
         self.embedder = embedder
+        self.matching = matching or MatchingOptions()
         self.reset()
 
     def reset(self) -> None:
@@ -750,6 +781,7 @@ class Tracker:
             (D,) row of the track's state, or -1.
         """
         config = self.config
+        options = self.matching
         tracks = self.state.tracks
         detections = frame.detections
         lazy = frame.lazy
@@ -759,8 +791,8 @@ class Tracker:
         score = detections.score[d]
         priority = self._priority_cost()[t]
         first = score >= config.high_score  # (M,), as all below
-        weak = (pairs.cost + priority > WEAK_MATCH_COST) & (tracks.embedded[t] >= 0)
-        ambiguous, rivals = ambiguous_pairs(pairs, first)
+        weak = (pairs.cost + priority > options.weak_cost) & (tracks.embedded[t] >= 0)
+        ambiguous, rivals = ambiguous_pairs(pairs, first, options.ambiguity_margin)
         agree = ambiguous | weak
         matched, refused = self._match(pairs, pairs.cost, priority, first, agree, rivals, lazy)
         track_of = np.full(len(detections), -1)
@@ -768,7 +800,7 @@ class Tracker:
         free = np.ones(len(tracks.mean), bool)
         free[t[matched]] = False
         low = free[t] & (track_of[d] < 0) & (score >= config.low_score)
-        second = low & ~refused & (pairs.iou >= LOW_IOU)
+        second = low & ~refused & (pairs.iou >= options.low_iou)
         if second.any():
             none = np.zeros(len(t), bool)
             matched, _ = self._match(pairs, 1 - pairs.iou, 0.0, second, weak, none, lazy)
@@ -777,30 +809,36 @@ class Tracker:
 
     def _gate(self, frame: FrameContext) -> Pairs:
         """Gate pairs of tracks and detections by motion, and compute their cost."""
+        options = self.matching
         tracks = self.state.tracks
         detections = frame.detections
         track, reach = tracks.mean[..., 0].T, tracks.uncertainty.T  # (4, T) cx, cy, w, h; (2, T)
         variance = center_variance(tracks.mean, tracks.cov).T  # (2, T)
-        gate = np.maximum(np.sqrt(GATE_CHI2 * variance), track[2:] / 2 + reach)  # distance, overlap
+        # distance, overlap
+        gate = np.maximum(np.sqrt(options.gate_chi2 * variance), track[2:] / 2 + reach)
         t, d = touching(track[:2], gate, detections.xyxy)  # (M,) each
         track, seen, reach = track.take(t, 1), frame.box.T.take(d, 1), reach.take(t, 1)  # (4, M)
         iou, weight = iou_within_uncertainty(track, reach, seen)
-        distance = squared_mahalanobis(track[:2] - seen[:2], variance.take(t, 1)) / GATE_CHI2
+        distance = squared_mahalanobis(track[:2] - seen[:2], variance.take(t, 1))
+        distance /= options.gate_chi2
         overlap = iou * weight
         same_class = tracks.votes.argmax(1)[t] == detections.class_id[d]
-        cost = (1 - DISTANCE_WEIGHT) * (1 - overlap)
-        cost += DISTANCE_WEIGHT * np.minimum(distance, 1) + CLASS_COST * ~same_class
-        good = ((distance < 1) | (iou > GATE_IOU)) & (same_class | (overlap > LOW_IOU))
+        cost = (1 - options.distance_weight) * (1 - overlap)
+        cost += options.distance_weight * np.minimum(distance, 1) + options.penalty * ~same_class
+        near = (distance < 1) | (iou > options.gate_iou)
+        good = near & (same_class | (overlap > options.low_iou))
         if not frame.lazy.available:
             growth = np.log(track[2:] / np.maximum(seen[2:], 1e-3))  # (2, M)
-            good &= (np.abs(growth) < math.log(MOTION_ONLY_SIZE)).all(0) & (iou >= MOTION_ONLY_IOU)
+            good &= (np.abs(growth) < math.log(options.motion_only_size)).all(0)
+            good &= iou >= options.motion_only_iou
         return Pairs(*(x[good] for x in (t, d, cost, iou, weight, same_class)))
 
     def _priority_cost(self) -> Array:
         """Return the extra cost (T,) that lets confirmed tracks just seen choose first."""
         tracks = self.state.tracks
-        age = np.minimum(np.maximum((tracks.missed - 1) / AGE_FRAMES, 0), 1)
-        return np.asarray(AGE_COST * age + UNCONFIRMED_COST * (tracks.identity < 0))
+        penalty = self.matching.penalty
+        age = np.minimum(np.maximum((tracks.missed - 1) / self.matching.age_frames, 0), 1)
+        return np.asarray(penalty * age + penalty * (tracks.identity < 0))
 
     def _match(
         self, pairs: Pairs, cost: Array, priority: Array | float, possible: BoolArray,
@@ -822,7 +860,7 @@ class Tracker:
         tracks = self.state.tracks
         compared = np.full(len(lazy.done), not (lazy.available and tracks.embedding.shape[1]))
         while True:
-            good = np.flatnonzero(possible & ~refused & (cost < MAX_COST))
+            good = np.flatnonzero(possible & ~refused & (cost < self.matching.max_cost))
             matched = good[assign(t[good], d[good], (cost + priority)[good])]
             ask = matched[must_agree[matched] & ~compared[d[matched]]]
             if not len(ask):
@@ -859,8 +897,10 @@ class Tracker:
         against = np.zeros(len(cost), bool)
         cost = cost.copy()
         cost[some] = (1 - weight) * cost[some] + weight * unlike
-        overlap = pairs.iou[some] - CLASS_COST * ~pairs.same_class[some]
-        evidence = pairs.overlap_weight[some] * (IOU_ODDS * overlap - NO_OVERLAP_ODDS)
+        options = self.matching
+        overlap = pairs.iou[some] - options.penalty * ~pairs.same_class[some]
+        evidence = options.iou_odds * overlap - options.no_overlap_odds
+        evidence *= pairs.overlap_weight[some]
         against[some] = known & (logit + evidence < 0)
         return cost, against
 
@@ -872,7 +912,7 @@ class Tracker:
         mean = tracks.mean[t]
         score = frame.detections.score[rows]
         growth = (np.maximum(1 - score, 0.05) / 0.2) ** SCORE_NOISE  # (n,) 1 at .8
-        noise = STD_MEASURE * _noise_scale(mean) * growth[:, None]
+        noise = STD_POSITION * _noise_scale(mean) * growth[:, None]
         tracks.mean[t], tracks.cov[t] = kalman_update(mean, tracks.cov[t], frame.box[rows], noise)
         self._count(frame.detections, rows, t)
 
@@ -1011,6 +1051,7 @@ class Tracker:
         counts against it. Identities seen since the new track started, and those whose ellipsoid
         projects elsewhere, are excluded. Moving objects have no ellipsoid.
         """
+        options = self.matching
         state = self.state
         tracks = self.state.tracks
         result = np.full(len(ready), -1, np.int64)
@@ -1021,14 +1062,15 @@ class Tracker:
         view = frame.img_from_world
         size = frame.image_size
         iou, weight = self.ellipsoid_map.overlap(box, identity, view, size)
-        at_projection = iou * weight > LOW_IOU
+        at_projection = iou * weight > options.low_iou
         rays = self._viewing_rays(frame, ready)
         logit = state.reid_calibration.logit(
             *state.gallery.parts(tracks.embedding[ready], identity, rays)
         )
         logit[at_projection & np.isinf(logit)] = 0  # without appearance the position decides
-        logit += np.where(at_projection, weight * (IOU_ODDS * iou - NO_OVERLAP_ODDS), 0)
-        logit -= JUMP_ODDS * self._far_from_coasting_track(frame, ready, identity)
+        evidence = weight * (options.iou_odds * iou - options.no_overlap_odds)
+        logit += np.where(at_projection, evidence, 0)
+        logit -= options.jump_odds * self._far_from_coasting_track(frame, ready, identity)
         possible = state.last_seen[identity] < tracks.first[ready][:, None]
         possible &= state.identity_class[identity] == tracks.votes[ready].argmax(1)[:, None]
         logit[~possible | (iou == 0)] = -np.inf
@@ -1054,7 +1096,8 @@ class Tracker:
         center = tracks.mean[:, :2, 0].T
         variance = center_variance(tracks.mean, tracks.cov).T
         offset = center[:, ready, None] - center[:, None, row]  # (2, n, I)
-        far = squared_mahalanobis(offset, variance[:, None, row]) > JUMP_GATE * GATE_CHI2
+        far_from = self.matching.jump_gate * self.matching.gate_chi2
+        far = squared_mahalanobis(offset, variance[:, None, row]) > far_from
         has_view = frame.img_from_world is not None
         located = rows_of(self.ellipsoid_map.known, identity, False) & has_view
         return np.asarray(far & (row >= 0) & ~located, bool)
@@ -1090,7 +1133,8 @@ class Tracker:
         A tracker that `load` reads continues exactly as this one does.
         """
         arrays = state_arrays(self.state, "state")
-        save_npz(Path(path), arrays, version=STATE_VERSION, config=dataclasses.asdict(self.config))
+        options = {name: dataclasses.asdict(getattr(self, name)) for name in ("config", "matching")}
+        save_npz(Path(path), arrays, version=STATE_VERSION, **options)
 
     @classmethod
     def load(cls, path: str | Path, embedder: Embedder | None = None) -> Tracker:
@@ -1099,7 +1143,8 @@ class Tracker:
             arrays, facts = load_npz(Path(path), sealed=True)
             if facts["version"] != STATE_VERSION:
                 raise ValueError(f"version {facts['version']}, this is {STATE_VERSION}")
-            tracker = cls(TrackerConfig(**facts["config"]), embedder)
+            matching = MatchingOptions(**facts.get("matching", {}))
+            tracker = cls(TrackerConfig(**facts["config"]), embedder, matching)
             restore_state(tracker.state, "state", arrays)
         except (KeyError, TypeError, ValueError) as error:
             raise ReobjError(

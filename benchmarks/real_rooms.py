@@ -160,9 +160,9 @@ COMPONENT = "reobj.objects.component"
 WITHOUT: dict[str, dict[str, Any]] = {
     "hidden edges": {f"{LIKELIHOOD}.OCCLUDED_EDGES": 0.0},
     "hidden edges in the fit": {
-        "quadrics.CAUCHY_HIDDEN": quadrics.CAUCHY,
-        "quadrics.HUBER_HIDDEN": quadrics.HUBER,
-        "quadrics.HIDDEN_CAP": quadrics.OUTLIER_CAP,
+        "quadrics.RobustOptions.cauchy_hidden": quadrics.RobustOptions().cauchy,
+        "quadrics.RobustOptions.huber_hidden": quadrics.RobustOptions().huber,
+        "quadrics.RobustOptions.hidden_cap": quadrics.RobustOptions().outlier_cap,
     },
     "edges behind nearer objects": {"reobj.objects.occlusion._occluded_by_nearer": all_visible},
     "edges above the floor": {"reobj.objects.occlusion.ABOVE_FLOOR": np.inf},
@@ -195,7 +195,7 @@ WITHOUT: dict[str, dict[str, Any]] = {
     "lower part occluded": {"quadrics.OCCLUDED_BELOW": 1e-12},
     "pooled noise": {"quadrics.OBJECT_NOISE_DOF": 1e-3},
     "votes of occluded objects": {
-        "quadrics.VOTES": ((0.75, 0.0, 0.0), (0.25, 0.0, quadrics.UNKNOWN_SIZE_LOG))
+        "quadrics.VOTES": ((0.75, 0.0, 0.0), (0.25, 0.0, quadrics.UNKNOWN_SIZE.size_log))
     },
 }
 

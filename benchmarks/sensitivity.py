@@ -50,7 +50,7 @@ MODULES = (
     ),
 )  # fmt: skip
 
-CODES = ("BOX", "CYLINDER", "AXIS_GROUPS", "AXIS_ORDERS", "UPRIGHT_ORDERS")  # not quantities
+CODES = ("AXIS_GROUPS", "AXIS_ORDERS")  # not quantities
 
 
 def constants(module: str) -> Iterator[str]:

@@ -43,12 +43,13 @@ GROUPS = {
         "read_tracks write_detections_npz list_models model_path COCO_NAMES",
         "Appearance": "Embedder CropEmbedder SamplingLayout",
         "Cameras": "Camera Poses estimate_poses read_poses",
-        "Options": "Config InputConfig DetectConfig EmbedConfig TrackerConfig PosesConfig "
-        "ObjectsConfig OutputConfig",
+        "Options": "Config InputConfig DetectConfig EmbedConfig TrackerConfig MatchingOptions "
+        "PosesConfig ObjectsConfig OutputConfig",
         "Errors, command line": "ReobjError main",
     },
     "quadrics": {
-        "Objects from boxes": "fit_objects ObjectFits Ellipsoids Scale FitConfig",
+        "Objects from boxes": "fit_objects ObjectFits Ellipsoids Scale FitConfig RobustOptions "
+        "StatusLimits",
         "Size priors": "Priors load_priors SUPPORTS",
         "Published methods": "fit_lfd fit_sfmo SfmoResult fit_psfmo PsfmoResult",
         "Projection and overlap": "project boxes_from_dual_conics solid_boxes clip_boxes box_iou "

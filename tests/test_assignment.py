@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linear_sum_assignment
 
-from reobj.tracking.assignment import AMBIGUITY_MARGIN, Pairs, ambiguous_pairs, assign, touching
+from reobj.tracking.assignment import Pairs, ambiguous_pairs, assign, touching
 
 
 def random_pairs(seed: int, rows: int, columns: int, density: float) -> tuple:
@@ -39,13 +39,13 @@ def test_rivals_cost_little_more_than_the_best_of_track_and_detection(density: f
         given = Pairs(*pairs.T, cost, cost, cost, same)
         whole = np.full((8, 7), np.inf)
         whole[tuple(pairs[possible].T)] = cost[possible]
-        near = whole <= np.minimum(whole.min(0)[None], whole.min(1)[:, None]) + AMBIGUITY_MARGIN
+        near = whole <= np.minimum(whole.min(0)[None], whole.min(1)[:, None]) + 0.3
         of_class = np.zeros((8, 7), bool)
         of_class[tuple(pairs[same & possible].T)] = True
         rivals = near & of_class
         several = (rivals.sum(0) > 1)[None] | (rivals.sum(1) > 1)[:, None]
         for found, expected in zip(
-            ambiguous_pairs(given, possible), (rivals & several, rivals), strict=True
+            ambiguous_pairs(given, possible, 0.3), (rivals & several, rivals), strict=True
         ):
             whole_found = np.zeros((8, 7), bool)
             whole_found[tuple(pairs[found].T)] = True

@@ -587,9 +587,21 @@ def test_an_unused_tracker_can_be_saved(options: dict[str, int], tmp_path: Path)
     rt.Tracker(rt.TrackerConfig(**options)).save(tmp_path / "state.npz")
     loaded = rt.Tracker.load(tmp_path / "state.npz")
     assert loaded.config == rt.TrackerConfig(**options)
+    assert loaded.matching == rt.MatchingOptions()
     loaded.update(rows((0, 0, 50, 50)))
     both = rows((0, 0, 50, 50), (90, 0, 140, 50))
     assert len(loaded.update(both)) == 1 + (options.get("n_init") == 1)
+
+
+def test_matching_options_are_applied_and_saved(tmp_path: Path) -> None:
+    """A box that has doubled its width is another object to a tracker of motion alone."""
+    for size, names in ((1.5, [2]), (3.0, [1])):
+        matching = rt.MatchingOptions(motion_only_size=size)
+        rt.Tracker(rt.TrackerConfig(n_init=1), matching=matching).save(tmp_path / "state.npz")
+        tracker = rt.Tracker.load(tmp_path / "state.npz")
+        assert tracker.matching == matching
+        tracker.update(rows((0, 0, 50, 50)))
+        assert tracker.update(rows((0, 0, 100, 50))).track_id.tolist() == names
 
 
 def test_invalid_saved_trackers_are_refused(tmp_path: Path) -> None:

@@ -58,6 +58,7 @@ def test_constants_are_scaled_by_kind() -> None:
     assert se.scaled((1.0, 4), 2.0) == (2.0, 8)
     np.testing.assert_array_equal(se.scaled(np.array([1.0, 2]), 0.5), [0.5, 1])
     names = set(se.constants("quadrics"))
-    assert {"HUBER", "UNKNOWN_SIZE_M"} <= names and not names & {"BOX", "SUPPORTS"}
-    assert quadrics.HUBER == 3.0
+    assert {"SMOOTH", "RobustOptions.huber"} <= names
+    assert not names & {"AXIS_ORDERS", "SUPPORTS"}
+    assert quadrics.RobustOptions().huber == 3.0
     assert "AssociationOptions.new_object" in set(se.constants("reobj.objects.association"))

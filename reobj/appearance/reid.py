@@ -19,11 +19,6 @@ from reobj.types import Array, Floats, IntArray, unit_rows
 
 # ---- Gallery -----------------------------------------------------------------------------------
 
-GALLERY_VIEWS = 12  # views kept of every identity (chosen)
-GALLERY_NOVELTY = 0.95  # largest cosine to all kept views of a new view (chosen)
-GALLERY_BLEND = 0.9  # weight of the kept view if a view is not new (chosen)
-UNUSED = -2.0  # below any cosine
-
 
 class Gallery:
     """A few diverse views of the appearance of every identity of a video; none expires.
@@ -33,6 +28,7 @@ class Gallery:
     Args:
         views: K, views kept of every identity.
         novelty: largest cosine to all kept views of a view that is kept as a new one.
+        blend: weight of the kept view where a view that is not new is blended into it.
 
     Attributes:
         rows: (I, K, E) unit rows. viewing_ray: (I, K, 3) viewing directions, NaN unknown.
@@ -41,9 +37,10 @@ class Gallery:
 
     ARRAYS = ("rows", "viewing_ray", "count", "foreground_width")  # the whole state
 
-    def __init__(self, views: int = GALLERY_VIEWS, novelty: float = GALLERY_NOVELTY) -> None:
+    def __init__(self, views: int = 12, novelty: float = 0.95, blend: float = 0.9) -> None:
         self.views = views
         self.novelty = novelty
+        self.blend = blend
         self.rows = np.zeros((0, views, 0), np.float32)
         self.viewing_ray = np.zeros((0, views, 3))
         self.count = np.zeros(0, np.int64)
@@ -62,13 +59,13 @@ class Gallery:
         self.reserve(int(identity.max(initial=-1)) + 1, rows.shape[1])
         views = self.rows[identity]  # (N, K, E)
         similarity = np.einsum("nke,ne->nk", views, rows)  # (N, K)
-        similarity[np.arange(self.views) >= self.count[identity][:, None]] = UNUSED
+        similarity[np.arange(self.views) >= self.count[identity][:, None]] = -np.inf
         nearest = similarity.argmax(1)  # (N,)
         novel = similarity.max(1) < self.novelty  # (N,)
         has_slot = self.count[identity] < self.views
         target = np.where(novel & has_slot, self.count[identity], nearest)  # (N,) slot to write
         target[novel & ~has_slot] = _most_redundant(views[novel & ~has_slot])
-        blend = np.where(novel, 0.0, GALLERY_BLEND)[:, None]
+        blend = np.where(novel, 0.0, self.blend)[:, None]
         picked = views[np.arange(len(identity)), target]  # (N, E)
         self.rows[identity, target] = unit_rows(blend * picked + (1 - blend) * rows)
         self.viewing_ray[identity[novel], target[novel]] = viewing_ray[novel]
@@ -92,7 +89,7 @@ class Gallery:
         self.reserve(int(identity.max()) + 1, rows.shape[1])  # some may have no view at all
         views = self.rows[identity].reshape(-1, rows.shape[1])  # (I * K, E)
         empty = np.arange(self.views) >= self.count[identity][:, None]  # (I, K)
-        fused = np.where(empty, UNUSED, (rows @ views.T).reshape(shape))  # (N, I, K)
+        fused = np.where(empty, -np.inf, (rows @ views.T).reshape(shape))  # (N, I, K)
         best = fused.argmax(2)[..., None]
         angle = angle_deg(viewing_ray[:, None], self.viewing_ray[identity].reshape(-1, 3))
         fore, back, angle = (
@@ -116,7 +113,7 @@ class Gallery:
 def _most_redundant(full: Floats) -> IntArray:
     """Find in each full set of views (N, K, E) the one most similar to another of its set, (N,)."""
     pairs = np.einsum("nke,nle->nkl", full, full)
-    pairs[:, np.arange(full.shape[1]), np.arange(full.shape[1])] = UNUSED
+    pairs[:, np.arange(full.shape[1]), np.arange(full.shape[1])] = -np.inf
     return np.asarray(pairs.max(2).argmax(1), np.int64)
 
 
@@ -150,8 +147,9 @@ def _cosine(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> Array:
 
 # ---- Calibrated similarity ---------------------------------------------------------------------
 
-PRIOR_PAIRS = 10.0  # pseudo-count of the usual mean and spread (chosen)
-OUTLIERS = 1e-3  # fraction of pairs of either kind that look like the other kind (chosen)
+# fraction of pairs of either kind that look like the other kind (chosen: no appearance counts more
+# than log odds of 7, which position and overlap can contradict)
+OUTLIERS = 1e-3
 
 
 class SimilarityCalibration:
@@ -178,7 +176,7 @@ class SimilarityCalibration:
     USUAL_STD = 0.45  # of the log similarity within a kind
     ARRAYS = ("moments",)
 
-    def __init__(self, weight: float = PRIOR_PAIRS) -> None:
+    def __init__(self, weight: float = 10.0) -> None:
         mean = np.array(self.USUAL)  # (2, 2)
         self.moments = weight * np.stack([mean**0, mean, mean**2 + self.USUAL_STD**2], 1)
 

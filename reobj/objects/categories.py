@@ -45,7 +45,7 @@ class Categories:
 
     def usual_size(self, classes: IntArray) -> Array:
         """Return width, depth and height (G, 3)."""
-        unknown = np.log(quadrics.UNKNOWN_SIZE_M)
+        unknown = np.log(quadrics.UNKNOWN_SIZE.mean_m)
         log_size = _with_unknown(self.priors.log_mean, unknown)[self.rows(classes)]
         return np.asarray(np.exp(log_size) / self.scale.value)
 

@@ -24,13 +24,12 @@ from reobj.objects.likelihood import NO_SHAPES, PosedDetections, Shapes
 from reobj.objects.observations import Fit, Scene, Views, gather_views
 from reobj.objects.occlusion import edges_above_floor, see_through_ratio
 from reobj.poses.floor import floor_of
-from reobj.tracking.linking import cut_at_gaps
+from reobj.tracking.linking import DUPLICATE_IOU, cut_at_gaps
 from reobj.types import Array, BoolArray, IntArray, Tracks, box_iou, class_shares, rows_by
 
 # Least score of untracked detections that give hypotheses (.3 finds 73.5 objects instead of 72, in
 # 1.2 times the time: benchmarks/LOG.md)
 HYPOTHESIS_SCORE = 0.4
-DUPLICATE_IOU = 0.6  # boxes of a class that overlap more are duplicates (NMS: .5 to .7)
 
 
 @dataclass(frozen=True, slots=True)

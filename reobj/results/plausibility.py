@@ -134,7 +134,7 @@ def _alone(rows: Tracks, others: Tracks) -> BoolArray:
         at = np.searchsorted(frames, rows.frame[group[0]])
         beside = frames[[k for k in (at - 1, at + 1) if 0 <= k < len(frames)]]
         neighbours = others[np.isin(others.frame, beside)]
-        overlaps = box_iou(rows.xyxy[group], neighbours.xyxy) > 0.3  # as in the tracker (LOW_IOU)
+        overlaps = box_iou(rows.xyxy[group], neighbours.xyxy) > 0.3  # as the tracker's low_iou
         same_class = rows.class_id[group][:, None] == neighbours.class_id
         alone[group] = ~(overlaps & same_class).any(1)
     return alone

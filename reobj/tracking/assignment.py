@@ -15,8 +15,6 @@ from scipy.optimize import linear_sum_assignment
 
 from reobj.types import Array, BoolArray, IntArray
 
-AMBIGUITY_MARGIN = 0.3  # of costs in [0, 1]; chosen on the rendered rooms and redkitchen
-
 
 @dataclass(frozen=True, slots=True)
 class Pairs:
@@ -51,10 +49,13 @@ def touching(center: Array, radius: Array, xyxy: Array) -> tuple[IntArray, IntAr
     return np.divmod(np.flatnonzero(touch[0] & touch[1]), max(len(xyxy), 1))
 
 
-def ambiguous_pairs(pairs: Pairs, possible: BoolArray) -> tuple[BoolArray, BoolArray]:
+def ambiguous_pairs(
+    pairs: Pairs, possible: BoolArray, margin: float
+) -> tuple[BoolArray, BoolArray]:
     """Mark possible pairs that have a rival of their class, and pairs that are rivals, (M,) each.
 
-    A pair is a rival if it costs little more than the best pair of its track and of its detection.
+    A pair is a rival if it costs at most `margin` more than the best pair of its track and of its
+    detection.
     (Two boxes of different classes around one object are not rivals: they show the same object.)
     """
     rivals = possible & pairs.same_class
@@ -64,7 +65,7 @@ def ambiguous_pairs(pairs: Pairs, possible: BoolArray) -> tuple[BoolArray, BoolA
         least = np.full(side.max(initial=0) + 1, np.inf)
         np.minimum.at(least, side, cost)
         best.append(least[side])
-    rivals &= pairs.cost <= np.minimum(*best) + AMBIGUITY_MARGIN
+    rivals &= pairs.cost <= np.minimum(*best) + margin
     several = [np.bincount(side, rivals)[side] > 1 for side in (pairs.track, pairs.detection)]
     return rivals & (several[0] | several[1]), rivals
 

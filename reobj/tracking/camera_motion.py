@@ -16,10 +16,6 @@ from reobj.sources.video import Video, one_ahead, shrunk
 from reobj.types import Array, Floats, Frame, Image
 
 FLOW_SIZE_PX = 320  # px, longer side of the image in which corners are followed: for speed
-FLOW_CORNERS = 100  # corners followed: for speed (BoT-SORT: 1000)
-# nearest corners whose median is the parallax of a point (measured, IoU of the true boxes with the
-# moved ones, against the transform alone: rendered room v900 .76 -> .82, benchmarks/LOG.md)
-PARALLAX_CORNERS = 5
 
 
 class CameraMotion:
@@ -76,7 +72,7 @@ class CameraMotion:
         for frame, self._ahead in one_ahead(steps()):
             yield frame
 
-    def parallax(self, xy: Array) -> Array:
+    def parallax(self, xy: Array, nearest: int = 5) -> Array:
         """Estimate the parallax at points of the old image: their residual motion.
 
         A scene is deep if less than half of the corners are inliers of the transform. There a point
@@ -85,14 +81,16 @@ class CameraMotion:
 
         Args:
             xy: (N, 2) pixels of the old image.
+            nearest: number of nearest corners (measured, IoU of the true boxes with the moved ones,
+                against the transform alone: rendered room v900 .76 -> .82, benchmarks/LOG.md).
         Returns:
             (N, 2) pixels, to be added to where `new_from_old` takes the points.
         """
         if not len(self.residual_flow):
             return np.zeros_like(xy)
         distance2 = ((xy[:, None] - self.residual_flow[:, :2]) ** 2).sum(-1)  # (N, K)
-        nearest = distance2.argsort(1)[:, :PARALLAX_CORNERS]  # (N, 5)
-        return np.asarray(np.median(self.residual_flow[nearest, 2:], 1))
+        corners = distance2.argsort(1)[:, :nearest]  # (N, nearest)
+        return np.asarray(np.median(self.residual_flow[corners, 2:], 1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,9 +124,9 @@ def _step(old: Image | None, corners: Floats | None, image: Image) -> _Step:
         fit = _fit_similarity(corners[found, 0], np.asarray(moved)[found, 0])
         fit = fit or _fit_similarity(*_orb_matches(old, gray))
         new_from_old, residual_flow = fit or (new_from_old, residual_flow)
-    # quality: strength over that of the strongest corner (as BoT-SORT); the distance, px of the
-    # small image, spreads the corners
-    good = cv2.goodFeaturesToTrack(gray, FLOW_CORNERS, qualityLevel=0.01, minDistance=12)
+    # number: for speed (BoT-SORT: 1000). Quality: strength over that of the strongest corner (as
+    # BoT-SORT); the distance, px of the small image, spreads the corners
+    good = cv2.goodFeaturesToTrack(gray, maxCorners=100, qualityLevel=0.01, minDistance=12)
     small_from_image = np.diag([shrink, shrink, 1.0])
     return _Step(
         old,
@@ -162,7 +160,6 @@ def _orb_matches(old: Image, new: Image) -> tuple[Floats, Floats]:
 
 # inliers that make a fit: in 450 pairs of frames of different videos at most 7 corners agreed
 FLOW_MIN_INLIERS = 8
-INLIER_PX = 2.0  # px, largest residual of an inlier in the small image (OpenCV: 3; not measured)
 
 
 def _fit_similarity(old: Floats, new: Floats) -> tuple[Array, Array] | None:
@@ -175,7 +172,8 @@ def _fit_similarity(old: Floats, new: Floats) -> tuple[Array, Array] | None:
     if len(old) < FLOW_MIN_INLIERS:
         return None
     cv2.setRNGSeed(0)
-    affine, inliers = cv2.estimateAffinePartial2D(old, new, ransacReprojThreshold=INLIER_PX)
+    # px of the small image (OpenCV: 3; not measured)
+    affine, inliers = cv2.estimateAffinePartial2D(old, new, ransacReprojThreshold=2.0)
     if affine is None or inliers.sum() < FLOW_MIN_INLIERS:
         return None
     residual_flow = np.empty((0, 4))

@@ -24,7 +24,9 @@ from reobj.visible_points import VisiblePoints
 # ---- Ellipsoids of identities ------------------------------------------------------------------
 
 
-MIN_PARALLAX_DEG = 2.0  # between the views of a fit (chosen)
+# between the views of a fit (chosen; lower: positions whose depth is the prior of the size, higher:
+# objects are unknown until the camera has walked round them)
+MIN_PARALLAX_DEG = 2.0
 
 
 def quick_fit(
@@ -37,7 +39,7 @@ def quick_fit(
         usual_size: of the scene's objects in the unit of the world (`usual_size`): the world may
             have any unit, but the prior of the fit is in metres.
     """
-    ratio = float(np.exp(np.log(quadrics.UNKNOWN_SIZE_M).mean())) / usual_size
+    ratio = float(np.exp(np.log(quadrics.UNKNOWN_SIZE.mean_m).mean())) / usual_size
     cameras = img_from_world.copy()
     cameras[..., 3] *= ratio
     config = quadrics.FitConfig(iterations=10, start_views=4, start_iterations=4)
@@ -84,11 +86,11 @@ def usual_size(sizes: Array) -> float:
     return float(np.median(known)) if len(known) else 1.0
 
 
-MAP_VIEWS = 16  # views kept of every identity (chosen)
+# fraction of a projected box in the image above which the object is expected there (not measured)
+EXPECTED_IN_VIEW = 0.5
 # longest half axis over the middle one: half-occluded objects give needles that reach behind the
 # camera (95 % of priors.json are below 5.8; IDF1 of redkitchen with poses 79.1 -> 88.4)
 MAP_MAX_ELONGATION = 6.0
-NO_FRAME = -1000  # frame number of a free slot: long before the first frame
 
 
 class EllipsoidMap:
@@ -98,8 +100,11 @@ class EllipsoidMap:
     ellipsoid is fitted to them from time to time. Memory grows with the number of identities, not
     with time.
 
+    Args:
+        views: V, views kept of every identity.
+
     Attributes:
-        frame: (I, V) frame of each view, negative: free slot. boxes: (I, V, 4) x1, y1, x2, y2.
+        frame: (I, V) frame of each view, -1: free slot. boxes: (I, V, 4) x1, y1, x2, y2.
         img_from_world: (I, V, 3, 4). rays: (I, V, 3) viewing rays, NaN: free slot.
         step_deg: (I,) least angle between the rays of two views. fresh: (I,) views since the fit.
         size: (I, V) rough size, NaN unknown. dual_q: (I, 4, 4) dual quadrics, NaN unknown.
@@ -110,14 +115,14 @@ class EllipsoidMap:
         "frame", "boxes", "img_from_world", "rays", "step_deg", "fresh", "size", "dual_q", "ends"
     )  # fmt: skip
 
-    def __init__(self) -> None:
-        self.frame = np.zeros((0, MAP_VIEWS), np.int64)
-        self.boxes = np.zeros((0, MAP_VIEWS, 4))
-        self.img_from_world = np.zeros((0, MAP_VIEWS, 3, 4))
-        self.rays = np.zeros((0, MAP_VIEWS, 3))
+    def __init__(self, views: int = 16) -> None:
+        self.frame = np.zeros((0, views), np.int64)
+        self.boxes = np.zeros((0, views, 4))
+        self.img_from_world = np.zeros((0, views, 3, 4))
+        self.rays = np.zeros((0, views, 3))
         self.step_deg = np.zeros(0)
         self.fresh = np.zeros(0, np.int64)
-        self.size = np.zeros((0, MAP_VIEWS))
+        self.size = np.zeros((0, views))
         self.dual_q = np.zeros((0, 4, 4))
         self.ends = np.zeros((0, 2, 3))
 
@@ -134,7 +139,7 @@ class EllipsoidMap:
         for i, box, ray in zip(identity[due], xyxy[due], rays[due], strict=True):
             if (self.frame[i] >= 0).all():
                 old = self.frame[i].argsort()[1::2]
-                self.frame[i, old] = NO_FRAME
+                self.frame[i, old] = -1
                 self.rays[i, old] = np.nan
                 self.step_deg[i] *= 2
             slot = self.frame[i].argmin()
@@ -256,7 +261,7 @@ class EllipsoidMap:
         extra = identities - len(self.frame)
         if extra > 0:
             extra = max(extra, len(self.frame), 16)  # doubling: amortised O(1)
-            fills = {"frame": NO_FRAME, "dual_q": np.nan, "rays": np.nan, "ends": np.nan}
+            fills = {"frame": -1, "dual_q": np.nan, "rays": np.nan, "ends": np.nan}
             fills |= {"size": np.nan, "step_deg": 1.0}  # between viewing rays; doubled when full
             for name in self.ARRAYS:
                 old = getattr(self, name)
@@ -271,8 +276,6 @@ def rows_of(rows: Any, identity: IntArray, missing: Any) -> npt.NDArray[Any]:
 
 
 # ---- Depth intervals of tracks -----------------------------------------------------------------
-
-MIN_POINTS = 3  # in a box to estimate its depth: fewer have no median and spread (chosen)
 
 
 class CameraInputs:
@@ -308,7 +311,7 @@ class CameraInputs:
 
 
 def depth_intervals(
-    xyxy: Array, points: Array, cam_from_world: Array, K: Array
+    xyxy: Array, points: Array, cam_from_world: Array, K: Array, min_points: int = 3
 ) -> tuple[Array, Array]:
     """Estimate the depth intervals of the objects in boxes from the sparse points in the boxes.
 
@@ -317,6 +320,7 @@ def depth_intervals(
 
     Args:
         xyxy: (D, 4) px. points: (N, 3) in world, seen in this frame.
+        min_points: in a box to estimate its depth; fewer than 3 have no median and spread.
     Returns:
         ends: (D, 2, 3) in world, end points of the interval on the viewing ray, one sigma in front
         of and behind the depth. size: (D, 2) width and height there, in the unit of the world. NaN
@@ -326,7 +330,7 @@ def depth_intervals(
     size = np.full((len(xyxy), 2), np.nan)
     in_cam = points @ cam_from_world[:, :3].T + cam_from_world[:, 3]  # (N, 3)
     in_cam = in_cam[in_cam[:, 2] > 0]
-    if len(in_cam) < MIN_POINTS:
+    if len(in_cam) < min_points:
         return ends, size
     xy = (in_cam @ K.T)[:, :2] / in_cam[:, 2:]
     log_depth = np.log(in_cam[:, 2])
@@ -338,7 +342,7 @@ def depth_intervals(
     sigma = np.empty(len(xyxy))
     for d, distance in enumerate(offset):  # each box has its own number of points
         sets = (log_depth[distance < limit] for limit in (0.25, 0.5))
-        found = next((s for s in sets if len(s) >= MIN_POINTS), None)
+        found = next((s for s in sets if len(s) >= min_points), None)
         median[d], sigma[d] = of_image if found is None else _median_and_spread(found)
     least = (box[:, 2:] / np.diag(K)[:2]).mean(1) / 2  # (D,) half the size over the depth
     depth = np.exp(median[:, None] + np.maximum(sigma, least)[:, None] * [-1, 1])  # (D, 2)

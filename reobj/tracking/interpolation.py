@@ -11,7 +11,8 @@ import numpy.typing as npt
 
 import quadrics
 from reobj.cameras import Poses
-from reobj.tracking.box_noise import STD_MEASURE, STD_POSITION, STD_START, STD_VELOCITY
+from reobj.tracking.box_noise import STD_POSITION, STD_START, STD_VELOCITY
+from reobj.tracking.ellipsoid_map import EXPECTED_IN_VIEW
 from reobj.types import (
     Array,
     IntArray,
@@ -24,12 +25,13 @@ from reobj.types import (
     xyxy_from_cxcywh,
 )
 
-# IoU of the boxes at both ends; less: too much motion to interpolate (not measured)
-MIN_END_IOU = 0.3
-
 
 def fill_gaps(
-    tracks: Tracks, image_size: tuple[int, int], max_gap: int, looked: IntArray | None = None
+    tracks: Tracks,
+    image_size: tuple[int, int],
+    max_gap: int,
+    looked: IntArray | None = None,
+    min_iou: float = 0.3,
 ) -> Tracks:
     """Interpolate gaps of at most `max_gap` frames between two detections of an identity.
 
@@ -37,6 +39,7 @@ def fill_gaps(
         tracks: of a video, in frames that were all read. image_size: (w, h) that boxes stay in.
         looked: frames that the detector was run on, the only ones that count and are filled;
             None: all that were read.
+        min_iou: of the boxes at both ends; less: too much motion to interpolate (not measured).
     Returns:
         the tracks with rows of score 0 and detection index -1 in the gaps, ordered by frame.
     """
@@ -49,7 +52,7 @@ def fill_gaps(
         between = np.diff(rows.frame) // step - 1  # (n - 1,) frames after each row
         missed = np.diff(number[of_identity]) // unit - 1  # of them the detector was run on
         for i in np.flatnonzero((missed > 0) & (missed <= max_gap)):
-            if box_iou(rows.xyxy[i : i + 1], rows.xyxy[i + 1 : i + 2])[0, 0] < MIN_END_IOU:
+            if box_iou(rows.xyxy[i : i + 1], rows.xyxy[i + 1 : i + 2])[0, 0] < min_iou:
                 continue
             # 10 frames on either side; with 40 boxes move by 1.3 px at most
             window = np.abs(rows.frame - rows.frame[i]) <= (10 + between[i]) * step
@@ -67,24 +70,15 @@ def fill_gaps(
     return Tracks.joined(tables)
 
 
-MIN_VISIBLE = 0.5  # fraction of the projected object in the image that makes a box (not measured)
-# A camera this near to another has the same view of an object: angle at the object (rad), log ratio
-# of the distances. Chosen on hololens_kitchen, redkitchen and office_loop: up to 25 deg and 2 times
-# the distance are as good where no walls occlude; without limits the IDF1 of office_loop falls from
-# .420 to .318 (benchmarks/RESULTS.md, "Gaps filled by projection").
-SAME_ANGLE = np.radians(10.0)
-SAME_LOG_DISTANCE = np.log(1.25)
-# Minimum fraction of a detection inside the projected object: it may be half occluded, but not
-# extend beyond the projection (chosen on hololens_kitchen and office_loop)
-MIN_INSIDE = 0.8
-
-
 def fill_from_objects(
     tracks: Tracks,
     poses: Poses,
     identity: IntArray,
     ellipsoids: quadrics.Ellipsoids,
     support: list[str],
+    max_angle_deg: float = 10.0,
+    max_distance_ratio: float = 1.25,
+    min_inside: float = 0.8,
 ) -> Tracks:
     """Add projected boxes in frames without a detection if a nearby view has one.
 
@@ -93,6 +87,14 @@ def fill_from_objects(
 
     Args:
         poses: of one component. identity: (O,) of the objects, which lie in that component.
+        max_angle_deg, max_distance_ratio: a camera this near to another has the same view of an
+            object: angle at the object, ratio of the distances. Chosen on hololens_kitchen,
+            redkitchen and office_loop: up to 25 deg and 2 times the distance are as good where no
+            walls occlude; without limits the IDF1 of office_loop falls from .420 to .318
+            (benchmarks/RESULTS.md, "Gaps filled by projection").
+        min_inside: least fraction of a detection inside the projected object: it may be half
+            occluded, but not extend beyond the projection (chosen on hololens_kitchen and
+            office_loop).
     Returns:
         the tracks with rows of score 0 and detection index -1, ordered by frame.
     """
@@ -101,7 +103,7 @@ def fill_from_objects(
     cam_from_world = poses.cam_from_world[poses.known]
     whole = quadrics.solid_boxes(ellipsoids, support, poses.camera.K @ cam_from_world)
     box = quadrics.clip_boxes(whole, size)  # (V, O, 4)
-    visible = box_area(box) > MIN_VISIBLE * box_area(whole)  # False where NaN
+    visible = box_area(box) > EXPECTED_IN_VIEW * box_area(whole)  # False where NaN
     center = -np.einsum("vij,vi->vj", cam_from_world[:, :, :3], cam_from_world[:, :, 3])
     ray = center[:, None] - ellipsoids.center_in_world  # (V, O, 3)
     distance = np.linalg.norm(ray, axis=2)
@@ -112,15 +114,17 @@ def fill_from_objects(
         empty = np.setdiff1d(np.flatnonzero(visible[:, o]), view)  # (T,) views without a detection
         low, high = np.split(box[view, o], 2, axis=1)
         common = (np.minimum(rows.xyxy[:, 2:], high) - np.maximum(rows.xyxy[:, :2], low)).clip(0)
-        agrees = common.prod(1) > MIN_INSIDE * box_area(rows.xyxy)
+        agrees = common.prod(1) > min_inside * box_area(rows.xyxy)
         rows = rows[agrees]
         view = view[agrees]
         if not (len(rows) and len(empty)):
             continue
         direction = ray[:, o] / distance[:, o, None]
-        angle = np.arccos((direction[empty] @ direction[view].T).clip(-1, 1)) / SAME_ANGLE  # (T, n)
-        log_ratio = np.log(distance[empty, None, o] / distance[view, o]) / SAME_LOG_DISTANCE
-        change = np.maximum(angle, np.abs(log_ratio))
+        angle = np.arccos((direction[empty] @ direction[view].T).clip(-1, 1))  # (T, n)
+        log_ratio = np.abs(np.log(distance[empty, None, o] / distance[view, o]))
+        change = np.maximum(
+            angle / np.radians(max_angle_deg), log_ratio / np.log(max_distance_ratio)
+        )
         near = change.min(1) < 1
         filled = empty[near]
         source = rows[change.argmin(1)[near]]
@@ -151,9 +155,9 @@ def smooth_boxes(at: npt.NDArray[np.int64], xyxy: Array) -> Array:
     kalman = KalmanFilter(dim_x=8, dim_z=4)  # cx, cy, w, h and their velocities
     kalman.F = np.eye(8) + np.eye(8, k=4)
     kalman.H = np.eye(4, 8)
-    kalman.R = np.eye(4) * (STD_MEASURE * side) ** 2
+    kalman.R = np.eye(4) * (STD_POSITION * side) ** 2
     kalman.Q = np.diag(np.repeat([STD_POSITION * side, STD_VELOCITY * side], 4) ** 2)
-    kalman.P = np.diag(np.repeat([STD_MEASURE * side, STD_START * side], 4) ** 2)
+    kalman.P = np.diag(np.repeat([STD_POSITION * side, STD_START * side], 4) ** 2)
     kalman.x = np.concatenate([box[0], np.zeros(4)])[:, None]
     mean, cov, _, _ = kalman.batch_filter(measured)
     smoothed = kalman.rts_smoother(mean, cov)[0]  # (F, 8, 1)

@@ -25,10 +25,10 @@ from reobj.types import (
 )
 
 # Chosen on examples/room and redkitchen (benchmarks/RESULTS.md) unless a source is given.
-LINK_PROBABILITY = 0.5  # least probability to join by appearance, given the rivals: even odds
-# frames between views of a fragment that show how the appearance of one object varies
+# frames between views of a fragment that show how the appearance of one object varies (lower:
+# nearly equal views, which are more alike than those of an object that was out of view)
 VIEW_GAP = 30
-DUPLICATE_IOU = 0.5  # boxes that overlap more may be two boxes of one object
+DUPLICATE_IOU = 0.6  # boxes that overlap more may be two boxes of one object (NMS: .5 to .7)
 FRAGMENT_GAP = 5  # frames without a detection after which a tracklet may be another object
 
 
@@ -202,8 +202,12 @@ class Linker:
         cams = np.where(known[:, None, None], self.poses.cam_from_world[pose_row], np.nan)
         return viewing_rays(undistort_boxes(self.tracks.xyxy[rows], camera), camera.K @ cams)
 
-    def by_appearance(self) -> IntArray:
-        """Return the identity (N,) of every row of the tracks, in any numbering."""
+    def by_appearance(self, probability: float = 0.5) -> IntArray:
+        """Return the identity (N,) of every row of the tracks, in any numbering.
+
+        Args:
+            probability: least probability, given the rivals, to join two fragments: even odds.
+        """
         group = np.unique(self.identity, return_inverse=True)[1]  # (L,)
         if np.isfinite(self.log_odds).any():
             keep = np.where(self.moving, -self.identity, self.tracklets)
@@ -214,7 +218,7 @@ class Linker:
             log_odds = _max_between_groups(self.log_odds, whole)  # (T, T)
             banned = _max_between_groups(self.co_occur, whole) | (kind[:, None] != kind)
             distinct = _max_between_groups(self.distinct, whole)
-            group = _agglomerate(log_odds, banned, distinct, LINK_PROBABILITY)[whole]
+            group = _agglomerate(log_odds, banned, distinct, probability)[whole]
         return np.asarray(group[self.fragment], np.int64)
 
     def changes(self, identity: IntArray, iou: Array | None) -> list[LinkEvent]:
