@@ -216,7 +216,7 @@ def part_paths(path: Path) -> list[Path]:
 # Bytes of memory that one input file may take; chosen: two million detections with masks in JSON,
 # or those of more than an hour of video in npz
 MEMORY_MAX = 1 << 31
-LINES_MAX = 2_000_000  # of a table; chosen: an hour at 30 Hz with 18 boxes a frame, MEMORY_MAX
+LINES_MAX = 2_000_000  # of a table; chosen: an hour at 30 Hz with 18 boxes a frame
 
 
 def read_text(path: Path, most: int | None = None, errors: str = "strict") -> str:
