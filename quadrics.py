@@ -98,8 +98,6 @@ class RobustOptions:
             positive residuals.
         huber, huber_hidden: Scale (sigma) of the loss after the inlier test, likewise.
         edge_outlier: Residual (sigma) beyond which an edge is an outlier (occlusion).
-        view_outlier: Largest mean square (sigma^2) of an inlier view (chi2 .9999 of four edges is
-            23.5 / 4).
         outlier_cap, hidden_cap: Largest cost (sigma^2) of an edge in the evidence, likewise:
             -2 log(p / 20 sigma / .4), the probability p of an outlier .02, or .2 if hidden.
     """
@@ -109,7 +107,6 @@ class RobustOptions:
     huber: float = 3.0
     huber_hidden: float = 2.5
     edge_outlier: float = 5.0
-    view_outlier: float = 6.0
     outlier_cap: float = 12.0
     hidden_cap: float = 7.4
 
@@ -1931,15 +1928,13 @@ def _weighted_median(values: Array, weight: Array) -> float:
 def _inlier_views(standard: Array, used: BoolArray, robust: RobustOptions) -> BoolArray:
     """Classify views (...) as inliers of the solid by their residuals (..., E) in sigma.
 
-    An inlier has a small mean square; or inliers among three quarters of its edges; or among half
-    of them where all other residuals are positive, as of a partly occluded object.
+    Of an inlier three quarters of the edges are inliers; or half of them where all other residuals
+    are positive, as of a partly occluded object.
     """
-    count = np.maximum((used & (standard != 0.0)).sum(-1), 1)
-    mean = (np.minimum(standard**2, 1e6) * used).sum(-1) / count
     close = used & (np.abs(standard) <= robust.edge_outlier)
     fraction = close.sum(-1) / np.maximum(used.sum(-1), 1)
     occluded = ~(used & (standard < -robust.edge_outlier)).any(-1)
-    inlier = (mean <= robust.view_outlier) | (fraction >= 0.75) | ((fraction >= 0.5) & occluded)
+    inlier = (fraction >= 0.75) | ((fraction >= 0.5) & occluded)
     return np.asarray(used.any(-1) & inlier)
 
 

@@ -9,7 +9,7 @@ of noise; the losses are those of `eliminate.py`, against the same boxes with al
 are. OUT/sensitivity.json keeps every evaluation, so that an interrupted run resumes;
 OUT/sensitivity.md has a row for each constant: mean and largest absolute loss. Constants that are
 copied when a module is imported (defaults of arguments, values computed from others) do not change;
-whole numbers do not go below 1.
+whole numbers do not go below 1, fractions do not exceed 1.
 """
 
 from __future__ import annotations
@@ -73,11 +73,16 @@ def constants(module: str) -> Iterator[str]:
 
 
 def scaled(value: Any, factor: float) -> Any:
-    """Scale a number, or all numbers of a tuple or array; integers stay integers, at least 1."""
+    """Scale a number, or all numbers of a tuple or array; integers stay integers, at least 1.
+
+    Of a fraction above a half, which must stay below 1, the distance to 1 is halved or doubled.
+    """
     if isinstance(value, tuple):
         return tuple(scaled(v, factor) for v in value)
     if isinstance(value, int):
         return max(round(value * factor), 1)
+    if isinstance(value, float) and 0.5 < value < 1:
+        return 1 - (1 - value) / factor
     return value * factor
 
 

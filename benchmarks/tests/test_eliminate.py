@@ -56,6 +56,7 @@ def test_elimination_stops_where_the_loss_exceeds_its_noise(tmp_path: Path) -> N
 def test_constants_are_scaled_by_kind() -> None:
     assert se.scaled(3, 0.5) == 2 and se.scaled(1, 0.5) == 1 and se.scaled(3, 2.0) == 6
     assert se.scaled((1.0, 4), 2.0) == (2.0, 8)
+    assert se.scaled(0.875, 2.0) == 0.9375 and se.scaled(0.875, 0.5) == 0.75
     np.testing.assert_array_equal(se.scaled(np.array([1.0, 2]), 0.5), [0.5, 1])
     names = set(se.constants("quadrics"))
     assert {"SMOOTH", "RobustOptions.huber"} <= names

@@ -13,7 +13,6 @@ import quadrics
 from reobj.objects.likelihood import Shapes
 from reobj.types import Array, BoolArray, IntArray
 
-UNKNOWN_LOG_SIGMA = 3.0  # of log sizes without a prior or scale (chosen: a factor of 20)
 SIZE_SIGMAS = 6.0  # limit on the deviation of a size (chosen: a class may be wrong)
 
 
@@ -56,8 +55,9 @@ class Categories:
     def size_log_odds(self, shapes: Shapes) -> Array:
         """Return the log odds (O,) of the sizes, 0 at the usual size, rotated by 90 deg or not."""
         rows = self.rows(shapes.class_id)
-        sigma = UNKNOWN_LOG_SIGMA if self.scale.source == "none" else self.scale.rel_sigma
-        unknown = UNKNOWN_LOG_SIGMA**2 * np.eye(3)
+        no_scale = quadrics.UNKNOWN_SCALE_LOG
+        sigma = no_scale if self.scale.source == "none" else self.scale.rel_sigma
+        unknown = no_scale**2 * np.eye(3)
         cov = _with_unknown(self.priors.log_cov, unknown)[rows] + sigma**2
         size = np.log(2 * shapes.ellipsoids.half_axes)
         off = size[:, [[0, 1, 2], [1, 0, 2]]] - np.log(self.usual_size(shapes.class_id))[:, None]
