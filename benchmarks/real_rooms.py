@@ -203,8 +203,8 @@ WITHOUT: dict[str, dict[str, Any]] = {
 def leave_out(name: str) -> None:
     """Switch a mechanism off, in this process."""
     for path, value in WITHOUT[name].items():
-        place, _, attribute = path.rpartition(".")
-        values = values_of(pkgutil.resolve_name(place))
+        owner, _, attribute = path.rpartition(".")
+        values = values_of(pkgutil.resolve_name(owner))
         if attribute not in values:
             raise SystemExit(f"error: --without {name}: {path} is no longer there")
         values[attribute] = value

@@ -58,12 +58,12 @@ def constants(module: str) -> Iterator[str]:
 
     These are constants, and options as `CLASS.field`.
     """
-    own = importlib.import_module(module)
-    source = Path(own.__file__ or "").read_text()
+    imported = importlib.import_module(module)
+    source = Path(imported.__file__ or "").read_text()
     values = {}
     for name in re.findall(r"^([A-Z][A-Z0-9_]+)(?:: \w+)? = ", source, re.MULTILINE):
-        values[name] = getattr(own, name)
-    for kind in filter(dataclasses.is_dataclass, vars(own).values()):
+        values[name] = getattr(imported, name)
+    for kind in filter(dataclasses.is_dataclass, vars(imported).values()):
         if isinstance(kind, type) and kind.__module__ == module:
             values |= {f"{kind.__name__}.{name}": v for name, v in values_of(kind).items()}
     for name, value in values.items():
@@ -90,25 +90,26 @@ def measure_changed(
     case: Case, data: Path, out: Path, module: str, name: str, factor: float
 ) -> Figures:
     """Score a case with one constant scaled, in this process, wherever it was imported to."""
-    place, _, name = f"{module}.{name}".rpartition(".")
-    places = [values_of(pkgutil.resolve_name(place))]
-    if place == module:
-        ours = ("reobj", "reobj_track", "quadrics")
-        places += [vars(m) for k, m in list(sys.modules.items()) if k.partition(".")[0] in ours]
-    value = places[0][name]
-    for values in places:
+    owner, _, name = f"{module}.{name}".rpartition(".")
+    namespaces = [values_of(pkgutil.resolve_name(owner))]
+    if owner == module:
+        packages = ("reobj", "reobj_track", "quadrics")
+        modules = list(sys.modules.items())
+        namespaces += [vars(m) for title, m in modules if title.partition(".")[0] in packages]
+    value = namespaces[0][name]
+    for values in namespaces:
         if values.get(name) is value:
             values[name] = scaled(value, factor)
-    own = out / f"{name}-{factor:g}-{case.name}"  # the cases of other processes are not touched
-    shutil.rmtree(own, ignore_errors=True)  # of an interrupted run
-    own.mkdir()
-    shutil.copytree(out / case.name, own / case.name)
-    for folder in [*out.glob("poses-*"), *out.glob("rendered-*-clip")]:
-        (own / folder.name).symlink_to(folder.resolve())
+    folder = out / f"{name}-{factor:g}-{case.name}"  # the cases of other processes are not touched
+    shutil.rmtree(folder, ignore_errors=True)  # of an interrupted run
+    folder.mkdir()
+    shutil.copytree(out / case.name, folder / case.name)
+    for link in [*out.glob("poses-*"), *out.glob("rendered-*-clip")]:
+        (folder / link.name).symlink_to(link.resolve())
     try:
-        return measure(case, data, own, seed=1)
+        return measure(case, data, folder, seed=1)
     finally:
-        shutil.rmtree(own)
+        shutil.rmtree(folder)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -293,8 +293,8 @@ def test_ablated_functions_exist(name: str, monkeypatch: pytest.MonkeyPatch) -> 
     """A renamed or removed function must not be measured as an ablation."""
     before = []
     for path in rr.WITHOUT[name]:
-        place, _, attribute = path.rpartition(".")
-        values = rr.values_of(pkgutil.resolve_name(place))
+        owner, _, attribute = path.rpartition(".")
+        values = rr.values_of(pkgutil.resolve_name(owner))
         before.append((values, attribute, values[attribute]))
         monkeypatch.setitem(values, attribute, values[attribute])  # put back afterwards
     rr.leave_out(name)

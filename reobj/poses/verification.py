@@ -51,9 +51,8 @@ class ConsistencyOptions:
             one image from 30 on).
         group: images; fewer with a weak connection are left to be located by PnP.
         reobserved, reobserved_count: fraction of the points of one group, and number, that near
-            views of the other must observe again: what only farther views share is matched by
-            chance (measured: right .065-.5, wrong 0-.007; right 31 and more, the last 30 frames of
-            the example mirrored 0).
+            views of the other must observe again (measured: right .065-.5, wrong 0-.007; right 31
+            and more, the last 30 frames of the example mirrored 0).
     """
 
     tied: float = 0.1

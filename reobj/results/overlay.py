@@ -520,11 +520,11 @@ def _legend(result: Result, layers: frozenset[str]) -> list[tuple[str, str]]:
     if (result.tracks.score == 0).any():
         lines.append(("dashed", "not detected: filled in"))
     if _located_by_part(result) and layers & {"solids", "ellipses"}:
-        name = "solid" if "solids" in layers else "ellipsoid"
+        name = "shape" if "solids" in layers else "ellipsoid"
         lines.append(("solid", f"its 3D {name}, projected"))
-        lines.append(("thin", f"{name} not detected in this frame"))
+        lines.append(("thin", f"{name} of an object not detected here"))
     if "trails" in layers:
-        lines.append(("trail", "its way in the last 1 s"))
+        lines.append(("trail", "its path in the last 1 s"))
     return lines
 
 
