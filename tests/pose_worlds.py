@@ -22,6 +22,8 @@ class FakeVideo:
         self.size = (images[0].shape[1], images[0].shape[0]) if len(images) else SIZE
         self.expected = self.frame_count = len(images)
         self.files = list(files)
+        self.fingerprint = ""
+        self.config = None
 
     def __iter__(self):
         for i, image in enumerate(self.images):

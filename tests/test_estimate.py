@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import functools
+import os
 import shutil
 import struct
 
@@ -12,8 +15,13 @@ import pytest
 from pose_worlds import FakeVideo, ate_percent, blank, textured_room
 
 import reobj_track as rt
-from reobj.poses.estimate import rows_around_breaks
+from reobj.poses import estimate, sfm
+from reobj.poses.estimate import KeyframeStore, rows_around_breaks
+from reobj.poses.keyframes import Keyframe, ResizedVideo, pick_keyframes
+from reobj.poses.localize import Located
+from reobj.poses.redundancy import RedundancyOptions, find_repeated
 from reobj.poses.sfm import Mapped
+from reobj.poses.windows import map_keyframes
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -63,7 +71,7 @@ def seen_job(monkeypatch, video, folder, **changes):
 
     def record(images, ids, frames, names, boxes, size, **options):
         assert len(ids) == len(frames) == len(names) == len(images)
-        seen.update(images=images, ids=ids, names=names, boxes=boxes, size=size, **options)
+        seen.update(images=list(images), ids=ids, names=names, boxes=boxes, size=size, **options)
         return Mapped([], ["stopped here"])
 
     monkeypatch.setattr("reobj.poses.estimate.reconstruct", record)
@@ -110,10 +118,11 @@ def reconstructed(walk, monkeypatch):
 def test_the_seed_reaches_pnp(reconstructed, tmp_path, monkeypatch):
     seeds = []
 
-    def note(model, key_rows, unmapped, video, seed, line):
+    def note(model, key_rows, unmapped, video, seed, line, before):
         seeds.append(seed)
         count = len(video.frames)
-        return np.full((count, 3, 4), np.nan), np.full(count, "none")
+        lost = np.full((count, 3, 4), np.nan)
+        return Located(model, key_rows, key_rows, lost, np.full(count, "none"))
 
     monkeypatch.setattr("reobj.poses.estimate.locate_between", note)
     poses = rt.estimate_poses(reconstructed[0], config(seed=4), tmp_path)
@@ -130,7 +139,10 @@ def test_gaps_are_filled_up_to_max_gap(reconstructed, tmp_path, monkeypatch, max
     cams, status = poses.cam_from_world.copy(), poses.status.copy()
     cams[11:13], status[11:13] = np.nan, "none"
     monkeypatch.setattr("reobj.poses.estimate._frame_name", lambda _, k: f"frame_{k:06d}.jpg")
-    monkeypatch.setattr("reobj.poses.estimate.locate_between", lambda *a: (cams, status))
+    monkeypatch.setattr(
+        "reobj.poses.estimate.locate_between",
+        lambda model, rows, *_: Located(model, rows, rows, cams, status),
+    )
     found = rt.estimate_poses(video, config(), tmp_path)
     assert found.known.all() == filled and (found.status[11] == "interpolated") == filled
     assert ("2 interpolated" in found.cameras_text) == filled and found.measured.sum() == 28
@@ -227,6 +239,166 @@ def test_a_broken_reconstruction_is_repeated_with_more_keyframes(walk, tmp_path,
     seen = poses.part[poses.visibility[:, 0]]  # (M,) rows of points of component 0 come first
     assert poses.visibility[seen == 0, 1].max() < poses.visibility[seen == 1, 1].min()
     assert "broke between frames 22 and 23" in poses.messages[0]
+
+
+# ---- Interrupted runs ----------------------------------------------------------------------------
+
+
+class Interrupted:
+    """A run of `estimate_poses` that ends when the keyframes are mapped.
+
+    Attributes:
+        seen: ids and images of the keyframes of the last run. picked: how often some were chosen.
+    """
+
+    def __init__(self, folder, monkeypatch):
+        self.folder = folder
+        self.seen = None
+        self.picked = 0
+        self.images, _ = textured_room(50, 0.1, -0.8, size=(160, 120))
+        monkeypatch.setattr(estimate, "mapping_child", lambda _: contextlib.nullcontext())
+        monkeypatch.setattr(estimate, "MIN_KEYFRAMES", 20)
+        monkeypatch.setattr(estimate, "reconstruct", self.interrupt)
+        monkeypatch.setattr(estimate, "pick_keyframes", self.pick)
+
+    def interrupt(self, images, ids, *_, **__):
+        self.seen = list(ids), np.array(list(images))
+        raise KeyboardInterrupt
+
+    def pick(self, *args):
+        self.picked += 1
+        return pick_keyframes(*args)
+
+    def run(self, fingerprint="one", **changes):
+        video = FakeVideo(self.images)
+        video.fingerprint = fingerprint
+        self.picked = 0
+        with contextlib.suppress(KeyboardInterrupt):
+            rt.estimate_poses(video, config(**changes), self.folder)
+        return self.seen
+
+
+@pytest.fixture
+def interrupted(tmp_path, monkeypatch):
+    made = Interrupted(tmp_path, monkeypatch)
+    made.run()
+    return made
+
+
+def test_keyframes_of_an_interrupted_run_are_not_chosen_again(interrupted):
+    ids, images = interrupted.seen
+    assert interrupted.picked > 1 and 10 < len(ids) < 50  # the steps were halved: some are spare
+    again_ids, again = interrupted.run()
+    assert interrupted.picked == 0 and again_ids == ids
+    np.testing.assert_array_equal(again, images)
+    np.testing.assert_array_equal(again, np.array(interrupted.images)[np.array(ids) - 1])
+
+
+@pytest.mark.parametrize("change", [{"fingerprint": "other"}, {"size_px": 80}])
+def test_keyframes_of_another_video_or_size_are_chosen_anew(interrupted, change):
+    interrupted.run(**change)
+    assert interrupted.picked > 0
+    interrupted.run(**change)
+    assert interrupted.picked == 0
+
+
+def damaged_text(table, raw):
+    table.write_text(table.read_text()[:-20])
+
+
+def damaged_list(table, raw):
+    table.write_text("[1, 2]")
+
+
+def missing_image(table, raw):
+    os.truncate(raw, raw.stat().st_size - 57600)
+
+
+@pytest.mark.parametrize("damage", [damaged_text, damaged_list, missing_image])
+def test_damaged_files_of_an_interrupted_run_are_ignored(interrupted, damage):
+    ids, images = interrupted.seen
+    damage(interrupted.folder / "keyframes.json", interrupted.folder / "keyframes.raw")
+    again_ids, again = interrupted.run()
+    assert interrupted.picked > 0 and again_ids == ids
+    np.testing.assert_array_equal(again, images)
+
+
+def test_files_of_keyframes_are_gone_after_success(interrupted, monkeypatch):
+    assert {"keyframes.json", "keyframes.raw"} <= {p.name for p in interrupted.folder.iterdir()}
+    monkeypatch.setattr(estimate, "reconstruct", lambda *_, **__: Mapped([], ["stopped"]))
+    interrupted.run()
+    assert not list(interrupted.folder.iterdir())
+
+
+def test_images_added_after_an_interruption_are_their_own(tmp_path):
+    """The interrupted run may have written some more images, the last one incompletely."""
+    images = np.random.default_rng(0).integers(0, 255, (6, 12, 16, 3)).astype(np.uint8)
+    video = ResizedVideo(FakeVideo(images), 16)
+    frames = list(video)
+    video.frames = list(range(6))
+    video.times_s = [0.1 * k for k in range(6)]
+    store = KeyframeStore(tmp_path, "key")
+    store.save(video, [store.keep(frames[row]) for row in (0, 3)])
+    store.keep(frames[1])
+    with open(tmp_path / "keyframes.raw", "ab") as file:
+        file.write(b"begun")
+    again = KeyframeStore(tmp_path, "key")
+    empty = ResizedVideo(FakeVideo(images), 16)
+    keys = again.load(empty)
+    assert keys == [Keyframe(0, 0), Keyframe(3, 3)]
+    assert (empty.frames, empty.times_s) == (video.frames, video.times_s)
+    keys += [again.keep(frames[row]) for row in (3, 5, 2)]
+    np.testing.assert_array_equal(list(again.images_of(keys)), images[[0, 3, 3, 5, 2]])
+
+
+def test_a_table_does_not_outlive_the_images_it_lists(tmp_path):
+    """A second run with other options began to write its own images and was interrupted too."""
+    images = np.random.default_rng(0).integers(0, 255, (3, 12, 16, 3)).astype(np.uint8)
+    video = ResizedVideo(FakeVideo(images), 16)
+    frames = list(video)
+    first = KeyframeStore(tmp_path, "first")
+    first.save(video, [first.keep(frames[0])])
+    second = KeyframeStore(tmp_path, "second")
+    assert second.load(video) is None
+    second.keep(frames[1])
+    assert KeyframeStore(tmp_path, "first").load(video) is None
+
+
+# ---- Repeated views ------------------------------------------------------------------------------
+
+
+def test_a_video_that_goes_back_and_forth_is_mapped_once(tmp_path, monkeypatch):
+    """Keyframes of the way back are registered without being mapped; all frames have a pose."""
+    images, truth = textured_room(48, 0.075, -0.5, size=(240, 180))
+    rows = [*range(0, 48, 2), *range(47, 0, -2)]  # back between the places of the way forth
+    mapped = []
+
+    class Here:
+        """Does the job in this process."""
+
+        def run(self, progress):
+            sfm._do_job(tmp_path / "mapping")
+            return ""
+
+    def note(database, frames, *args):
+        mapped.append(list(frames.values()))
+        return map_keyframes(database, frames, *args)
+
+    few = functools.partial(find_repeated, options=RedundancyOptions(map_all_of=8, block=4))
+    monkeypatch.setattr(sfm, "find_repeated", few)
+    monkeypatch.setattr(sfm, "map_keyframes", note)
+    monkeypatch.setattr(estimate, "mapping_child", lambda _: contextlib.nullcontext(Here()))
+    monkeypatch.setattr(estimate, "MAX_KEYFRAMES", 16)
+    monkeypatch.setattr(estimate, "MIN_KEYFRAMES", 8)
+    options = config(camera="216,216,120,90")
+    poses = rt.estimate_poses(FakeVideo([images[row] for row in rows]), options, tmp_path)
+    assert poses.known.all() and poses.messages == () and set(poses.status) == {"keyframe", "pnp"}
+    assert ate_percent(poses.cam_from_world, truth[rows]) < 1.0
+    keys = np.flatnonzero(poses.status == "keyframe")
+    registered = set(keys.tolist()) - set(mapped[0])
+    assert len(mapped) == 1 and sum(row >= 24 for row in registered) > 2  # of the way back
+    kept = rt.read_poses(tmp_path / "sparse", FakeVideo(images))
+    np.testing.assert_array_equal(np.flatnonzero(kept.known), keys)
 
 
 # ---- EXIF ----------------------------------------------------------------------------------------

@@ -153,8 +153,14 @@ MAX_FOCAL_SIGMA = 0.03
 SAME_FOCAL = 0.05
 
 
+MAX_DENSE = 500  # images whose covariance is computed: a dense (6 R)^2 matrix, .1 GB
+
+
 def adjusted(model: Any, calibrate: bool) -> Adjusted:
     """Adjust a model, with its intrinsics if the observations determine them.
+
+    Of more than MAX_DENSE images, whose windows were measured each, the covariance is not computed;
+    their centre_sigma is 0.
 
     Args:
         model: changed where its intrinsics stay; a copy is returned where they do not.
@@ -165,14 +171,19 @@ def adjusted(model: Any, calibrate: bool) -> Adjusted:
         free = import_pycolmap().Reconstruction(model)
         is_determined = _calibrate(free)
         arrays = read_arrays(free)
-        centre_sigma, focal_sigma = relative_sigmas(arrays, True)
+        centre_sigma, focal_sigma = _sigmas(arrays, True)
         low, high = FOCAL_RANGE
         is_plausible = low <= arrays.focal_over_size <= high
         if is_determined and focal_sigma <= MAX_FOCAL_SIGMA and is_plausible:
             return Adjusted(free, arrays, True, centre_sigma)
     refine(model)
     arrays = read_arrays(model)
-    return Adjusted(model, arrays, False, relative_sigmas(arrays, False)[0])
+    return Adjusted(model, arrays, False, _sigmas(arrays, False)[0])
+
+
+def _sigmas(arrays: ModelArrays, free_camera: bool) -> tuple[float, float]:
+    """Return `relative_sigmas`, zero for a model of too many images."""
+    return (0.0, 0.0) if len(arrays.ids) > MAX_DENSE else relative_sigmas(arrays, free_camera)
 
 
 def refine(model: Any) -> None:

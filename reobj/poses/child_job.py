@@ -1,6 +1,7 @@
 """Jobs of COLMAP in a child process: its aborts and its log stay there, progress is shown here.
 
-A job is a folder with `job.json` and the keyframes; the child leaves its results in the folder.
+A job is a folder with `job.json`, which names the file of the keyframes; the child leaves its
+results in the folder.
 """
 
 from __future__ import annotations
@@ -8,18 +9,18 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import json
+import math
 import os
 import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from reobj.files import LockedError, Progress, atomic, locked, writing
 from reobj.types import Image, ReobjError
@@ -27,20 +28,61 @@ from reobj.types import Image, ReobjError
 # ---- The files of a job --------------------------------------------------------------------------
 
 
-def write_job(folder: Path, job: dict[str, Any], images: Sequence[Image]) -> None:
-    """Write a job and its keyframes (K, h, w, 3) BGR into a folder, which is made."""
+class ImageFile:
+    """Images (h, w, 3) of one size in a file, of which one at a time is in memory.
+
+    Attributes:
+        path: of the file, which holds the pixels of one image after the other.
+        shape: (h, w, 3); () before the first image.
+        slots: number in the file of each image of this sequence.
+    """
+
+    def __init__(
+        self, path: Path, shape: Sequence[int] = (), slots: Sequence[int] | None = None
+    ) -> None:
+        self.path = path
+        self.shape = tuple(shape)
+        self.slots = [] if slots is None else list(slots)
+
+    def __len__(self) -> int:
+        return len(self.slots)
+
+    def __getitem__(self, k: int) -> Image:
+        size = math.prod(self.shape)
+        pixels = np.fromfile(self.path, np.uint8, size, offset=self.slots[k] * size)
+        return pixels.reshape(self.shape)
+
+    def __iter__(self) -> Iterator[Image]:
+        return (self[k] for k in range(len(self)))
+
+    def append(self, image: Image) -> None:
+        """Write an image at the end of the file."""
+        if not self.slots:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self.path.unlink(missing_ok=True)
+        self.shape = image.shape
+        with writing(self.path), open(self.path, "ab") as file:
+            file.write(np.ascontiguousarray(image).data)
+        self.slots.append(len(self.slots))
+
+    def select(self, rows: Sequence[int]) -> ImageFile:
+        """Return some of the images as a sequence of their own, of the same file."""
+        return ImageFile(self.path, self.shape, [self.slots[k] for k in rows])
+
+
+def write_job(folder: Path, job: dict[str, Any], images: ImageFile) -> None:
+    """Write a job for the child into a folder, which is made; the images stay in their file."""
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        np.save(folder / "keyframes.npy", np.stack(images))
+    file = {"path": str(images.path), "shape": images.shape, "slots": images.slots}
     with atomic(folder / "job.json") as part:
-        part.write_text(json.dumps(job))
+        part.write_text(json.dumps(job | {"image_file": file}))
 
 
-def read_job(folder: Path) -> tuple[dict[str, Any], npt.NDArray[np.uint8]]:
-    """Read a job and its keyframes (K, h, w, 3) BGR, mapped into memory."""
+def read_job(folder: Path) -> tuple[dict[str, Any], ImageFile]:
+    """Read a job and its keyframes (BGR)."""
     job = json.loads((folder / "job.json").read_text())
-    images = np.load(folder / "keyframes.npy", mmap_mode="r")
-    return job, images.view(np.ndarray)  # indexing a memmap itself is slow
+    return job, ImageFile(**job["image_file"] | {"path": Path(job["image_file"]["path"])})
 
 
 # ---- The process ---------------------------------------------------------------------------------

@@ -9,8 +9,11 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import itertools
+import json
+import math
+import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,19 +21,21 @@ from typing import Any
 import numpy as np
 
 from reobj.cameras import Camera, Poses, SparseModel, import_pycolmap, read_sparse_model
-from reobj.files import Progress, spans
+from reobj.files import Progress, atomic, load_cached, load_json, spans
+from reobj.poses.child_job import ImageFile
 from reobj.poses.intrinsics import parse_camera
 from reobj.poses.keyframes import (
     MIN_KEYFRAMES,
     FlowOptions,
+    Keyframe,
     ResizedFrame,
     ResizedVideo,
     pick_keyframes,
 )
-from reobj.poses.localize import beside_mapped, fill_gaps, locate_between
+from reobj.poses.localize import Located, beside_mapped, fill_gaps, locate_between
 from reobj.poses.mapping import ADVICE, FOCAL_GUESS
 from reobj.poses.sfm import Mapped, listed, mapping_child, reconstruct
-from reobj.types import Array, BoolArray, IntArray, ReobjError, option
+from reobj.types import Array, BoolArray, IntArray, ReobjError, nearest_of, option
 
 MAX_GAP = 15  # consecutive lost frames that are interpolated: half a second at 30 Hz
 
@@ -98,14 +103,17 @@ def estimate_poses(
     resized = ResizedVideo(video, config.size_px)
     first_models = work_dir / "first"
     with mapping_child(work_dir) as child:
-        line = progress("keyframes", video.expected)
-        keys = _enough_keyframes(resized, MAX_KEYFRAMES, line)
+        store = KeyframeStore(work_dir, _keyframes_key(video, config))
+        keys = store.load(resized)
+        if keys is None:
+            keys = _enough_keyframes(resized, MAX_KEYFRAMES, store, progress)
+            store.save(resized, keys)
         focal_guess = _exif_focal(video) or FOCAL_GUESS
         row_of = {_frame_name(video, number): row for row, number in enumerate(resized.frames)}
 
-        def attempt(keys: list[ResizedFrame]) -> _Attempt:
+        def attempt(keys: list[Keyframe], before: Sequence[Located] = ()) -> _Attempt:
             mapped = reconstruct(
-                [key.bgr for key in keys],
+                store.images_of(keys),
                 [key.row + 1 for key in keys],
                 [key.frame for key in keys],
                 [_frame_name(video, key.frame) for key in keys],
@@ -117,6 +125,7 @@ def estimate_poses(
                 size,
                 camera=camera,
                 focal_guess=focal_guess,
+                is_video=len(resized.frames) >= 3 * len(keys),
                 seed=config.seed,
                 child=child,
                 work_dir=work_dir,
@@ -126,22 +135,28 @@ def estimate_poses(
             component_rows = [np.array([row_of[name] for name in model.names]) for model in models]
             matched = [key.row for key in keys if key.row + 1 not in mapped.unmatched]
             key_rows = np.array(matched, np.int64)
-            line = progress("pnp", len(resized.frames))
-            poses = _locate_all(models, component_rows, key_rows, resized, config, line)
-            return _Attempt(poses, component_rows, key_rows, mapped)
+            line = progress("pnp", len(models) * len(resized.frames))
+            poses, located = _locate_all(
+                models, component_rows, key_rows, resized, config, line, before
+            )
+            return _Attempt(poses, component_rows, key_rows, mapped, located)
 
         best = attempt(keys)
         wanted = set(best.more_keyframes())
-        extra = [key for key in resized if key.row in wanted and key.has_texture] if wanted else []
+        extra = []
+        if wanted:
+            frames = resized.shown(progress("more keys", len(resized.frames)))
+            extra = [store.keep(f) for f in frames if f.row in wanted and f.has_texture]
         if extra:
             _move_models(best.mapped.models, first_models)
-            second = attempt(sorted([*keys, *extra], key=lambda key: key.row))
-            if second.located > best.located:
+            second = attempt(sorted([*keys, *extra], key=lambda key: key.row), best.located)
+            if second.pairs > best.pairs:
                 best = second
             else:
                 _move_models(sorted(first_models.iterdir()), work_dir)
     for folder in (work_dir / "mapping", first_models):
         shutil.rmtree(folder, ignore_errors=True)
+    store.remove()
     poses = best.poses
     messages = best.mapped.messages
     if poses.known.any():
@@ -165,15 +180,17 @@ class _Attempt:
     Attributes:
         component_rows: row of each image of each model. key_rows: (K,) of all keyframes with a
             verified match with another one, ascending. mapped: the models and messages.
+        located: the frames by each model.
     """
 
     poses: Poses
     component_rows: list[IntArray]
     key_rows: IntArray
     mapped: Mapped
+    located: list[Located]
 
     @property
-    def located(self) -> int:
+    def pairs(self) -> int:
         """Count the pairs of frames with measured poses in one component."""
         measured = self.poses.known & (self.poses.status != "interpolated")
         return int((np.bincount(self.poses.part[measured], minlength=1) ** 2).sum())
@@ -200,11 +217,15 @@ def _locate_all(
     video: ResizedVideo,
     config: PosesConfig,
     line: Progress,
-) -> Poses:
+    before: Sequence[Located],
+) -> tuple[Poses, list[Located]]:
     """Locate all frames, each in the first component of the trajectory that explains it.
 
     Args:
         component_rows: row of each image of each model in the video. key_rows: of all keyframes.
+        before: the frames by each model of an earlier call with fewer keyframes.
+    Returns:
+        poses of all frames, and the frames by each model.
     """
     frame = np.array(video.frames, np.int64)
     time_s = np.array(video.times_s, np.float64)
@@ -212,20 +233,21 @@ def _locate_all(
     status = np.full(len(frame), "none", "<U12")
     component = np.full(len(frame), -1)
     if not models:
+        line.close()
         size = (int(video.video.size[0]), int(video.video.size[1]))
         guess = (FOCAL_GUESS * max(size), size[0] / 2, size[1] / 2)
         camera = parse_camera(config.camera, size) or Camera("SIMPLE_PINHOLE", *size, guess)
-        return Poses(camera, frame, time_s, cam_from_world, status, "none")
+        return Poses(camera, frame, time_s, cam_from_world, status, "none"), []
     visibility = []
+    by_model = list[Located]()
     first_point = 0
     for number, (model, rows) in enumerate(zip(models, component_rows, strict=True)):
         unmapped = np.setdiff1d(key_rows, rows)
-        located, how = locate_between(model, rows, unmapped, video, config.seed, line)
+        earlier = next((old for old in before if old.is_of(model, rows)), None)
+        by_model.append(locate_between(model, rows, unmapped, video, config.seed, line, earlier))
         size = model.cameras[0].width, model.cameras[0].height
         shrink = min(1.0, config.size_px / max(size))
-        located, how = fill_gaps(
-            model, rows, frame, time_s, located, how, MAX_GAP, shrink, unmapped
-        )
+        located, how = fill_gaps(by_model[-1], frame, time_s, MAX_GAP, shrink, unmapped)
         own = (how != "none") & (component < 0)
         own |= np.isin(np.arange(len(frame)), rows)  # keyframes of the model
         cam_from_world[own] = located[own]
@@ -233,9 +255,9 @@ def _locate_all(
         component[own] = number
         visibility.append(np.column_stack([rows[model.obs_image], first_point + model.obs_point]))
         first_point += len(model.points)
+    line.close()
     known = np.flatnonzero(component >= 0)
-    nearest = np.abs(known[:, None] - np.arange(len(frame))).argmin(0)  # (F,)
-    return Poses(
+    poses = Poses(
         models[0].cameras[0],
         frame,
         time_s,
@@ -245,31 +267,112 @@ def _locate_all(
         points=np.concatenate([model.points for model in models]),
         colors=np.concatenate([model.colors for model in models]),
         visibility=np.concatenate(visibility),
-        part=component[known[nearest]],
+        part=component[known[nearest_of(np.arange(len(frame)), known)]],
     )
+    return poses, by_model
 
 
 # ---- Keyframes -----------------------------------------------------------------------------------
 
 
-MAX_KEYFRAMES = 400  # a longer video has wider steps (measured: 150 broke a walk of 373 photos)
+MAX_KEYFRAMES = 6000  # a longer video has wider steps
 
 
-def _enough_keyframes(video: ResizedVideo, most: int, line: Progress) -> list[ResizedFrame]:
+class KeyframeStore:
+    """The images of keyframes in a file, which also serves the next run after an interruption.
+
+    Args:
+        folder: of the files. key: of the video and the options; keyframes of another are not used.
+    Attributes:
+        file: with an image for each row of the video that was kept. position: of each in it.
+    """
+
+    def __init__(self, folder: Path, key: str) -> None:
+        self.file = ImageFile(folder / "keyframes.raw")
+        self.table = folder / "keyframes.json"
+        self.key = key
+        self.position: dict[int, int] = {}
+
+    def keep(self, frame: ResizedFrame) -> Keyframe:
+        """Write the image of a frame, unless it is in the file."""
+        if not self.position:
+            self.table.unlink(missing_ok=True)  # it describes the file that is replaced
+        if frame.row not in self.position:
+            self.position[frame.row] = len(self.file)
+            self.file.append(frame.bgr)
+        return Keyframe.of(frame)
+
+    def images_of(self, keys: Sequence[Keyframe]) -> ImageFile:
+        """Return the images of some keyframes."""
+        return self.file.select([self.position[key.row] for key in keys])
+
+    def save(self, video: ResizedVideo, keys: Sequence[Keyframe]) -> None:
+        """Keep the choice of keyframes for the next run."""
+        rows = [key.row for key in keys]
+        table = {
+            "key": self.key,
+            "shape": self.file.shape,
+            "rows": rows,
+            "slots": [self.position[row] for row in rows],
+            "frames": video.frames,
+            "times_s": video.times_s,
+        }
+        with atomic(self.table) as part:
+            part.write_text(json.dumps(table))
+
+    def load(self, video: ResizedVideo) -> list[Keyframe] | None:
+        """Read the keyframes that an interrupted run chose; None if there are none.
+
+        Args:
+            video: gets the numbers and times of its frames.
+        """
+        table = load_cached(self.table, load_json)
+        if not isinstance(table, dict) or table.get("key") != self.key:
+            return None
+        count = 1 + max(table["slots"], default=-1)
+        size = count * math.prod(table["shape"])
+        if not self.file.path.exists() or self.file.path.stat().st_size < size:
+            return None
+        os.truncate(self.file.path, size)  # images after them have no number in the table
+        video.frames = table["frames"]
+        video.times_s = table["times_s"]
+        self.file = ImageFile(self.file.path, table["shape"], range(count))
+        self.position = dict(zip(table["rows"], table["slots"], strict=True))
+        return [Keyframe(row, video.frames[row]) for row in table["rows"]]
+
+    def remove(self) -> None:
+        """Remove the files."""
+        self.table.unlink(missing_ok=True)
+        self.file.path.unlink(missing_ok=True)
+
+
+def _keyframes_key(video: Any, config: PosesConfig) -> str:
+    """Identify what the choice of keyframes depends on."""
+    return repr((video.fingerprint, video.config, config.size_px, FlowOptions(), MAX_KEYFRAMES))
+
+
+def _enough_keyframes(
+    video: ResizedVideo,
+    most: int,
+    store: KeyframeStore,
+    progress: Callable[[str, int], Progress],
+) -> list[Keyframe]:
     """Pick keyframes, halving the flow between them while they are fewer than MIN_KEYFRAMES.
 
     Of so few images all are keyframes: they are photos, with wide steps.
     """
-    keys = pick_keyframes(video.first_pass(line), most)
     options = FlowOptions()
+    line = progress("keyframes", video.video.expected)
+    keys = pick_keyframes(video.first_pass(line), most, options, store.keep)
     if not video.frames:
         raise ReobjError("no readable frame in the video: nothing to reconstruct")
     if len(video.frames) <= MIN_KEYFRAMES:
-        return list(video)
+        return [store.keep(frame) for frame in video]
     wanted = min(MIN_KEYFRAMES, most // 2)  # thinning leaves half of them
     while len(keys) < wanted and options.max_flow > 2 * options.min_flow:
         options = dataclasses.replace(options, max_flow=options.max_flow / 2)
-        keys = pick_keyframes(video, most, options)
+        frames = video.shown(progress("keyframes", len(video.frames)))
+        keys = pick_keyframes(frames, most, options, store.keep)
     return keys
 
 

@@ -31,8 +31,8 @@ def extract_features(
     """Write keyframes and their RootSIFT features into a database that does not have them yet.
 
     Args:
-        images: (K, h, w, 3) BGR. ids: of each, above 0. boxes: (M, 4) xyxy of each, pixels of the
-            images: no features there. camera: `pycolmap.Camera` with id 1, of all images.
+        images: K of (h, w, 3), BGR. ids: of each, above 0. boxes: (M, 4) xyxy of each, pixels of
+            the images: no features there. camera: `pycolmap.Camera` with id 1, of all images.
     """
     pc = import_pycolmap()
     threads = cv2.getNumThreads()
@@ -44,6 +44,8 @@ def extract_features(
             db.write_rig(rig, use_rig_id=True)
         todo = [k for k, number in enumerate(ids) if not db.exists_descriptors(number)]
         cv2.setNumThreads(1)
+        if todo:
+            send_progress("features", 0, len(todo))
         features = pool.map(lambda k: _root_sift(images[k], np.array(boxes[k])), todo)
         for done, (k, (xy, descriptors)) in enumerate(zip(todo, features, strict=True), 1):
             if not db.exists_image(ids[k]):
@@ -88,30 +90,41 @@ def _root_sift(bgr: Image, boxes: Array) -> tuple[npt.NDArray[np.float32], Image
 
 
 MAX_RATIO = 0.8  # of angles or distances to the best and the second best (Lowe, IJCV 2004; COLMAP)
+RETRIEVED = 6  # most similar keyframes with which one is matched (chosen; more take longer)
+UNORDERED = 20  # the same of photos whose order says nothing (usual: 20 to 50)
+ALL_PAIRS = 30  # keyframes of which all pairs are matched: 435 pairs
 MIN_MATCHES = 30  # verified matches of a pair that count as evidence (COLMAP registers from 30 on)
 
 
-def choose_pairs(database: Path, ids: Sequence[int], seed: int) -> list[tuple[int, int]]:
+def choose_pairs(
+    path: Sequence[int], ids: Sequence[int], vlad: Floats, retrieved: int = RETRIEVED
+) -> list[tuple[int, int]]:
     """Choose all pairs of a few keyframes, else sequential pairs and retrieved ones.
 
     Args:
-        ids: of the keyframes, in the order of time.
+        path: ids along the path of the camera, which may pass a keyframe several times.
+        ids: of the keyframes, in the order of time. vlad: (K, D) of `vlad_vectors`.
+        retrieved: most similar keyframes of each.
     """
-    if (count := len(ids)) <= 30:  # 435 pairs
+    count = len(ids)
+    if count <= ALL_PAIRS:
         return list(itertools.combinations(ids, 2))
-    with contextlib.closing(import_pycolmap().Database.open(str(database))) as db:
-        descriptors = [np.asarray(db.read_descriptors(number).data) for number in ids]
-    offsets = [1 << k for k in range(12)]  # COLMAP: quadratic overlap
-    pairs = {(i, i + offset) for offset in offsets for i in range(count - offset)}
-    pairs |= set(_pairs_from_retrieval(descriptors, seed))
-    return [(ids[i], ids[j]) for i, j in sorted(pairs)]
+    pairs = {(ids[i], ids[j]) for i, j in _pairs_from_retrieval(vlad, retrieved)}
+    # COLMAP: quadratic overlap
+    pairs |= {(ids[i], ids[i + (1 << k)]) for k in range(12) for i in range(count - (1 << k))}
+    for offset in (1, 2, 4):  # neighbours where the path comes back to earlier keyframes
+        steps = zip(path[:-offset], path[offset:], strict=True)
+        pairs |= {(min(step), max(step)) for step in steps if step[0] != step[1]}
+    return sorted(pairs)
 
 
-def match_pairs(database: Path, pairs: Sequence[tuple[int, int]], seed: int) -> None:
+def match_pairs(
+    database: Path, pairs: Sequence[tuple[int, int]], seed: int, stage: str = "match"
+) -> None:
     """Match pairs of images and verify them by two-view geometry; verified pairs are skipped.
 
     Args:
-        pairs: ids of images in the database.
+        pairs: ids of images in the database. stage: of the line of progress; "": none.
     """
     pc = import_pycolmap()
     listed = database.parent / "pairs.txt"
@@ -123,23 +136,38 @@ def match_pairs(database: Path, pairs: Sequence[tuple[int, int]], seed: int) -> 
     ransac.dyn_num_trials_multiplier = 1.0
     with contextlib.closing(pc.Database.open(str(database))) as db:
         todo = [pair for pair in pairs if not db.exists_two_view_geometry(*pair)]
-        unit = {}
-        for number in sorted({number for pair in todo for number in pair}):
-            descriptors = np.asarray(db.read_descriptors(number).data).astype(np.float32)
-            norm = np.linalg.norm(descriptors, axis=1, keepdims=True)
-            unit[number] = descriptors / np.maximum(norm, 1e-9)
+    unit: dict[int, Floats] = {}
     with ThreadPoolExecutor(2) as pool:
-        step = 100  # pairs between two lines of progress
+        if stage and todo:
+            send_progress(stage, 0, len(todo))
+        step = 100  # pairs between two lines of progress; their descriptors are in memory
         for start in range(0, len(todo), step):
             chunk = todo[start : start + step]
-            matches = list(pool.map(lambda pair: _matches(unit[pair[0]], unit[pair[1]]), chunk))
+            numbers = {number for pair in chunk for number in pair}
+            with contextlib.closing(pc.Database.open(str(database))) as db:
+                unit = {n: unit[n] if n in unit else _unit_descriptors(db, n) for n in numbers}
+            one, other = ([unit[pair[side]] for pair in chunk] for side in (0, 1))
+            matches = list(pool.map(_matches, one, other))
             with contextlib.closing(pc.Database.open(str(database))) as db:
                 for pair, match in zip(chunk, matches, strict=True):
                     if not db.exists_matches(*pair):
                         db.write_matches(*pair, match)
             listed.write_text("".join(f"{i:06d} {j:06d}\n" for i, j in chunk))
             pc.verify_matches(str(database), str(listed), verification)
-            send_progress("match", start + len(chunk), len(todo))
+            if stage:
+                send_progress(stage, start + len(chunk), len(todo))
+
+
+def _descriptors(db: Any, number: int) -> Image:
+    """Read the descriptors (n, 128) of an image."""
+    return np.asarray(db.read_descriptors(number).data)
+
+
+def _unit_descriptors(db: Any, number: int) -> Floats:
+    """Read the descriptors (n, 128) of an image as unit vectors."""
+    descriptors = _descriptors(db, number).astype(np.float32)
+    norm = np.linalg.norm(descriptors, axis=1, keepdims=True)
+    return np.asarray(descriptors / np.maximum(norm, 1e-9))
 
 
 def _matches(a: Floats, b: Floats) -> npt.NDArray[np.uint32]:
@@ -173,33 +201,60 @@ def _distinct(top: Floats, second: Floats) -> BoolArray:
     return np.asarray((angle < MAX_RATIO * rival) & (angle < most), bool)
 
 
-def _pairs_from_retrieval(
-    descriptors: list[Image], seed: int, count: int = 6
-) -> list[tuple[int, int]]:
-    """Find the pairs of keyframes with the most similar VLAD vectors, to close loops.
+def visual_words(database: Path, ids: Sequence[int], seed: int, count: int = 64) -> Floats:
+    """Cluster the descriptors of some keyframes.
 
     Args:
-        descriptors: (n, 128) of each keyframe. count: pairs of each (chosen; more take longer).
-    Ref: Jegou et al., CVPR 2010.
+        ids: of the keyframes in the database. count: of words (Jegou et al.: 16 to 256).
+    Returns:
+        (W, 128); W is 0 where the keyframes have too few features.
     """
-    features = np.concatenate(descriptors).astype(np.float32)  # (N, 128)
-    sample = features[:: max(1, len(features) // 6000)]  # to cluster all takes long
-    word_count = 64  # the paper: 16-256
-    if len(sample) < word_count:
-        return []
+    with contextlib.closing(import_pycolmap().Database.open(str(database))) as db:
+        found = [db.num_descriptors_for_image(number) for number in ids]
+        step = max(1, sum(found) // 6000)  # to cluster all takes long
+        offset = -np.cumsum([0, *found[:-1]]) % step
+        sample = np.concatenate([
+            _descriptors(db, number)[first::step]
+            for number, first in zip(ids, offset.tolist(), strict=True)
+        ]).astype(np.float32)  # fmt: skip
+    if len(sample) < count:
+        return np.empty((0, 128), np.float32)
     cv2.setRNGSeed(seed)
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 10, 0.1)
     start = cv2.KMEANS_PP_CENTERS
-    words = cv2.kmeans(sample, word_count, np.empty(0), stop, 1, start)[2]  # (W, 128)
-    vlad = np.zeros((len(descriptors), *words.shape), np.float32)  # (K, W, 128) sums of residuals
-    for sums, rows in zip(vlad, descriptors, strict=True):
-        # argmin |d - w|^2 = argmax d'w - |w|^2 / 2
-        nearest = (rows @ words.T - 0.5 * (words**2).sum(1)).argmax(1)  # (n,)
-        np.add.at(sums, nearest, rows - words[nearest])
+    return np.asarray(cv2.kmeans(sample, count, np.empty(0), stop, 1, start)[2], np.float32)
+
+
+def vlad_vectors(database: Path, ids: Sequence[int], words: Floats) -> Floats:
+    """Describe each keyframe by one vector (K, D): unit sums of residuals to each visual word.
+
+    Args:
+        ids: of the keyframes in the database. words: (W, 128) of `visual_words`.
+    Ref: Jegou et al., CVPR 2010.
+    """
+    vlad = np.zeros((len(ids), *words.shape), np.float32)  # (K, W, 128)
+    with contextlib.closing(import_pycolmap().Database.open(str(database))) as db:
+        for number, sums in zip(ids if len(words) else (), vlad, strict=False):
+            rows = _descriptors(db, number)
+            # argmin |d - w|^2 = argmax d'w - |w|^2 / 2
+            nearest = (rows @ words.T - 0.5 * (words**2).sum(1)).argmax(1)  # (n,)
+            np.add.at(sums, nearest, rows - words[nearest])
     vlad /= np.maximum(np.linalg.norm(vlad, axis=2, keepdims=True), 1e-9)
-    flat = vlad.reshape(len(vlad), -1)
-    similarity = flat @ flat.T  # (K, K)
-    order = np.arange(len(flat))
+    return vlad.reshape(len(ids), words.size)
+
+
+def _pairs_from_retrieval(vlad: Floats, count: int) -> list[tuple[int, int]]:
+    """Find the pairs of keyframes with the most similar vectors, to close loops.
+
+    Args:
+        vlad: (K, D). count: pairs of each keyframe.
+    Returns:
+        rows of the pairs, the lower first.
+    """
+    if not vlad.shape[1]:
+        return []
+    similarity = vlad @ vlad.T  # (K, K)
+    order = np.arange(len(vlad))
     similarity[np.abs(order[:, None] - order) <= 2] = -np.inf  # matched already
     best = np.argsort(-similarity, axis=1, kind="stable")[:, :count]
     return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(best) for j in row})
@@ -252,6 +307,12 @@ class MatchedPairs:
     def enough(self) -> BoolArray:
         """Mark the pairs (P,) with as many verified matches as register an image."""
         return np.array([len(found) >= MIN_MATCHES for found in self.inliers], bool)
+
+    def in_order(self, ids: Sequence[int]) -> bool:
+        """True if at least half of consecutive images match: they follow a path."""
+        matched = set(map(tuple, self.image_ids[self.enough].tolist()))
+        steps = list(itertools.pairwise(ids))
+        return 2 * sum(step in matched for step in steps) >= len(steps)
 
     def only(self, ids: Sequence[int]) -> MatchedPairs:
         """Return the pairs of some images."""

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,6 +40,19 @@ class ResizedFrame:
         return len(_corners(self.gray)) >= 20
 
 
+@dataclass(frozen=True, slots=True)
+class Keyframe:
+    """A frame that is mapped; its row and number as in `ResizedFrame`."""
+
+    row: int
+    frame: int
+
+    @staticmethod
+    def of(frame: ResizedFrame) -> Keyframe:
+        """Drop the images of a frame."""
+        return Keyframe(frame.row, frame.frame)
+
+
 def _square(image: Image, aspect: float) -> Image:
     """Stretch an image so that pixels of this aspect ratio (width over height) become square."""
     if aspect == 1:
@@ -53,12 +66,12 @@ class ResizedVideo:
     """A video whose frames have square pixels and a longer side of at most `size_px`.
 
     Args:
-        cache_mb: of gray images kept in memory: 3200 of 640x480.
+        cache_mb: of gray images kept in memory: 650 of 640x480.
     Attributes:
         frames, times_s: numbers and times of the frames, known after `first_pass`.
     """
 
-    def __init__(self, video: Any, size_px: int, cache_mb: float = 1000) -> None:
+    def __init__(self, video: Any, size_px: int, cache_mb: float = 200) -> None:
         self.video = video
         self.size_px = size_px
         self.cache_mb = cache_mb
@@ -74,21 +87,26 @@ class ResizedVideo:
             gray = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY), np.uint8)
             yield ResizedFrame(row, frame.index, frame.time_s, bgr, gray)
 
+    def shown(self, line: Progress) -> Iterator[ResizedFrame]:
+        """Iterate with a line of progress."""
+        for frame in self:
+            line.step()
+            yield frame
+        line.close()
+
     def first_pass(self, line: Progress) -> Iterator[ResizedFrame]:
         """Iterate, and keep numbers, times and (if they fit) the gray images."""
-        for frame in self:
+        for frame in self.shown(line):
             self.frames.append(frame.frame)
             self.times_s.append(frame.time_s)
             self.used_mb += frame.gray.nbytes / 1e6
             self.cache = [] if self.used_mb > self.cache_mb else self.cache
             self.cache.append(frame.gray)
-            line.step()
             yield frame
-        line.close()
 
     def grays(self) -> Iterator[Image]:
         """Iterate over the gray images again: from memory, or by reading the video again."""
-        kept = self.used_mb <= self.cache_mb
+        kept = len(self.cache) == len(self.frames)
         return iter(self.cache) if kept else (frame.gray for frame in self)
 
 
@@ -172,15 +190,21 @@ class FlowOptions:
 
 
 def pick_keyframes(
-    frames: Iterable[ResizedFrame], max_keyframes: int, options: FlowOptions = FlowOptions()
-) -> list[ResizedFrame]:
+    frames: Iterable[ResizedFrame],
+    max_keyframes: int,
+    options: FlowOptions = FlowOptions(),
+    keep: Callable[[ResizedFrame], Keyframe] = Keyframe.of,
+) -> list[Keyframe]:
     """Choose keyframes by optical flow, the sharpest near the threshold, with the first and last.
 
     When there are more than `max_keyframes`, every second one is dropped and the thresholds double:
     one pass, bounded memory, reproducible. An image without texture (black, white) is no keyframe:
     nothing in it can be matched.
+
+    Args:
+        keep: stores the image of each chosen frame.
     """
-    keys: list[ResizedFrame] = []
+    keys: list[Keyframe] = []
     replay: deque[ResizedFrame] = deque()  # frames after a keyframe that were read already
     window: list[ResizedFrame] = []  # frames near the threshold
     stream = iter(frames)
@@ -191,7 +215,7 @@ def pick_keyframes(
     while (frame := replay.popleft() if replay else next(stream, None)) is not None:
         if track is None:
             if frame.has_texture:
-                keys = [frame]
+                keys = [keep(frame)]
                 track = _KeyframeFlow(frame, options.min_left)
                 last = frame
             continue
@@ -205,7 +229,7 @@ def pick_keyframes(
         if late or flow > wider * options.max_flow or left < options.min_left**wider:
             best = max(window or [frame], key=lambda f: cv2.Laplacian(f.gray, cv2.CV_32F).var())
             replay.extendleft(f for f in reversed(window) if f.row > best.row)
-            keys.append(best)
+            keys.append(keep(best))
             if len(keys) > max_keyframes:
                 keys = keys[::2]
                 wider *= 2
@@ -214,7 +238,7 @@ def pick_keyframes(
     moved = flow > options.min_flow or len(keys) == 1
     if last is None or last.row == keys[-1].row or not moved:
         return keys
-    return [*keys[: max(max_keyframes - 1, 1)], last]
+    return [*keys[: max(max_keyframes - 1, 1)], keep(last)]
 
 
 # ---- Keyframes of supplied poses -----------------------------------------------------------------

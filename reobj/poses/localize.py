@@ -9,6 +9,7 @@ import itertools
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -23,6 +24,28 @@ from reobj.poses.keyframes import ResizedVideo, follow_points
 from reobj.types import Array, BoolArray, Image, IntArray
 
 
+@dataclass(frozen=True, slots=True)
+class Located:
+    """Poses of all frames by one model.
+
+    Attributes:
+        key_rows: (R,) row of each image of the model. keys: rows of all keyframes, ascending.
+        cam_from_world: (F, 3, 4), NaN where PnP failed or the camera jumped. status: (F,) as in
+            `Poses`.
+    """
+
+    model: SparseModel
+    key_rows: IntArray
+    keys: IntArray
+    cam_from_world: Array
+    status: npt.NDArray[np.str_]
+
+    def is_of(self, model: SparseModel, key_rows: IntArray) -> bool:
+        """True if a model has the same points, and these keyframes among others."""
+        has_images = np.isin(self.key_rows, key_rows).all()
+        return bool(has_images) and np.array_equal(model.points, self.model.points)
+
+
 def locate_between(
     model: SparseModel,
     key_rows: IntArray,
@@ -30,7 +53,8 @@ def locate_between(
     video: ResizedVideo,
     seed: int,
     line: Progress,
-) -> tuple[Array, npt.NDArray[np.str_]]:
+    before: Located | None = None,
+) -> Located:
     """Locate every frame by PnP on points tracked from the keyframes before and after it.
 
     Points are not tracked to or past a keyframe that is not in the model: mapping rejected it with
@@ -39,9 +63,8 @@ def locate_between(
     Args:
         model: of the keyframes, native pixels. key_rows: (R,) row of each of its images in the
             video, ascending. unmapped: (L,) rows of the other keyframes, ascending.
-    Returns:
-        cam_from_world: (F, 3, 4), NaN where PnP failed or the camera jumped. status: (F,) as in
-        `Poses`.
+        before: of an earlier call with fewer keyframes. Where the model has not changed, only
+            frames beside keyframes that are new, or new in the model, are located again.
     """
     count = len(video.frames)
     camera = model.cameras[0]
@@ -49,10 +72,19 @@ def locate_between(
     status = np.full(count, "none", "<U12")
     cam_from_world[key_rows] = model.cam_from_world
     status[key_rows] = "keyframe"
-    tried = beside_mapped(np.union1d(key_rows, unmapped), key_rows, count)
+    keys = np.union1d(key_rows, unmapped)
+    tried = beside_mapped(keys, key_rows, count)
+    if before is not None and before.is_of(model, key_rows):
+        new = np.union1d(np.setdiff1d(keys, before.keys), np.setdiff1d(key_rows, before.key_rows))
+        same = ~beside_mapped(keys, new, count) & (status == "none")
+        cam_from_world[same] = before.cam_from_world[same]
+        status[same] = before.status[same]
+        tried &= ~same
 
     def locate(segment: tuple[int, int, list[tuple[int, Image]]]) -> int:
         before, after, run = segment
+        if not any(tried[row] and status[row] == "none" for row, _ in run):
+            return len(run) - 1
         images = [gray for _, gray in run]
         ahead = _track_model_points(model, before, images)
         back = _track_model_points(model, after, images[::-1])[::-1]
@@ -73,11 +105,10 @@ def locate_between(
             for done in pool.map(locate, batch):
                 line.step(done)
     cv2.setNumThreads(threads)
-    line.close()
     jump = _detours(cam_from_world) & (status == "pnp")
     cam_from_world[jump] = np.nan
     status[jump] = "none"
-    return cam_from_world, status
+    return Located(model, key_rows, keys, cam_from_world, status)
 
 
 def beside_mapped(keys: IntArray, mapped: IntArray, count: int) -> BoolArray:
@@ -166,6 +197,8 @@ def absolute_pose(
         return None
     error_px = INLIER_PX * camera.width / resized_width
     ransac = {"max_error": error_px, "confidence": 0.999, "random_seed": seed}
+    # COLMAP: 100 and 3; the same poses in less time (measured)
+    ransac |= {"min_num_trials": 10, "dyn_num_trials_multiplier": 1.0}
     estimate = import_pycolmap().estimate_and_refine_absolute_pose(
         xy, points, camera.to_pycolmap(), estimation_options={"ransac": ransac}
     )
@@ -201,12 +234,9 @@ NEAR_GAPS = 2.0
 
 
 def fill_gaps(
-    model: SparseModel,
-    key_rows: IntArray,
+    located: Located,
     frame: IntArray,
     time_s: Array,
-    cam_from_world: Array,
-    status: npt.NDArray[np.str_],
     max_gap: int,
     shrink: float,
     unmapped: Sequence[int] | IntArray = (),
@@ -218,22 +248,22 @@ def fill_gaps(
     The rotation is interpolated by slerp and the camera's centre linearly.
 
     Args:
-        model: whose points the frames see. key_rows: (R,) row of each of its images, ascending.
         frame: (F,) numbers in the source: frames that were not read count too. time_s: (F,).
-        cam_from_world: (F, 3, 4), NaN where lost. status: (F,) as in `Poses`.
         shrink: side of the resized image over the native one; errors are in resized pixels.
     Returns:
-        copies of cam_from_world and status, the latter "interpolated" where filled.
+        cam_from_world (F, 3, 4) and status (F,), "interpolated" where filled.
     """
+    model = located.model
+    cam_from_world = located.cam_from_world
     filled = cam_from_world.copy()
-    status = status.copy()
+    status = located.status.copy()
     known = np.flatnonzero(np.isfinite(cam_from_world).all((1, 2)))
     for k in np.flatnonzero(np.diff(known) > 1).tolist():
         a, b = known[k : k + 2].tolist()
         if frame[b] - frame[a] - 1 > max_gap or any(a < row < b for row in unmapped):
             continue
         camera = model.cameras[0]
-        points = _points_around(model, key_rows, a, b)
+        points = _points_around(model, located.key_rows, a, b)
         size = shrink * np.array([camera.width, camera.height])
         sides = known[: k + 1], known[k + 1 :]
         focal = float(shrink * camera.K[0, 0])

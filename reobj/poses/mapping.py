@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -98,7 +99,8 @@ class MapperSearch:
         ids: of the keyframes in the order of time. frames: their numbers in the video, for
             messages. pairs: their verified matches.
         focal: of all images, as far as it is known before mapping. guess: used in its place where
-            the matches no longer determine it. options: of the checks and of the choice.
+            the matches no longer determine it. options: of the checks and of the choice. show: is
+        called with the name of the attempt, the number of registered images and of all.
     """
 
     def __init__(
@@ -110,8 +112,11 @@ class MapperSearch:
         guess: float,
         seed: int,
         options: SearchOptions = SearchOptions(),
+        show: Callable[[str, int, int], None] = send_progress,
     ) -> None:
         self.options = options
+        self.show = show
+        self.attempts = 0
         self.database = database
         self.ids = list(frames)
         self.frames = frames
@@ -120,13 +125,14 @@ class MapperSearch:
         self.guess = guess
         self.seed = seed
 
-    def run(self) -> tuple[list[Any], list[str]]:
+    def run(self) -> tuple[list[Any], list[str], list[str]]:
         """Try mappers until sound components contain nearly all keyframes.
 
-        Images of another focal length are left out as soon as they are found.
+        Images of another focal length are left out of `ids` as soon as they are found.
 
         Returns:
-            models of the components, the largest first ([]: none is sound); messages.
+            models of the components, the largest first ([]: none is sound); messages about the
+            focal length; messages about keyframes without poses.
         """
         zooms = list[tuple[int, int, float]]()
         for _ in range(3):  # each without the images of other focal lengths found before
@@ -155,28 +161,29 @@ class MapperSearch:
         if not sound:
             problem = best[0].problem if best else "no pair of keyframes initialises a model"
             advice = (best[0].advice if best else "") or ADVICE
-            return [], [without_poses(f"{problem}; {self._match_counts()}", advice)]
+            return [], [], [without_poses(f"{problem}; {self._match_counts()}", advice)]
         messages = [
             f"the focal length changed between frames {self.frames[a]} and {self.frames[b]} "
             f"(x {ratio:.2f}): only the frames of one focal length have poses; do not zoom"
             for a, b, ratio in zooms
         ] + messages
+        lost = list[str]()
         for component in sound:
             uncertain = np.setdiff1d(component.arrays.ids, component.kept)
             if len(uncertain):
                 frames = spans([self.frames[i] for i in uncertain.tolist()])
-                messages.append(
+                lost.append(
                     f"keyframes {frames} are left out: their poses are uncertain, and a second "
                     "mapper does not reproduce them"
                 )
         for component in best:
             ids = component.arrays.ids.tolist()
             if component.problem and len(ids) >= self.options.soundness.images:
-                messages.append(
+                lost.append(
                     f"frames {self.frames[ids[0]]}-{self.frames[ids[-1]]} have no poses: "
                     f"{component.problem}"
                 )
-        return models_of_one_camera(sound), messages
+        return models_of_one_camera(sound), messages, lost
 
     def _match_counts(self) -> str:
         """Describe the matches of the keyframes for a message."""
@@ -255,9 +262,23 @@ class MapperSearch:
 
         The models are adjusted first: what is checked is what is returned.
         """
+        done = itertools.count(2)
+        count = len(self.ids)
+        self.attempts += 1
+        step = "mapping" if self.attempts == 1 else f"mapping-{self.attempts}"
+
+        def tick() -> None:
+            self.show(step, min(next(done), count), count)
+
+        self.show(step, 0, count if mapper == "incremental" else 0)
+        models = _run_mapper(self.database, mapper, keep_intrinsics, self.ids, self.seed, tick)
+        return self.components_of(models)
+
+    def components_of(self, models: Sequence[Any]) -> list[Component]:
+        """Adjust models and measure their consistent components, the largest first."""
         given = self.focal.source is FocalSource.GIVEN
         groups = list[tuple[IntArray, Adjusted]]()
-        for model in _run_mapper(self.database, mapper, keep_intrinsics, self.ids, self.seed):
+        for model in models:
             whole = adjusted(model, not given)
             found = consistent_groups(whole.arrays, self.pairs, self.options.consistency)
             groups += [(group, whole) for group in found]
@@ -329,9 +350,18 @@ def _set_focal(database: Path, focal: float, is_prior: bool) -> None:
 
 
 def _run_mapper(
-    database: Path, mapper: str, keep_intrinsics: bool, ids: list[int], seed: int
+    database: Path,
+    mapper: str,
+    keep_intrinsics: bool,
+    ids: list[int],
+    seed: int,
+    tick: Callable[[], None],
 ) -> list[Any]:
-    """Run a mapper ("incremental" or "global") on some images and return all its models."""
+    """Run a mapper ("incremental" or "global") on some images and return all its models.
+
+    Args:
+        tick: is called by the incremental mapper for each image that it registers.
+    """
     pc = import_pycolmap()
     out = database.parent / mapper
     out.mkdir(exist_ok=True)
@@ -354,7 +384,5 @@ def _run_mapper(
     options["mapper"] |= {"abs_pose_min_num_inliers": 15, "abs_pose_min_inlier_ratio": 0.15}
     options["mapper"] |= {"filter_min_tri_angle": 0.5}
     options["triangulation"] = {"min_angle": 0.5}
-    count = len(ids)
-    done = itertools.count(2)
-    tick = {"next_image_callback": lambda: send_progress("mapping", min(next(done), count), count)}
-    return list(pc.incremental_mapping(*paths, options=options, **tick).values())
+    found = pc.incremental_mapping(*paths, options=options, next_image_callback=tick)
+    return list(found.values())

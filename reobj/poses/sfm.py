@@ -22,20 +22,25 @@ from typing import Any
 import numpy as np
 
 from reobj.cameras import Camera, Poses, import_pycolmap, write_colmap
-from reobj.files import Progress, load_cached, load_json, load_npz, save_npz
-from reobj.poses.child_job import Child, read_job, serve, write_job
+from reobj.files import Progress, atomic, load_cached, load_json, load_npz, save_npz
+from reobj.poses.child_job import Child, ImageFile, read_job, serve, write_job
 from reobj.poses.features import (
     MIN_MATCHES,
+    UNORDERED,
     choose_pairs,
     choose_posed_pairs,
     extract_features,
     match_pairs,
     read_pairs,
+    visual_words,
+    vlad_vectors,
 )
 from reobj.poses.keyframes import choose_posed_keyframes, path_steps, sharpest_images
-from reobj.poses.mapping import Focal, MapperSearch, estimate_focal, without_poses
+from reobj.poses.mapping import Focal, estimate_focal, without_poses
+from reobj.poses.redundancy import find_repeated, register
 from reobj.poses.verification import FocalSource
-from reobj.types import Array, Image, IntArray
+from reobj.poses.windows import map_keyframes
+from reobj.types import Array, IntArray
 
 # ---- Keyframes of unknown poses ------------------------------------------------------------------
 
@@ -61,7 +66,7 @@ def mapping_child(work_dir: Path) -> Child:
 
 
 def reconstruct(
-    images: Sequence[Image],
+    images: ImageFile,
     ids: Sequence[int],
     frames: Sequence[int],
     names: Sequence[str],
@@ -70,6 +75,7 @@ def reconstruct(
     *,
     camera: Camera | None,
     focal_guess: float,
+    is_video: bool,
     seed: int,
     child: Child,
     work_dir: Path,
@@ -86,6 +92,7 @@ def reconstruct(
         moving_boxes: (N, 4) xyxy of each image, native pixels: no features there.
         size: (w, h), native. camera: kept as it is; None: calibrated.
         focal_guess: over the longer side, used where it cannot be estimated from the matches.
+        is_video: there are frames between the keyframes.
         child: `mapping_child` of `work_dir`.
     """
     folder = work_dir / "mapping"
@@ -96,7 +103,7 @@ def reconstruct(
         if len(images):
             problem = f"only {len(images)} different views"
         return Mapped([], [without_poses(problem)])
-    scale = np.tile(np.array(images[0].shape[1::-1]) / size, 2)
+    scale = np.tile(np.array(images.shape[1::-1]) / size, 2)
     boxes = [(xyxy * scale).tolist() for xyxy in moving_boxes]
     job = {
         "task": "map",
@@ -108,6 +115,7 @@ def reconstruct(
         "size": size,
         "guess": focal_guess,
         "seed": seed,
+        "is_video": is_video,
         "images": {
             str(number): hashlib.sha256(image.tobytes() + json.dumps(box).encode()).hexdigest()
             for number, image, box in zip(ids, images, boxes, strict=True)
@@ -149,14 +157,18 @@ def _import_ahead() -> None:
 
 
 def _may_continue(folder: Path, job: dict[str, Any]) -> bool:
-    """True if the database in the folder serves this job: same camera, images and boxes."""
+    """True if the database in the folder serves this job: same camera, images and boxes.
+
+    It may have fewer images, or more, which an interrupted second attempt added.
+    """
     old = load_cached(folder / "job.json", load_json)
     new = json.loads(json.dumps(job))
     if not isinstance(old, dict) or not isinstance(old.get("images"), dict):
         return False
-    same = all(old.get(key) == new[key] for key in ("camera", "size", "seed"))
-    images = old["images"].items()
-    return same and all(new["images"].get(number) == digest for number, digest in images)
+    same = all(old.get(key) == new[key] for key in ("camera", "size", "guess", "seed"))
+    common = old["images"].keys() & new["images"].keys()
+    is_subset = len(common) == min(len(old["images"]), len(new["images"]))
+    return same and is_subset and all(old["images"][i] == new["images"][i] for i in common)
 
 
 # ---- Points of supplied poses --------------------------------------------------------------------
@@ -205,7 +217,10 @@ def triangulate(
     }
     with Child("reobj.poses.sfm", folder, work_dir / "points.log") as child:
         shutil.rmtree(folder, ignore_errors=True)
-        write_job(folder, job, [images[row] for row in rows])
+        file = ImageFile(folder / "keyframes.raw")
+        for row in rows:
+            file.append(images[row])
+        write_job(folder, job, file)
         problem = child.run(progress)
     if problem:
         return _without_points(poses, f"the triangulation {problem}")
@@ -274,10 +289,10 @@ def _do_job(folder: Path) -> None:
     {"map": _map_job, "triangulate": _triangulate_job}[job["task"]](folder, job, images)
 
 
-def _map_job(folder: Path, job: dict[str, Any], images: Any) -> None:
+def _map_job(folder: Path, job: dict[str, Any], images: ImageFile) -> None:
     """Reconstruct the keyframes of a job folder into messages.json and sparse*/."""
     database = folder / "database.db"
-    size = (images.shape[2], images.shape[1])
+    size = (images.shape[1], images.shape[0])
     guess = job["guess"]
     is_given = job["camera"] is not None
     if is_given:
@@ -286,29 +301,54 @@ def _map_job(folder: Path, job: dict[str, Any], images: Any) -> None:
         focal_px = guess * max(size)
         pc = import_pycolmap()
         camera = pc.Camera.create_from_model_name(1, "SIMPLE_RADIAL", focal_px, *size)
-    extract_features(database, images, job["ids"], job["boxes"], camera)
-    match_pairs(database, choose_pairs(database, job["ids"], job["seed"]), job["seed"])
-    pairs = read_pairs(database)
-    frames = dict(zip(job["ids"], job["frames"], strict=True))
+    ids = job["ids"]
+    row_of = {number: row for row, number in enumerate(ids)}
+    seed = job["seed"]
+
+    def extract(chosen: Sequence[int]) -> None:
+        rows = [row_of[number] for number in chosen]
+        boxes = [job["boxes"][row] for row in rows]
+        extract_features(database, images.select(rows), chosen, boxes, camera)
+
+    before = load_cached(folder / "views.json", load_json) or {}
+    before = {int(i): view for i, view in before.items() if int(i) in row_of and view in {0, *ids}}
+    view_of = find_repeated(database, ids, extract, size[0], seed, job["is_video"], before)
+    with atomic(folder / "views.json") as part:
+        part.write_text(json.dumps(view_of))
+    mapped = sorted({view for view in view_of.values() if view})
+    vlad = vlad_vectors(database, mapped, visual_words(database, mapped, seed))
+    path = [view_of[number] for number in ids if view_of[number]]
+    match_pairs(database, choose_pairs(path, mapped, vlad), seed)
+    every_pair = read_pairs(database)
+    if not every_pair.only(mapped).in_order(mapped):
+        match_pairs(database, choose_pairs(path, mapped, vlad, UNORDERED), seed)
+        every_pair = read_pairs(database)
+    pairs = every_pair.only(mapped)
+    frames = {number: job["frames"][row_of[number]] for number in mapped}
     focal = Focal(guess, FocalSource.GIVEN) if is_given else estimate_focal(pairs, size, guess)
-    models, messages = MapperSearch(database, frames, pairs, focal, guess, job["seed"]).run()
+    models, messages, weak = map_keyframes(database, frames, pairs, focal, guess, seed)
+    for model in models:
+        inside = set(model.reg_image_ids())
+        repeated = [i for i in ids if view_of[i] in inside and view_of[i] != i]
+        added = register(model, database, [*repeated, *weak], seed)
+        weak = [number for number in weak if number not in added]
     for old in folder.glob("sparse*"):
         shutil.rmtree(old)
     for number, model in enumerate(models):
         name = f"sparse_part{number}" if number else "sparse"
         _write_native_model(model, images, folder / name, job)
-    unmatched = sorted(set(job["ids"]) - set(np.unique(pairs.image_ids[pairs.enough]).tolist()))
+    matched = np.unique(every_pair.image_ids[every_pair.enough])
+    unmatched = sorted(set(ids) - set(matched.tolist()))
     result = {"messages": messages, "unmatched": unmatched}
     (folder / "messages.json").write_text(json.dumps(result))
 
 
-def _write_native_model(model: Any, images: Any, folder: Path, job: dict[str, Any]) -> None:
+def _write_native_model(model: Any, images: ImageFile, folder: Path, job: dict[str, Any]) -> None:
     """Write a model in native pixels with the frames' names and coloured points."""
-    height, width = images.shape[1:3]
+    height, width = images.shape[:2]
     row_of = {number: row for row, number in enumerate(job["ids"])}
-    for point_id in model.point3D_ids():
-        point = model.point3D(point_id)
-        point.color = _color(model, point, images, row_of)
+    for point_id, color in _colors(model, images, row_of).items():
+        model.point3D(point_id).color = color
     scale = np.array(job["size"]) / (width, height)
     for image_id, image in model.images.items():
         image.name = job["names"][row_of[image_id]]
@@ -319,11 +359,11 @@ def _write_native_model(model: Any, images: Any, folder: Path, job: dict[str, An
     model.write(str(folder))
 
 
-def _triangulate_job(folder: Path, job: dict[str, Any], images: Any) -> None:
+def _triangulate_job(folder: Path, job: dict[str, Any], images: ImageFile) -> None:
     """Triangulate the points of a job folder into points.npz."""
     pc = import_pycolmap()
     database = folder / "database.db"
-    camera = _resized_camera(job, (images.shape[2], images.shape[1]))
+    camera = _resized_camera(job, (images.shape[1], images.shape[0]))
     ids = range(1, len(images) + 1)
     extract_features(database, images, ids, [np.empty((0, 4))] * len(images), camera)
     match_pairs(database, [(i + 1, j + 1) for i, j in job["pairs"]], job["seed"])
@@ -336,9 +376,10 @@ def _triangulate_job(folder: Path, job: dict[str, Any], images: Any) -> None:
     points = []
     colors = []
     visibility = []
-    for number, (_, point) in enumerate(sorted(model.points3D.items())):
+    color_of = _colors(model, images, row_of)
+    for number, (point_id, point) in enumerate(sorted(model.points3D.items())):
         points.append(point.xyz)
-        colors.append(_color(model, point, images, row_of))
+        colors.append(color_of[point_id])
         visibility += [(row_of[element.image_id], number) for element in point.track.elements]
     arrays = {
         "points": np.array(points).reshape(-1, 3),
@@ -389,13 +430,19 @@ def _count_ties(database: Path, model: Any, count: int) -> IntArray:
     return ties
 
 
-def _color(model: Any, point: Any, images: Any, row_of: Mapping[int, int]) -> Any:
-    """Return the colour (3,) RGB of a point in the image that observed it first."""
-    height, width = images.shape[1:3]
-    first = point.track.elements[0]
-    xy = model.image(first.image_id).point2D(first.point2D_idx).xy.astype(int)
-    x, y = xy.clip(0, (width - 1, height - 1))
-    return images[row_of[first.image_id], y, x, ::-1]
+def _colors(model: Any, images: ImageFile, row_of: Mapping[int, int]) -> dict[int, Any]:
+    """Return the colour (3,) RGB of each point in the image that observed it first."""
+    height, width = images.shape[:2]
+    seen: dict[int, list[tuple[int, Any]]] = {}
+    for point_id, point in model.points3D.items():
+        first = point.track.elements[0]
+        xy = model.image(first.image_id).point2D(first.point2D_idx).xy.astype(int)
+        seen.setdefault(first.image_id, []).append((point_id, xy.clip(0, (width - 1, height - 1))))
+    colors: dict[int, Any] = {}
+    for image_id, points in seen.items():
+        image = images[row_of[image_id]]
+        colors |= {point_id: image[y, x, ::-1] for point_id, (x, y) in points}
+    return colors
 
 
 def _resized_camera(job: dict[str, Any], size: tuple[int, int]) -> Any:

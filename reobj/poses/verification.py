@@ -236,8 +236,10 @@ def _weak_cut(
     cuts = below[order[1:]]  # (R - 1, R) one for each edge of the tree
     inside = np.flatnonzero(np.isin(pairs.image_ids, arrays.ids[rows]).all(1) & (explained > 0))
     one, other = np.searchsorted(arrays.ids[rows], pairs.image_ids[inside]).T
-    across = np.where(cuts[:, one] != cuts[:, other], explained[inside], 0)  # (R - 1, p)
-    bridge = np.minimum(_bridges(arrays, rows, cuts), across.max(1, initial=0))
+    most = np.zeros(len(cuts), np.int64)  # matches of a pair across each cut
+    for k, cut in enumerate(cuts):
+        most[k] = explained[inside[cut[one] != cut[other]]].max(initial=0)
+    bridge = np.minimum(_bridges(arrays, rows, cuts), most)
     for cut in np.argsort(bridge, kind="stable"):
         if bridge[cut] < options.bridge:
             return np.asarray(cuts[cut])
