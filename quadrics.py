@@ -161,6 +161,8 @@ class FitConfig:
         correlation_deg: Views of an object less than this (deg) apart have correlated errors and
             count as fewer; 0: all views are independent.
         max_views: Most views of an object that are used, spread evenly over the camera's path.
+        path_where_seen: The path excludes the parts on which an object was not seen (for a long
+            video, of which it is in view for a small part).
         start_views: Number of views on which the candidate orientations and shapes of an object
             are compared; fewer are faster and select a wrong candidate more often.
         start_iterations: Optimisation steps of each candidate on those views.
@@ -175,6 +177,7 @@ class FitConfig:
     border_px: float = 3.0
     correlation_deg: float = 3.0
     max_views: int = 48
+    path_where_seen: bool = False
     start_views: int = 8
     start_iterations: int = 7
     iterations: int = 40
@@ -563,12 +566,18 @@ def _usable_boxes(boxes_xyxy: Array, cams: _Cameras, limit: float = 1e7) -> Bool
 
 
 def _select_views(
-    usable: BoolArray, quality: Array, cams: _Cameras, max_views: int, leap: float = 2.0
+    usable: BoolArray,
+    quality: Array,
+    cams: _Cameras,
+    max_views: int,
+    path_where_seen: bool = False,
+    leap: float = 2.0,
 ) -> IntArray:
     """Choose up to `max_views` frames an object, spread evenly along the camera's path.
 
     Args:
         usable, quality: (F, O); in each segment of the path the frame of best quality is chosen.
+        path_where_seen: as in `FitConfig`.
         leap: upper limit of the length of a step, over the upper quartile of all steps: outliers
             among the camera positions must not attract all views.
     Returns:
@@ -585,6 +594,8 @@ def _select_views(
     # a fifth of the length is time: also a camera that rests gives several views
     step[posed] += 0.2 * step.sum() / max(posed.sum(), 1) + 1e-12
     path = np.cumsum(step)[frame]  # (K,)
+    if path_where_seen:
+        path = np.cumsum(step[:, None] * usable, 0)[frame, obj]
     n_obj = usable.shape[1]
     low = np.full(n_obj, np.inf)
     high = np.full(n_obj, -np.inf)
@@ -1502,7 +1513,9 @@ class _Given:
 def _gather_data(measured: _Measured, quality: Array, cfg: FitConfig) -> _Data:
     """Choose each object's views by `quality` (F, O) and back-project their edges."""
     cams = measured.cams
-    index = _select_views(measured.usable, quality, cams, cfg.max_views)  # (O, V)
+    index = _select_views(
+        measured.usable, quality, cams, cfg.max_views, cfg.path_where_seen
+    )  # (O, V)
     seen = (index >= 0)[..., None]
     column = np.arange(len(index))[:, None]
     boxes = np.where(seen, measured.boxes[index, column], np.nan)  # (O, V, 4)

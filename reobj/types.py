@@ -629,6 +629,17 @@ def rows_by(group: IntArray) -> list[IntArray]:
     return np.split(order, starts[1:]) if len(group) else []
 
 
+def nearest_of(values: IntArray, known: IntArray) -> IntArray:
+    """Return the index of the nearest of K known values, ascending, to each value (N,).
+
+    Of two equally near ones it is the first.
+    """
+    after = np.searchsorted(known, values).clip(max=len(known) - 1)
+    before = (after - 1).clip(0)
+    nearer = np.abs(known[before] - values) <= np.abs(known[after] - values)
+    return np.where(nearer, before, after)
+
+
 def widen(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Pad the second axis of a with zeros to the width of b.
 

@@ -311,7 +311,7 @@ def association_of(solids: Shapes, poses: rt.Poses) -> tuple[Associator, Associa
         lambda rows, label, classes, current: solids[np.unique(label)],
         lambda s: np.zeros(len(s)),
     )
-    return made, made._assign(solids, np.full(len(table), -1))
+    return made, made.assign(solids, np.full(len(table), -1))
 
 
 def test_detections_are_assigned_to_their_objects_one_to_one() -> None:
@@ -326,8 +326,8 @@ def test_a_detection_without_evidence_is_unassigned() -> None:
         found.shapes.ellipsoids, center_in_world=found.shapes.ellipsoids.center_in_world + 50.0
     )
     gone = dataclasses.replace(found.shapes, ellipsoids=away)
-    assert (made._assign(gone, found.label).label == -1).all()
-    four = made._assign(Shapes.concatenate([gone[[0]], chairs()]), found.label + 1)
+    assert (made.assign(gone, found.label).label == -1).all()
+    four = made.assign(Shapes.concatenate([gone[[0]], chairs()]), found.label + 1)
     assert len(made._prune(four).shapes) == 3
 
 

@@ -626,6 +626,21 @@ def test_the_sigma_of_sizes_includes_systematic_box_errors() -> None:
     assert np.median(np.sqrt(np.einsum("oii->oi", exact.cov)[:, 3:6])) < 0.03  # no noise, no bias
 
 
+def test_views_are_spread_over_the_part_of_the_path_on_which_an_object_is_seen() -> None:
+    """It is seen from 100 of 5,000 equal steps along a line, and once more at the end."""
+    cams = np.tile(np.eye(3, 4), (5000, 1, 1))
+    cams[:, 0, 3] = -np.arange(5000.0)
+    usable = np.zeros((5000, 1), bool)
+    usable[:100] = True
+    usable[-1] = True
+    quality = np.ones((5000, 1))
+    chosen = [
+        q._select_views(usable, quality, q._cameras(cams), 10, own)[0] for own in (False, True)
+    ]
+    assert len(chosen[0]) == 2  # all others would lie where it is out of view
+    assert len(chosen[1]) == 10 and np.diff(chosen[1][:9]).max() <= 11
+
+
 def test_option_max_views() -> None:
     """Of 40 views 5 are used, evenly spread; the one with the highest score of each interval."""
     rng = np.random.default_rng(36)

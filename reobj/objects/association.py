@@ -25,6 +25,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from reobj.objects.likelihood import Evidence, PosedDetections, Shapes, gather_evidence
+from reobj.objects.phases import Reach, ignore
 from reobj.types import Array, BoolArray, IntArray
 
 
@@ -139,6 +140,7 @@ class Associator:
     Args:
         detections: of all frames. fit_shapes: fits shapes to detections. size_log_odds: of shapes
             by the size priors of their categories. options: None: the defaults.
+        reach: reports the progress.
     """
 
     def __init__(
@@ -147,36 +149,43 @@ class Associator:
         fit_shapes: FitShapes,
         size_log_odds: SizeLogOdds,
         options: AssociationOptions | None = None,
+        reach: Reach = ignore,
     ) -> None:
         self.detections = detections
         self.fit_shapes = fit_shapes
         self.size_log_odds = size_log_odds
         self.options = options or AssociationOptions()
+        self.reach = reach
 
     def run(self, hypotheses: Shapes, floor_known: bool) -> Association:
         """Select among hypotheses, then alternate between assignment and shapes."""
-        selected = self._select_greedily(self._unassigned(hypotheses, 0.0))
-        current = self._assign(hypotheses[selected], np.full(len(self.detections.view), -1))
+        selected = self._select_greedily(self._unassigned(hypotheses, 0.0, self.reach))
+        self.reach("hypotheses", 1.0)
+        current = self.assign(hypotheses[selected], np.full(len(self.detections.view), -1))
         visited = {current.label.tobytes()}
-        for _ in range(self.options.max_rounds):
+        for done in range(self.options.max_rounds):
             for step in (self._refit, self._prune, self._merge):
                 current = step(current)
+            self.reach("rounds", (done + 1) / (self.options.max_rounds + 1))
             if (state := current.label.tobytes()) in visited:
                 break
             visited.add(state)
         # last, as wide shapes take over the detections of their neighbours
         for _ in range(self.options.widening_rounds if floor_known else 0):
             current = self._refit(current, widen=True)
+        self.reach("rounds", 1.0)
         return current
 
-    def _unassigned(self, shapes: Shapes, min_log_odds: float | None = None) -> Association:
+    def _unassigned(
+        self, shapes: Shapes, min_log_odds: float | None = None, reach: Reach = ignore
+    ) -> Association:
         """Gather the evidence of shapes without any assigned detection.
 
         Args:
-            min_log_odds: None: that of the options.
+            min_log_odds: None: that of the options. reach: reports the progress.
         """
         limit = self.options.min_log_odds if min_log_odds is None else min_log_odds
-        evidence = gather_evidence(shapes, self.detections, limit)
+        evidence = gather_evidence(shapes, self.detections, limit, reach=reach)
         return self._association(shapes, np.full_like(self.detections.view, -1), evidence)
 
     def _association(self, shapes: Shapes, label: IntArray, evidence: Evidence) -> Association:
@@ -198,16 +207,17 @@ class Associator:
         row = evidence.row[positive]
         log_odds = value[positive]
         start = np.searchsorted(obj, np.arange(len(cost) + 1))
-        hit = self.options.missed * evidence.expected  # (V, O)
+        expected = evidence.expected  # (V, O)
         explained = np.zeros(len(view))  # log odds of each row
         selected = list[int]()
 
         def marginal_gain(k: int) -> float:
             """Return the gain of adding hypothesis k, with its best detection of each frame."""
             rows = row[start[k] : start[k + 1]]
-            best = np.zeros(len(hit))
+            best = np.zeros(len(expected))
             np.maximum.at(best, view[rows], log_odds[start[k] : start[k + 1]] - explained[rows])
-            return float(best.sum() + hit[best > 0, k].sum() - cost[k])
+            hits = np.count_nonzero(expected[best > 0, k])
+            return float(best.sum() + self.options.missed * hits - cost[k])
 
         # The marginal gain only decreases as others are selected: a hypothesis that still leads
         # after its gain was updated is the best (lazy greedy, Minoux 1978).
@@ -225,7 +235,7 @@ class Associator:
             explained[rows] = np.maximum(explained[rows], log_odds[start[k] : start[k + 1]])
         return np.array(selected, np.int64)
 
-    def _assign(self, shapes: Shapes, label: IntArray) -> Association:
+    def assign(self, shapes: Shapes, label: IntArray) -> Association:
         """Assign detections to objects frame by frame, given the neighbours in their tracklets.
 
         Args:
@@ -275,7 +285,7 @@ class Associator:
         succeeded = np.isfinite(fitted.ellipsoids.center_in_world).all(1)
         both = Shapes.concatenate([current.shapes, fitted])
         pick = np.arange(len(fitted)) + np.where(succeeded, len(fitted), 0)
-        return self._assign(both[pick], current.label)
+        return self.assign(both[pick], current.label)
 
     def _prune(self, current: Association) -> Association:
         """Prune objects with negative marginal gain, as others take over their detections.
@@ -315,7 +325,7 @@ class Associator:
         keep = np.setdiff1d(np.arange(len(current.shapes)), removed)
         number = np.full(len(current.shapes) + 1, -1)
         number[keep] = np.arange(len(keep))
-        return self._assign(current.shapes[keep], number[current.label])
+        return self.assign(current.shapes[keep], number[current.label])
 
     def _merge(self, current: Association) -> Association:
         """Merge pairs of nearby objects if one object explains the detections of both."""

@@ -6,7 +6,6 @@ Classes that move, and detections that no object explains, are left to the linki
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -15,17 +14,24 @@ import numpy as np
 import numpy.typing as npt
 
 import quadrics
-from reobj.cameras import Poses, undistort_boxes
+from reobj.cameras import Poses, place_of, undistort_boxes
 from reobj.objects import confidence
-from reobj.objects.association import AssociationOptions, Associator, FitShapes
+from reobj.objects.association import (
+    Association,
+    AssociationOptions,
+    Associator,
+    FitShapes,
+)
 from reobj.objects.categories import Categories
+from reobj.objects.frames import informative_frames, only_frames
 from reobj.objects.hypotheses import propose, propose_along_rays
 from reobj.objects.likelihood import NO_SHAPES, PosedDetections, Shapes
 from reobj.objects.observations import Fit, Scene, Views, gather_views
 from reobj.objects.occlusion import edges_above_floor, see_through_ratio
+from reobj.objects.phases import Reach, ignore
 from reobj.poses.floor import floor_of
 from reobj.tracking.linking import DUPLICATE_IOU, cut_at_gaps
-from reobj.types import Array, BoolArray, IntArray, Tracks, box_iou, class_shares, rows_by
+from reobj.types import Array, BoolArray, IntArray, Tracks, box_area, box_iou, class_shares, rows_by
 
 # Least score of untracked detections that give hypotheses (.3 finds 73.5 objects instead of 72, in
 # 1.2 times the time: benchmarks/LOG.md)
@@ -58,16 +64,21 @@ def associate_component(
     moving: Collection[str] = (),
     looked: IntArray | None = None,
     options: AssociationOptions | None = None,
+    reach: Reach = ignore,
 ) -> ComponentObjects:
     """Associate the detections of a component with 3D objects.
 
     Args:
         rows: all detections by frame; tracklet 0: untracked. moving: names of classes that move.
         looked: frames that the detector was run on, the only ones in which a detection can be
-            missed; None: all. options: None: the defaults.
+            missed; None: all. options: None: the defaults. reach: reports the progress.
     """
     names = np.array([*class_names, ""])
-    used = np.flatnonzero(_is_static_and_posed(rows, names, poses, moving) & ~_duplicates(rows))
+    processed = poses.frame[poses.known]
+    if looked is not None:
+        processed = processed[np.isin(processed, looked)]
+    moves = _moves(rows, names, moving)
+    used = np.flatnonzero(~moves & np.isin(rows.frame, processed) & ~_duplicates(rows))
     table = rows[used]
     tracked = table[table.tracklet_id > 0]
     label = np.full(len(rows), -1)
@@ -75,32 +86,45 @@ def associate_component(
     unknown = quadrics.Ellipsoids(*(np.full(s, np.nan) for s in ((1, 3), (1, 3), (1, 3, 3))))
     if not len(tracked):
         return ComponentObjects(label, iou, np.empty(0), None, unknown)
+    frames, informative = informative_frames(tracked, poses, processed)
     fragment = cut_at_gaps(tracked, looked)
+    # fragments that show nothing new need no hypotheses: those before them have them
+    chosen = np.isin(tracked.frame, frames) & np.isin(fragment, fragment[informative])
+    tracked = tracked[chosen]
+    fragment = np.unique(fragment[chosen], return_inverse=True)[1]
     count = int(fragment.max()) + 1
-    observing = _without_unprocessed(poses, looked)
+    observing = only_frames(poses, frames)
     views = gather_views(tracked, observing, fragment, count, 0.0)
     classes = class_shares(tracked, fragment, count).argmax(1)
     fits = fit(views, classes.tolist(), Scene(trusts_classes=True))
     floor = find_floor(poses, fits)
+    reach("first fit", 1.0)
     categories = Categories(priors, names, fits.scale)
     usual_size = categories.usual_size(classes)
     on_floor = categories.on_floor(classes)
+    in_chosen = np.isin(table.frame, frames)
     hypotheses = Shapes.concatenate([
         propose(fits, views, classes, usual_size, floor, on_floor),
-        _propose_from_untracked(table, observing, categories, fits.up, floor),
+        _propose_from_untracked(table[in_chosen], observing, categories, fits.up, floor),
     ])  # fmt: skip
-    detections = _posed_detections(table, poses, views)
+    detections = _posed_detections(table[in_chosen], poses, frames)
     scene = Scene(floor, None, None if poses.metric else fits.scale, trusts_classes=True)
-    fit_shapes = _cached_fit(detections, views, categories, scene, fit)
-    associator = Associator(detections, fit_shapes, categories.size_log_odds, options)
+    fit_shapes = _cached_fit(detections, categories, scene, fit)
+    associator = Associator(detections, fit_shapes, categories.size_log_odds, options, reach)
     found = associator.run(hypotheses, floor is not None)
-    assigned = np.flatnonzero(found.label >= 0)
-    boxes = _project(found.shapes, views)[detections.view[assigned], found.label[assigned]]
+    if len(frames) < len(processed):
+        detections = _posed_detections(table, poses, processed)
+        start = np.full(len(table), -1)
+        start[in_chosen] = found.label
+        associator = Associator(detections, fit_shapes, categories.size_log_odds, options, reach)
+        found = associator.assign(found.shapes, start)
+        reach("assign", 0.5)
     label[used] = found.label
-    iou[used[assigned]] = quadrics.box_iou(boxes, detections.box[assigned])
+    iou[used] = _iou_with_projections(detections, found)
     see_through = see_through_ratio(
-        found.shapes.ellipsoids, found.evidence.expected, poses, views.frame
+        found.shapes.ellipsoids, found.evidence.expected, poses, processed
     )
+    reach("assign", 1.0)
     none = Shapes(unknown, np.array([""]), np.array([-1]))
     return ComponentObjects(
         label,
@@ -111,13 +135,10 @@ def associate_component(
     )
 
 
-def _is_static_and_posed(
-    rows: Tracks, names: npt.NDArray[np.str_], poses: Poses, moving: Collection[str]
-) -> BoolArray:
-    """Mark rows (N,) of classes that do not move, in frames with a pose."""
+def _moves(rows: Tracks, names: npt.NDArray[np.str_], moving: Collection[str]) -> BoolArray:
+    """Mark rows (N,) of classes that move."""
     moves = np.isin(names, list(moving))  # (C + 1,), the last: unknown class
-    static = ~moves[rows.class_id.clip(-1, len(names) - 1)]
-    return np.asarray(static & np.isin(rows.frame, poses.frame[poses.known]))
+    return np.asarray(moves[rows.class_id.clip(-1, len(names) - 1)], bool)
 
 
 def _duplicates(rows: Tracks) -> BoolArray:
@@ -133,16 +154,6 @@ def _duplicates(rows: Tracks) -> BoolArray:
                 later = best_first[i + 1 :]
                 found[later] |= overlaps[i, i + 1 :] & (rows.tracklet_id[later] == 0)
     return found
-
-
-def _without_unprocessed(poses: Poses, looked: IntArray | None) -> Poses:
-    """Remove the poses of frames that the detector was not run on."""
-    if looked is None:
-        return poses
-    unprocessed = ~np.isin(poses.frame, looked)[:, None, None]
-    return dataclasses.replace(
-        poses, cam_from_world=np.where(unprocessed, np.nan, poses.cam_from_world)
-    )
 
 
 def find_floor(poses: Poses, fits: quadrics.ObjectFits) -> quadrics.Floor | None:
@@ -161,45 +172,71 @@ def _propose_from_untracked(
     floor: quadrics.Floor | None,
 ) -> Shapes:
     """Propose shapes along the rays of good untracked detections: photos have many."""
-    table = table[(table.tracklet_id == 0) & (table.score >= HYPOTHESIS_SCORE)]
-    views = gather_views(table, poses, np.arange(len(table)), len(table), 0.0)
+    measured = np.isin(table.frame, poses.frame[poses.measured])
+    table = table[measured & (table.tracklet_id == 0) & (table.score >= HYPOTHESIS_SCORE)]
+    box = undistort_boxes(table.xyxy, poses.camera)
+    row, _ = place_of(poses, table.frame)
+    cams = poses.camera.K @ poses.cam_from_world[row]
+    group = np.flatnonzero(box_area(box) > 0)
     classes = table.class_id
     usual_size = categories.usual_size(classes)
     on_floor = categories.on_floor(classes)
-    return propose_along_rays(views, classes, usual_size, up, floor, on_floor)
+    best = (box[group], cams[group], group)
+    return propose_along_rays(*best, classes, usual_size, up, floor, on_floor)
 
 
-def _posed_detections(table: Tracks, poses: Poses, views: Views) -> PosedDetections:
-    """Arrange rows of frames with a pose, by frame."""
+def _posed_detections(table: Tracks, poses: Poses, frames: IntArray) -> PosedDetections:
+    """Arrange the rows of some frames with a pose.
+
+    Args:
+        frames: (V,) numbers, ascending.
+    """
     before, after = np.full((2, len(table)), -1)
     order = np.lexsort((table.frame, table.tracklet_id))
     tracklet = table.tracklet_id[order]
     follows = (np.diff(tracklet) == 0) & (tracklet[1:] > 0)
     after[order[:-1][follows]] = order[1:][follows]
     before[order[1:][follows]] = order[:-1][follows]
+    row, _ = place_of(poses, frames)
     return PosedDetections(
-        np.searchsorted(views.frame, table.frame),
+        np.searchsorted(frames, table.frame),
         undistort_boxes(table.xyxy, poses.camera),
         table.score,
         table.class_id,
         before,
         after,
-        views.img_from_world,
-        views.image_size,
+        poses.camera.K @ poses.cam_from_world[row],
+        (poses.camera.width, poses.camera.height),
     )
 
 
-def _project(shapes: Shapes, views: Views) -> Array:
+def _project(shapes: Shapes, cams: Array, image_size: tuple[int, int]) -> Array:
     """Return the boxes (V, O, 4) of shapes in the images, NaN where they are out of view."""
-    boxes = quadrics.solid_boxes(shapes.ellipsoids, list(shapes.support), views.img_from_world)
-    return quadrics.clip_boxes(boxes, views.image_size)
+    boxes = quadrics.solid_boxes(shapes.ellipsoids, list(shapes.support), cams)
+    return quadrics.clip_boxes(boxes, image_size)
+
+
+def _iou_with_projections(detections: PosedDetections, found: Association) -> Array:
+    """Return the IoU (N,) of detections with the projections of their objects; NaN without one."""
+    iou = np.full(len(detections.view), np.nan)
+    block = 256  # frames that are projected together, to bound the memory
+    for first in range(0, len(detections.img_from_world), block):
+        in_block = (detections.view >= first) & (detections.view < first + block)
+        rows = np.flatnonzero(in_block & (found.label >= 0))
+        cams = detections.img_from_world[first : first + block]
+        boxes = _project(found.shapes, cams, detections.image_size)
+        boxes = boxes[detections.view[rows] - first, found.label[rows]]
+        iou[rows] = quadrics.box_iou(boxes, detections.box[rows])
+    return iou
 
 
 def _cached_fit(
-    detections: PosedDetections, views: Views, categories: Categories, scene: Scene, fit: Fit
+    detections: PosedDetections, categories: Categories, scene: Scene, fit: Fit
 ) -> FitShapes:
     """Return the function that fits shapes to detections; it fits each set of them once."""
     cache: dict[tuple[bytes, int], Shapes] = {}
+    cams = detections.img_from_world
+    size = detections.image_size
 
     def fit_shapes(
         rows: IntArray, label: IntArray, classes: IntArray, current: Shapes | None
@@ -209,7 +246,7 @@ def _cached_fit(
         label = label[order]
         occluded = np.zeros((len(rows), 4), bool)
         if current is not None and scene.floor is not None:
-            projected = _project(current, views)[detections.view[rows], label]
+            projected = _project(current, cams, size)[detections.view[rows], label]
             occluded = edges_above_floor(detections.box[rows], projected)
             occluded &= categories.on_floor(classes)[label, None]
         start = np.searchsorted(label, np.arange(len(classes) + 1))
@@ -220,7 +257,7 @@ def _cached_fit(
         ]
         missing = [k for k, key in enumerate(keys) if key not in cache]
         if missing:
-            boxes = np.full((len(views.frame), len(missing), 4), np.nan)
+            boxes = np.full((len(cams), len(missing), 4), np.nan)
             score = np.zeros(boxes.shape[:2])
             edges = np.zeros(boxes.shape, bool)
             for column, k in enumerate(missing):
@@ -228,7 +265,7 @@ def _cached_fit(
                 boxes[cell] = detections.box[rows[slices[k]]]
                 score[cell] = detections.score[rows[slices[k]]]
                 edges[cell] = occluded[slices[k]]
-            seen = Views(views.frame, boxes, score, views.img_from_world, views.image_size, edges)
+            seen = Views(np.arange(len(cams)), boxes, score, cams, size, edges)
             fits = fit(seen, classes[missing].tolist(), scene)
             shapes = Shapes(fits.ellipsoids, fits.support, classes[missing])
             cache.update((keys[k], shapes[[column]]) for column, k in enumerate(missing))

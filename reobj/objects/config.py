@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import quadrics
 from reobj.cameras import Poses
+from reobj.objects.frames import FrameOptions
 from reobj.objects.observations import Fit, Scene, Views
 from reobj.options import load_size_priors, parse_known_size, parse_up
 from reobj.types import ReobjError, option
@@ -71,6 +72,7 @@ def make_fit(config: ObjectsConfig, poses: Poses, class_names: Sequence[str]) ->
         raise ReobjError(f"--solver {config.solver}: expected {expected}")
     up = parse_up(config.up) if config.up else poses.up_in_world
     support = None if config.support == "auto" else config.support
+    plain = quadrics.FitConfig(path_where_seen=int(poses.known.sum()) > FrameOptions().all_of)
 
     def fit(views: Views, classes: list[int], scene: Scene) -> quadrics.ObjectFits:
         names = [class_names[c] if c < len(class_names) else "" for c in classes]
@@ -79,7 +81,7 @@ def make_fit(config: ObjectsConfig, poses: Poses, class_names: Sequence[str]) ->
             up=scene.up if up is None else up, support=support, score=views.score,
             hidden=views.occluded, metric=poses.metric if scene.scale is None else scene.scale,
             known_size=known_size, floor=scene.floor, points=views.points,
-            config=quadrics.FitConfig(wrong_class=0) if scene.trusts_classes else None,
+            config=dataclasses.replace(plain, wrong_class=0) if scene.trusts_classes else plain,
         )  # fmt: skip
         up_is_given = up is not None or scene.up is None
         return fits if up_is_given else dataclasses.replace(fits, up_source="floor")

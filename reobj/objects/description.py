@@ -17,7 +17,7 @@ from reobj.objects.likelihood import CLASS_KEPT
 from reobj.objects.observations import Views
 from reobj.poses.floor import floor_of
 from reobj.results.result import Object, Part, World
-from reobj.types import Array, LinkEvent, Tracks, object_classes, rows_by
+from reobj.types import Array, IntArray, LinkEvent, Tracks, object_classes, rows_by
 
 
 def describe_objects(
@@ -28,6 +28,7 @@ def describe_objects(
     config: ObjectsConfig,
     confidence: Mapping[int, float] | None = None,
     component: int = 0,
+    view_count: IntArray | None = None,
 ) -> list[Object]:
     """Describe every identity of the tracks: class, visits, and its shape or why it has none.
 
@@ -36,6 +37,7 @@ def describe_objects(
     Args:
         fits, views: of the identities in ascending order; None without cameras.
         confidence: of identities, where it is known. component: of the trajectory.
+        view_count: (O,) views of the identities if `views` has some of the frames; None: all.
     Returns:
         one `Object` per identity, by id.
     """
@@ -52,7 +54,8 @@ def describe_objects(
         moves = class_name in config.moving_classes
         fields: dict[str, Any] = {"status": "tracked", "reason": ""}
         if fits is not None and views is not None:
-            fields = _fit_fields(fits, i, views, iou[:, i], moves, config.min_views)
+            count = None if view_count is None else int(view_count[i])
+            fields = _fit_fields(fits, i, views, iou[:, i], moves, config.min_views, count)
         if confidence and identity in confidence and not moves:
             value = confidence[identity]
             status, reason = with_low_confidence(fields["status"], fields["reason"], value)
@@ -93,18 +96,33 @@ def _likeliest_classes(
 
 
 def _fit_fields(
-    fits: quadrics.ObjectFits, i: int, views: Views, iou: Array, moves: bool, min_views: int
+    fits: quadrics.ObjectFits,
+    i: int,
+    views: Views,
+    iou: Array,
+    moves: bool,
+    min_views: int,
+    view_count: int | None,
 ) -> dict[str, Any]:
-    """Return the fields of object i that its fit determines."""
+    """Return the fields of object i that its fit determines.
+
+    Args:
+        view_count: in all frames; the outliers of the other frames are extrapolated. None: `views`
+            has all frames.
+    """
     seen = np.isfinite(views.boxes[:, i, 0])
-    view_count = int(seen.sum())
+    dropped = int((seen & ~fits.inlier[:, i]).sum())
+    if view_count is None:
+        view_count = int(seen.sum())
+    elif seen.any():
+        dropped = round(dropped * view_count / int(seen.sum()))
     status, reason, support = _verdict(fits, i, moves, view_count, min_views)
     fields = {
         "status": status,
         "reason": reason,
         "support": support,
         "views": view_count,
-        "dropped_boxes": int((seen & ~fits.inlier[:, i]).sum()),
+        "dropped_boxes": dropped,
         "parallax_deg": rounded(fits.parallax_deg[i], 2),
         "reprojection_iou_median": rounded(np.median(iou[seen]), 3) if seen.any() else None,
     }

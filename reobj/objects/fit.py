@@ -22,25 +22,31 @@ from reobj.objects.categories import name_of, on_floor
 from reobj.objects.component import ComponentObjects, associate_component, find_floor
 from reobj.objects.config import ObjectsConfig, make_fit
 from reobj.objects.description import describe_objects, describe_world
+from reobj.objects.frames import informative_frames, only_frames
 from reobj.objects.observations import MIN_SCORE, Fit, Scene, gather_views, points_on
 from reobj.objects.occlusion import occluded_edges
+from reobj.objects.phases import PhasesOfFit, Reach, ignore
 from reobj.results.edits import Edits, apply_edits
 from reobj.results.result import Object, Result
 from reobj.tracking.interpolation import fill_from_objects, fill_gaps
 from reobj.tracking.linking import FRAGMENT_GAP, link
 from reobj.types import (
+    BoolArray,
     Embeddings,
     IntArray,
     LinkEvent,
     ReobjError,
     Tracks,
     looks,
+    nearest_of,
     object_classes,
     rows_by,
 )
 
 
-def link_and_fit(result: Result, config: ObjectsConfig) -> Result:
+def link_and_fit(
+    result: Result, config: ObjectsConfig, phases: PhasesOfFit | None = None
+) -> Result:
     """Decide which detections belong to one object, and fit a shape to each object.
 
     An object lies in one component: an identity ends at a break of the trajectory. Only identities
@@ -48,6 +54,8 @@ def link_and_fit(result: Result, config: ObjectsConfig) -> Result:
     their boxes. The result's edits are applied after linking. Edits of an earlier fit that no
     longer find their objects are skipped with a warning.
 
+    Args:
+        phases: shows the progress.
     Returns:
         the result with its tracks (identities; untracked detections may join them), objects, fits
         and world.
@@ -57,12 +65,16 @@ def link_and_fit(result: Result, config: ObjectsConfig) -> Result:
     priors = quadrics.load_priors(config.priors or None)
     poses = result.poses
     components = _split_trajectory(poses, config, result.class_names)
+
+    def reach(component: _Component) -> Reach:
+        return ignore if phases is None else phases.of(component.number)
+
     if result.identities_given:
         linked = _unlinked(result.tracks, len(components))
     else:
         tables = zip(components, _split_table(result), strict=True)
         linked = _joined(
-            _link_component(component, table, source, result, priors, config)
+            _link_component(component, table, source, result, priors, config, reach(component))
             for component, (table, source) in tables
         )
     edited = _Edited(linked, result.class_names, [], None)
@@ -78,7 +90,9 @@ def link_and_fit(result: Result, config: ObjectsConfig) -> Result:
     fits = list[quadrics.ObjectFits | None]()
     for component in components:
         rows = np.flatnonzero(component_of_object[object_of_row] == component.number)
-        described, fit = _fit_component(component, rows, linked, edited.class_names, priors, config)
+        described, fit = _fit_component(
+            component, rows, linked, edited.class_names, priors, config, reach(component)
+        )
         objects += described
         fits.append(fit)
     embeddings, embedding_row = _select_embeddings(result, linked.source)
@@ -179,18 +193,20 @@ def _link_component(
     result: Result,
     priors: quadrics.Priors,
     config: ObjectsConfig,
+    reach: Reach,
 ) -> _Linked:
     """Link the tracks of a component; identities are numbered from 1.
 
     Args:
         table: detections of the component. source: (N,) their rows in the result's tracks, or -1.
+        reach: reports the progress.
     """
     _, poses, fit = component
     objects = None
     if config.link and fit and poses is not None and poses.known.sum() >= config.min_views:
         moving = config.moving_classes
         objects = associate_component(
-            table, result.class_names, poses, fit, priors, moving, result.looked
+            table, result.class_names, poses, fit, priors, moving, result.looked, reach=reach
         )
     label = np.full(len(table), -1) if objects is None else objects.label
     keep = (source >= 0) | (label >= 0)
@@ -208,6 +224,7 @@ def _link_component(
         )  # fmt: skip
     else:
         tracks = tracks.with_identities(tracks.track_id)
+    reach("link", 1.0)
     certainty: dict[int, float] = {}
     label_of: dict[int, int] = {}
     if objects is not None and poses is not None:
@@ -290,8 +307,8 @@ def _component_of_rows(tracks: Tracks, poses: Poses) -> IntArray:
         unposed_rows = rows[~posed[rows]]
         posed_rows = rows[posed[rows]]
         if tracks.tracklet_id[rows[0]] and len(unposed_rows) and len(posed_rows):
-            gap = np.abs(tracks.frame[unposed_rows, None] - tracks.frame[posed_rows])
-            component[unposed_rows] = component[posed_rows[gap.argmin(1)]]
+            near = nearest_of(tracks.frame[unposed_rows], tracks.frame[posed_rows])
+            component[unposed_rows] = component[posed_rows[near]]
     return component
 
 
@@ -398,20 +415,25 @@ def _fit_component(
     class_names: Sequence[str],
     priors: quadrics.Priors,
     config: ObjectsConfig,
+    reach: Reach,
 ) -> tuple[list[Object], quadrics.ObjectFits | None]:
     """Fit and describe the objects of a component.
 
     Args:
-        rows: of its objects in the linked tracks.
+        rows: of its objects in the linked tracks. reach: reports the progress.
     """
     number, poses, fit = component
     tracks = linked.tracks[rows]
-    fits = views = None
+    fits = views = view_count = None
     if len(tracks) and fit is not None and poses is not None:
         classes = object_classes(dataclasses.replace(tracks, class_id=linked.category[rows]))
         categories = list(classes.values())
         group = np.searchsorted(list(classes), tracks.track_id)
-        views = gather_views(tracks, poses, group, len(classes), MIN_SCORE)
+        usable = tracks.score >= MIN_SCORE
+        usable &= np.isin(tracks.frame, poses.frame[poses.measured])
+        view_count = np.bincount(group[usable], minlength=len(classes))
+        frames, informative = _frames_of_fit(tracks[usable], poses)
+        views = gather_views(tracks, only_frames(poses, frames), group, len(classes), MIN_SCORE)
         objects = linked.objects[number]
         if objects is None:
             first = fit(views, categories, Scene())
@@ -427,11 +449,35 @@ def _fit_component(
             occluded=occluded_edges(views, ellipsoids, standing & (floor is not None)),
             points=points_on(views, poses, ellipsoids),
         )
+        reach("occlusion", 1.0)
+        # repeated views are more numerous than those of other sides: the fit takes new ones only
+        new = np.zeros(views.boxes.shape[:2], bool)
+        rows = np.flatnonzero(usable)[informative]
+        new[np.searchsorted(views.frame, tracks.frame[rows]), group[rows]] = True
+        views = dataclasses.replace(views, boxes=np.where(new[..., None], views.boxes, np.nan))
         fits = fit(views, categories, Scene(floor, None if floor is None else floor.normal))
+    reach("fit", 1.0)
     described = describe_objects(
-        tracks, class_names, fits, views, config, linked.confidence, number
+        tracks, class_names, fits, views, config, linked.confidence, number, view_count
     )
+    reach("describe", 1.0)
+    if fits is not None and views is not None and poses is not None:
+        inlier = np.zeros((int(poses.known.sum()), fits.inlier.shape[1]), bool)
+        inlier[np.isin(poses.frame[poses.known], views.frame)] = fits.inlier
+        fits = dataclasses.replace(fits, inlier=inlier)
     return described, fits
+
+
+def _frames_of_fit(tracks: Tracks, poses: Poses) -> tuple[IntArray, BoolArray]:
+    """Choose the frames of a fit: informative ones, and those with observations of points.
+
+    Returns:
+        (K,) frames; (N,) informative rows.
+    """
+    frames, informative = informative_frames(tracks, poses, poses.frame[poses.known])
+    observing = poses.frame[np.unique(poses.visibility[:, 0])]
+    observing = observing[np.isin(observing, poses.frame[poses.known])]
+    return np.union1d(frames, observing), informative
 
 
 def join_fits(
@@ -485,8 +531,10 @@ def fill(result: Result, image_size: tuple[int, int], max_gap: int) -> Tracks:
         if component.poses is not None and (located := component.located):
             identity = np.array([o.id for o in located])
             support = [str(o.support) for o in located]
+            poses = component.poses
+            frames, _ = informative_frames(result.tracks, poses, poses.frame[poses.known])
             tracks = fill_from_objects(
-                tracks, component.poses, identity, component.ellipsoids(), support
+                tracks, poses, identity, component.ellipsoids(), support, sources=frames
             )
     if result.looked is not None:
         tracks = tracks[np.isin(tracks.frame, result.looked)]

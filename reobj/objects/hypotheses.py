@@ -43,31 +43,36 @@ def propose(
     """
     good = np.isfinite(fits.ellipsoids.center_in_world[:, 0])
     fitted = Shapes(fits.ellipsoids[good], fits.support[good], classes[good])
-    rays = propose_along_rays(views, classes, usual_size, fits.up, floor, on_floor)
+    group, view = _best_views(views)
+    best = (views.boxes[view, group], views.img_from_world[view], group)
+    rays = propose_along_rays(*best, classes, usual_size, fits.up, floor, on_floor)
     return Shapes.concatenate([fitted, rays])
 
 
 def propose_along_rays(
-    views: Views,
+    box: Array,
+    img_from_world: Array,
+    group: IntArray,
     classes: IntArray,
     usual_size: Array,
     up: Array,
     floor: quadrics.Floor | None,
     on_floor: BoolArray,
 ) -> Shapes:
-    """Propose shapes at several depths along the rays of the best boxes of G groups.
+    """Propose shapes at several depths along the rays of boxes of G groups.
 
     Args:
+        box: (g, 4) xyxy in undistorted pixels. img_from_world: (g, 3, 4) of its frame.
+        group: (g,) of the boxes.
         up: (3,) unit; all 0: unknown, and nothing is proposed. The others: as in `propose`.
     """
     sets = [NO_SHAPES]
-    group, view = _best_views(views)
     stands = on_floor[group] & (floor is not None)
     for standing in (True, False):
         pick = (stands == standing) & bool(up.any())
         if pick.any():
-            boxes = (view[pick], group[pick], usual_size[group[pick]])
-            ellipsoids, source = _along_rays(views, *boxes, up, floor if standing else None)
+            boxes = (box[pick], img_from_world[pick], group[pick], usual_size[group[pick]])
+            ellipsoids, source = _along_rays(*boxes, up, floor if standing else None)
             sets.append(Shapes(ellipsoids, np.full(len(source), "cylinder"), classes[source]))
     return Shapes.concatenate(sets)
 
@@ -94,14 +99,14 @@ def _best_views(views: Views) -> tuple[IntArray, IntArray]:
 
 
 def _along_rays(
-    views: Views,
-    view: IntArray,
+    box: Array,
+    img: Array,
     group: IntArray,
     usual_size: Array,
     up: Array,
     floor: quadrics.Floor | None,
 ) -> tuple[quadrics.Ellipsoids, IntArray]:
-    """Place upright shapes along the rays of boxes, of views (g,) of groups (g,).
+    """Place upright shapes along the rays of boxes (g, 4), in images (g, 3, 4) of groups (g,).
 
     One kind fills the box. The other has the usual width and extends from the top of the box down
     to the floor, or over the usual height, as the lower part of the object may be occluded.
@@ -109,8 +114,6 @@ def _along_rays(
     Returns:
         ellipsoids; the group of each.
     """
-    img = views.img_from_world[view]  # (g, 3, 4)
-    box = views.boxes[view, group]  # (g, 4)
     inverse = np.linalg.inv(img[:, :, :3])
     centre = -np.einsum("gij,gj->gi", inverse, img[:, :, 3])
     middle = (box[:, :2] + box[:, 2:]) / 2

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 import quadrics
+from reobj.objects.phases import Reach, ignore
 from reobj.types import Array, BoolArray, IntArray, box_area
 
 # Chosen on hololens_kitchen and redkitchen unless a source is given (benchmarks/RESULTS.md).
@@ -115,21 +116,27 @@ class Evidence:
 
 
 def gather_evidence(
-    shapes: Shapes, detections: PosedDetections, min_log_odds: float, at_once: int = 500
+    shapes: Shapes,
+    detections: PosedDetections,
+    min_log_odds: float,
+    at_once: int = 500,
+    reach: Reach = ignore,
 ) -> Evidence:
     """Compare the projections of objects with the detections of all frames.
 
     Args:
         min_log_odds: pairs of a lower `assignment` are dropped.
         at_once: objects that are projected together, to bound the memory.
+        reach: reports the progress of the hypotheses.
     """
     votes = np.bincount(detections.class_id.clip(0), detections.score) + 0.5
     frequency: Array = np.asarray(votes, np.float64)
     frequency /= frequency.sum()
     starts = range(0, max(len(shapes), 1), at_once)
-    batches = [
-        _gather(shapes[k : k + at_once], detections, frequency, min_log_odds) for k in starts
-    ]
+    batches = list[Evidence]()
+    for done, k in enumerate(starts):
+        batches.append(_gather(shapes[k : k + at_once], detections, frequency, min_log_odds))
+        reach("hypotheses", (done + 0.8) / len(starts))  # the selection follows
     return Evidence(
         np.concatenate([batch.obj + k for k, batch in zip(starts, batches, strict=True)]),
         np.concatenate([batch.row for batch in batches]),
@@ -147,24 +154,26 @@ def _gather(
     Args:
         frequency: of the classes in all detections.
     """
-    cams = detections.img_from_world
     size = detections.image_size
-    whole = quadrics.solid_boxes(shapes.ellipsoids, list(shapes.support), cams)  # (V, O, 4)
-    clipped = quadrics.clip_boxes(whole, size)
-    visible = np.nan_to_num(box_area(clipped) / box_area(whole))  # (V, O)
     score_log_odds = logit(detections.score)
     starts = detections.start_of_view
+    expected = np.zeros((len(detections.img_from_world), len(shapes)), bool)
     found: list[tuple[IntArray, IntArray, Array, Array]] = []
     chunk = 64  # frames whose pairs are compared together, to bound the memory
-    for first in range(0, len(cams), chunk):
+    for first in range(0, len(expected), chunk):
+        cams = detections.img_from_world[first : first + chunk]
+        whole = quadrics.solid_boxes(shapes.ellipsoids, list(shapes.support), cams)  # (v, O, 4)
+        clipped = quadrics.clip_boxes(whole, size)
+        visible = np.nan_to_num(box_area(clipped) / box_area(whole))  # (v, O)
+        expected[first : first + chunk] = visible > EXPECTED
         pairs = list[tuple[IntArray, IntArray]]()
-        for v in range(first, min(first + chunk, len(cams))):
+        for v in range(len(cams)):
             shown = np.flatnonzero(visible[v] > MIN_VISIBLE)
-            rows = slice(starts[v], starts[v + 1])
+            rows = slice(starts[first + v], starts[first + v + 1])
             i, j = np.nonzero(_overlapping(clipped[v, shown], detections.box[rows]))
-            pairs.append((shown[i], starts[v] + j))
+            pairs.append((shown[i], starts[first + v] + j))
         obj, row = (np.concatenate(column) for column in zip(*pairs, strict=True))
-        box = _box_log_odds(clipped[detections.view[row], obj], detections.box[row], size)
+        box = _box_log_odds(clipped[detections.view[row] - first, obj], detections.box[row], size)
         obj_class = shapes.class_id[obj]
         row_class = detections.class_id[row]
         class_log_odds = np.log(
@@ -179,7 +188,7 @@ def _gather(
         np.concatenate(column) for column in zip(*found, strict=True)
     )
     order = np.lexsort((row, obj))
-    return Evidence(obj[order], row[order], existence[order], assignment[order], visible > EXPECTED)
+    return Evidence(obj[order], row[order], existence[order], assignment[order], expected)
 
 
 def logit(score: Array) -> Array:

@@ -146,6 +146,8 @@ def see_through_ratio(
     behind, others = np.zeros((2, expected.shape[1]))
     for v in np.flatnonzero(expected.any(1)):
         points = visible.observed(row[v])
+        if not len(points):
+            continue
         objects = np.flatnonzero(expected[v])
         ray = poses.points[points[:: len(points) // most_points + 1]] - camera[v]  # (N, 3)
         scaled = ellipsoids.world_from_obj[objects] / ellipsoids.half_axes[objects][:, None]

@@ -79,6 +79,7 @@ def fill_from_objects(
     max_angle_deg: float = 10.0,
     max_distance_ratio: float = 1.25,
     min_inside: float = 0.8,
+    sources: IntArray | None = None,
 ) -> Tracks:
     """Add projected boxes in frames without a detection if a nearby view has one.
 
@@ -95,43 +96,49 @@ def fill_from_objects(
         min_inside: least fraction of a detection inside the projected object: it may be half
             occluded, but not extend beyond the projection (chosen on hololens_kitchen and
             office_loop).
+        sources: (K,) frames whose detections are tried; None: all.
     Returns:
         the tracks with rows of score 0 and detection index -1, ordered by frame.
     """
     frame = poses.frame[poses.known]  # (V,)
     size = (poses.camera.width, poses.camera.height)
     cam_from_world = poses.cam_from_world[poses.known]
-    whole = quadrics.solid_boxes(ellipsoids, support, poses.camera.K @ cam_from_world)
-    box = quadrics.clip_boxes(whole, size)  # (V, O, 4)
-    visible = box_area(box) > EXPECTED_IN_VIEW * box_area(whole)  # False where NaN
+    cams = poses.camera.K @ cam_from_world
     center = -np.einsum("vij,vi->vj", cam_from_world[:, :, :3], cam_from_world[:, :, 3])
-    ray = center[:, None] - ellipsoids.center_in_world  # (V, O, 3)
-    distance = np.linalg.norm(ray, axis=2)
     tables = [tracks]
     for o, track_id in enumerate(identity.tolist()):
+        whole = quadrics.solid_boxes(ellipsoids[[o]], [support[o]], cams)[:, 0]
+        box = quadrics.clip_boxes(whole, size)  # (V, 4)
+        visible = box_area(box) > EXPECTED_IN_VIEW * box_area(whole)  # False where NaN
         rows = tracks[(tracks.track_id == track_id) & np.isin(tracks.frame, frame)]  # (n,)
+        empty = np.setdiff1d(np.flatnonzero(visible), np.searchsorted(frame, rows.frame))  # (T,)
+        rows = rows if sources is None else rows[np.isin(rows.frame, sources)]
         view = np.searchsorted(frame, rows.frame)
-        empty = np.setdiff1d(np.flatnonzero(visible[:, o]), view)  # (T,) views without a detection
-        low, high = np.split(box[view, o], 2, axis=1)
+        low, high = np.split(box[view], 2, axis=1)
         common = (np.minimum(rows.xyxy[:, 2:], high) - np.maximum(rows.xyxy[:, :2], low)).clip(0)
         agrees = common.prod(1) > min_inside * box_area(rows.xyxy)
         rows = rows[agrees]
         view = view[agrees]
         if not (len(rows) and len(empty)):
             continue
-        direction = ray[:, o] / distance[:, o, None]
-        angle = np.arccos((direction[empty] @ direction[view].T).clip(-1, 1))  # (T, n)
-        log_ratio = np.abs(np.log(distance[empty, None, o] / distance[view, o]))
-        change = np.maximum(
-            angle / np.radians(max_angle_deg), log_ratio / np.log(max_distance_ratio)
-        )
-        near = change.min(1) < 1
+        ray = center - ellipsoids.center_in_world[o]  # (V, 3)
+        distance = np.linalg.norm(ray, axis=1)
+        direction = ray / distance[:, None]
+        nearest = np.empty((2, len(empty)))  # row and change of the most similar view
+        for block in np.array_split(np.arange(len(empty)), len(empty) // 1024 + 1):  # memory
+            angle = np.arccos((direction[empty[block]] @ direction[view].T).clip(-1, 1))  # (t, n)
+            log_ratio = np.abs(np.log(distance[empty[block], None] / distance[view]))
+            change = np.maximum(
+                angle / np.radians(max_angle_deg), log_ratio / np.log(max_distance_ratio)
+            )
+            nearest[:, block] = change.argmin(1), change.min(1)
+        near = nearest[1] < 1
         filled = empty[near]
-        source = rows[change.argmin(1)[near]]
+        source = rows[nearest[0, near].astype(np.int64)]
         one = np.ones(len(filled), np.int64)
         tables.append(
             Tracks(
-                frame[filled], source.track_id, source.tracklet_id, box[filled, o],
+                frame[filled], source.track_id, source.tracklet_id, box[filled],
                 np.zeros(len(filled)), source.class_id, -one,
             )
         )  # fmt: skip

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from reobj.appearance.reid import SimilarityCalibration, paired_cosine
-from reobj.cameras import Poses, angle_deg, place_of, undistort_boxes, viewing_rays
+from reobj.cameras import Poses
+from reobj.tracking.fragment_appearance import FragmentAppearance
 from reobj.types import (
     Array,
     BoolArray,
@@ -20,14 +20,11 @@ from reobj.types import (
     box_iou,
     class_shares,
     looks,
+    nearest_of,
     rows_by,
-    unit_rows,
 )
 
 # Chosen on examples/room and redkitchen (benchmarks/RESULTS.md) unless a source is given.
-# frames between views of a fragment that show how the appearance of one object varies (lower:
-# nearly equal views, which are more alike than those of an object that was out of view)
-VIEW_GAP = 30
 DUPLICATE_IOU = 0.6  # boxes that overlap more may be two boxes of one object (NMS: .5 to .7)
 FRAGMENT_GAP = 5  # frames without a detection after which a tracklet may be another object
 
@@ -79,8 +76,8 @@ def propagate_labels(tracks: Tracks, label: IntArray, fragment: IntArray) -> Int
         labelled = rows[label[rows] >= 0]
         unlabelled = rows[label[rows] < 0]
         if len(labelled) and len(unlabelled):
-            gap = np.abs(tracks.frame[unlabelled][:, None] - tracks.frame[labelled])
-            nearest = label[labelled[gap.argmin(1)]]
+            near = nearest_of(tracks.frame[unlabelled], tracks.frame[labelled])
+            nearest = label[labelled[near]]
             for row, name in zip(unlabelled.tolist(), nearest.tolist(), strict=True):
                 if (key := (int(tracks.frame[row]), name)) not in taken:
                     label[row] = name
@@ -98,7 +95,7 @@ class Linker:
 
     Attributes:
         fragment: (N,) fragment of each row, 0 .. L - 1: a tracklet, or a piece of one.
-        log_odds: (L, L) that two look like one object, -inf: unknown.
+        appearance: of the fragments, None: unknown.
         co_occur: (L, L) seen in one frame. distinct: (L, L) those that cannot be duplicates.
     """
 
@@ -115,7 +112,7 @@ class Linker:
         self.fragment = cut_at_gaps(tracks, looked)  # (N,)
         self._describe_fragments(class_names, moving)
         self.co_occur, self.distinct = self._co_occurrence()
-        self.log_odds = np.full(self.co_occur.shape, -np.inf)
+        self.appearance: FragmentAppearance | None = None
 
     def _describe_fragments(self, class_names: Sequence[str], moving: Collection[str]) -> None:
         """Set tracklet, identity and class of every fragment, and whether it moves, (L,) each."""
@@ -144,63 +141,13 @@ class Linker:
         return co_occur, co_occur & ~overlapping
 
     def measure_appearance(self, embeddings: Embeddings, embedding_row: IntArray) -> None:
-        """Set the log odds that fragments look like one object, -inf: unknown.
-
-        The similarity is calibrated on this video without labels: fragments of a class seen side by
-        side are different objects, views of one fragment some time apart are the same.
-        """
-        if not embeddings.foreground.size:
-            return
-        foreground, background, angle = self._best_views(embeddings, embedding_row)
-        calibration = SimilarityCalibration()
-        pairs = np.triu(self.distinct & (self.classes[:, None] == self.classes), 1)
-        for rows, same in ((pairs, False), (np.eye(len(pairs), dtype=bool), True)):
-            calibration.add(foreground[rows], background[rows], same)
-        self.log_odds = calibration.logit(foreground, background, angle)
-
-    def _best_views(
-        self, embeddings: Embeddings, embedding_row: IntArray
-    ) -> tuple[Array, Array, Array]:
-        """Compare the most similar views of every two fragments.
-
-        Returns:
-            (L, L) cosines of foreground and of background, and degrees between the viewing rays;
-            NaN where unknown. Diagonal: of views of one fragment at least VIEW_GAP frames apart.
-        """
-        similarity = np.full((3, len(self.tracklets), len(self.tracklets)), np.nan)
-        order = np.argsort(self.fragment[embedding_row], kind="stable")
-        rows = embedding_row[order]
-        width = embeddings.foreground.shape[1]
-        fused = np.concatenate([embeddings.foreground, embeddings.background], 1)
-        unit = unit_rows(fused[order])  # (n, E)
-        fragments, starts, block = np.unique(
-            self.fragment[rows], return_index=True, return_inverse=True
-        )
-        ray = self._viewing_rays(rows)
-        for fragment, members in zip(
-            fragments, np.split(np.arange(len(rows)), starts[1:]), strict=True
-        ):
-            cosine = unit[members] @ unit.T  # (k, n)
-            frame = self.tracks.frame[rows[members]]
-            soon = np.abs(frame[:, None] - frame) < VIEW_GAP
-            cosine[:, members] = np.where(soon, -np.inf, cosine[:, members])
-            view = np.lexsort((-cosine.max(0), block))[starts]  # the best of each fragment
-            member = members[cosine[:, view].argmax(0)]
-            paired = [paired_cosine(x[member], x[view]) for x in np.split(unit, [width], 1)]
-            paired.append(angle_deg(ray[member], ray[view]))
-            similarity[:, fragment, fragments] = np.where(
-                np.isinf(cosine[:, view].max(0)), np.nan, paired
-            )
-        return similarity[0], similarity[1], similarity[2]
-
-    def _viewing_rays(self, rows: IntArray) -> Array:
-        """Return viewing directions (n, 3) of rows, unit vectors in world, NaN without a pose."""
-        if self.poses is None:
-            return np.full((len(rows), 3), np.nan)
-        pose_row, known = place_of(self.poses, self.tracks.frame[rows])
-        camera = self.poses.camera
-        cams = np.where(known[:, None, None], self.poses.cam_from_world[pose_row], np.nan)
-        return viewing_rays(undistort_boxes(self.tracks.xyxy[rows], camera), camera.K @ cams)
+        """Compare fragments by embeddings of n rows, whose numbers are (n,)."""
+        if embeddings.foreground.size:
+            fragments = (self.tracks, self.fragment)
+            found = FragmentAppearance(*fragments, embeddings, embedding_row, self.poses)
+            if found.comparable:
+                found.calibrate(self.classes, self.distinct)
+                self.appearance = found
 
     def by_appearance(self, probability: float = 0.5) -> IntArray:
         """Return the identity (N,) of every row of the tracks, in any numbering.
@@ -209,16 +156,25 @@ class Linker:
             probability: least probability, given the rivals, to join two fragments: even odds.
         """
         group = np.unique(self.identity, return_inverse=True)[1]  # (L,)
-        if np.isfinite(self.log_odds).any():
+        if self.appearance is not None:
             keep = np.where(self.moving, -self.identity, self.tracklets)
             whole = np.unique(keep, return_inverse=True)[1]  # (L,) tracklet of each fragment
             shares = class_shares(self.tracks, whole[self.fragment], int(whole.max()) + 1)
             kind = shares.argmax(1)  # (T,)
             kind[whole[self.moving]] = -1 - whole[self.moving]  # unique: never joined
-            log_odds = _max_between_groups(self.log_odds, whole)  # (T, T)
-            banned = _max_between_groups(self.co_occur, whole) | (kind[:, None] != kind)
-            distinct = _max_between_groups(self.distinct, whole)
-            group = _agglomerate(log_odds, banned, distinct, probability)[whole]
+            joined = np.zeros(len(kind), np.int64)  # (T,)
+            for tracklets in rows_by(kind):  # others are never joined
+                members = np.flatnonzero(np.isin(whole, tracklets))
+                of_kind = np.searchsorted(tracklets, whole[members])
+                square = np.ix_(members, members)
+                log_odds = self.appearance.log_odds(members, members)
+                log_odds, banned, distinct = (
+                    _max_between_groups(matrix, of_kind)
+                    for matrix in (log_odds, self.co_occur[square], self.distinct[square])
+                )
+                found = _agglomerate(log_odds, banned, distinct, probability)
+                joined[tracklets] = joined.max() + 1 + found
+            group = joined[whole]
         return np.asarray(group[self.fragment], np.int64)
 
     def changes(self, identity: IntArray, iou: Array | None) -> list[LinkEvent]:
@@ -244,7 +200,9 @@ class Linker:
             for piece in long[1:]:
                 rest = np.unique(self.fragment[np.setdiff1d(rows, piece)])
                 fragment = np.unique(self.fragment[piece])
-                log_odds = max(float(self.log_odds[np.ix_(rest, fragment)].max()), -9.0)
+                log_odds = -9.0
+                if self.appearance is not None:
+                    log_odds = float(self.appearance.log_odds(rest, fragment).max(initial=-9.0))
                 ids = np.unique(self.tracks.tracklet_id[rows if kind == "join" else piece]).tolist()
                 finite = iou[piece][np.isfinite(iou[piece])]
                 median_iou = float(np.median(finite)) if len(finite) else None
