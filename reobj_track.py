@@ -74,6 +74,7 @@ from reobj.files import Progress, atomic, load_cached, load_npz, save_npz, wrapp
 from reobj.objects.config import ObjectsConfig
 from reobj.objects.description import components_message
 from reobj.objects.fit import fill, link_and_fit
+from reobj.objects.phases import PhasesOfFit
 from reobj.objects.published import solve_again
 from reobj.options import (
     check_known_size,
@@ -97,6 +98,7 @@ from reobj.poses.stage import (
 from reobj.poses.supplied.imageless import open_video
 from reobj.poses.supplied.interpretation import PoseReading
 from reobj.poses.supplied.readers import read_poses
+from reobj.results.checkpoint import Checkpoint
 from reobj.results.edits import kept_edits, read_edits
 from reobj.results.evaluation import evaluate, score_report
 from reobj.results.export import EXPORTS, Viewer, export
@@ -1296,30 +1298,64 @@ def _last_config(out: str | Path) -> Config:
     return read_config(Config(), path) if path.is_file() else Config()
 
 
+# What an interrupted stage leaves for the next run, besides the results of the stages before it
+KEPT = {
+    "detect": "the frames detected so far",
+    "poses": "the features and matches so far",
+    "track": "the frames up to the last save",  # `collect_tracks` says how many
+    "objects": "nothing",
+    "write": "the files that are complete",
+}
+
+
 @dataclass(frozen=True, slots=True)
 class _Job:
     """Inputs of every stage of `run`.
 
     Attributes:
-        seconds: wall time of each stage, added by the stage.
+        seconds: wall time of each stage, added by the stage. step_seconds: of its steps; {} if its
+            result was taken from the cache.
+        lines: progress lines of the current stage.
     """
 
     video: Video
     workspace: Workspace
     config: Config
     seconds: dict[str, float] = field(default_factory=dict)
+    step_seconds: dict[str, dict[str, float]] = field(default_factory=dict)
+    lines: list[Progress] = field(default_factory=list)
 
     @property
     def runtime(self) -> tuple[int, bool, str]:
         """Return the options of networks: threads, offline, device."""
         return self.config.threads, self.config.offline, self.config.device
 
+    def progress(self, step: str, total: int = 0, counted: bool = True) -> Progress:
+        """Begin the progress line of a step of the current stage."""
+        self.lines.append(Progress(step, total, counted))
+        return self.lines[-1]
+
     @contextmanager
-    def timed(self, stage: str) -> Iterator[None]:
-        """Measure the wall time of a stage; nothing is stored after an exception."""
+    def timed(self, stage: str, may_be_cached: bool = False) -> Iterator[None]:
+        """Measure the wall time of a stage and of its steps; nothing is stored after an exception.
+
+        Args:
+            may_be_cached: without any step, the result was taken from the cache.
+        """
         started = time.monotonic()
-        yield
+        self.lines.clear()
+        try:
+            yield
+        except KeyboardInterrupt as interruption:
+            kept = getattr(interruption, "__notes__", None) or [KEPT[stage]]
+            interruption.add_note(f"in the stage {stage}, which keeps {kept[0]}")
+            raise
         self.seconds[stage] = time.monotonic() - started
+        steps: dict[str, float] = {}
+        for line in self.lines:
+            steps[line.stage] = steps.get(line.stage, 0.0) + line.seconds
+        if steps or may_be_cached:
+            self.step_seconds[stage] = steps
 
 
 def _check_objects(config: ObjectsConfig) -> None:
@@ -1344,14 +1380,16 @@ def _detect(
     source = keep_detections(opened, job.video, job.workspace)
     if not in_3d or job.video.is_live:
         return source, Tracks.empty()
-    with job.timed("detect"):
-        return detect_all(source, job.video, job.workspace)
+    with job.timed("detect", may_be_cached=source.recorded is None):
+        return detect_all(source, job.video, job.workspace, job.progress)
 
 
 def _supplied_cameras(job: _Job, readings: list[PoseReading], boxes: Tracks) -> Poses:
     """Choose the interpretation of the user's poses that agrees with images and boxes."""
     with job.timed("poses"):
-        return settled_poses(readings, boxes, job.video, job.config.poses, job.workspace)
+        return settled_poses(
+            readings, boxes, job.video, job.config.poses, job.workspace, job.progress
+        )
 
 
 def _reconstructed_cameras(
@@ -1362,10 +1400,10 @@ def _reconstructed_cameras(
     Returns:
         poses, and the folders of the COLMAP models.
     """
-    with job.timed("poses"):
+    with job.timed("poses", may_be_cached=True):
         moving = np.isin([*class_names, ""], job.config.objects.moving_classes)[boxes.class_id]
         rows = boxes[moving & (boxes.score >= job.config.tracker.high_score)]
-        return reconstruct_cached(job.video, job.config.poses, job.workspace, rows)
+        return reconstruct_cached(job.video, job.config.poses, job.workspace, rows, job.progress)
 
 
 def _track_video(
@@ -1376,17 +1414,26 @@ def _track_video(
     config = job.config
     poses = poses if poses is not None and poses.known.any() else None
     setup = (config.embed, config.tracker, config.device, poses_key(poses))
-    path = job.workspace.path("tracks", *detections_key(source, video), *setup)
-    if source.key and not video.is_live and (known := load_cached(path, Result.load_tracked)):
-        return known
-    with job.timed("track"):
+    key = (*detections_key(source, video), *setup)
+    path = job.workspace.path("tracks", *key)
+    keep = bool(source.key) and not video.is_live
+    with job.timed("track", may_be_cached=keep):
+        if keep and (known := load_cached(path, Result.load_tracked)):
+            return known
         embedder = make_embedder(config.embed.model, config.embed.head, *job.runtime)
         tracker = Tracker(config.tracker, embedder)
+        checkpoint = None
+        if keep and viewer is None:  # which shows all frames
+            checkpoint = Checkpoint(job.workspace.path("tracking", *key).with_suffix(""))
+            tracker = checkpoint.load(lambda file: Tracker.load(file, embedder)) or tracker
+            video = video.after(checkpoint.last)
         steps = track(video, source, tracker, poses=poses)
         if viewer is not None:
             steps = viewer.follow(steps, source.class_names, video, poses)
-        result = collect_tracks(steps, tracker, video, source)
-    result.save_tracked(path)
+        result = collect_tracks(steps, tracker, video, source, job.progress, checkpoint)
+        result.save_tracked(path)
+        if checkpoint is not None:
+            checkpoint.remove()
     return result
 
 
@@ -1423,23 +1470,24 @@ def _finish(job: _Job, result: Result) -> Result:
         result = _write(job, result)
     for warning in result.warnings:
         log.warning(warning)
-    return dataclasses.replace(result, seconds=job.seconds)
+    return dataclasses.replace(result, seconds=job.seconds, step_seconds=job.step_seconds)
 
 
 def _fit_objects(job: _Job, result: Result) -> Result:
     """Link and fit; gaps of tracks are filled with the default solver's shapes."""
     config = job.config
     edits = result.edits or kept_edits(job.workspace.out)
-    with Progress("objects"):
-        fitted = link_and_fit(dataclasses.replace(result, edits=edits), config.objects)
-    gap = 0 if result.identities_given else config.output.fill_gaps
-    tracks = fill(fitted, job.video.size, gap)
-    detected = np.flatnonzero(tracks.detection_index >= 0)  # rows that were not filled in
-    return dataclasses.replace(
-        solve_again(fitted, config.objects),
-        tracks=tracks,
-        embedding_row=detected[fitted.embedding_row],
-    )
+    with job.progress("objects", PhasesOfFit.TOTAL, counted=False) as line:
+        phases = PhasesOfFit(line, result.poses)
+        fitted = link_and_fit(dataclasses.replace(result, edits=edits), config.objects, phases)
+        gap = 0 if result.identities_given else config.output.fill_gaps
+        tracks = fill(fitted, job.video.size, gap)
+        detected = np.flatnonzero(tracks.detection_index >= 0)  # rows that were not filled in
+        return dataclasses.replace(
+            solve_again(fitted, config.objects),
+            tracks=tracks,
+            embedding_row=detected[fitted.embedding_row],
+        )
 
 
 def _warnings(config: Config, result: Result) -> list[str]:
@@ -1473,7 +1521,8 @@ def _write(job: _Job, result: Result) -> Result:
     stale = (OutputFile.MODEL,) if models is not None or result.poses is None else ()
     result.save(workspace.out, output.doubtful, write_more, stale)
     shown = (output.overlay, output.scene, output.doubtful)
-    failures = write_pictures(result, workspace.out, job.video, *shown)
+    line = job.progress("write", job.video.expected)
+    failures = write_pictures(result, workspace.out, job.video, *shown, line)
     if failures:
         result = dataclasses.replace(result, warnings=[*result.warnings, *failures])
         result.write_objects(workspace.out / OutputFile.OBJECTS)
@@ -1585,8 +1634,10 @@ def _main(words: Sequence[str]) -> int:
         handler.setFormatter(SafeFormatter("%(levelname)s: %(message)s"))
         logging.basicConfig(level=level, handlers=[handler], force=True)
         return int(args.func(args))
-    except KeyboardInterrupt:
-        say("\ninterrupted: what was computed is kept; run the same command again to go on")
+    except KeyboardInterrupt as interruption:
+        where = "".join(f" {note}" for note in getattr(interruption, "__notes__", [])[-1:])
+        say(f"\ninterrupted{where}; what was computed before is kept: run the same command again "
+            "to go on")  # fmt: skip
         return 130
     except BrokenPipeError:  # `with_streams` handles it
         raise

@@ -340,51 +340,89 @@ def load_cached(path: Path, read: Callable[[Path], T]) -> T | None:
 
 
 class Progress:
-    """Show one progress line a stage on stderr with rate and time left, if stderr is a terminal.
+    """Show the progress of a stage on stderr: how much is done, the time left, the rate.
 
-    Used in a `with` block: the stage is complete if the block ends without an exception, whatever
-    the expected total was.
+    On a terminal it is one line that is drawn again. Elsewhere (a log file) a long stage leaves a
+    plain line each minute and one at its end. Used in a `with` block: the stage is complete if the
+    block ends without an exception, whatever the expected total was.
 
+    Args:
+        counted: the steps are things that the user knows, such as frames; False: they are shares
+            of the work, and only their percentage is shown.
     Attributes:
-        done, total: steps so far and in all (0: unknown).
+        done, total: steps so far and in all (0: unknown). seconds: duration, 0 until it is closed.
+        complete: set it to False where the block ends early without an exception.
     """
 
-    def __init__(self, stage: str, total: int = 0) -> None:
+    def __init__(self, stage: str, total: int = 0, counted: bool = True) -> None:
         self.stage = stage
         self.total = total
+        self.counted = counted
         self.done = 0
+        self.seconds = 0.0
+        self.complete = True
         self.started = self.shown = time.monotonic()
-        self.marks = [(self.started, 0)]  # time and number of steps, of the last 5 s
-        self.enabled = sys.stderr is not None and sys.stderr.isatty()
+        self._resumed = 0  # steps of an earlier run
+        self._measured = 0  # steps that are in the rate
+        self._recent_steps = 0.0  # weighted, as the next
+        self._recent_s = 0.0
+        self._is_terminal = sys.stderr is not None and sys.stderr.isatty()
+        self._every_s = (
+            0.1 if self._is_terminal else math.inf if sys.stderr is None else LOG_EVERY_S
+        )
 
     def __enter__(self) -> Progress:
-        if self.enabled:
+        if self._is_terminal:
             self._write("...")
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        self.close(kind is None)
+        self.close(self.complete and kind is None)
+
+    def resume(self, done: int) -> None:
+        """Continue after `done` steps of an earlier run, which are not in the rate."""
+        self.done = self._resumed = self._measured = done
+        if self._is_terminal and done:
+            self._write(f"{self._count()}, continued")
 
     def step(self, n: int = 1) -> None:
         """Count n more steps."""
         self.done += n
-        if self.enabled and time.monotonic() - self.shown > 0.1:  # readable, and costs no time
-            self._draw()
+        now = time.monotonic()
+        if now - self.shown > self._every_s:  # readable, and costs no time
+            self._show(now)
 
-    def _draw(self) -> None:
-        self.shown = now = time.monotonic()
-        self.marks = [mark for mark in self.marks if mark[0] >= now - 5] or self.marks[-1:]
-        then, before = self.marks[0]
-        self.marks.append((now, self.done))
-        rate = (self.done - before) / (now - then) if now > then else 0.0
-        text = str(self.done)
-        if self.total:
-            text += f"/{self.total} {min(100 * self.done / self.total, 99):3.0f} %"
-            text += f", {max(self.total - self.done, 0) / rate:.0f} s left" if rate else ""
-        self._write(text + (f", {rate:.1f}/s" if rate else ""))
+    def _show(self, now: float) -> None:
+        """Show the steps, and the time left at the rate of the latest third of the stage.
+
+        Steps of uneven cost change the rate little, and a stage that becomes slower (its first
+        frames were in the cache) is noticed.
+        """
+        since = now - self.shown
+        self.shown = now
+        kept = math.exp(-since / max(10.0, (now - self.started) / 3))
+        self._recent_s = self._recent_s * kept + since
+        self._recent_steps = self._recent_steps * kept + self.done - self._measured
+        self._measured = self.done
+        rate = self._recent_steps / self._recent_s if self._recent_s > 0 else 0.0
+        texts = [self._count()]
+        if self.total and rate:
+            texts.append(f"{duration(max(self.total - self.done, 0) / rate)} left")
+        if self.counted and rate:
+            texts.append(f"{rate:.1f}/s")
+        self._write(", ".join(texts))
+
+    def _count(self) -> str:
+        """Format the steps so far; 100 % is left to `close`."""
+        if not self.total:
+            return str(self.done)
+        percent = f"{min(100 * self.done / self.total, 99):3.0f} %"
+        return f"{self.done}/{self.total} {percent}" if self.counted else percent.strip()
 
     def _write(self, text: str) -> None:
-        sys.stderr.write(f"\r{self.stage:<10}{text}\x1b[K")  # erases the rest of a longer line
+        line = f"{self.stage:<10}{text}"
+        # erases the rest of a longer line
+        sys.stderr.write(f"\r{line}\x1b[K" if self._is_terminal else f"{line}\n")
         sys.stderr.flush()
 
     def close(self, complete: bool = True) -> float:
@@ -393,18 +431,44 @@ class Progress:
         Returns:
             seconds since the start.
         """
-        seconds = time.monotonic() - self.started
-        if self.enabled:
-            text = ""
-            if self.done:
-                total = f"/{self.done} 100 %" if complete else f"/{self.total}" * (self.total > 0)
-                text = f"{self.done}{total}, "
-            text += f"{seconds:.1f} s" + ("" if complete else ", not finished")
-            if self.done and seconds > 0.1:  # the rate of a cached stage means nothing
-                text += f", {self.done / seconds:.1f}/s"
-            self._write(text)
+        self.seconds = time.monotonic() - self.started
+        texts = [f"{self.seconds:.1f} s"]
+        if self.done and not self.counted:
+            texts.insert(0, "100 %" if complete else self._count())
+        elif self.done:
+            total = f"/{self.done} 100 %" if complete else f"/{self.total}" * (self.total > 0)
+            texts.insert(0, f"{self.done}{total}")
+        if not complete:
+            texts.append("not finished")
+        now_done = self.done - self._resumed
+        if now_done and self.counted and self.seconds > 0.1:  # that of a cached stage: no meaning
+            texts.append(f"{now_done / self.seconds:.1f}/s")
+        if self._is_terminal or (sys.stderr is not None and self.seconds > LOG_LEAST_S):
+            self._write(", ".join(texts))
+        if self._is_terminal:
             sys.stderr.write("\n")
-        return seconds
+        return self.seconds
+
+
+# Where stderr is no terminal: s between lines of a stage, and its least duration for a line at its
+# end (chosen: the run of the example leaves only its reconstruction)
+LOG_EVERY_S = 60.0
+LOG_LEAST_S = 10.0
+
+
+def duration(seconds: float) -> str:
+    """Format a duration, above a minute to 10 s.
+
+    >>> duration(36.4), duration(131), duration(3900)
+    ('36 s', '2 min 10 s', '1 h 5 min')
+    """
+    if round(seconds) < 60:
+        return f"{seconds:.0f} s"
+    if seconds < 3595:
+        minutes, tens = divmod(round(seconds / 10), 6)
+        return f"{minutes} min {10 * tens} s" if tens else f"{minutes} min"
+    hours, minutes = divmod(round(seconds / 60), 60)
+    return f"{hours} h {minutes} min" if minutes else f"{hours} h"
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

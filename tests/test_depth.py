@@ -388,7 +388,7 @@ def test_a_reconstruction_and_its_model_become_metric_once(tmp_path, walk, monke
     folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS)
     found, asked = with_points(walk, 0.5), []
 
-    def estimate(video, config, work, boxes_to_mask=None):
+    def estimate(video, config, work, **_):
         asked.append(config)
         write_colmap(work / "text", found, NUMBERS)
         (work / "sparse").mkdir()
@@ -415,7 +415,7 @@ def test_supplied_poses_without_points_are_triangulated_once(tmp_path, walk, mon
     folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS)
     asked = []
 
-    def triangulate(poses, video, *, size_px, seed, work_dir):
+    def triangulate(poses, video, *, size_px, seed, **_):
         asked.append((size_px, seed))
         return with_points(poses, 1.0)
 

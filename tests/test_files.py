@@ -9,6 +9,7 @@ import io
 import json
 import math
 import os
+import re
 import struct
 import sys
 import time
@@ -401,8 +402,8 @@ def test_progress_shows_percentage_rate_and_remaining_time(
     progress.step()  # too soon to be visible
     assert screen.getvalue() == "\rtrack     20/200  10 %, 36 s left, 5.0/s\x1b[K"
     clock[0] += 5.99
-    progress.step(9)  # the rate is that of the last seconds
-    assert last_line(screen) == "track     30/200  15 %, 102 s left, 1.7/s\x1b[K"
+    progress.step(9)  # slower: 10 steps in 6 s, the 20 in 4 s before count exp(-6 / 10) of that
+    assert last_line(screen) == "track     30/200  15 %, 1 min 10 s left, 2.6/s\x1b[K"
     assert progress.close() == pytest.approx(10)
     assert last_line(screen) == "track     30/30 100 %, 10.0 s, 3.0/s\x1b[K\n"
 
@@ -460,13 +461,102 @@ def test_progress_without_a_total(clock: list[float], monkeypatch: pytest.Monkey
     assert screen.getvalue() == "\rlive      3, 1.5/s\x1b[K"
 
 
-def test_progress_is_silent_without_a_terminal(
+def test_a_short_stage_is_silent_without_a_terminal(
     clock: list[float], capsys: pytest.CaptureFixture[str]
 ) -> None:
     with files.Progress("track", 200) as progress:
         clock[0] += 4
         progress.step(20)
     assert progress.close() == 4 and capsys.readouterr().err == ""
+
+
+def test_a_long_stage_leaves_plain_lines_in_a_log(
+    clock: list[float], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One each minute and one at the end, without control characters."""
+    with files.Progress("track", 600) as progress:
+        for _ in range(150):
+            clock[0] += 1
+            progress.step(4)
+    assert capsys.readouterr().err.splitlines() == [
+        "track     244/600  41 %, 1 min 30 s left, 4.0/s",
+        "track     488/600  81 %, 28 s left, 4.0/s",
+        "track     600/600 100 %, 150.0 s, 4.0/s",
+    ]
+
+
+def test_without_stderr_progress_is_only_measured(
+    clock: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As under pythonw."""
+    monkeypatch.setattr("sys.stderr", None)
+    with files.Progress("track", 600) as progress:
+        clock[0] += 100
+        progress.step(4)
+    assert progress.seconds == 100
+
+
+def test_the_time_left_follows_a_stage_that_becomes_slower(
+    clock: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first half was in the cache: 300 frames a second, then 10."""
+    screen = Terminal()
+    monkeypatch.setattr("sys.stderr", screen)
+    progress = files.Progress("detect", 18_000)
+    for rate, seconds in ((300, 30), (10, 90)):
+        for _ in range(10 * seconds):
+            clock[0] += 0.1001
+            progress.step(rate // 10)
+    left = re.search(r"(\d+) min", last_line(screen))
+    assert left is not None and 10 <= int(left[1]) <= 14  # 8100 / 10 s = 13.5 min
+
+
+def test_uneven_steps_change_the_time_left_little(
+    clock: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every tenth step takes 5 s, the others .5 s: the true rate is 10 in 9.5 s."""
+    screen = Terminal()
+    monkeypatch.setattr("sys.stderr", screen)
+    progress = files.Progress("match", 200)
+    for k in range(100):
+        clock[0] += 5 if k % 10 == 9 else 0.5
+        progress.step()
+        found = re.search(r"(?:(\d+) min )?(?:(\d+) s )?left", last_line(screen))
+        if k >= 30 and found:
+            left = 60 * int(found[1] or 0) + int(found[2] or 0)
+            assert 0.7 < left / (0.95 * (199 - k)) < 1.5
+
+
+def test_steps_of_an_earlier_run_are_not_in_the_rate(
+    clock: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    screen = Terminal()
+    monkeypatch.setattr("sys.stderr", screen)
+    with files.Progress("track", 200) as progress:
+        progress.resume(100)
+        assert last_line(screen) == "track     100/200  50 %, continued\x1b[K"
+        clock[0] += 5
+        progress.step(50)
+        assert last_line(screen) == "track     150/200  75 %, 5 s left, 10.0/s\x1b[K"
+    assert last_line(screen) == "track     150/150 100 %, 5.0 s, 10.0/s\x1b[K\n"
+
+
+def test_shares_of_the_work_are_shown_as_percent_only(
+    clock: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    screen = Terminal()
+    monkeypatch.setattr("sys.stderr", screen)
+    with files.Progress("objects", 1000, counted=False) as progress:
+        clock[0] += 4
+        progress.step(250)
+        assert last_line(screen) == "objects   25 %, 12 s left\x1b[K"
+    assert last_line(screen) == "objects   100 %, 4.0 s\x1b[K\n"
+
+
+def test_durations_are_readable() -> None:
+    found = [files.duration(s) for s in (0.4, 59.4, 59.6, 64, 130, 3594, 3596, 3660, 9000)]
+    assert found == ["0 s", "59 s", "1 min", "1 min", "2 min 10 s", "59 min 50 s", "1 h",
+                     "1 h 1 min", "2 h 30 min"]  # fmt: skip
 
 
 # ---- Text for messages ---------------------------------------------------------------------------

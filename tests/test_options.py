@@ -998,7 +998,7 @@ def _(lab: Lab) -> None:
             shown = Mock(return_value=[])
             patch.setattr(rt, "write_pictures", shown)
             assert {found.status for found in lab.refit(value).objects} == {"doubtful"}
-        result, out, video, *_, doubtful = shown.call_args[0]
+        result, out, video, *_, doubtful, _ = shown.call_args[0]
         assert len(result.objects) == 2 and doubtful == value
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(scene, "Overlay", drawn := Mock())

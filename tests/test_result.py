@@ -260,6 +260,17 @@ def test_the_summary_is_the_table_printed_by_run(chairs: rt.Result, saved: Path)
     assert f"look at: {saved / 'objects.json'}" in text
 
 
+def test_the_summary_says_where_the_time_went(chairs: rt.Result) -> None:
+    """In one line: steps of a stage, unless the stage is its only step, and cached results."""
+    result = copy_of(
+        chairs,
+        seconds={"detect": 0.04, "poses": 30.16, "track": 5.0, "objects": 2.0},
+        step_seconds={"detect": {}, "poses": {"match": 20.0, "pnp": 10.04}, "track": {"track": 5}},
+    )
+    line = "seconds: detect 0.0 (from the cache), poses 30.2 (match 20.0, pnp 10.0), track 5.0, "
+    assert f"\n{line}objects 2.0\n" in f"{result.summary()}\n"
+
+
 def test_sizes_are_rounded_by_the_smallest_sigma(chairs: rt.Result) -> None:
     found = dataclasses.replace(
         chairs.objects[0], size=np.array([4.1234, 2.0, 1.0]), size_m=np.array([0.41234, 0.2, 0.1]),

@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
 from reobj.cameras import Poses, import_pycolmap, load_poses, save_poses, write_colmap
-from reobj.files import load_cached, load_npz, part_path
+from reobj.files import Progress, load_cached, load_npz, part_path
 from reobj.poses.estimate import PosesConfig, estimate_poses
 from reobj.poses.intrinsics import camera_line, parse_camera
 from reobj.poses.sfm import triangulate
@@ -20,6 +21,8 @@ from reobj.poses.supplied.interpretation import PoseReading, by_images, by_track
 from reobj.poses.supplied.readers import pose_readings, the_reading
 from reobj.sources.video import Video, source_fingerprint
 from reobj.types import ReobjError, Tracks, rows_by
+
+MakeProgress = Callable[[str, int], Progress]  # name and total of a step -> its progress line
 
 
 class StageCache(Protocol):
@@ -55,6 +58,7 @@ def settled_poses(
     video: Video,
     config: PosesConfig,
     workspace: StageCache,
+    progress: MakeProgress = Progress,
 ) -> Poses:
     """Choose between readings of supplied poses by tracks, check them, and add points.
 
@@ -65,10 +69,16 @@ def settled_poses(
     """
     poses = the_reading(by_tracks(readings, tracks), Path(config.mode))
     check_directions(poses, tracks)
-    return with_points(poses, video, config, workspace)
+    return with_points(poses, video, config, workspace, progress)
 
 
-def with_points(poses: Poses, video: Video, config: PosesConfig, workspace: StageCache) -> Poses:
+def with_points(
+    poses: Poses,
+    video: Video,
+    config: PosesConfig,
+    workspace: StageCache,
+    progress: MakeProgress = Progress,
+) -> Poses:
     """Add points to poses: triangulated where they have none, from depth maps, or cached."""
     if (
         not video.has_images
@@ -83,9 +93,13 @@ def with_points(poses: Poses, video: Video, config: PosesConfig, workspace: Stag
     if depth_first:
         poses = add_depth(poses, config.depth, video)
     if not len(poses.visibility):
-        work_dir = workspace.cache / "sfm"
         poses = triangulate(
-            poses, video, size_px=config.size_px, seed=config.seed, work_dir=work_dir
+            poses,
+            video,
+            size_px=config.size_px,
+            seed=config.seed,
+            work_dir=workspace.cache / "sfm",
+            progress=progress,
         )
     if config.depth and not depth_first:
         poses = add_depth(poses, config.depth, video)
@@ -116,12 +130,17 @@ def check_directions(poses: Poses, tracks: Tracks) -> None:
 
 
 def reconstruct_cached(
-    video: Video, config: PosesConfig, workspace: StageCache, moving: Tracks | None = None
+    video: Video,
+    config: PosesConfig,
+    workspace: StageCache,
+    moving: Tracks | None = None,
+    progress: MakeProgress = Progress,
 ) -> tuple[Poses, list[Path]]:
     """Reconstruct the cameras of a video, or take them from the output folder's cache.
 
     Args:
         moving: tracks of moving objects, where no features are used.
+        progress: makes the progress line of a step from its name and total.
     Returns:
         poses, and the folder of the COLMAP model of each component of the trajectory (missing if
         the reconstruction failed).
@@ -141,17 +160,17 @@ def reconstruct_cached(
     model = path.with_suffix(".sparse")
     if (cached := load_cached(path, _load_reconstruction)) is not None:
         models = [part_path(model, k) for k in range(cached.part_count)]
-        return _with_depth(cached, models, video, config, workspace)
+        return _with_depth(cached, models, video, config, workspace, progress)
     work_dir = workspace.cache / "sfm"
     boxes_of = (lambda frame: boxes[boxes[:, 0] == frame, 1:]) if len(boxes) else None
-    poses = estimate_poses(video, config, work_dir, boxes_to_mask=boxes_of)
+    poses = estimate_poses(video, config, work_dir, progress=progress, boxes_to_mask=boxes_of)
     if poses.known.any():
         for k in range(poses.part_count):
             shutil.rmtree(part_path(model, k), ignore_errors=True)
             part_path(work_dir / "sparse", k).replace(part_path(model, k))
         save_poses(path, poses, models=_digest_of(model, poses.part_count))
     models = [part_path(model, k) for k in range(poses.part_count)]
-    return _with_depth(poses, models, video, config, workspace)
+    return _with_depth(poses, models, video, config, workspace, progress)
 
 
 def _load_reconstruction(path: Path) -> Poses:
@@ -184,12 +203,17 @@ def poses_key(poses: Poses | None) -> str:
 
 
 def _with_depth(
-    poses: Poses, models: list[Path], video: Video, config: PosesConfig, workspace: StageCache
+    poses: Poses,
+    models: list[Path],
+    video: Video,
+    config: PosesConfig,
+    workspace: StageCache,
+    progress: MakeProgress,
 ) -> tuple[Poses, list[Path]]:
     """Scale a reconstruction by depth maps, with its COLMAP models, and add their points."""
     if not config.depth or not poses.known.any():
         return poses, models
-    scaled = with_points(poses, video, config, workspace)
+    scaled = with_points(poses, video, config, workspace, progress)
     if not scaled.metric:
         return scaled, models
     pc = import_pycolmap()

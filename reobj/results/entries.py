@@ -36,7 +36,8 @@ class Object:
         size: (3,) full extents of the shape along its own axes; size_m: the same in metres, None
             where the scale is unknown; size_rel_sigma: (3,) relative standard deviation.
         cov: (9, 9) of center, log half axes, rotation vector in object axes.
-        views: frames with a pose in which it was detected; dropped_boxes: outliers among them.
+        views: frames with a pose in which it was detected; dropped_boxes: outliers among
+            them, extrapolated from the fitted frames if the video has more than 600.
         frames_seen: frames in which it was detected.
         parallax_deg: largest angle between two of its viewing rays.
         reprojection_iou_median: IoU of the projected shape with the boxes.

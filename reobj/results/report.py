@@ -24,12 +24,22 @@ def summary(result: Result) -> str:
     if doubtful > 0:
         lines.append(f"low confidence: {doubtful} more, probably false positives (objects.json)")
     lines += _cameras(result)
-    lines.append("seconds: " + ", ".join(f"{k} {v:.1f}" for k, v in result.seconds.items()))
+    lines.append("seconds: " + ", ".join(_stage_time(result, s) for s in result.seconds))
     if result.out is not None:
         names = ("scene.html", "overlay.mp4", "overlay.webm", "objects.json")
         files = [result.out / name for name in names]
         lines.append("look at: " + ", ".join(str(file) for file in files if file.exists()))
     return "\n".join(lines)
+
+
+def _stage_time(result: Result, stage: str) -> str:
+    """Format the seconds of a stage: of its steps, or that it was taken from the cache."""
+    text = f"{stage} {result.seconds[stage]:.1f}"
+    steps = result.step_seconds.get(stage)
+    if steps is None or list(steps) == [stage]:
+        return text
+    times = ", ".join(f"{step} {seconds:.1f}" for step, seconds in steps.items())
+    return f"{text} ({times or 'from the cache'})"
 
 
 def sides(found: Object) -> list[tuple[str, ...]]:

@@ -34,12 +34,15 @@ class Result:
         class_names: names of the tracks' `class_id`.
         objects: one for each identity, by id. world: units, gravity, scale, joins and splits.
         poses: cameras, or None. fits: of the objects, in their order; None without cameras, and for
-            a result read from a folder.
+            a result read from a folder. Frames that are not fitted (of more than 600) have no
+            inliers.
         embeddings: (n, E1) and (n, E2), fused: foreground and background of the rows
             `embedding_row` (n,) of the tracks that the tracker embedded.
         looked: (F,) frames that the detector was run on, ascending; None: all that were read.
         identities_given: by the user; they are not joined, split or renumbered.
-        seconds: wall time by stage. warnings: for the user. edits: manual corrections.
+        seconds: wall time by stage. step_seconds: of the steps of a stage; {} if its result was
+            taken from the cache.
+        warnings: for the user. edits: manual corrections.
         out: the folder that it was saved to or loaded from.
     """
 
@@ -56,6 +59,7 @@ class Result:
     looked: IntArray | None = None
     identities_given: bool = False
     seconds: dict[str, float] = field(default_factory=dict)
+    step_seconds: dict[str, dict[str, float]] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     edits: Edits | None = None
     out: Path | None = None

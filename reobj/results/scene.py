@@ -344,6 +344,7 @@ def write_pictures(
     overlay: str = "solids",
     scene: bool = True,
     doubtful: bool = False,
+    progress: Progress | None = None,
 ) -> list[str]:
     """Write the overlay video and scene.html in one pass over the video.
 
@@ -354,6 +355,7 @@ def write_pictures(
         overlay: layers of the overlay video (`film_layers`); "none": no video.
         doubtful: include low-confidence objects in the overlay video; in the viewer, which always
             contains them, show them initially.
+        progress: the line of the stage, whose steps are the frames.
     Returns:
         messages about files that could not be written, with the option to omit them. With the
         environment variable REOBJ_RAISE, as in our tests, bugs are raised instead.
@@ -362,33 +364,35 @@ def write_pictures(
     shown = result if doubtful else result.without_doubtful()
     faults = _Faults()
     film = pictures = None
-    if film_layers(overlay) and visible:
-        with faults.of("overlay"):
-            film = Overlay(shown, out / "overlay.mp4", video, overlay)
-    if scene:
-        with faults.of("scene"):
-            pictures = Pictures(result, video)
-    sinks = [(n, sink) for n, sink in (("overlay", film), ("scene", pictures)) if sink and visible]
-    progress = Progress("write", video.expected)
     complete = False
-    try:
-        with faults.of("video"):
-            for frame in video if sinks else ():
-                for name, sink in sinks:
-                    if name not in faults.found:
-                        with faults.of(name):
-                            sink.take(frame)
-                progress.step()
-        complete = "video" not in faults.found
-    finally:
-        progress.close(complete)
-        if film is not None:
+    line = progress or Progress("write", video.expected)
+    with line:
+        if film_layers(overlay) and visible:
             with faults.of("overlay"):
-                film.close(complete and "overlay" not in faults.found)
-    if pictures is not None and "scene" not in faults.found:
-        with faults.of("scene"):
-            page = dataclasses.replace(result, warnings=[*result.warnings, *faults.messages()])
-            write_scene(page, pictures, out / "scene.html", video, doubtful)
+                film = Overlay(shown, out / "overlay.mp4", video, overlay)
+        if scene:
+            with faults.of("scene"):
+                pictures = Pictures(result, video)
+        found = (("overlay", film), ("scene", pictures))
+        sinks = [(name, sink) for name, sink in found if sink and visible]
+        try:
+            with faults.of("video"):
+                for frame in video if sinks else ():
+                    for name, sink in sinks:
+                        if name not in faults.found:
+                            with faults.of(name):
+                                sink.take(frame)
+                    line.step()
+            complete = "video" not in faults.found
+        finally:
+            if film is not None:
+                with faults.of("overlay"):
+                    film.close(complete and "overlay" not in faults.found)
+        if pictures is not None and "scene" not in faults.found:
+            with faults.of("scene"):
+                page = dataclasses.replace(result, warnings=[*result.warnings, *faults.messages()])
+                write_scene(page, pictures, out / "scene.html", video, doubtful)
+        line.complete = complete
     return faults.messages()
 
 

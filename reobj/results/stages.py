@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from reobj.files import Progress, load_cached, load_npz, save_npz
+from reobj.results.checkpoint import Checkpoint, TrackedFrames
 from reobj.results.result import Result, VideoInfo
 from reobj.results.workspace import Workspace
 from reobj.sources.detectors import DetectionCache, DetectionSource
 from reobj.sources.video import Video
-from reobj.types import Array, Detections, Embeddings, Floats, Frame, IntArray, ReobjError, Tracks
+from reobj.types import Array, Detections, Embeddings, Frame, IntArray, ReobjError, Tracks
 
 
 def detections_key(source: DetectionSource, video: Video) -> tuple[Any, ...]:
@@ -32,10 +34,15 @@ def keep_detections(source: DetectionSource, video: Video, workspace: Workspace)
 
 
 def detect_all(
-    source: DetectionSource, video: Video, workspace: Workspace
+    source: DetectionSource,
+    video: Video,
+    workspace: Workspace,
+    progress: Callable[[str, int], Progress] = Progress,
 ) -> tuple[DetectionSource, Tracks]:
     """Detect objects in all frames of a video; the cameras are not needed.
 
+    Args:
+        progress: makes the progress line of a step from its name and total.
     Returns:
         the source, which returns these detections from now on, so that no frame is detected twice;
         all detections as rows without identities, in native pixels.
@@ -55,12 +62,12 @@ def detect_all(
     frames: list[int] = []
     steps = []
     try:
-        with Progress("detect", video.expected) as progress:
+        with progress("detect", video.expected) as line:
             for frame in video:
                 detected = source(frame)
                 frames += [frame.index] * len(detected)
                 steps.append((detected.xyxy / video.scale, detected.score, detected.class_id))
-                progress.step()
+                line.step()
     finally:
         source.flush()
     rows = Tracks.empty()
@@ -96,7 +103,7 @@ def _untracked(
 def tracked_embeddings(
     tracks: Tracks,
     frames: Sequence[int],
-    embedded: Sequence[tuple[IntArray, Floats]],
+    embedded: Sequence[tuple[IntArray, npt.NDArray[Any]]],
     foreground_width: int,
 ) -> tuple[Embeddings, IntArray]:
     """Select the tracker's embeddings of detections that are in the tracks.
@@ -114,54 +121,63 @@ def tracked_embeddings(
         for frame, (index, _) in zip(frames, embedded, strict=True)
         for detection in index.tolist()
     ], np.int64)  # fmt: skip
-    blocks = [block for _, block in embedded if block.size] or [np.empty((0, 0), np.float32)]
+    blocks = [block for _, block in embedded if block.size] or [np.empty((0, 0), np.float16)]
     fused = np.concatenate(blocks)[row >= 0].astype(np.float16)
     width = foreground_width or fused.shape[1]
     return Embeddings(fused[:, :width], fused[:, width:]), row[row >= 0]
 
 
 def collect_tracks(
-    steps: Iterator[tuple[Frame, Tracks]], tracker: Any, video: Video, source: DetectionSource
+    steps: Iterator[tuple[Frame, Tracks]],
+    tracker: Any,
+    video: Video,
+    source: DetectionSource,
+    progress: Callable[[str, int], Progress] = Progress,
+    checkpoint: Checkpoint | None = None,
 ) -> Result:
     """Run a tracker over a video and collect its tracks, embeddings and warnings.
 
     Args:
         steps: the running `track(video, source, tracker)`.
+        progress: makes the progress line of a step from its name and total.
+        checkpoint: keeps the tracker and what was collected; after an interruption `steps` begins
+            after its frames.
     """
-    frames: list[int] = []
-    found: list[Tracks] = []
-    embedded: list[tuple[IntArray, Floats]] = []
-    detected: list[Detections] = []
-    looked: list[bool] = []
+    collected = TrackedFrames() if checkpoint is None else checkpoint.collected
     try:
-        with Progress("track", video.expected) as progress:
+        with progress("track", video.expected) as line:
+            line.resume(len(collected.frames))
             for frame, _ in steps:
-                frames.append(frame.index)
-                found.append(tracker.latest)
-                embedded.append(tracker.latest_embeddings())
-                looked.append(tracker.looked)
-                detected.append(dataclasses.replace(tracker.detections, masks=None))  # memory
-                progress.step()
-    except KeyboardInterrupt:  # the way to end a live source
+                collected.add(frame.index, tracker)
+                if checkpoint is not None:
+                    checkpoint.save_if_due(tracker)
+                line.step()
+    except KeyboardInterrupt as interruption:  # the way to end a live source
         if not video.is_live:
+            if checkpoint is not None:
+                interruption.add_note(f"{checkpoint.kept} tracked frames")
             raise
     finally:
         source.flush()
         if source.cache is not None and not source.key:
             shutil.rmtree(Path(source.cache.folder), ignore_errors=True)
+    frames = collected.frames
     if not frames:
         why = "--start/--stop/--every leave none, or the file is damaged"
         raise ReobjError(f"{video.source}: no frame could be read ({why})")
-    tracks = Tracks.concatenate(frames, found, video.scale)
-    untracked = _untracked(tracks, frames, detected, video.scale)
+    tracks = Tracks.concatenate(frames, collected.found, video.scale)
+    untracked = _untracked(tracks, frames, collected.detected, video.scale)
     foreground_width = tracker.state.gallery.foreground_width
-    embeddings, embedding_row = tracked_embeddings(tracks, frames, embedded, foreground_width)
+    embeddings, embedding_row = tracked_embeddings(
+        tracks, frames, collected.embedded, foreground_width
+    )
     warnings = [*source.messages, *video.messages]
     if video.is_live:
         warnings += [
             f"live: {video.read} frames came, {video.dropped} of them were dropped to keep up",
             "a live source cannot be read twice: identities only; record it for 3D",
         ]
+    looked = collected.looked
     if not len(tracks):
         reason = _why_none(untracked.score, sum(looked), tracker)
         warnings.append(f"no object was tracked: {reason}")

@@ -80,4 +80,5 @@ class ImagelessVideo(Video):
         no_image: Any = None
         for index in range(self.config.start, stop, self.config.every):
             time_s = index / IMAGE_FPS if times_s is None else float(times_s[index])
-            yield Frame(index, time_s, no_image)
+            if index > self._after:
+                yield Frame(index, time_s, no_image)

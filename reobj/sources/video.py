@@ -6,6 +6,7 @@ Start at `Video`; `resized` and `shrunk` scale images.
 from __future__ import annotations
 
 import contextlib
+import copy
 import dataclasses
 import functools
 import glob
@@ -125,6 +126,7 @@ class Video:
     """
 
     has_images = True
+    _after = -1  # frames up to this one are decoded and checked, but not yielded
 
     def __init__(
         self,
@@ -164,6 +166,16 @@ class Video:
         width, height = (max(round(side * ratio), 1) for side in self.size)
         self.working_size = (width, height)
         self.scale = width / self.size[0]
+
+    def after(self, index: int) -> Video:
+        """Return this video without the frames up to `index`, to continue with the next one.
+
+        They are decoded all the same: seeking is not exact in all files, and the messages are those
+        of the whole video.
+        """
+        rest = copy.copy(self)
+        rest._after = index
+        return rest
 
     def name(self, index: int) -> str:
         """Return the file name of a frame, "" for videos."""
@@ -224,6 +236,8 @@ class Video:
             if image is None or (image.shape[1], image.shape[0]) != self.size:
                 (unreadable if image is None else other_size).append(index)
                 self.skipped.append(index)
+                continue
+            if index <= self._after:
                 continue
             if self.working_size != self.size:
                 small = cv2.resize(image, self.working_size, interpolation=cv2.INTER_AREA)
