@@ -125,11 +125,18 @@ def ambient_open(
 
 
 def bake_light(
-    surfaces: Surfaces, size: tuple[float, float, float], height: int, rays: int, rng: Rng
+    surfaces: Surfaces,
+    size: tuple[float, float, float],
+    height: int,
+    rays: int,
+    rng: Rng,
+    shell: int = 6,
 ) -> npt.NDArray[np.float32]:
-    """Irradiance of every patch: ceiling panels (warm), window (cool), ambient."""
+    """Irradiance of every patch: ceiling panels (warm), window (cool), ambient; the first `shell`
+    patches (walls, floor, ceiling) cast no shadow.
+    """
     points, normals, slices = light_samples(surfaces)
-    voxels = voxelize(surfaces, size)
+    voxels = voxelize(surfaces, size, shell)
     opened = ambient_open(points, normals, voxels, size, rng)
     up = 0.5 + 0.5 * normals[:, 2:]  # (N, 1)
     total = opened[:, None] * (

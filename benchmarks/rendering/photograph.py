@@ -79,22 +79,37 @@ class Frame:
     truth: FrameTruth
 
 
+def render_frame(
+    room: Room, config: RoomConfig, index: int, poses: Array, drawn: Room | None = None
+) -> Frame:
+    """One frame of a clip; it has its own random stream, so it does not depend on the others.
+
+    Args:
+        poses: cam_from_world (F, 3, 4) of the whole clip.
+        drawn: the room without patches that this view cannot show; all of it by default.
+    """
+    K = camera_matrix(config)
+    pose = poses[index]
+    rng = np.random.default_rng([config.seed, 4, index])
+    clean, instance, depth = render(
+        room if drawn is None else drawn,
+        K,
+        pose,
+        (config.width, config.height),
+        config.supersample,
+        exposure_at(index, config),
+    )
+    moves = index + 1 < len(poses) and config.path != "table"  # photos: nothing is blurred
+    after = poses[index + 1] if moves else pose
+    rotation = after[:, :3] @ pose[:, :3].T
+    next_from_cam = np.concatenate([rotation, (after[:, 3] - rotation @ pose[:, 3])[:, None]], 1)
+    flow = image_flow(depth.astype(np.float64), K, next_from_cam)
+    image = photograph(clean, flow, config, rng)
+    return Frame(index, image, instance, depth, pose, ground_truth(room, K, pose, instance))
+
+
 def render_clip(room: Room, config: RoomConfig, cameras: Array | None = None) -> Iterator[Frame]:
     """Render frame after frame; each frame has its own random stream, so any subset repeats."""
-    K = camera_matrix(config)
     poses = camera_path(room, config) if cameras is None else cameras  # (F, 3, 4)
-    size = (config.width, config.height)
-    for index, pose in enumerate(poses):
-        rng = np.random.default_rng([config.seed, 4, index])
-        clean, instance, depth = render(
-            room, K, pose, size, config.supersample, exposure_at(index, config)
-        )
-        moves = index + 1 < len(poses) and config.path != "table"  # photos: nothing is blurred
-        after = poses[index + 1] if moves else pose
-        rotation = after[:, :3] @ pose[:, :3].T
-        next_from_cam = np.concatenate(
-            [rotation, (after[:, 3] - rotation @ pose[:, 3])[:, None]], 1
-        )
-        flow = image_flow(depth.astype(np.float64), K, next_from_cam)
-        image = photograph(clean, flow, config, rng)
-        yield Frame(index, image, instance, depth, pose, ground_truth(room, K, pose, instance))
+    for index in range(len(poses)):
+        yield render_frame(room, config, index, poses)

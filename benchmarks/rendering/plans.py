@@ -319,9 +319,12 @@ def turned(placements: Sequence[Placement], yaw_rad: float, x: float, y: float) 
     ]
 
 
-def varied_group(config: RoomConfig, rng: Rng) -> list[Placement]:
-    """A table with chairs, a desk or a lounge around the origin; some furniture missing."""
-    kind = rng.choice(3, p=[0.4, 0.4, 0.2])
+def varied_group(config: RoomConfig, rng: Rng, kind: int | None = None) -> list[Placement]:
+    """A table with chairs (0), a desk (1) or a lounge (2) around the origin; some furniture
+    missing; without a kind, a random one.
+    """
+    if kind is None:
+        kind = int(rng.choice(3, p=[0.4, 0.4, 0.2]))
     if kind == 0:
         group = dining_placements(config, rng, (0.0, 0.0))
     elif kind == 1:

@@ -81,15 +81,15 @@ def pack(
 
 
 def build_atlas(
-    textures: dict[str, Image],
+    textures: dict[str, Image], width: int = ATLAS_WIDTH
 ) -> tuple[tuple[Image, ...], dict[str, tuple[int, int, int, int]]]:
     """Pack all textures, with replicated borders, and shrink by two for each mip level."""
     pad = ATLAS_PAD
     padded = [
         cv2.copyMakeBorder(t, pad, pad, pad, pad, cv2.BORDER_REPLICATE) for t in textures.values()
     ]
-    positions, height = pack([(p.shape[1], p.shape[0]) for p in padded], ATLAS_WIDTH, ATLAS_PAD)
-    level = np.zeros((height, ATLAS_WIDTH, 3), np.uint8)
+    positions, height = pack([(p.shape[1], p.shape[0]) for p in padded], width, ATLAS_PAD)
+    level = np.zeros((height, width, 3), np.uint8)
     rects = {}
     for (name, texture), image, (x, y) in zip(textures.items(), padded, positions, strict=True):
         level[y : y + image.shape[0], x : x + image.shape[1]] = image

@@ -6,6 +6,7 @@ import importlib
 import json
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -33,9 +34,25 @@ def run_lengths(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.uint32]:
     return np.diff(edges).astype(np.uint32)
 
 
-def save_detections(path: Path, frames: Sequence[FrameDetections], size: tuple[int, int]) -> None:
+@dataclass(frozen=True, slots=True)
+class PackedDetections:
+    """Detections of one frame with their masks as run lengths."""
+
+    xyxy: Array  # (D, 4) px, corner convention
+    score: Array  # (D,)
+    class_id: npt.NDArray[np.int64]  # (D,)
+    runs: tuple[npt.NDArray[np.uint32], ...]  # D times; an empty array where there is no mask
+
+
+def pack_detections(found: FrameDetections) -> PackedDetections:
+    """Replace the masks of a frame by their run lengths, which take far less memory."""
+    runs = tuple(run_lengths(mask) for mask in found.masks)
+    return PackedDetections(found.xyxy, found.score, found.class_id, runs)
+
+
+def save_detections(path: Path, frames: Sequence[PackedDetections], size: tuple[int, int]) -> None:
     """Write `detections.npz`: arrays over all frames, masks as concatenated run lengths."""
-    runs = [run_lengths(mask) for frame in frames for mask in frame.masks]
+    runs = [run for frame in frames for run in frame.runs]
     lengths = np.array([len(run) for run in runs], np.int64)
     np.savez_compressed(
         path,
@@ -187,14 +204,16 @@ def write_clip(
     size = (config.width, config.height)
     mot: list[str] = []
     tum: list[str] = []
-    found: list[FrameDetections] = []
+    found: list[PackedDetections] = []
     writer = VideoSink(out / "room.mp4", config, crf)
     for frame in render_clip(room, config):
         writer.write(frame.image)
         if png:
             cv2.imwrite(str(out / f"frame_{frame.index:05d}.png"), frame.image)
         rng = np.random.default_rng([config.seed, 5, frame.index])
-        found.append(simulate_detections(room, frame.truth, frame.instance, detector, rng))
+        found.append(
+            pack_detections(simulate_detections(room, frame.truth, frame.instance, detector, rng))
+        )
         mot += mot_lines(frame.index, frame.truth, room, size)
         tum.append(tum_line(frame.index / config.fps, frame.cam_from_world))
         show_progress(frame.index + 1, config.frames)

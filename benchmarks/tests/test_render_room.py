@@ -204,7 +204,7 @@ def test_rooms_of_the_corridor_look_identical(room) -> None:
     assert np.quantile(depth, 0.95) > 1.5 * w  # no wall between
 
 
-def test_unknown_path_is_refused(room) -> None:
+def test_unknpath_where_seen_is_refused(room) -> None:
     with pytest.raises(ValueError, match="use revisit, walk"):
         rr.camera_path(room, rr.RoomConfig(path="fly"))
 

@@ -1,0 +1,180 @@
+#!/usr/bin/env python3
+"""Time and peak memory of `run` over the length of a video, and ratios between two lengths.
+
+    python benchmarks/long_video.py -o OUT [--frames 600 2400 4800] [--plot]
+
+The clip of examples/room (240 frames, about 10 boxes in each) is played forwards and backwards
+until it has the wanted number of frames; the boxes are given, the cameras are reconstructed. Each
+length is one command in a process of its own. A clip keeps its file names and is reused.
+
+    whole    wall time of the command, s
+    poses, track, objects, write     wall times that it reports, s
+    MB       largest resident size of one process, and of all together at one time
+
+OUT/long_video.json has all figures, also the largest resident size in each stage; --plot draws them
+(OUT/long_video.png, needs matplotlib).
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import itertools
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from recordings import ROOT
+
+ROOM = ROOT / "examples" / "room"
+STAGES = ("poses", "track", "objects", "write")
+
+
+def source_frames(count: int, of: int) -> Iterator[int]:
+    """Yield the frame of the clip for each frame of a video that plays it back and forth."""
+    there_and_back = [*range(of), *range(of - 2, 0, -1)]
+    return itertools.islice(itertools.cycle(there_and_back), count)
+
+
+def write_clip(folder: Path, count: int) -> None:
+    """Write clip.mp4 and boxes.csv with `count` frames into a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    capture = cv2.VideoCapture(str(ROOM / "room.mp4"))
+    images = []
+    while (read := capture.read())[0]:
+        images.append(read[1])
+    height, width = images[0].shape[:2]
+    boxes = np.load(ROOM / "detections.npz")
+    names = boxes["class_names"]
+    start = np.searchsorted(boxes["frame"], np.arange(len(images) + 1))
+    writer = cv2.VideoWriter(
+        str(folder / "part.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 30.0, (width, height)
+    )
+    with open(folder / "boxes.csv", "w", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(["frame", "x1", "y1", "x2", "y2", "score", "class"])
+        for frame, source in enumerate(source_frames(count, len(images))):
+            writer.write(images[source])
+            for k in range(start[source], start[source + 1]):
+                box = boxes["xyxy"][k].round(2).tolist()
+                rows.writerow([frame, *box, boxes["score"][k], names[boxes["class_id"][k]]])
+    writer.release()
+    (folder / "part.mp4").rename(folder / "clip.mp4")
+
+
+def resident_mb(root: int) -> list[float]:
+    """Return the resident size of a process and of each of its descendants, MB."""
+    parent = {}
+    size = {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            fields = (folder / "stat").read_text().rpartition(")")[2].split()
+        except OSError:  # it has ended
+            continue
+        parent[int(folder.name)] = int(fields[1])
+        size[int(folder.name)] = int(fields[21]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+    family = {root}
+    while more := {pid for pid, above in parent.items() if above in family} - family:
+        family |= more
+    return [size[pid] for pid in family if pid in size]
+
+
+def measure(out: Path, count: int, options: Sequence[str]) -> dict[str, Any]:
+    """Run the command on a clip of `count` frames."""
+    folder = out / str(count)
+    if not (folder / "clip.mp4").exists():
+        write_clip(folder, count)
+    words = [sys.executable, str(ROOT / "reobj_track.py"), "run", "clip.mp4", "--detections"]
+    words += ["boxes.csv", "-o", "out", "--overwrite", *options]
+    shutil.rmtree(folder / "out", ignore_errors=True)
+    samples = []  # seconds since the start, MB of the largest process, MB of all
+    began = time.monotonic()
+    with open(folder / "log.txt", "w") as log, open(folder / "progress.txt", "w") as progress:
+        process = subprocess.Popen(words, stdout=log, stderr=progress, cwd=folder)
+        while process.poll() is None:
+            sizes = resident_mb(process.pid) or [0.0]
+            samples.append((time.monotonic() - began, max(sizes), sum(sizes)))
+            time.sleep(0.2)
+    whole = time.monotonic() - began
+    if process.returncode:
+        last = (folder / "progress.txt").read_text().strip().splitlines()[-1]
+        raise SystemExit(f"{count} frames: exit code {process.returncode}: {last}")
+    text = (folder / "log.txt").read_text()
+    line = re.findall(r"^seconds: (.*)$", text, re.MULTILINE)[-1]
+    steps = dict(re.findall(r"(\w+) [\d.]+ \(([^)]*)\)", line))
+    seconds = dict(re.findall(r"(\w+) ([\d.]+)", re.sub(r"\([^)]*\)", "", line)))
+    result: dict[str, Any] = {"whole": whole} | {s: float(seconds.get(s, 0)) for s in STAGES}
+    result["MB"] = max(one for _, one, _ in samples)
+    result["MB_all"] = max(every for _, _, every in samples)
+    result["steps"] = steps
+    result["stage_MB"] = {}
+    end = whole - sum(result[s] for s in STAGES)
+    for stage in STAGES:  # they follow each other to the end
+        start = end
+        end = start + result[stage]
+        inside = [every for t, _, every in samples if start <= t <= end]
+        result["stage_MB"][stage] = max(inside, default=0.0)
+    return result
+
+
+def plot(results: dict[int, dict[str, Any]], path: Path) -> None:
+    """Draw time and memory of each stage over the number of frames."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    frames = sorted(results)
+    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
+    for stage in STAGES:
+        left.plot(frames, [results[n][stage] for n in frames], marker="o", label=stage)
+        memory = [results[n]["stage_MB"][stage] / 1000 for n in frames]
+        right.plot(frames, memory, marker="o", label=stage)
+    left.plot(frames, [n / 30 for n in frames], "k:", label="duration of the video (30 fps)")
+    left.set(xlabel="frames", ylabel="seconds", title="Time of each stage")
+    right.set(xlabel="frames", ylabel="GB, all processes", title="Peak memory in each stage")
+    for axis in (left, right):
+        axis.set_ylim(bottom=0)
+        axis.grid(alpha=0.3)
+        axis.legend()
+    figure.savefig(path, dpi=110)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Measure all lengths and print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("-o", "--out", type=Path, required=True)
+    parser.add_argument("--frames", type=int, nargs="+", default=[600, 2400, 4800])
+    parser.add_argument("--plot", action="store_true", help="draw OUT/long_video.png (matplotlib)")
+    parser.add_argument("options", nargs="*", help="further options of `run`, after --")
+    args = parser.parse_args(argv)
+    names = ("whole", *STAGES, "MB", "MB_all")
+    found: dict[int, dict[str, Any]] = {}
+    titles = [*names[:-2], "MB, largest process", "MB, together"]
+    print("| frames | " + " | ".join(titles) + " |\n" + "|---" * (len(names) + 1) + "|")
+    for count in args.frames:
+        found[count] = measure(args.out, count, args.options)
+        cells = [f"{found[count][name]:.{0 if name.startswith('MB') else 1}f}" for name in names]
+        print(f"| {count} | " + " | ".join(cells) + " |", flush=True)
+        (args.out / "long_video.json").write_text(json.dumps(found, indent=1))
+    if {600, 2400} <= found.keys():
+        ratios = [found[2400][n] / max(found[600][n], 1e-9) for n in names]
+        print("| 2400 / 600 | " + " | ".join(f"{r:.1f}" for r in ratios) + " |")
+    if args.plot:
+        plot(found, args.out / "long_video.png")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
