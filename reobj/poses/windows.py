@@ -13,7 +13,7 @@ import copy
 import itertools
 import json
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -102,16 +102,34 @@ def map_keyframes(
         models of the components, the largest first ([]: none is sound); messages; keyframes whose
         windows alone do not determine their poses, to be registered in the joined models.
     """
+    search = MapperSearch(database, frames, pairs, focal, guess, seed)
     windows = split(_path(list(frames), pairs), options)
     if len(windows) == 1:
-        search = MapperSearch(database, frames, pairs, focal, guess, seed)
-        models, messages, lost, _ = _kept_search(database.parent / "whole", search)
-        return models, [*messages, *lost], []
+        models, found = _kept(database.parent / "whole", list(frames), lambda: _run(search))
+        return models, [*found["messages"], *found["lost"]], []
+    models, found = _kept(
+        database.parent / "all", list(frames), lambda: _map_windows(windows, search, options)
+    )
+    return models, found["messages"], found["weak"]
+
+
+def _map_windows(
+    windows: list[list[int]], whole: MapperSearch, options: WindowOptions
+) -> tuple[list[Any], dict[str, Any]]:
+    """Map windows of keyframes and join their models.
+
+    Args:
+        whole: a search with all keyframes.
+    Returns:
+        models of the components; "messages" and "weak" keyframes as of `map_keyframes`.
+    """
+    database = whole.database
+    pairs = whole.pairs
     done = [0] * len(windows)
     total = sum(map(len, windows))
     lock = threading.Lock()
 
-    def map_window(k: int) -> tuple[list[Any], list[str], list[str], list[int]]:
+    def map_window(k: int) -> tuple[list[Any], dict[str, Any]]:
         ids = windows[k]
         folder = database.parent / f"window{k}"
         folder.mkdir(exist_ok=True)
@@ -122,24 +140,27 @@ def map_keyframes(
                 done[k] = max(done[k], registered)
                 send_progress("mapping", sum(done), total)
 
-        search = MapperSearch(
-            path, {i: frames[i] for i in ids}, pairs.only(ids), focal, guess, seed, show=show
-        )
-        if not (folder / "search.json").exists():
+        frames = {i: whole.frames[i] for i in ids}
+        known = (whole.focal, whole.guess, whole.seed, whole.options, show)
+        search = MapperSearch(path, frames, pairs.only(ids), *known)
+
+        def run() -> tuple[list[Any], dict[str, Any]]:
             with lock:
                 copy_database(database, path, ids)
-        found = _kept_search(folder, search)
+            return _run(search)
+
+        models, found = _kept(folder, ids, run)
         path.unlink(missing_ok=True)
         show("", len(ids), len(ids))
-        return found
+        return models, found
 
     with ThreadPoolExecutor(2) as pool:  # mappers use one core each: reproducible
         results = list(pool.map(map_window, range(len(windows))))
-    models = [model for found, *_ in results for model in found]
-    messages = list(dict.fromkeys(text for _, found, *_ in results for text in found))
-    tried = {number for *_, ids in results for number in ids}
+    models = [model for found, _ in results for model in found]
+    messages = list(dict.fromkeys(text for _, found in results for text in found["messages"]))
+    tried = {number for _, found in results for number in found["tried"]}
     if not models:
-        return [], [*messages, *results[0][2]], []
+        return [], {"messages": [*messages, *results[0][1]["lost"]], "weak": []}
     posed = [_merged_poses(models, place) for place in aligned(models, pairs, options)]
     del models, results  # memory
     steps = itertools.count()
@@ -150,47 +171,57 @@ def map_keyframes(
     show_step()
     joined = list[Any]()
     for pose, camera in posed:
-        model = triangulated(pose, camera, database, seed)
+        model = triangulated(pose, camera, database, whole.seed)
         show_step()
-        model = adjusted(model, focal.source is not FocalSource.GIVEN).model
+        model = adjusted(model, whole.focal.source is not FocalSource.GIVEN).model
         show_step()
         pose = {i: model.image(i).cam_from_world().matrix() for i in model.reg_image_ids()}
-        joined.append(triangulated(pose, model.camera(1), database, seed))
+        joined.append(triangulated(pose, model.camera(1), database, whole.seed))
         show_step()
-    search = MapperSearch(database, frames, pairs, focal, guess, seed)
-    components = search.components_of(joined)
+    components = whole.components_of(joined)
     sound = [component for component in components if not component.problem]
     if not sound:
-        return [], [*messages, without_poses(components[0].problem)], []
+        problem = without_poses(components[0].problem)
+        return [], {"messages": [*messages, problem], "weak": []}
     mapped = {number for component in sound for number in component.kept.tolist()}
-    return models_of_one_camera(sound), messages, sorted(tried - mapped)
+    found = {"messages": messages, "weak": sorted(tried - mapped)}
+    return models_of_one_camera(sound), found
 
 
-def _kept_search(
-    folder: Path, search: MapperSearch
-) -> tuple[list[Any], list[str], list[str], list[int]]:
-    """Search for consistent models, or read those that the same search left in a folder.
+def _run(search: MapperSearch) -> tuple[list[Any], dict[str, Any]]:
+    """Search for consistent models.
 
     Returns:
-        what `MapperSearch.run` returns; ids of the images that have the focal length of the models.
+        models; "messages" and "lost" as of `MapperSearch.run`, and "tried": ids of the images that
+        have the focal length of the models.
+    """
+    models, messages, lost = search.run()
+    return models, {"messages": messages, "lost": lost, "tried": search.ids}
+
+
+def _kept(
+    folder: Path, ids: list[int], search: Callable[[], tuple[list[Any], dict[str, Any]]]
+) -> tuple[list[Any], dict[str, Any]]:
+    """Search for models of some keyframes, or read those that the search before left in a folder.
+
+    Returns:
+        models, and what else the search has found.
     """
     folder.mkdir(exist_ok=True)
     path = folder / "search.json"
-    ids = list(search.ids)
     last = load_cached(path, load_json) or {}
     if last.get("ids") == ids:
         pc = import_pycolmap()
         models = [pc.Reconstruction(str(folder / f"model{k}")) for k in range(last["models"])]
-        return models, last["messages"], last["lost"], last["tried"]
-    models, messages, lost = search.run()
+        return models, last
+    models, found = search()
     path.unlink(missing_ok=True)
     for k, model in enumerate(models):
         (folder / f"model{k}").mkdir(exist_ok=True)
         model.write(str(folder / f"model{k}"))
-    result = {"ids": ids, "models": len(models), "messages": messages, "lost": lost}
     with atomic(path) as part:
-        part.write_text(json.dumps(result | {"tried": search.ids}))
-    return models, messages, lost, search.ids
+        part.write_text(json.dumps({"ids": ids, "models": len(models)} | found))
+    return models, found
 
 
 def copy_database(source: Path, path: Path, ids: Sequence[int], camera: Any = None) -> None:
