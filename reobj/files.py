@@ -347,7 +347,7 @@ class Progress:
     block ends without an exception, whatever the expected total was.
 
     Args:
-        counted: the steps are things that the user knows, such as frames; False: they are shares
+        counted: the steps have a meaning for the user, such as frames; False: they are fractions
             of the work, and only their percentage is shown.
     Attributes:
         done, total: steps so far and in all (0: unknown). seconds: duration, 0 until it is closed.

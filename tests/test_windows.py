@@ -255,7 +255,8 @@ def mapped(tmp_path_factory):
         pairs = read_pairs(database)
         focal = Focal(430 / 480, FocalSource.GIVEN)
         frames = {i: 10 * i for i in ids}
-        return map_keyframes(database, frames, pairs, focal, 0.9, 0, WindowOptions(**options))
+        search = MapperSearch(database, frames, pairs, focal, 0.9, 0)
+        return map_keyframes(search, WindowOptions(**options))
 
     return world, folder, run, run("windows", size=12, overlap=4)
 

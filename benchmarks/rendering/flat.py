@@ -223,7 +223,7 @@ def skirting_with_doors(size: tuple[float, float, float], doors: Walls) -> list[
 
 
 def fixed_parts(rng: Rng, size: tuple[float, float, float], doors: Walls) -> list[Part]:
-    """Background furniture and things on the walls, none of them in front of an opening."""
+    """Background furniture and objects on the walls, none of them in front of an opening."""
     quarter = int(rng.choice([1, 3]))  # the window is in the north or south wall: a wall outside
     turn = rotation_z(quarter * np.pi / 2)
     candidates = [moved(p, turn, np.zeros(3)) for p in fixed_furniture((size[1], size[0], size[2]))]
@@ -231,18 +231,18 @@ def fixed_parts(rng: Rng, size: tuple[float, float, float], doors: Walls) -> lis
     kept = list(openings)
     zones = door_zones(size, doors)
     for group in touching_groups(candidates):
-        own = [candidates[i] for i in group]
+        parts = [candidates[i] for i in group]
         high = DOOR_M[1] + 0.2
-        if not overlap(rectangles(own, (0.05, high)), zones, 0.0):
-            kept += own
+        if not overlap(rectangles(parts, (0.05, high)), zones, 0.0):
+            kept += parts
     beside = rectangles(kept, (0.3, 3.0))
     for _ in range(2):
-        things = wall_objects(rng, size)
-        for first in range(0, len(things), 6):  # boxes of six quads
-            own = things[first : first + 6]
-            taken = rectangles(own, (0.05, 3.0))
+        on_walls = wall_objects(rng, size)
+        for first in range(0, len(on_walls), 6):  # boxes of six quads
+            parts = on_walls[first : first + 6]
+            taken = rectangles(parts, (0.05, 3.0))
             if not (overlap(taken, zones, 0.0) or overlap(taken, beside, 0.02)):
-                kept += own
+                kept += parts
                 beside = np.concatenate([beside, taken])
     return kept + skirting_with_doors(size, doors)
 
@@ -322,7 +322,7 @@ def furnish_group(
 
     Args:
         corners: of `model_corners`.
-        taken: rectangles (A, 4) of fixed things, and (B, 4) of other groups and door zones.
+        taken: rectangles (A, 4) of fixed furniture, and (B, 4) of other groups and door zones.
     """
     fixed, others = taken
     half = np.array(size[:2]) / 2 - 0.09  # pictures hang behind the furniture
@@ -496,7 +496,9 @@ def make_flat(config: RoomConfig, count: int) -> Flat:
         (t.shape[0] + 2 * ATLAS_PAD) * (t.shape[1] + 2 * ATLAS_PAD) for t in textures.values()
     )
     if area > 0.8 * FLAT_ATLAS_WIDTH * ATLAS_LIMIT:
-        raise ValueError("the textures of so many rooms do not fit: use fewer --texels")
+        raise ValueError(
+            "the textures of all rooms do not fit: use fewer --texels, or fewer --rooms"
+        )
     atlas, rects = build_atlas(textures, FLAT_ATLAS_WIDTH)
     del textures
     windows: dict[str, list[list[float]]] = {}

@@ -21,7 +21,7 @@ class FrameOptions:
     """How many frames of a video are informative.
 
     Attributes:
-        all_of: videos of at most so many frames are used whole; of longer ones as many at least.
+        all_of: videos of at most this number of frames are used whole; of longer ones at least it.
         same_direction_deg: viewing rays of an object within this angle see it from one side.
         identity_frames: least number of chosen frames of each identity of the tracker, so that an
             object that is seen briefly has enough views.

@@ -15,7 +15,7 @@ def ignore(phase: str, fraction: float = 1.0) -> None:
 
 
 def _seconds(frames: int) -> dict[str, dict[str, float]]:
-    """Estimate the seconds of the phases of a component with so many posed frames.
+    """Estimate the seconds of the phases of a component from the number of its posed frames.
 
     Measured on videos of 100 to 18,000 frames; only the ratios count. Of more than 600 frames most
     phases use those that are informative, 600 if the camera returns. The rounds are the least

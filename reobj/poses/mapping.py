@@ -99,8 +99,8 @@ class MapperSearch:
         ids: of the keyframes in the order of time. frames: their numbers in the video, for
             messages. pairs: their verified matches.
         focal: of all images, as far as it is known before mapping. guess: used in its place where
-            the matches no longer determine it. options: of the checks and of the choice. show: is
-        called with the name of the attempt, the number of registered images and of all.
+            the matches no longer determine it. options: of the checks and of the choice.
+        show: is called with the name of the attempt, the number of registered images and of all.
     """
 
     def __init__(

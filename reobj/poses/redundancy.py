@@ -1,7 +1,7 @@
 """Keyframes of a long video that repeat the view of an earlier one: they are not mapped.
 
-A camera that comes back takes keyframes of mapped places again. They add little to a model but
-time: a mapper takes longer for each image that is in it. They are registered by PnP after mapping.
+A camera that comes back takes keyframes of views that are mapped already. They add little to a
+model, and a mapper takes longer for each image in it. They are registered by PnP after mapping.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ class RedundancyOptions:
     """When a keyframe repeats the view of an earlier one.
 
     Attributes:
-        map_all_of: so many keyframes are all mapped (chosen: their mapping takes a minute).
-        map_more_to: where more are mapped already, those that are added in a second attempt are
-            only registered (chosen: to map them takes minutes).
+        map_all_of: up to this number all keyframes are mapped (chosen: it takes a minute).
+        map_more_to: keyframes that are added in a second attempt are all mapped, but only
+            registered where more than this number are mapped already (chosen: it takes minutes).
         flow: median displacement of the matches, over the width: half of that between consecutive
             keyframes (`FlowOptions.max_flow`).
         matches: verified ones, which register a keyframe with certainty (chosen: three times those
@@ -72,11 +72,16 @@ def find_repeated(
         return {number: number for number in ids}
     view_of = dict(before or {})
     new = [number for number in ids if number not in view_of]
+    mapped = sum(number == view for number, view in view_of.items())
+    if before and mapped <= options.map_more_to:  # they are where the steps were too wide
+        extract(new)
+        return view_of | {number: number for number in new}
     first = [*ids[::2], *ids[1::2][-1:]] if is_video and not before else new
     extract(first)
     compared = {*first, *(number for number, view in view_of.items() if view)}
     words = visual_words(database, sorted(compared), seed)
-    search = _ViewSearch(database, words, view_of, width, seed, options)
+    limit_px = np.inf if before else options.flow * width
+    search = _ViewSearch(database, words, view_of, limit_px, seed, options)
 
     def add(numbers: Sequence[int], step: str) -> None:
         for start in range(0, len(numbers), options.block):
@@ -101,6 +106,7 @@ class _ViewSearch:
 
     Attributes:
         words: (W, 128) of `features.visual_words`. view_of: as of `find_repeated`, is extended.
+        limit_px: largest displacement of a repeated view; infinite: no further one is mapped.
         mapped: keyframes to map. vlad: (M, D) of them.
     """
 
@@ -109,7 +115,7 @@ class _ViewSearch:
         database: Path,
         words: Floats,
         view_of: dict[int, int],
-        width: int,
+        limit_px: float,
         seed: int,
         options: RedundancyOptions,
     ) -> None:
@@ -121,8 +127,7 @@ class _ViewSearch:
         self.keypoints: dict[int, Array] = {}
         self.mapped = np.array([i for i, view in view_of.items() if i == view], np.int64)
         self.vlad = vlad_vectors(database, self.mapped.tolist(), words)
-        is_enough = len(self.mapped) > options.map_more_to
-        self.limit_px = np.inf if is_enough else options.flow * width  # of the displacement
+        self.limit_px = limit_px
 
     def add(self, block: Sequence[int]) -> None:
         """Find whether some keyframes repeat the view of one that is mapped already."""

@@ -36,7 +36,7 @@ from reobj.poses.features import (
     vlad_vectors,
 )
 from reobj.poses.keyframes import choose_posed_keyframes, path_steps, sharpest_images
-from reobj.poses.mapping import Focal, estimate_focal, without_poses
+from reobj.poses.mapping import Focal, MapperSearch, estimate_focal, without_poses
 from reobj.poses.redundancy import find_repeated, register
 from reobj.poses.verification import FocalSource
 from reobj.poses.windows import map_keyframes
@@ -311,7 +311,8 @@ def _map_job(folder: Path, job: dict[str, Any], images: ImageFile) -> None:
         extract_features(database, images.select(rows), chosen, boxes, camera)
 
     before = load_cached(folder / "views.json", load_json) or {}
-    before = {int(i): view for i, view in before.items() if int(i) in row_of and view in {0, *ids}}
+    known = {0, *ids}
+    before = {int(i): view for i, view in before.items() if {int(i), view} <= known}
     view_of = find_repeated(database, ids, extract, size[0], seed, job["is_video"], before)
     with atomic(folder / "views.json") as part:
         part.write_text(json.dumps(view_of))
@@ -326,7 +327,8 @@ def _map_job(folder: Path, job: dict[str, Any], images: ImageFile) -> None:
     pairs = every_pair.only(mapped)
     frames = {number: job["frames"][row_of[number]] for number in mapped}
     focal = Focal(guess, FocalSource.GIVEN) if is_given else estimate_focal(pairs, size, guess)
-    models, messages, weak = map_keyframes(database, frames, pairs, focal, guess, seed)
+    search = MapperSearch(database, frames, pairs, focal, guess, seed)
+    models, messages, weak = map_keyframes(search)
     for model in models:
         inside = set(model.reg_image_ids())
         repeated = [i for i in ids if view_of[i] in inside and view_of[i] != i]

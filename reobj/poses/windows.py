@@ -30,7 +30,7 @@ from reobj.files import atomic, load_cached, load_json
 from reobj.poses.bundle import INLIER_PX, adjusted, read_arrays
 from reobj.poses.child_job import send_progress
 from reobj.poses.features import MatchedPairs
-from reobj.poses.mapping import Focal, MapperSearch, models_of_one_camera, without_poses
+from reobj.poses.mapping import MapperSearch, models_of_one_camera, without_poses
 from reobj.poses.verification import FocalSource
 from reobj.types import Array, IntArray
 
@@ -82,13 +82,7 @@ def split(ids: Sequence[int], options: WindowOptions = WindowOptions()) -> list[
 
 
 def map_keyframes(
-    database: Path,
-    frames: dict[int, int],
-    pairs: MatchedPairs,
-    focal: Focal,
-    guess: float,
-    seed: int,
-    options: WindowOptions = WindowOptions(),
+    search: MapperSearch, options: WindowOptions = WindowOptions()
 ) -> tuple[list[Any], list[str], list[int]]:
     """Map keyframes: at once, or in windows whose models are joined.
 
@@ -96,20 +90,18 @@ def map_keyframes(
     continues from there.
 
     Args:
-        database: with the features and verified matches. frames: number of each keyframe by its id,
-            in the order of time. pairs: the matches. focal, guess, seed: of `MapperSearch`.
+        search: with all keyframes; its database has their features and verified matches.
     Returns:
         models of the components, the largest first ([]: none is sound); messages; keyframes whose
         windows alone do not determine their poses, to be registered in the joined models.
     """
-    search = MapperSearch(database, frames, pairs, focal, guess, seed)
-    windows = split(_path(list(frames), pairs), options)
+    ids = list(search.ids)
+    folder = search.database.parent
+    windows = split(_path(ids, search.pairs), options)
     if len(windows) == 1:
-        models, found = _kept(database.parent / "whole", list(frames), lambda: _run(search))
+        models, found = _kept(folder / "whole", ids, lambda: _run(search))
         return models, [*found["messages"], *found["lost"]], []
-    models, found = _kept(
-        database.parent / "all", list(frames), lambda: _map_windows(windows, search, options)
-    )
+    models, found = _kept(folder / "all", ids, lambda: _map_windows(windows, search, options))
     return models, found["messages"], found["weak"]
 
 
