@@ -380,9 +380,9 @@ def test_a_video_that_goes_back_and_forth_is_mapped_once(tmp_path, monkeypatch):
             sfm._do_job(tmp_path / "mapping")
             return ""
 
-    def note(database, frames, *args):
-        mapped.append(list(frames.values()))
-        return map_keyframes(database, frames, *args)
+    def note(search):
+        mapped.append(list(search.frames.values()))
+        return map_keyframes(search)
 
     few = functools.partial(find_repeated, options=RedundancyOptions(map_all_of=8, block=4))
     monkeypatch.setattr(sfm, "find_repeated", few)
