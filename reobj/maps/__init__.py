@@ -1,0 +1,1 @@
+"""Map of a room: objects that keep their numbers over several recordings."""
