@@ -135,8 +135,11 @@ class MapperSearch:
             focal length; messages about keyframes without poses.
         """
         zooms = list[tuple[int, int, float]]()
+        is_path = self.pairs.in_order(self.ids)
         for _ in range(3):  # each without the images of other focal lengths found before
             best, messages = self._best()
+            if not is_path:  # photos: the one before does not show the same points
+                break
             known = [c for c in best if c.focal_source is not FocalSource.GUESS]
             # with little parallax a zoom cannot be observed
             known = [c for c in known if not c.problem] or known
