@@ -127,7 +127,10 @@ GUESS, MATCHES = Focal(0.8, FocalSource.GUESS), Focal(0.8, FocalSource.MATCHES)
 def search(monkeypatch):
     """A model search over 30 keyframes with mapper outputs set by the test: `search.made`."""
     pairs = MatchedPairs(
-        np.array([[1, 2]]), [np.zeros((1000, 2))], dict.fromkeys(range(1, 31)), np.ones((1, 3, 3))
+        np.column_stack([np.arange(1, 30), np.arange(2, 31)]),  # a path
+        [np.zeros((34, 2))] * 29,
+        dict.fromkeys(range(1, 31)),
+        np.ones((29, 3, 3)),
     )
     frames = {i: 10 * i for i in range(1, 31)}
     search = MapperSearch(Path("database.db"), frames, pairs, GUESS, 0.8, 0)
@@ -231,6 +234,21 @@ def test_a_focal_length_that_keeps_changing_is_refused(search, monkeypatch):
     models, _, (message,) = search.run()
     assert models == [] and "the focal length keeps changing" in message
     assert len(search.ran) == 3
+
+
+def test_photos_without_an_order_have_no_zoom(search, monkeypatch):
+    """The photo before one in the list does not show the same points: their errors are no zoom."""
+    asked = []
+    monkeypatch.setattr(
+        mapping, "constant_focal", lambda a, _: (asked.append(a) or np.array([1]), [(1, 2, 1.4)])
+    )
+    ids = np.column_stack([np.arange(1, 21), np.arange(10, 30)])  # photos 9 apart match
+    matches = [np.zeros((50, 2), np.int64)] * 20
+    search.pairs = MatchedPairs(ids, matches, dict.fromkeys(range(1, 31)), fundamental(0.9, 20))
+    search.focal = MATCHES
+    search.made = [component(1, 30)]
+    models, messages, _ = search.run()
+    assert asked == [] and messages == [] and len(models) == 1
 
 
 def test_after_a_zoom_the_kept_images_determine_the_focal_length(search, monkeypatch):

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from reobj.cameras import import_pycolmap
 from reobj.files import spans
@@ -135,14 +136,11 @@ class MapperSearch:
             focal length; messages about keyframes without poses.
         """
         zooms = list[tuple[int, int, float]]()
+        # in photos without an order the one before does not show the same points
+        is_path = self.pairs.in_order(self.ids)
         for _ in range(3):  # each without the images of other focal lengths found before
             best, messages = self._best()
-            known = [c for c in best if c.focal_source is not FocalSource.GUESS]
-            # with little parallax a zoom cannot be observed
-            known = [c for c in known if not c.problem] or known
-            others, changes = constant_focal(
-                [component.arrays for component in known], self.options.zoom
-            )
+            others, changes = self._other_focal(best) if is_path else (np.empty(0), [])
             if not len(others):
                 break
             zooms += changes
@@ -184,6 +182,15 @@ class MapperSearch:
                     f"{component.problem}"
                 )
         return models_of_one_camera(sound), messages, lost
+
+    def _other_focal(
+        self, components: list[Component]
+    ) -> tuple[npt.NDArray[Any], list[tuple[int, int, float]]]:
+        """Find images of another focal length than most, and the changes (`constant_focal`)."""
+        known = [c for c in components if c.focal_source is not FocalSource.GUESS]
+        # with little parallax a zoom cannot be observed
+        known = [c for c in known if not c.problem] or known
+        return constant_focal([component.arrays for component in known], self.options.zoom)
 
     def _match_counts(self) -> str:
         """Describe the matches of the keyframes for a message."""
