@@ -46,7 +46,7 @@ def extract_features(
         cv2.setNumThreads(1)
         if todo:
             send_progress("features", 0, len(todo))
-        features = pool.map(lambda k: _root_sift(images[k], np.array(boxes[k])), todo)
+        features = pool.map(lambda k: root_sift(images[k], np.array(boxes[k])), todo)
         for done, (k, (xy, descriptors)) in enumerate(zip(todo, features, strict=True), 1):
             if not db.exists_image(ids[k]):
                 image = pc.Image(name=f"{ids[k]:06d}", camera_id=1, image_id=ids[k])
@@ -62,7 +62,7 @@ def extract_features(
         cv2.setNumThreads(threads)
 
 
-def _root_sift(bgr: Image, boxes: Array) -> tuple[npt.NDArray[np.float32], Image]:
+def root_sift(bgr: Image, boxes: Array) -> tuple[npt.NDArray[np.float32], Image]:
     """Detect features outside the boxes and describe them by RootSIFT.
 
     Args:

@@ -1,0 +1,552 @@
+"""Place a recording in a map: match features to the map's points, PnP, one similarity a component.
+
+Each chosen image is matched to the points of the map (one descriptor a point) and located by PnP.
+The images of a component of the trajectory must agree on one similarity transform from its world
+to that of the map; the component is then moved as a whole. Its cameras relative to each other stay
+as they are.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import least_squares
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from reobj.cameras import Camera, Poses, import_pycolmap, invert_rigid
+from reobj.files import Progress
+from reobj.maps.room_map import MapPoints
+from reobj.poses.features import root_sift
+from reobj.sources.video import Video, shrunk
+from reobj.types import Array, BoolArray, Floats, Image, IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class PlacementOptions:
+    """When images, components and recordings are placed in a map.
+
+    Attributes:
+        size_px: longer side of the images for features, as in the reconstruction.
+        images: of a component that are matched to the map; more take longer.
+        ratio: largest ratio of angles to the best and to the second best point of the map that
+            lies elsewhere (Lowe, IJCV 2004).
+        elsewhere: distance of such a point, over that of the best one from the camera.
+        error_px: largest error of an inlier of PnP, px of the shrunk image (COLMAP: 4; 12 for
+            localisation: two reconstructions deform differently).
+        inliers: least of an image that counts. Measured in ../shared/map.md: wrong images had at
+            most 9, right ones at least 23.
+        frames: least images that agree on one similarity; of few images, half.
+        turn_deg, shift: largest difference of the camera's orientation and position (over the
+            median depth of its points) between PnP and the similarity.
+        rival: fraction of the images that agree, in another placement, that makes both ambiguous.
+    """
+
+    size_px: int = 640
+    images: int = 60
+    ratio: float = 0.8
+    elsewhere: float = 0.03
+    error_px: float = 6.0
+    inliers: int = 15
+    frames: int = 5
+    turn_deg: float = 5.0
+    shift: float = 0.1
+    rival: float = 0.5
+
+
+# ---- Features ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class ImageFeatures:
+    """Features of an image.
+
+    Attributes:
+        row: of the frame in the poses. xy: (n, 2) native pixels, COLMAP's. descriptor: (n, 128).
+    """
+
+    row: int
+    xy: Array
+    descriptor: npt.NDArray[np.uint8]
+
+
+def image_features(
+    poses: Poses, video: Video, options: PlacementOptions, line: Progress, most: int = 200
+) -> list[ImageFeatures]:
+    """Extract RootSIFT features of images spread over the keyframes of each component.
+
+    Without observed points: over all frames.
+
+    Args:
+        most: images; more cover long recordings more densely and take longer.
+    """
+    rows = np.unique(poses.visibility[:, 0])
+    rows = rows[poses.measured[rows]] if len(rows) else np.arange(len(poses.frame))
+    step = max(1, -(-len(rows) // most))
+    row_of = {int(poses.frame[row]): int(row) for row in rows[::step]}
+    size = np.array(video.size, np.float64)
+
+    def describe(pair: tuple[int, Image]) -> ImageFeatures:
+        row, image = pair
+        xy, descriptor = root_sift(image, np.empty((0, 4)))
+        return ImageFeatures(row, xy * (size / image.shape[1::-1]), descriptor)
+
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    found = list[ImageFeatures]()
+    images = (
+        (row_of[frame.index], shrunk(frame.image, options.size_px))
+        for frame in video
+        if frame.index in row_of
+    )
+    with ThreadPoolExecutor(2) as pool:
+        while batch := list(itertools.islice(images, 8)):
+            found += pool.map(describe, batch)
+            line.step(len(batch))
+    line.close()
+    cv2.setNumThreads(threads)
+    return found
+
+
+def points_with_descriptors(
+    poses: Poses, features: Sequence[ImageFeatures], session: int, most: int = 20_000
+) -> MapPoints:
+    """Describe the sparse points of a recording by the mean descriptor of their keypoints.
+
+    A keypoint belongs to the observed point that projects within 1.5 px (of images of 640 px) of
+    it.
+
+    Args:
+        session: number. most: points; those in most images are kept.
+    """
+    count = len(poses.points)
+    sums = np.zeros((count, 128), np.float32)
+    ray = np.zeros((count, 3))
+    number = np.zeros(count, np.int64)
+    distance = np.zeros(count)
+    order = np.argsort(poses.visibility[:, 0], kind="stable")
+    frame_row, point = poses.visibility[order].T
+    centre = invert_rigid(poses.cam_from_world)[:, :, 3]
+    camera = poses.camera.to_pycolmap()
+    near_px = 1.5 * max(poses.camera.width, poses.camera.height) / 640
+    for image in features:
+        if not len(image.xy):
+            continue
+        first, last = np.searchsorted(frame_row, (image.row, image.row + 1))
+        seen = point[first:last]
+        pose = poses.cam_from_world[image.row]
+        in_cam = poses.points[seen] @ pose[:, :3].T + pose[:, 3]
+        seen = seen[in_cam[:, 2] > 0]
+        if not len(seen):
+            continue
+        xy = np.asarray(camera.img_from_cam(in_cam[in_cam[:, 2] > 0]), np.float64).reshape(-1, 2)
+        gap, keypoint = cKDTree(image.xy).query(xy)
+        seen = seen[gap < near_px]
+        keypoint = keypoint[gap < near_px]
+        sums[seen] += _unit(image.descriptor[keypoint])
+        away = poses.points[seen] - centre[image.row]
+        length = np.linalg.norm(away, axis=1)
+        ray[seen] += away / length[:, None]
+        distance[seen] += length
+        number[seen] += 1
+    kept = np.argsort(-number, kind="stable")[:most]
+    kept = np.sort(kept[number[kept] > 0])
+    mean = _unit(sums[kept]) * 512
+    rays = ray[kept] / np.linalg.norm(ray[kept], axis=1, keepdims=True).clip(1e-9)
+    return MapPoints(
+        poses.points[kept],
+        np.minimum(mean, 255).astype(np.uint8),
+        np.full(len(kept), session),
+        np.zeros(len(kept), np.int64),
+        rays,
+        distance[kept] / number[kept],
+    )
+
+
+def _unit(rows: npt.NDArray[np.generic]) -> Floats:
+    """Scale descriptors to unit length."""
+    values = rows.astype(np.float32)
+    return np.asarray(values / np.linalg.norm(values, axis=1, keepdims=True).clip(1e-9))
+
+
+# ---- Images in the map -------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class LocatedImage:
+    """An image that PnP located in the map.
+
+    Attributes:
+        row: of the frame in the poses. cam_from_map: (3, 4).
+        xy: (n, 2) native pixels of its inliers. point: (n,) rows of the map's points.
+        depth: median depth of these.
+        matches: before PnP. in_view: points of the map that the image should show again: in it,
+            seen from a similar direction and distance before.
+    """
+
+    row: int
+    cam_from_map: Array
+    xy: Array
+    point: IntArray
+    depth: float
+    matches: int
+    in_view: int
+
+
+class PointMatcher:
+    """Matches the features of an image to the points of a map.
+
+    Args:
+        points: N, of the map.
+    """
+
+    def __init__(self, points: MapPoints, options: PlacementOptions) -> None:
+        self.points = points
+        self.options = options
+        self.descriptor = _unit(points.descriptor)
+
+    def match(self, image: ImageFeatures) -> tuple[IntArray, IntArray]:
+        """Return rows of features (n,) and of points (n,) that match by the ratio test.
+
+        The second best point is the best of those that lie elsewhere: a point may be in the map
+        several times, from several sessions. Each point keeps its best feature.
+        """
+        few = 6  # best points of a feature, among which one elsewhere is looked for
+        if len(image.xy) < 2 or len(self.points) <= few:
+            return np.empty(0, np.int64), np.empty(0, np.int64)
+        cosine = _unit(image.descriptor) @ self.descriptor.T  # (n, N)
+        best = np.argpartition(-cosine, few, axis=1)[:, :few]  # (n, few)
+        value = np.take_along_axis(cosine, best, 1)
+        order = np.argsort(-value, axis=1)
+        best = np.take_along_axis(best, order, 1)
+        angle = np.arccos(np.take_along_axis(value, order, 1).clip(-1, 1))  # (n, few)
+        apart = np.linalg.norm(self.points.xyz[best] - self.points.xyz[best[:, :1]], axis=2)
+        elsewhere = apart > self.options.elsewhere * self.points.distance[best[:, :1]]
+        second = np.where(elsewhere, angle, np.inf).min(1)
+        second = np.minimum(second, np.where(elsewhere.any(1), np.inf, angle[:, -1]))
+        good = np.flatnonzero((angle[:, 0] < self.options.ratio * second) & (angle[:, 0] < 0.9))
+        nearest = good[np.argsort(angle[good, 0], kind="stable")]
+        _, first = np.unique(best[nearest, 0], return_index=True)
+        feature = np.sort(nearest[first])
+        return feature, best[feature, 0]
+
+    def locate(self, image: ImageFeatures, camera: Camera) -> LocatedImage | None:
+        """Locate an image by PnP on its matches; None with too few inliers."""
+        options = self.options
+        feature, point = self.match(image)
+        if len(feature) < options.inliers:
+            return None
+        xy = image.xy[feature]
+        xyz = self.points.xyz[point]
+        scale = max(camera.width, camera.height) / options.size_px
+        ransac = {"max_error": options.error_px * max(scale, 1.0), "random_seed": 0}
+        estimate = import_pycolmap().estimate_and_refine_absolute_pose(
+            xy, xyz, camera.to_pycolmap(), estimation_options={"ransac": ransac}
+        )
+        if estimate is None:
+            return None
+        pose = np.asarray(estimate["cam_from_world"].matrix(), np.float64)
+        inlier = np.asarray(estimate["inlier_mask"], bool)
+        depth = xyz @ pose[2, :3] + pose[2, 3]
+        inlier &= depth > 0
+        if inlier.sum() < options.inliers or not np.isfinite(pose).all():
+            return None
+        return LocatedImage(
+            image.row, pose, xy[inlier], point[inlier], float(np.median(depth[inlier])),
+            len(feature), int(self.in_view(pose, camera).sum()),
+        )  # fmt: skip
+
+    def in_view(self, cam_from_map: Array, camera: Camera) -> BoolArray:
+        """Mark points (N,) in an image that were seen from a similar direction and distance.
+
+        Similar: less than 30 degrees and a factor 1.5 apart, where SIFT is repeatable
+        (Mikolajczyk et al., IJCV 2005).
+        """
+        points = self.points
+        in_cam = points.xyz @ cam_from_map[:, :3].T + cam_from_map[:, 3]
+        length = np.linalg.norm(in_cam, axis=1)
+        z = np.where(in_cam[:, 2] > 1e-9, in_cam[:, 2], np.nan)
+        xy = in_cam[:, :2] / z[:, None] @ camera.K[:2, :2].T + camera.K[:2, 2]
+        inside = ((xy > 0) & (xy < (camera.width, camera.height))).all(1)
+        ray = in_cam @ cam_from_map[:, :3] / length[:, None].clip(1e-9)  # in map axes
+        turned = (ray * points.viewing_ray).sum(1) > np.cos(np.radians(30))
+        near = np.abs(np.log(length.clip(1e-9) / points.distance.clip(1e-9))) < np.log(1.5)
+        return np.asarray(inside & turned & near, bool)
+
+
+# ---- One similarity a component ----------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Similarity:
+    """Similarity transform map_from_session: x_map = scale * rotation @ x + translation.
+
+    Attributes:
+        cov: (7, 7) of (rotation vector, translation, log scale) of a transform applied after it, in
+            the world of the map.
+    """
+
+    scale: float
+    rotation: Array
+    translation: Array
+    cov: Array
+
+    def apply(self, xyz: Array) -> Array:
+        """Transform points (..., 3)."""
+        return np.asarray(self.scale * xyz @ self.rotation.T + self.translation)
+
+    def poses(self, cam_from_session: Array) -> Array:
+        """Transform poses (F, 3, 4) of cameras; their unit of length becomes the map's."""
+        rotation = cam_from_session[:, :, :3] @ self.rotation.T
+        moved = self.scale * cam_from_session[:, :, 3] - rotation @ self.translation
+        return np.concatenate([rotation, moved[:, :, None]], 2)
+
+
+@dataclass(frozen=True, slots=True)
+class ComponentPlacement:
+    """How a component of the trajectory was placed in the map, or why it was not.
+
+    Attributes:
+        similarity: None: refused. images: that agree. tried: images compared. reason: of a refusal.
+        support: fraction of the points in view that were found again, median over the images.
+    """
+
+    similarity: Similarity | None
+    images: tuple[LocatedImage, ...]
+    tried: int
+    reason: str = ""
+    support: float = 0.0
+
+
+def place_component(
+    poses: Poses,
+    features: Sequence[ImageFeatures],
+    matcher: PointMatcher,
+    options: PlacementOptions,
+) -> ComponentPlacement:
+    """Place a component of the trajectory in the map.
+
+    Args:
+        poses: of the whole recording. features: of images of this component.
+    """
+    step = max(1, -(-len(features) // options.images))
+    tried = features[::step]
+    with ThreadPoolExecutor(2) as pool:
+        found = list(pool.map(lambda image: matcher.locate(image, poses.camera), tried))
+    located = [image for image in found if image is not None]
+    needed = max(2, min(options.frames, -(-len(tried) // 2)))
+    if len(located) < needed:
+        reason = (
+            f"{len(located)} of {len(tried)} images match points of the map, {needed} are needed"
+        )
+        return ComponentPlacement(None, tuple(located), len(tried), reason)
+    guess, agrees, rival = _agreement(poses, located, options)
+    agreeing = [image for image, good in zip(located, agrees, strict=True) if good]
+    count = f"{len(agreeing)} of {len(tried)} images agree on a position in the map"
+    if guess is None or len(agreeing) < max(needed, 0.1 * len(tried)):
+        reason = f"{count}, {needed} are needed"
+        return ComponentPlacement(None, tuple(agreeing), len(tried), reason)
+    if rival >= max(2, options.rival * len(agreeing)):
+        reason = f"two positions in the map are alike ({len(agreeing)} and {rival} images)"
+        return ComponentPlacement(None, tuple(agreeing), len(tried), reason)
+    similarity = _refined(guess, poses, agreeing, matcher.points.xyz)
+    support = float(np.median([len(im.point) / max(im.in_view, 1) for im in agreeing]))
+    return ComponentPlacement(similarity, tuple(agreeing), len(tried), support=support)
+
+
+def _agreement(
+    poses: Poses, images: Sequence[LocatedImage], options: PlacementOptions
+) -> tuple[Similarity | None, BoolArray, int]:
+    """Find the similarity on which most images agree.
+
+    Each pair of images with a baseline is a hypothesis: rotation of one, scale and translation of
+    both.
+
+    Returns:
+        the similarity; (L,) images that agree; images that agree on the best placement elsewhere
+        (by more than a fifth of the depth or .3 rad).
+    """
+    row = np.array([image.row for image in images])
+    depth = np.array([image.depth for image in images])  # (L,) map units
+    in_map = invert_rigid(np.stack([image.cam_from_map for image in images]))  # (L, 3, 4)
+    in_session = invert_rigid(poses.cam_from_world[row])
+    turn = in_map[:, :, :3] @ np.swapaxes(in_session[:, :, :3], 1, 2)  # (L, 3, 3)
+    a = in_session[:, :, 3]
+    b = in_map[:, :, 3]
+    i, j = np.nonzero(~np.eye(len(images), dtype=bool))
+    length_a = np.linalg.norm(a[i] - a[j], axis=1)
+    length_b = np.linalg.norm(b[i] - b[j], axis=1)
+    usable = (length_b > 0.02 * depth[i]) & (length_a > 0)  # a shorter baseline gives no scale
+    i = i[usable]
+    j = j[usable]
+    if not len(i):
+        return None, np.zeros(len(images), bool), 0
+    if len(i) > 3000:
+        chosen = np.linspace(0, len(i) - 1, 3000).astype(int)
+        i = i[chosen]
+        j = j[chosen]
+        length_a, length_b = (x[usable][chosen] for x in (length_a, length_b))
+    else:
+        length_a, length_b = (x[usable] for x in (length_a, length_b))
+    scale = length_b / length_a  # (H,)
+    rotation = turn[i]
+    shift = b[i] - scale[:, None] * np.einsum("hij,hj->hi", rotation, a[i])
+    predicted = scale[:, None, None] * np.einsum("hij,lj->hli", rotation, a) + shift[:, None]
+    off = np.linalg.norm(predicted - b, axis=2) / depth  # (H, L)
+    cosine = (np.einsum("hij,lij->hl", rotation, turn) - 1) / 2
+    good = (off < options.shift) & (cosine > np.cos(np.radians(options.turn_deg)))
+    best = int(np.argmax(good.sum(1) - 0.5 * np.where(good, off / options.shift, 0).mean(1)))
+    middle = predicted[best]
+    apart = np.linalg.norm(predicted - middle, axis=2).min(1) / np.median(depth) > 0.2
+    other_turn = (np.einsum("hij,ij->h", rotation, rotation[best]) - 1) / 2 < np.cos(0.3)
+    rival = int(good[apart | other_turn].sum(1).max(initial=0))
+    guess = Similarity(float(scale[best]), rotation[best], shift[best], np.zeros((7, 7)))
+    return guess, good[best], rival
+
+
+def _refined(
+    guess: Similarity, poses: Poses, images: Sequence[LocatedImage], xyz: Array
+) -> Similarity:
+    """Minimise the reprojection errors of the map's points in the moved cameras.
+
+    The covariance is that of M-estimation with one cluster an image ("sandwich"): the errors of an
+    image have common causes, such as the deformation of its reconstruction.
+    """
+    image = np.repeat(np.arange(len(images)), [len(im.point) for im in images])
+    points = xyz[np.concatenate([im.point for im in images])]  # (n, 3) in the map
+    xy = poses.camera.undistort(np.concatenate([im.xy for im in images]))
+    pose = poses.cam_from_world[[im.row for im in images]]  # (L, 3, 4)
+    K = poses.camera.K
+    origin = points.mean(0)  # rotation and scale about it are independent of the translation
+    known = np.isfinite(xy).all(1)
+    image = image[known]
+    points = points[known]
+    xy = xy[known]
+
+    def moved(x: Array) -> tuple[float, Array, Array]:
+        """Return the similarity with a correction about the origin applied."""
+        turn = Rotation.from_rotvec(x[:3]).as_matrix()
+        grow = float(np.exp(x[6]))
+        rotation = turn @ guess.rotation
+        translation = grow * turn @ (guess.translation - origin) + origin + x[3:6]
+        return guess.scale * grow, rotation, translation
+
+    def residual(x: Array) -> Array:
+        scale, rotation, translation = moved(x)
+        in_session = (points - translation) @ rotation / scale
+        in_cam = np.einsum("nij,nj->ni", pose[image][:, :, :3], in_session) + pose[image][:, :, 3]
+        depth = np.where(in_cam[:, 2] > 1e-9, in_cam[:, 2], 1e-9)
+        found = in_cam[:, :2] / depth[:, None] @ K[:2, :2].T + K[:2, 2]
+        return np.asarray((found - xy).clip(-1e4, 1e4).ravel())
+
+    spread = float(np.linalg.norm(points - origin, axis=1).mean())
+    scales = np.array([1, 1, 1, spread, spread, spread, 1.0])
+    loss_px = 2.0 * max(poses.camera.width, poses.camera.height) / 640
+    fit = least_squares(
+        residual, np.zeros(7), loss="cauchy", f_scale=loss_px, x_scale=scales, max_nfev=50
+    )
+    J = fit.jac.reshape(-1, 2, 7)  # weighted by the loss
+    error = residual(fit.x).reshape(-1, 2)
+    weight = 1 / np.sqrt(1 + (error**2).sum(1, keepdims=True) / loss_px**2)
+    gradient = np.einsum("nij,ni->nj", J, error * weight)  # (n, 7)
+    of_image = np.zeros((len(images), 7))
+    np.add.at(of_image, image, gradient)
+    bread = np.linalg.pinv(np.einsum("nij,nik->jk", J, J))
+    few = len(images) / max(len(images) - 2, 1)  # each image has common errors; few: underestimated
+    cov = few * bread @ (of_image.T @ of_image) @ bread
+    scale, rotation, translation = moved(fit.x)
+    # from a correction about `origin` to one about the origin of the map's world
+    about = np.eye(7)
+    about[3:6, :3] = _cross(origin)
+    about[3:6, 6] = -origin
+    return Similarity(scale, rotation, translation, about @ cov @ about.T)
+
+
+def _cross(v: Array) -> Array:
+    """Return the matrix (3, 3) of the cross product with a vector."""
+    x, y, z = v
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0.0]])
+
+
+# ---- The recording -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """A recording placed in a map.
+
+    Attributes:
+        poses: placed components are one component, the first, in the world of the map; the others
+            follow as they are. components: how each was placed, in their order before.
+        refused: why no component was placed; "": some was.
+    """
+
+    poses: Poses
+    components: tuple[ComponentPlacement, ...]
+    refused: str = ""
+
+    @property
+    def cov(self) -> Array:
+        """(7, 7) of the alignment of the placed component with most images that agree."""
+        placed = [c for c in self.components if c.similarity is not None]
+        best = max(placed, key=lambda c: len(c.images))
+        assert best.similarity is not None
+        return best.similarity.cov
+
+
+def place(
+    poses: Poses,
+    features: Sequence[ImageFeatures],
+    points: MapPoints,
+    options: PlacementOptions | None = None,
+    report: Callable[[int], None] = lambda _: None,
+) -> Placement:
+    """Place the components of a recording in a map.
+
+    Args:
+        features: of some images of each component. points: of the map.
+        report: gets the number of images that were compared.
+    """
+    options = options or PlacementOptions()
+    matcher = PointMatcher(points, options)
+    components = list[ComponentPlacement]()
+    for part in range(poses.part_count):
+        of_part = [im for im in features if poses.part[im.row] == part and poses.known[im.row]]
+        if of_part:
+            components.append(place_component(poses, of_part, matcher, options))
+        else:
+            components.append(ComponentPlacement(None, (), 0, "no image has points"))
+        report(components[-1].tried)
+    placed = [k for k, found in enumerate(components) if found.similarity is not None]
+    if not placed:
+        return Placement(poses, tuple(components), components[0].reason)
+    return Placement(_joined(poses, components, placed), tuple(components))
+
+
+def _joined(
+    poses: Poses, components: Sequence[ComponentPlacement], placed: Sequence[int]
+) -> Poses:
+    """Move the placed components into the world of the map, as one component, the first."""
+    cam_from_world = poses.cam_from_world.copy()
+    points = poses.points.copy()
+    part = np.zeros_like(poses.part)
+    others = [k for k in range(poses.part_count) if k not in placed]
+    for number, k in enumerate(others, 1):
+        part[poses.part == k] = number
+    part_of_point = np.full(len(points), -1)
+    part_of_point[poses.visibility[:, 1]] = poses.part[poses.visibility[:, 0]]
+    for k in placed:
+        similarity = components[k].similarity
+        assert similarity is not None
+        rows = poses.part == k
+        cam_from_world[rows] = similarity.poses(cam_from_world[rows])
+        of_part = part_of_point == k if poses.part_count > 1 else np.ones(len(points), bool)
+        points[of_part] = similarity.apply(points[of_part])
+    return dataclasses.replace(poses, cam_from_world=cam_from_world, points=points, part=part)
