@@ -107,14 +107,32 @@ def test_sizes_that_contradict_are_not_averaged() -> None:
 def test_orientations_that_disagree_are_not_averaged() -> None:
     sure = np.where(np.arange(9) > 5, 0.02, SIGMA)
     a = true_shape(yaw_deg=0)
-    b = true_shape(yaw_deg=40)
     loose = np.where(np.arange(9) > 5, 0.9, SIGMA)
-    for other in (SIGMA, loose):  # more than 3 sigma; more than 30 degrees
+    for yaw_deg, other in ((20, SIGMA), (40, loose)):  # more than 3 sigma; than 30 degrees
+        b = true_shape(yaw_deg=yaw_deg)
         state = state_of(observed(1, "new", b, sigma=other), observed(2, "stayed", a, sigma=sure))
         np.testing.assert_allclose(rotation(state), rotation(a), atol=1e-12)
         sigma = np.sqrt(np.diag(state.cov))
         np.testing.assert_allclose(sigma[6:], 0.02, rtol=1e-6)
         np.testing.assert_allclose(sigma[3:6], 0.05 / np.sqrt(2), rtol=1e-6)
+
+
+def test_third_axis_stays_vertical_where_up_is_known() -> None:
+    """A solid whose axes were named differently is another orientation then."""
+    cycle = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    sigma = np.concatenate([SIGMA[:3], [0.04, 0.05, 0.06], [0.02, 0.03, 0.04]])
+    renamed = np.concatenate([SIGMA[:3], cycle.T @ sigma[3:6], cycle.T @ sigma[6:]])
+    true = true_shape()
+    rows = [
+        observed(1, "new", true, sigma=sigma),
+        observed(2, "stayed", turned(true, cycle), sigma=2 * renamed),
+    ]
+    both = sigma / np.sqrt(1.25)
+    free = state_of(*rows, up=None)
+    np.testing.assert_allclose(np.sqrt(np.diag(free.cov))[3:], both[3:], rtol=1e-6)
+    upright = state_of(*rows)
+    expected = np.concatenate([both[3:6], sigma[6:]])
+    np.testing.assert_allclose(np.sqrt(np.diag(upright.cov))[3:], expected, rtol=1e-6)
 
 
 def test_yaw_of_a_cylinder_is_arbitrary() -> None:
@@ -137,7 +155,7 @@ def test_yaw_of_a_cylinder_is_arbitrary() -> None:
 def test_kind_of_shape_is_that_of_most_views() -> None:
     """Half axes of an ellipsoid and of a box are other quantities: only the centre is shared."""
     box = true_shape()
-    ellipsoid = true_shape(half_axes=(0.25, 0.35, 0.5), support="ellipsoid")
+    ellipsoid = true_shape(half_axes=(0.21, 0.31, 0.46), support="ellipsoid")
     shifted = ellipsoid | {"center": box["center"] + 0.02}
     few = observed(1, "new", shifted, views=3)
     state = state_of(few, observed(2, "stayed", box, views=9))
@@ -241,9 +259,10 @@ def test_embeddings_are_those_of_the_last_model() -> None:
         row(1, (0, 1), 90),
         row(2, (1, 0), 3),
         row(3, (0.6, 0.8), 1),
-        observed(4, "stayed", true_shape()),
+        row(4, (0, -1), 0),
     ]
-    sessions = tuple(a_session(k, embedder="old" if k == 1 else "net") for k in range(1, 5))
+    names = ("old", "net", "net", "newest")
+    sessions = tuple(a_session(k, embedder=name) for k, name in enumerate(names, 1))
     state = state_of(*rows, sessions=sessions)
     mean = np.array([3.6, 0.8]) / np.hypot(3.6, 0.8)
     np.testing.assert_allclose(state.foreground, mean, rtol=1e-6)
