@@ -318,9 +318,7 @@ def _decoded(arrays: dict[str, Any], facts: dict[str, Any]) -> RoomMap:
                 values[name] = arrays[f"observation_{name}"][start : end[row]].astype(np.float32)
             observations.append(Observation(**fields, **values))
             row += 1
-        objects.append(
-            MapObject(entry["id"], tuple(observations), entry["name"], entry["deleted"])
-        )
+        objects.append(MapObject(entry["id"], tuple(observations), entry["name"], entry["deleted"]))
     return RoomMap(
         map_id=facts["map_id"],
         sessions=sessions,
