@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,10 +11,30 @@ from typing import Any
 
 import numpy as np
 
-from reobj.files import atomic, significant
-from reobj.types import Array
+from reobj.files import atomic, load_json, rounded, significant
+from reobj.results.entries import decode
+from reobj.types import Array, ReobjError
 
 HEADER = {"format": "reobj-changes", "version": 1}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shape:
+    """Shape and orientation of an object, without its centre.
+
+    Attributes:
+        support: "box", "cylinder" or "ellipsoid". half_axes: (3,) world units.
+        quat_wxyz: (4,) unit quaternion, world_from_obj.
+    """
+
+    support: str
+    half_axes: Array
+    quat_wxyz: Array
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the `from_shape` of changes.json."""
+        axes = {k: significant(getattr(self, k)).tolist() for k in ("half_axes", "quat_wxyz")}
+        return {"support": self.support, **axes}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,6 +49,7 @@ class Change:
         distance_m: between them, and sigma_m, its standard deviation; None: the scale is unknown.
         evidence: for the decision, in one sentence.
         candidates: of an ambiguous object: numbers that it may have as well.
+        before_shape: at `before`; None: not known. Page and film draw it at the former place.
     """
 
     id: int
@@ -39,19 +60,45 @@ class Change:
     sigma_m: float | None = None
     evidence: str = ""
     candidates: tuple[int, ...] = ()
+    before_shape: Shape | None = None
+
+    @property
+    def name(self) -> str:
+        """Class and number: "chair 6"."""
+        return f"{self.class_name} {self.id}"
 
     def to_json(self) -> dict[str, Any]:
         """Return the entry of changes.json."""
-        entry: dict[str, Any] = {"id": self.id, "class": self.class_name}
-        for key, center in (("from", self.before), ("to", self.after)):
-            entry[key] = None if center is None else significant(center).tolist()
-        for key in ("distance_m", "sigma_m"):
-            value = getattr(self, key)
-            entry[key] = None if value is None else round(float(value), 4)
-        entry["evidence"] = self.evidence
-        if self.candidates:
-            entry["candidates"] = list(self.candidates)
-        return entry
+        return {
+            "id": self.id,
+            "class": self.class_name,
+            "from": None if self.before is None else significant(self.before).tolist(),
+            "to": None if self.after is None else significant(self.after).tolist(),
+            "distance_m": rounded(self.distance_m, 4),
+            "sigma_m": rounded(self.sigma_m, 4),
+            "evidence": self.evidence,
+            "candidates": list(self.candidates),
+            "from_shape": None if self.before_shape is None else self.before_shape.to_json(),
+        }
+
+    def fault(self, kind: str) -> str:
+        """Describe what is missing or contradictory in a change of a kind; "" if nothing is."""
+        wanted = {"moved": ("before", "after"), "gone": ("before",), "new": ("after",)}
+        for name in wanted.get(kind, ()):
+            if getattr(self, name) is None:
+                place = {"before": "from", "after": "to"}[name]
+                return f"{self.name} is {kind} without a position {place!r}"
+        if min(self.distance_m or 0, self.sigma_m or 0) < 0:
+            return f"{self.name} has a negative distance or sigma"
+        shape = self.before_shape
+        if shape is None:
+            return ""
+        if self.before is None or shape.support not in ("box", "cylinder", "ellipsoid"):
+            return f"{self.name} has a shape {shape.support!r} without position, or of unknown kind"
+        # rounded to six digits its length is off by 1e-6
+        if abs(np.linalg.norm(shape.quat_wxyz) - 1) > 1e-3:
+            return f"quat_wxyz of {self.name} is not of length 1"
+        return ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,15 +106,20 @@ class Changes:
     """Changes between a map and a recording.
 
     Every object of the map is in exactly one of stayed, moved, gone, not_seen; every object of the
-    recording with a shape in exactly one of stayed, moved, new.
+    recording with a shape in exactly one of stayed, moved, new. The number of an object of the
+    recording (`Object.id`) is that of its change, and its world is that of the map.
 
     Attributes:
         map_path, session: of the map, and the name of this recording in it.
         refused: why the recording was not placed in the map; "": it was placed.
         localised_frames, tried_frames: that agree with the map, and that were compared with it.
+        components: components of the trajectory (`Object.part`) that were placed in the map.
         sigma_m: standard deviation of positions due to the alignment with the map, metres.
         stayed, moved, gone, new: changes. not_seen: objects of the map where no view passed.
         ambiguous: objects, listed above too, that another object of the same look may be.
+
+    Raises:
+        ReobjError: an object is in two lists, or its change lacks a position that its kind needs.
     """
 
     map_path: str
@@ -75,6 +127,7 @@ class Changes:
     refused: str = ""
     localised_frames: int = 0
     tried_frames: int = 0
+    components: Sequence[int] = (0,)
     sigma_m: float | None = None
     stayed: Sequence[Change] = field(default_factory=tuple)
     moved: Sequence[Change] = field(default_factory=tuple)
@@ -85,6 +138,25 @@ class Changes:
 
     KINDS = ("stayed", "moved", "gone", "new", "not_seen", "ambiguous")
 
+    def __post_init__(self) -> None:
+        """Check that every object has one change, with the positions of its kind."""
+        each = [(kind, c) for kind in self.KINDS for c in getattr(self, kind)]
+        counts = Counter(c.id for kind, c in each if kind != "ambiguous")
+        faults = [f"object {i} is in {n} lists of changes" for i, n in counts.items() if n > 1]
+        faults += [
+            f"{c.name} is ambiguous and in no other list"
+            for c in self.ambiguous
+            if c.id not in counts
+        ]
+        faults += [fault for kind, c in each if (fault := c.fault(kind))]
+        if faults:
+            raise ReobjError(faults[0])
+
+    def of_objects(self) -> dict[int, tuple[str, Change]]:
+        """Map the number of each object to its kind of change, other than ambiguous, and change."""
+        kinds = [kind for kind in self.KINDS if kind != "ambiguous"]
+        return {c.id: (kind, c) for kind in kinds for c in getattr(self, kind)}
+
     def to_json(self) -> dict[str, Any]:
         """Return the content of changes.json."""
         facts = {
@@ -94,12 +166,13 @@ class Changes:
             "refused": self.refused,
             "localised_frames": self.localised_frames,
             "tried_frames": self.tried_frames,
-            "sigma_m": None if self.sigma_m is None else round(self.sigma_m, 5),
+            "components": list(self.components),
+            "sigma_m": rounded(self.sigma_m, 5),
         }
         return facts | {kind: [c.to_json() for c in getattr(self, kind)] for kind in self.KINDS}
 
     def summary(self) -> str:
-        """Summarise the changes in a line: "12 stayed, 2 moved (chair 6 by .56 m), 9 not seen"."""
+        """Summarise the changes in a line: "12 stayed, 1 moved (chair 6 by 0.56 m)"."""
         if self.refused:
             return f"map {self.map_path}: not placed; {self.refused}"
         counts = []
@@ -111,7 +184,7 @@ class Changes:
             if kind == "moved":
                 text += f" ({', '.join(map(_moved_text, changes))})"
             elif kind in ("gone", "new"):
-                text += f" ({', '.join(f'{c.class_name} {c.id}' for c in changes)})"
+                text += f" ({', '.join(c.name for c in changes)})"
             counts.append(text)
         if self.ambiguous:
             counts.append(f"{len(self.ambiguous)} ambiguous among identical objects")
@@ -119,11 +192,10 @@ class Changes:
 
 
 def _moved_text(change: Change) -> str:
-    """Format a moved object: "chair 6 by .56 m"."""
-    text = f"{change.class_name} {change.id}"
-    if change.distance_m is not None:
-        text += f" by {change.distance_m:.2f} m"
-    return text
+    """Format a moved object: "chair 6 by 0.56 m"."""
+    if change.distance_m is None:
+        return change.name
+    return f"{change.name} by {change.distance_m:.2f} m"
 
 
 def write_changes(path: Path, changes: Changes) -> None:
@@ -133,37 +205,20 @@ def write_changes(path: Path, changes: Changes) -> None:
 
 
 def read_changes(path: Path) -> Changes:
-    """Read changes.json.
+    """Read changes.json, and check the types, shapes and ranges of its values.
 
     Raises:
         ReobjError: damaged, or another kind of file.
     """
-    from reobj.files import load_json
-    from reobj.types import ReobjError
-
     data = load_json(path)
+    header = {key: data.get(key) for key in HEADER} if isinstance(data, dict) else {}
+    if header != HEADER:
+        form, number = HEADER.values()
+        raise ReobjError(f"{path}: expected format {form}, version {number}; run the video again")
+    if missing := [kind for kind in Changes.KINDS if kind not in data]:
+        raise ReobjError(f"{path}: {missing[0]!r} is missing; run the video again")
     try:
-        if {key: data[key] for key in HEADER} != HEADER:
-            raise ReobjError(f"{path}: expected format {HEADER['format']}, version "
-                             f"{HEADER['version']}")  # fmt: skip
-        lists = {
-            kind: tuple(_change(entry) for entry in data[kind])
-            for kind in Changes.KINDS
-        }
-        names = {f.name for f in dataclasses.fields(Changes)} - {"map_path", *Changes.KINDS}
-        facts = {name: data[name] for name in names}
-        return Changes(map_path=data["map"], **facts, **lists)
-    except (KeyError, TypeError, ValueError) as error:
-        raise ReobjError(f"{path}: damaged ({error}); run the video again") from error
-
-
-def _change(entry: dict[str, Any]) -> Change:
-    """Read an entry of changes.json."""
-    before, after = (
-        None if entry[key] is None else np.array(entry[key], np.float64).reshape(3)
-        for key in ("from", "to")
-    )
-    return Change(
-        int(entry["id"]), str(entry["class"]), before, after, entry["distance_m"],
-        entry["sigma_m"], str(entry["evidence"]), tuple(entry.get("candidates", ())),
-    )  # fmt: skip
+        changes: Changes = decode(Changes, data)
+    except ReobjError as error:
+        raise ReobjError(f"{path}: {error}; run the video again") from error
+    return changes

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import types
 import typing
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,8 +17,11 @@ from reobj.poses.floor import Floor
 from reobj.sources.video import Video
 from reobj.types import Array, LinkEvent, ReobjError, visible_name
 
-# keys of objects.json that differ from the names of our fields
-_JSON_KEYS = {"class_name": "class", "tracklet_ids": "tracks", "visits": "frames"}
+# keys of objects.json and changes.json that differ from the names of our fields
+_JSON_KEYS = {
+    "class_name": "class", "tracklet_ids": "tracks", "visits": "frames",
+    "map_path": "map", "before": "from", "after": "to", "before_shape": "from_shape",
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -217,12 +221,12 @@ def decode(kind: Any, value: Any, at: str = "$", name: str = "") -> Any:
         entry = _checked(value, dict, at)
         return quadrics.Scale(*(decode(k, entry.get(n), f"{at}.{n}", n) for n, k in names.items()))
     origin = typing.get_origin(kind)
-    if origin in (list, tuple):
+    if origin in (list, tuple, Sequence):
         item = typing.get_args(kind)[0]
         values = [decode(item, v, f"{at}[{k}]") for k, v in enumerate(_checked(value, list, at))]
         if name in ("visits", "spans") and any(len(pair) != 2 for pair in values):
             raise ReobjError(f"{at}: expected pairs of frames")
-        return origin(values)
+        return values if origin is list else tuple(values)
     if origin is dict:
         item = typing.get_args(kind)[1]
         pairs = _checked(value, dict, at).items()
@@ -247,7 +251,7 @@ def _decode_record(kind: Any, value: Any, at: str) -> Any:
             values[f.name] = decode(hints[f.name], entry[key], f"{at}.{key}", f.name)
         elif f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING:
             raise ReobjError(f"{at}: {key!r} is missing")
-    if kind is Object:
+    if "class_name" in values:
         values["class_name"] = visible_name(values["class_name"])
     return kind(**values)
 

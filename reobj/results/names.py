@@ -12,6 +12,7 @@ class OutputFile(enum.StrEnum):
     OBJECTS = "objects.json"
     POSES = "poses.txt"
     MESH = "objects.ply"
+    CHANGES = "changes.json"
     EDITS = "edits.json"
     CONFIG = "config.toml"  # options of the last run
     MODEL = "sparse"  # folder of a COLMAP model

@@ -9,17 +9,19 @@ from __future__ import annotations
 import difflib
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 import quadrics
 from reobj.cameras import Camera
 from reobj.files import cut
+from reobj.results.changes import Change
 from reobj.results.film import FilmWriter
 from reobj.results.origin import centred
 from reobj.results.ply import CYLINDER_SIDES as SIDES
@@ -61,6 +63,8 @@ def draw_tracks(
     scale: float,
     positions: dict[int, int] | None = None,
     thin: frozenset[int] = frozenset(),
+    marks: Mapping[int, Color] | None = None,
+    gone: Mapping[int, IntArray] | None = None,
 ) -> None:
     """Draw the boxes and identities of one frame's rows, in place; interpolated boxes are dashed.
 
@@ -71,19 +75,27 @@ def draw_tracks(
         positions: index of the position of each identity's label in the previous frame, updated
             here, so that labels jump less.
         thin: identities whose solid is drawn too.
+        marks: colours of the labels of changed objects, and of a second outline of their boxes.
+        gone: bounds (4,) of the outlines of gone objects, pixels of the image: they get a label.
     """
+    marks = marks or {}
+    gone = gone or {}
     boxes = (tracks.xyxy * scale).round().astype(int)  # (N, 4)
     ids = tracks.track_id.tolist()
     scores = tracks.score.tolist()
     for obj, box, score in zip(ids, boxes, scores, strict=True):
         _draw_box(image, box, object_color(obj), 1 if obj in thin else 2, dashed=score == 0)
+        if obj in marks:  # 1 px between both outlines
+            _draw_box(image, box + np.array([-4, -4, 4, 4]), marks[obj], 2, dashed=False)
+    ids = [*ids, *gone]
+    boxes = np.array([*boxes, *gone.values()], int).reshape(-1, 4)
     positions = {} if positions is None else positions
     texts = [labels.get(obj, str(obj)) for obj in ids]
     sizes = np.array([_text_size(text) for text in texts], int).reshape(-1, 2)
     spots = place_labels(ids, sizes, boxes, (image.shape[1], image.shape[0]), positions)
     for obj, text, spot in zip(ids, texts, spots, strict=True):
         if spot is not None:
-            _draw_label(image, text, spot, object_color(obj))
+            _draw_label(image, text, spot, marks.get(obj, object_color(obj)))
 
 
 def _draw_box(image: Image, box: IntArray, color: Color, thickness: int, dashed: bool) -> None:
@@ -92,11 +104,20 @@ def _draw_box(image: Image, box: IntArray, color: Color, thickness: int, dashed:
         cv2.rectangle(image, (x1, y1), (x2, y2), color, thickness, cv2.LINE_AA)
         return
     corners = np.array([[x1, y1], [x2, y1], [x2, y2], [x1, y2], [x1, y1]])
-    for a, b in itertools.pairwise(corners):
-        steps = max(1, int(np.abs(b - a).max() / 6))  # dashes of 6 px
-        points = np.linspace(a, b, steps + 1).round().astype(np.int32)  # (steps + 1, 2)
-        dashes = [points[i : i + 2] for i in range(0, steps, 2)]
-        cv2.polylines(image, dashes, False, color, thickness, cv2.LINE_AA)
+    for side in itertools.pairwise(corners):
+        _draw_dashes(image, np.array(side), color, thickness)
+
+
+def _draw_dashes(image: Image, line: Array | IntArray, color: Color, thickness: int) -> None:
+    """Draw a polyline (n, 2), pixels, with dashes and gaps of 6 px."""
+    length = np.linalg.norm(np.diff(line, axis=0), axis=1)
+    along = np.concatenate([[0.0], length.cumsum()])  # (n,)
+    steps = max(1, int(along[-1] / 6))
+    at = np.linspace(0, along[-1], steps + 1)
+    points = np.column_stack([np.interp(at, along, line[:, k]) for k in (0, 1)])
+    points = points.round().astype(np.int32)  # (steps + 1, 2)
+    dashes = [points[i : i + 2] for i in range(0, steps, 2)]
+    cv2.polylines(image, dashes, False, color, thickness, cv2.LINE_AA)
 
 
 def _text_size(text: str) -> tuple[int, int]:
@@ -381,6 +402,97 @@ def _fits(pixels: Array, image: Image) -> bool:
     return bool(np.isfinite(flat).all() and np.ptp(flat, 0).max() < _max_outline(image))
 
 
+# ---- Changes since a map -----------------------------------------------------------------------
+
+# BGR. Colours of identities have a saturation of at most .78 (`object_color`): these are purer or
+# grey, and no two of them have the same lightness. Black text is readable on each.
+CHANGE_COLORS: dict[str, Color] = {
+    "moved": (255, 0, 255), "new": (40, 255, 90), "gone": (225, 225, 225),
+}  # fmt: skip
+
+
+def change_label(kind: str, change: Change) -> str:
+    """Describe the change of a moved, new or gone object for its label; "" for other kinds.
+
+    >>> change_label("moved", Change(6, "chair", distance_m=0.564))
+    ', moved 0.56 m'
+    """
+    if kind not in CHANGE_COLORS:
+        return ""
+    known = kind == "moved" and change.distance_m is not None
+    return f", {kind} {change.distance_m:.2f} m" if known else f", {kind}"
+
+
+def surface_points(support: str) -> Array:
+    """Return points (P, 3) of a unit solid whose projections have its outline as convex hull.
+
+    Args:
+        support: "box" (half sides 1), "cylinder" (radius and half height 1) or "ellipsoid".
+    """
+    if support == "box":
+        corners, edges, *_ = _unit_box()
+        # lens distortion bends edges: 8 segments look smooth
+        fraction = np.linspace(0, 1, 9)[:, None, None]
+        ends = corners[edges]  # (12, 2, 3)
+        points = ends[:, 0] + fraction * (ends[:, 1] - ends[:, 0])
+        return np.asarray(points.reshape(-1, 3))
+    if support == "cylinder":
+        return _unit_cylinder()[0]
+    angle = 2 * np.pi * np.arange(SIDES) / SIDES
+    height = np.cos(np.linspace(0, np.pi, SIDES // 2 + 1))[:, None]  # (L, 1)
+    radius = np.sqrt(1 - height**2)
+    rings = (radius * np.cos(angle), radius * np.sin(angle), height + 0 * angle)
+    return np.stack(rings, -1).reshape(-1, 3)
+
+
+def outline_of(camera: Camera, cam_from_world: Array, points: Array) -> Array | None:
+    """Return the closed outline (n, 2), native pixels, of points (P, 3) of a convex solid.
+
+    None where the solid is not entirely in front of the camera, or its centre is not in the image.
+    """
+    in_cam = points @ cam_from_world[:, :3].T + cam_from_world[:, 3]
+    least = 0.05 * np.linalg.norm(np.ptp(in_cam, axis=0))  # as for edges: nearer is not drawn
+    if not (in_cam[:, 2] > least).all():
+        return None
+    middle = image_points(camera, in_cam.mean(0))
+    if not ((middle > 0) & (middle < (camera.width, camera.height))).all():
+        return None
+    hull = cv2.convexHull(image_points(camera, in_cam).astype(np.float32))[:, 0]
+    return np.concatenate([hull, hull[:1]]).astype(np.float64)
+
+
+def _former_surface(change: Change) -> Array:
+    """Return surface points (P, 3) of an object at its former place, world of the map."""
+    shape = change.before_shape
+    assert shape is not None and change.before is not None
+    turn = Rotation.from_quat(shape.quat_wxyz[[1, 2, 3, 0]]).as_matrix()
+    points = surface_points(shape.support) * shape.half_axes @ turn.T + change.before
+    return np.asarray(points, np.float64)
+
+
+def _gone_places(result: Result) -> dict[int, tuple[dict[int, Array], Camera, Array]]:
+    """Map frames to the gone objects in the world of their component, the camera and the pose.
+
+    Objects are surface points (P, 3) by number. Only components placed in the map are included.
+    """
+    places: dict[int, tuple[dict[int, Array], Camera, Array]] = {}
+    changes = result.changes
+    gone = () if changes is None else changes.gone
+    if changes is None or not any(c.before_shape for c in gone):
+        return places
+    for k, component in enumerate(result.parts()):
+        shifted, origin = centred(component)
+        poses = shifted.poses
+        if poses is None or k not in changes.components:
+            continue
+        solids = {c.id: _former_surface(c) - origin for c in gone if c.before_shape}
+        known = poses.known
+        for frame, pose in zip(poses.frame[known].tolist(), poses.cam_from_world[known],
+                               strict=True):  # fmt: skip
+            places[frame] = (solids, poses.camera, pose)
+    return places
+
+
 # ---- The video ---------------------------------------------------------------------------------
 
 
@@ -405,10 +517,17 @@ class Overlay:
         self.measured = {o.id for o in result.located if o.status == "ok"}
         # 24 characters are 200 px
         self.labels = {o.id: f"{o.id} {cut(o.class_name, 24)}" for o in result.objects}
+        self.marks: dict[int, Color] = {}
+        for i, (kind, change) in _changes_of(result).items():
+            if kind in CHANGE_COLORS:
+                name = self.labels.get(i, f"{i} {cut(change.class_name, 24)}")
+                self.labels[i] = name + change_label(kind, change)
+                self.marks[i] = CHANGE_COLORS[kind]
+        self.gone = _gone_places(result) if self.layers & {"solids", "ellipses"} else {}
         self.outlines = _project_all(result, self.scale, self.layers)
         self.label_positions: dict[int, int] = {}
         self.cameras = _cameras(result) if "solids" in self.layers else {}
-        self.legend = _legend(result, self.layers)
+        self.legend = _legend(result, self.layers, bool(self.gone))
         self.trails: dict[int, list[tuple[int, Array]]] = {}  # by identity: frame, position
 
     def take(self, frame: Frame) -> None:
@@ -421,7 +540,10 @@ class Overlay:
         if "trails" in self.layers:
             self._draw_trails(image, rows)
         thin = self._draw_solids(image, frame.index, seen)
-        draw_tracks(image, rows, self.labels, self.scale, self.label_positions, thin)
+        gone = self._draw_gone(image, frame.index)
+        draw_tracks(
+            image, rows, self.labels, self.scale, self.label_positions, thin, self.marks, gone
+        )
         if self.legend and self.writer.count < 2 * self.fps:  # 2 s are enough to read it
             draw_legend(image, self.legend)
         self.writer.write(image)
@@ -445,6 +567,24 @@ class Overlay:
             shown |= set(ids)
         return frozenset(shown & seen)
 
+    def _draw_gone(self, image: Image, frame: int) -> dict[int, IntArray]:
+        """Draw the outlines of gone objects whose former place is in view.
+
+        Returns:
+            bounds (4,) of each outline by the number of the object, pixels of the image.
+        """
+        bounds: dict[int, IntArray] = {}
+        if frame not in self.gone:
+            return bounds
+        solids, camera, cam_from_world = self.gone[frame]
+        for number, points in solids.items():
+            outline = outline_of(camera, cam_from_world, points)
+            if outline is not None and _fits(self.scale * outline, image):
+                line = self.scale * outline - 0.5  # OpenCV draws with the pixel's centre at 0
+                _draw_dashes(image, line, CHANGE_COLORS["gone"], 1)
+                bounds[number] = np.array([line.min(0), line.max(0)]).round().astype(int).ravel()
+        return bounds
+
     def _draw_trails(self, image: Image, rows: Tracks) -> None:
         """Draw the path of the centre of each box in the last second."""
         now = self.writer.count
@@ -458,6 +598,11 @@ class Overlay:
     def close(self, complete: bool) -> None:
         """Finish the video; the file appears only if it is complete."""
         self.writer.close(complete)
+
+
+def _changes_of(result: Result) -> dict[int, tuple[str, Change]]:
+    """Map the number of each object to its change since the map; {} without a map."""
+    return {} if result.changes is None else result.changes.of_objects()
 
 
 def _located_by_part(result: Result) -> list[tuple[Result, list[int]]]:
@@ -514,8 +659,12 @@ def _project_all(
 # ---- Legend ------------------------------------------------------------------------------------
 
 
-def _legend(result: Result, layers: frozenset[str]) -> list[tuple[str, str]]:
-    """List the kinds of lines in this video and their meaning."""
+def _legend(result: Result, layers: frozenset[str], gone: bool) -> list[tuple[str, str]]:
+    """List the kinds of lines in this video and their meaning.
+
+    Args:
+        gone: outlines of gone objects are drawn.
+    """
     lines = [("box", "detected; number = identity")]
     if (result.tracks.score == 0).any():
         lines.append(("dashed", "not detected: filled in"))
@@ -525,6 +674,11 @@ def _legend(result: Result, layers: frozenset[str]) -> list[tuple[str, str]]:
         lines.append(("thin", f"{name} of an object not detected here"))
     if "trails" in layers:
         lines.append(("trail", "its path in the last 1 s"))
+    kinds = {kind for kind, _ in _changes_of(result).values()}
+    meanings = {"moved": "moved since the map", "new": "not in the map"}
+    lines += [(kind, text) for kind, text in meanings.items() if kind in kinds]
+    if gone:
+        lines.append(("gone", "was here, gone now"))
     return lines
 
 
@@ -544,6 +698,11 @@ def draw_legend(image: Image, lines: Sequence[tuple[str, str]]) -> None:
         box = np.array([x, y + 4, x + sample_px - 8, y + line_px - 5])
         if kind in ("box", "dashed"):
             _draw_box(image, box, color, 1 + (len(lines) == 1), kind == "dashed")
+        elif kind in ("moved", "new"):
+            _draw_box(image, box + np.array([3, 3, -3, -3]), color, 1, dashed=False)
+            _draw_box(image, box, CHANGE_COLORS[kind], 2, dashed=False)
+        elif kind == "gone":
+            _draw_box(image, box, CHANGE_COLORS[kind], 1, dashed=True)
         else:
             middle = y + line_px // 2
             thickness = 1 if kind == "thin" else 2

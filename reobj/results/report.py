@@ -20,6 +20,8 @@ def summary(result: Result) -> str:
     lines = _table(result, counted)
     lines += _reasons(counted)
     lines += _class_counts(result, counted)
+    if result.changes is not None:
+        lines += wrapped(result.changes.summary())
     doubtful = len(result.objects) - len(counted)
     if doubtful > 0:
         lines.append(f"low confidence: {doubtful} more, probably false positives (objects.json)")

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 import quadrics
 from reobj.cameras import Poses
 from reobj.results import report, saving
+from reobj.results.changes import Changes
 from reobj.results.edits import Edits
 from reobj.results.entries import Object, Part, VideoInfo, World
 from reobj.types import Embeddings, IntArray, Tracks
@@ -43,6 +44,7 @@ class Result:
         seconds: wall time by stage. step_seconds: of the steps of a stage; {} if its result was
             taken from the cache.
         warnings: for the user. edits: manual corrections.
+        changes: since the map that the recording was placed in; None: run without a map.
         out: the folder that it was saved to or loaded from.
     """
 
@@ -62,6 +64,7 @@ class Result:
     step_seconds: dict[str, dict[str, float]] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     edits: Edits | None = None
+    changes: Changes | None = None
     out: Path | None = None
 
     @property
@@ -127,6 +130,8 @@ class Result:
         stale: Sequence[str] = (),
     ) -> Result:
         """Write tracks.txt, objects.json, and where there are cameras poses.txt and objects.ply.
+
+        changes.json is written after a run with a map, and removed after one without.
 
         objects.json includes doubtful objects, tracks.txt only if `doubtful`. Each further
         component of the trajectory has its own poses and objects: poses_part1.txt,

@@ -1,4 +1,4 @@
-"""Files of a result: objects.json, tracks.txt, poses, meshes and npz; how new files replace old.
+"""Files of a result: objects.json, changes.json, tracks.txt, poses, meshes; how new replace old.
 
 An output folder: `save`, `load`. The tracks in its cache: `save_tracked`, `load_tracked`.
 """
@@ -32,6 +32,7 @@ from reobj.files import (
     save_npz,
     staged,
 )
+from reobj.results.changes import read_changes, write_changes
 from reobj.results.edits import write_edits
 from reobj.results.entries import Object, VideoInfo, World, decode
 from reobj.results.names import OutputFile
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
 
 HEADER = {"format": "reobj-objects", "version": 1}  # of objects.json
 STALE = (  # files that not every run writes; cameras.csv: before 0.2
-    OutputFile.POSES, OutputFile.MESH, OutputFile.LAST_POSES,
+    OutputFile.POSES, OutputFile.MESH, OutputFile.LAST_POSES, OutputFile.CHANGES,
     "cameras.csv", "overlay.mp4", "overlay.webm", "scene.html",
 )  # fmt: skip
 
@@ -133,6 +134,8 @@ def save(
         write_mot(new / OutputFile.TRACKS, shown.tracks)
         write_objects(result, new / OutputFile.OBJECTS)
         write_edits(new, result.edits)
+        if result.changes is not None:
+            write_changes(new / OutputFile.CHANGES, result.changes)
         if result.poses is not None:
             save_poses(new / OutputFile.LAST_POSES, result.poses)
             write_trajectories(new, result.poses)
@@ -165,6 +168,7 @@ def load(kind: type[Result], out: Path) -> Result:
     corners = np.concatenate([rows[:, 2:4], rows[:, 2:4] + rows[:, 4:6]], 1)  # (N, 4)
     classes = np.array([class_of.get(i, -1) for i in ids.tolist()], np.int64)
     unknown = np.full(len(rows), -1, np.int64)
+    changes = out / OutputFile.CHANGES
     return kind(
         Tracks(frame, ids, ids, corners, rows[:, 6], classes, unknown),
         class_names,
@@ -173,6 +177,7 @@ def load(kind: type[Result], out: Path) -> Result:
         entries.world,
         poses,
         warnings=entries.warnings,
+        changes=read_changes(changes) if changes.is_file() else None,
         out=out,
     )
 

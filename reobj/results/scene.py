@@ -181,8 +181,9 @@ def write_scene(
 ) -> None:
     """Write scene.html: solids, cameras, points and pictures in one page that needs no network.
 
-    Its data are the entries of objects.json, and base64 of little-endian float32 / uint8 arrays. A
-    world far from its origin is shifted, by `origin` of its component.
+    Its data are the entries of objects.json and changes.json, and base64 of little-endian float32 /
+    uint8 arrays. A world far from its origin is shifted, by `origin` of its component; centres in
+    entries of changes.json are not.
 
     Args:
         doubtful: show low-confidence objects initially; a switch shows and hides them.
@@ -218,6 +219,8 @@ def write_scene(
             for k, (part, origin) in enumerate(zip(parts, origins, strict=True))
         ],
     }
+    if result.changes is not None:
+        data["changes"] = result.changes.to_json() | {"summary": result.changes.summary()}
     text = json.dumps(data, separators=(",", ":"), allow_nan=False)
     head, tail = page_text().split("@DATA@")
     with atomic(path) as part:  # "<" is escaped: no name can end the script element

@@ -14,7 +14,7 @@ function row(o) {
   const made = el("button", { className: `row ${o.status}`, onclick: () => select(o),
     title: o.reason || o.status.replace("_", " ") }, el("i"), el("b", {}, nameOf(o)),
   el("small", {}, [(o.status === "prior_dominated" ? "≈ " : "") + sizeText(o), S.why_flat ? "" : NOTE[o.status], o.edited ? "edited" : ""]
-    .filter(Boolean).map((text) => ` · ${text}`).join("")), bar(o));
+    .filter(Boolean).map((text) => ` · ${text}`).join("")), ...kindTag(o), bar(o));
   made.style.setProperty("--own", rgb(o));
   return made;
 }
@@ -25,21 +25,25 @@ const ORDER = {
   name: (a, b) => a.class.localeCompare(b.class) || a.id - b.id,
   size: (a, b) => bySize(a) - bySize(b) || a.id - b.id,
   seen: (a, b) => b.frames_seen - a.frames_seen || a.id - b.id,
-  first: (a, b) => a.visits[0][0] - b.visits[0][0] || a.id - b.id,
+  first: (a, b) => a.visits[0]?.[0] - b.visits[0]?.[0] || a.id - b.id,
+  change: (a, b) => rankOf(a) - rankOf(b) || a.id - b.id,
 };
 
 function filterList() {
   const words = $("search").value.toLowerCase().split(/\s+/).filter(Boolean);
   for (const o of here) {
-    const text = `${nameOf(o)} ${o.status} ${o.reason}`.toLowerCase();
+    const text = `${nameOf(o)} ${o.status} ${o.reason} ${kindText(changeOf(o))}`.toLowerCase();
     o.row.hidden = !allowed(o) || !words.every((word) => text.includes(word));
     o.row.classList.toggle("now", state.step >= 0 && seenAt(o, state.step));
   }
+  filterGhosts(words);
 }
 
 function fillList() {
   here.forEach((o) => { o.row = row(o); });
-  $("rows").replaceChildren(...[...here].sort(ORDER[$("sort").value]).map((o) => o.row));
+  const listed = [...here, ...ghosts.filter(absent)];
+  $("rows").replaceChildren(...listed.sort(ORDER[$("sort").value]).map((o) => o.row));
+  fillKinds(listed);
   const names = [...new Set(here.map((o) => o.class))].sort();
   $("classes").querySelector("summary").textContent = `classes (${names.length})`;
   $("classes").querySelector("div").replaceChildren(...names.map((name) => {
@@ -90,6 +94,7 @@ function facts(o) {
   if (o.sides.length) rows.push(
     ["scale", scale && scale.source !== "none" ? `from ${scale.source.replace("_", " ")}, ± `
       + percent(scale.rel_sigma || 0) : "unknown"], ["shape", o.support]);
+  rows.push(...changeFacts(changeOf(o)));
   if (o.confidence !== null) rows.push(["confidence", percent(o.confidence)]);
   const [, second] = Object.entries(o.classes);
   if (second && second[1] >= 0.05) rows.push(["class", Object.entries(o.classes)
@@ -108,6 +113,8 @@ function select(o) {
   }
   if (!state.merging) hint("");
   state.selected = o === state.selected ? null : o;  // a second time: no more
+  state.ghost = null;
+  markGhostRow();
   here.forEach((x) => x.row.classList.toggle("selected", x === state.selected));
   $("panel").replaceChildren();
   redraw();

@@ -8,6 +8,7 @@ function hint(text) {
 function gather() {                              // the objects of the part
   here = objects.filter((o) => o.part === state.part);
   solid = here.filter((o) => o.center);
+  gatherGhosts();
 }
 
 function enter(part) {                           // show one part of the cameras' path, a world
@@ -55,6 +56,7 @@ function leave() {                               // the innermost mode
   else if (state.ride) setRide(false);
   else if (state.follow) setFollow(false);
   else if (state.selected) select(state.selected);
+  else if (state.ghost) select(null);
 }
 
 addEventListener("keydown", (e) => {
@@ -114,7 +116,7 @@ canvas.addEventListener("pointerup", (e) => {
   if (!pressed || e.button !== 0) { pressed = null; return; }
   pressed = null;
   const { left, top } = canvas.getBoundingClientRect(), at = [e.clientX - left, e.clientY - top];
-  if (state.measuring) measureAt(...at); else select(pick(...at));
+  if (state.measuring) measureAt(...at); else choose(...at);
 });
 canvas.addEventListener("dblclick", () => lookAt(state.selected));
 addEventListener("resize", redraw);
@@ -130,6 +132,7 @@ document.title = $("title").textContent = `${S.title}: ${S.objects.filter(
   + (S.parts.length > 1 ? ` in ${S.parts.length} components` : "");
 $("part").append(...S.parts.map(({ name }, value) => el("option", { value }, name)));
 $("part").hidden = S.parts.length < 2;
+startChanges();
 $("doubtful").checked = S.doubtful;
 $("doubtful-label").hidden = !S.objects.some((o) => o.status === "doubtful");
 objects = S.objects.map((o) => ({ ...o, ids: [o.id] }));

@@ -6,7 +6,7 @@ scene.add(root);
 const orbit = new THREE.PerspectiveCamera(50, 1, 0.01, 1000), seat = new THREE.PerspectiveCamera();
 seat.matrixAutoUpdate = false;
 orbit.up.set(0, 0, 1);
-let controls, room, cloud, wires, travel, now, floorGrid;
+let controls, room, cloud, wires, former, travel, now, floorGrid;
 const dark = matchMedia("(prefers-color-scheme: dark)");
 const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
@@ -63,8 +63,8 @@ function solidOf(o) {                            // group of an object: faces, e
     0, 0, 0, 1);
   const pale = (opacity) => new THREE.MeshBasicMaterial(
     { color, transparent: true, opacity, depthWrite: false, side: THREE.DoubleSide });
-  const wire = WIRES[o.support], doubt = o.status === "doubtful", ink = color.clone();
-  if (!dark.matches) ink.multiplyScalar(0.6);    // pale lines would be lost on white
+  const wire = WIRES[o.support], doubt = o.status === "doubtful" || o.kind, ink = color.clone();
+  if (!dark.matches && !o.kind) ink.multiplyScalar(0.6);    // pale lines would be lost on white
   group.parts = {
     faces: new THREE.Mesh(FACES[o.support], pale(0.06)),
     ellipsoid: new THREE.Mesh(FACES.ellipsoid, pale(0.16)),
@@ -159,6 +159,7 @@ function clear(group) {
 function fillSolids() {                          // the objects as the edits have them
   clear(wires);
   solid.forEach((o) => wires.add(solidOf(o)));
+  fillGhosts();
 }
 
 function fillScene() {                           // everything of the part
@@ -166,9 +167,9 @@ function fillScene() {                           // everything of the part
   const points = pointsOf(state.part);
   room = extent(points.at);
   cloud = cloudOf(points);
-  [wires, travel, now] = [new THREE.Group(), new THREE.Group(), new THREE.Group()];
+  [wires, former, travel, now] = [1, 2, 3, 4].map(() => new THREE.Group());
   floorGrid = gridOf();
-  root.add(floorGrid, cloud, travel, now, wires);
+  root.add(floorGrid, cloud, travel, now, wires, former);
   const ends = [], color = css("--path");
   cams.forEach((c, i) => { if (c && cams[i + 1]) ends.push(...c.at, ...cams[i + 1].at); });
   if (ends.length) travel.add(lines(ends, color, 2, 0.9));
@@ -278,12 +279,15 @@ function draw() {
     o.group.visible = visible.has(o);
     wire.visible = faces.visible = $("solids").checked;
     ellipsoid.visible = $("ellipsoids").checked || !$("solids").checked;
-    halo.visible = chosen;
+    halo.visible = chosen || Boolean(markOf(o));
+    halo.material.color.set(css(chosen ? "--halo" : `--${changeOf(o)?.kind}`) || "#000");
+    halo.material.opacity = chosen ? 1 : 0.6;
     wire.material.opacity = lit ? 1 : 0.35;
     wire.material.linewidth = chosen ? 2.4 : inside ? 2.4 : 1.8;
     faces.material.opacity = lit && !inside ? 0.06 : 0.02;
     ellipsoid.material.opacity = (lit ? 0.16 : 0.05) * (inside ? 0.6 : 1);
   }
+  drawGhosts(inside);
   cloud.visible = $("points").checked && !inside;
   cloud.material.uniforms.pixels.value = devicePixelRatio;
   cloud.material.uniforms.reach.value = orbit.position.distanceTo(controls.target);
@@ -299,18 +303,25 @@ function draw() {
   placePicture(inside);
 }
 
+const LABEL_SHIFTS = [-26, -46, 26, 46, -66, 66];  // of changed objects, px: the arrow stays visible
 function drawLabels(cam) {                       // nearer labels win where two would overlap
   const taken = [];
-  const placed = shown().map((o) => [o, project(o.at, cam)]).filter(([, at]) => at)
-    .sort(([a, p], [b, q]) => (b === state.selected) - (a === state.selected) || p[2] - q[2]);
+  const first = (o) => 8 * (o === state.selected || o === state.ghost)
+    + (o.kind || markOf(o) ? RANK.length - rankOf(o) : 0);
+  const placed = [...shown(), ...absentHere()].map((o) => [o, project(o.at, cam)])
+    .filter(([, at]) => at).sort(([a, p], [b, q]) => first(b) - first(a) || p[2] - q[2]);
   $("labels").replaceChildren();
   for (const [o, [x, y]] of $("names").checked ? placed : []) {
-    if (cam === seat && o !== state.selected && !seenAt(o, state.step)) continue;
-    const text = `${o.class} ${o.id}`, w = 7 * text.length + 8;
-    if (taken.some((t) => Math.abs(t[0] - x) < (t[2] + w) / 2 && Math.abs(t[1] - y) < 17)) continue;
-    taken.push([x, y, w]);
-    $("labels").append(el("span", { className: o === state.selected ? "selected" : "",
-      style: `transform: translate(${x}px, ${y}px) translate(-50%, -50%)` }, text));
+    if (cam === seat && !o.kind && o !== state.selected && !seenAt(o, state.step)) continue;
+    const mark = o.kind ? kindText(o) : markOf(o), text = [nameOf(o), mark].filter(Boolean).join(" ");
+    const w = 7 * text.length + 8, free = (at) => !taken.some((t) =>
+      Math.abs(t[0] - x) < (t[2] + w) / 2 && Math.abs(t[1] - at) < 17);
+    const at = (mark ? LABEL_SHIFTS : [0]).map((shift) => y + shift).find(free);
+    if (at === undefined) continue;
+    taken.push([x, at, w]);
+    const chosen = o === state.selected || o === state.ghost ? "selected" : "";
+    $("labels").append(el("span", { className: [chosen, mark && (o.kind || changeOf(o).kind)].join(" ").trim(),
+      style: `transform: translate(${x}px, ${at}px) translate(-50%, -50%)` }, text));
   }
 }
 
@@ -331,13 +342,13 @@ function drawCorner() {                          // scale bar at the turning poi
 
 // ---- What lies under a pixel ----
 const ray = new THREE.Raycaster();
-function aim(x, y) {
+function aim(x, y, targets = shown()) {
   const cam = viewpoint(), ndc = [2 * x / canvas.clientWidth - 1, 1 - 2 * y / canvas.clientHeight];
   ray.ray.origin.setFromMatrixPosition(cam.matrixWorld);
   ray.ray.direction.set(...ndc, 0.5).applyMatrix4(cam.projectionMatrixInverse)
     .applyMatrix4(cam.matrixWorld).sub(ray.ray.origin).normalize();
   scene.updateMatrixWorld();
-  return ray.intersectObjects(shown().map((o) => o.group.parts.faces), false);
+  return ray.intersectObjects(targets.map((o) => o.group.parts.faces), false);
 }
 
 const volume = (o) => o.half_axes[0] * o.half_axes[1] * o.half_axes[2];

@@ -1,0 +1,162 @@
+"""Changes since a map: changes.json, the summary, and how a result keeps them."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import reobj_track as rt
+from reobj.results.changes import Change, Changes, Shape, read_changes, write_changes
+
+HALF_TURN = np.array([0.0, 0.0, 0.0, 1.0])
+SHAPE = Shape("box", np.array([0.2, 0.25, 0.4]), HALF_TURN)
+
+
+def room_changes() -> Changes:
+    """A stayed table, a moved chair, a gone lamp, a new cup, a bottle out of view."""
+    table = Change(1, "table", np.zeros(3), np.array([0.0, 0.01, 0.0]), 0.01, 0.02, "same place")
+    chair = Change(6, "chair", np.array([1.0, 0, 0.4]), np.array([1.5, 0.25, 0.4]), 0.559, 0.03,
+                   "own points", (7,), SHAPE)  # fmt: skip
+    lamp = Change(9, "lamp", np.array([2.0, 1, 0.5]), None, evidence="seen through in 3 of 4 views",
+                  before_shape=dataclasses.replace(SHAPE, support="cylinder"))  # fmt: skip
+    cup = Change(12, "cup", None, np.array([0.1, 0.2, 0.8]))
+    bottle = Change(3, "bottle", np.array([9.0, 9, 1]), None, evidence="no view passed")
+    return Changes("flat.map", "tuesday", "", 30, 40, (0, 1), 0.0125, (table,), (chair,), (lamp,),
+                   (cup,), (bottle,), (chair,))  # fmt: skip
+
+
+def assert_equal(a: Any, b: Any) -> None:
+    """Compare dataclasses with arrays, also nested."""
+    if dataclasses.is_dataclass(a):
+        assert type(a) is type(b)
+        for f in dataclasses.fields(a):
+            assert_equal(getattr(a, f.name), getattr(b, f.name))
+    elif isinstance(a, tuple):
+        assert len(a) == len(b)
+        for x, y in zip(a, b, strict=True):
+            assert_equal(x, y)
+    else:
+        np.testing.assert_array_equal(a, b)
+
+
+def test_written_changes_are_read_back(tmp_path: Path) -> None:
+    write_changes(tmp_path / "changes.json", room_changes())
+    assert_equal(read_changes(tmp_path / "changes.json"), room_changes())
+    refused = Changes("flat.map", "tuesday", "3 frames agree", 3, 40, ())
+    write_changes(tmp_path / "refused.json", refused)
+    assert_equal(read_changes(tmp_path / "refused.json"), refused)
+
+
+def test_entries_have_the_documented_keys(tmp_path: Path) -> None:
+    write_changes(tmp_path / "changes.json", room_changes())
+    data = json.loads((tmp_path / "changes.json").read_text())
+    assert data["moved"] == [{
+        "id": 6, "class": "chair", "from": [1, 0, 0.4], "to": [1.5, 0.25, 0.4],
+        "distance_m": 0.559, "sigma_m": 0.03, "evidence": "own points", "candidates": [7],
+        "from_shape": {"support": "box", "half_axes": [0.2, 0.25, 0.4], "quat_wxyz": [0, 0, 0, 1]},
+    }]  # fmt: skip
+    assert (data["map"], data["session"], data["components"]) == ("flat.map", "tuesday", [0, 1])
+    assert data["gone"][0]["to"] is None and data["new"][0]["from"] is None
+
+
+def test_the_summary_counts_the_changes() -> None:
+    assert room_changes().summary() == (
+        "map flat.map: 1 stayed, 1 moved (chair 6 by 0.56 m), 1 gone (lamp 9), 1 new (cup 12), "
+        "1 not seen, 1 ambiguous among identical objects"
+    )
+    assert Changes("a.map", "b").summary() == "map a.map: 0 stayed"
+    unscaled = Change(6, "chair", np.zeros(3), np.ones(3))
+    assert Changes("a.map", "b", moved=(unscaled,)).summary().endswith("1 moved (chair 6)")
+    refused = Changes("a.map", "b", "3 of 40 frames agree")
+    assert refused.summary() == "map a.map: not placed; 3 of 40 frames agree"
+
+
+def test_every_object_has_one_change() -> None:
+    changes = room_changes()
+    assert {i: kind for i, (kind, _) in changes.of_objects().items()} == {
+        1: "stayed", 6: "moved", 9: "gone", 12: "new", 3: "not_seen"
+    }  # fmt: skip
+    with pytest.raises(rt.ReobjError, match="object 6 is in 2 lists"):
+        dataclasses.replace(changes, stayed=(*changes.stayed, *changes.moved))
+    with pytest.raises(rt.ReobjError, match="chair 8 is ambiguous and in no other list"):
+        dataclasses.replace(changes, ambiguous=(Change(8, "chair"),))
+    with pytest.raises(rt.ReobjError, match="chair 6 is moved without a position 'from'"):
+        dataclasses.replace(changes, moved=(dataclasses.replace(changes.moved[0], before=None),))
+    with pytest.raises(rt.ReobjError, match="cup 12 is new without a position 'to'"):
+        Changes("a.map", "b", new=(Change(12, "cup", np.zeros(3)),))
+
+
+def _set(kind: str, **values: Any) -> Callable[[dict[str, Any]], None]:
+    return lambda data: data[kind][0].update(values)
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda d: d.update(format="reobj-objects"), "expected format reobj-changes, version 1"),
+        (lambda d: d.update(version=2), "expected format reobj-changes, version 1"),
+        (lambda d: d.pop("gone"), "'gone' is missing"),
+        (lambda d: d.pop("map"), "'map' is missing"),
+        (lambda d: d["new"][0].pop("class"), r"\$\.new\[0\]: 'class' is missing"),
+        (_set("moved", to=[1, 2]), r"\$\.moved\[0\]\.to: expected 3 finite numbers"),
+        (_set("moved", to=[1, 2, float("nan")]), r"to: expected 3 finite numbers"),
+        (_set("moved", id=0), r"\$\.moved\[0\]\.id: 0, expected an integer > 0"),
+        (_set("moved", distance_m="far"), r"distance_m: 'far', expected a number"),
+        (_set("moved", distance_m=-1), "chair 6 has a negative distance or sigma"),
+        (_set("moved", candidates=[1.5]), r"candidates\[0\]: 1.5, expected an integer"),
+        (_set("stayed", id=6), "object 6 is in 2 lists"),
+        (_set("gone", **{"from": None}), "lamp 9 is gone without a position 'from'"),
+        (lambda d: d["gone"][0]["from_shape"].update(half_axes=[1, 1, 0]), "positive numbers"),
+        (lambda d: d["gone"][0]["from_shape"].update(quat_wxyz=[2, 0, 0, 0]), "not of length 1"),
+        (lambda d: d["gone"][0]["from_shape"].update(support="cone"), "shape 'cone'"),
+        (lambda d: d.update(moved={}), r"\$\.moved: an object, expected a list"),
+    ],
+)
+def test_damaged_files_are_refused_in_one_line(
+    tmp_path: Path, damage: Callable[[dict[str, Any]], None], message: str
+) -> None:
+    path = tmp_path / "changes.json"
+    data = room_changes().to_json()
+    damage(data)
+    path.write_text(json.dumps(data))
+    with pytest.raises(rt.ReobjError, match=message) as caught:
+        read_changes(path)
+    text = str(caught.value)
+    assert text.startswith(f"{path}: ") and text.endswith("run the video again")
+    assert "\n" not in text
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "7", "null"])
+def test_other_files_are_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "changes.json").write_text(text)
+    with pytest.raises(rt.ReobjError, match=r"changes\.json"):
+        read_changes(tmp_path / "changes.json")
+
+
+def test_a_result_keeps_its_changes(chairs: rt.Result, parted: rt.Result, tmp_path: Path) -> None:
+    """In its folder, in its components, without doubtful objects; a run without a map has none."""
+    result = dataclasses.replace(chairs, changes=room_changes())
+    result.save(tmp_path)
+    assert_equal(rt.Result.load(tmp_path).changes, room_changes())
+    assert result.without_doubtful().changes is result.changes
+    assert dataclasses.replace(parted, changes=result.changes).of_part(1).changes is result.changes
+    dataclasses.replace(chairs).save(tmp_path)
+    assert not (tmp_path / "changes.json").exists()
+    assert rt.Result.load(tmp_path).changes is None
+
+
+def test_the_report_has_the_summary(chairs: rt.Result) -> None:
+    """After the counts of the objects, wrapped."""
+    changes = dataclasses.replace(room_changes(), map_path="a/rather/long/path/of/the/flat.map")
+    lines = dataclasses.replace(chairs, changes=changes).summary().splitlines()
+    (counts,) = (k for k, line in enumerate(lines) if line.startswith("distinct objects"))
+    text = " ".join(line.strip() for line in lines[counts + 1 : counts + 3])
+    assert text == changes.summary()
+    assert max(map(len, lines[counts + 1 : counts + 3])) <= 100
+    assert "map" not in chairs.summary()
