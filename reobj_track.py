@@ -70,7 +70,17 @@ from reobj.appearance.reid import (
 from reobj.appearance.sampling import SamplingLayout
 from reobj.cameras import Camera, Poses, checked_pose, viewing_rays
 from reobj.commands import SafeFormatter, make_parser, say, short_help, with_streams
-from reobj.files import Progress, atomic, load_cached, load_npz, save_npz, wrapped
+from reobj.files import Progress, atomic, load_cached, load_npz, part_path, save_npz, wrapped
+from reobj.maps.room_map import RoomMap
+from reobj.maps.stage import (
+    MapConfig,
+    OpenMap,
+    Placed,
+    finish_map,
+    move_models,
+    opened_map,
+    place_recording,
+)
 from reobj.objects.config import ObjectsConfig
 from reobj.objects.description import components_message
 from reobj.objects.fit import fill, link_and_fit
@@ -163,10 +173,10 @@ __all__ = [
     "COCO_NAMES", "Camera", "Config", "CropEmbedder", "DetectConfig", "DetectionSource",
     "Detections", "EmbedConfig", "Embedder", "Embeddings", "Frame", "InputConfig", "LinkEvent",
     "MatchingOptions", "Object", "ObjectsConfig", "OnnxDetector", "OutputConfig", "Part", "Poses",
-    "PosesConfig", "ReobjError", "Result", "SamplingLayout", "Tracker", "TrackerConfig", "Tracks",
-    "Video", "World", "__version__", "estimate_poses", "evaluate", "export", "list_models", "main",
-    "model_path", "open_detections", "read_detections", "read_poses", "read_tracks", "refit", "run",
-    "track", "write_detections_npz",
+    "PosesConfig", "ReobjError", "Result", "RoomMap", "SamplingLayout", "Tracker", "TrackerConfig",
+    "Tracks", "Video", "World", "__version__", "estimate_poses", "evaluate", "export",
+    "list_models", "main", "model_path", "open_detections", "read_detections", "read_poses",
+    "read_tracks", "refit", "run", "track", "write_detections_npz",
 ]  # fmt: skip
 
 # ---- Configuration -----------------------------------------------------------------------------
@@ -242,6 +252,7 @@ class Config:
     poses: PosesConfig = field(default_factory=PosesConfig)
     objects: ObjectsConfig = field(default_factory=ObjectsConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
+    map: MapConfig = field(default_factory=MapConfig)
     threads: int = option(0, "threads of onnxruntime and OpenCV (0: all cores)", "--threads")
     device: str = option(
         "cpu", "device of the networks: cpu, cuda, coreml, ... (onnxruntime)", "--device"
@@ -1229,7 +1240,7 @@ def run(
         cv2.setNumThreads(config.threads)
     _check_objects(config.objects)
     video = open_video(source, config.input, config.poses, tracks or detections, config.detect)
-    with Workspace(out, overwrite) as workspace:
+    with Workspace(out, overwrite) as workspace, opened_map(config.map) as room:
         workspace.bind(video, overwrite)
         job = _Job(video, workspace, config)
         viewer = Viewer(VideoInfo.of(video)) if show else None
@@ -1250,10 +1261,15 @@ def run(
             poses = _supplied_cameras(job, readings, boxes if tracks else _tracklets(boxes))
         elif in_3d and not video.is_live:
             poses, models = _reconstructed_cameras(job, boxes, class_names)
+        placed = None
+        if room is not None and poses is not None and poses.known.any():
+            placed, models = _place(job, room, poses, models)
+            poses = placed.poses
         if not tracks:
             result = _track_video(job, detected, poses, viewer)
         warnings = [*result.warnings, *workspace.save_last(result, poses, models)]
-        result = _finish(job, dataclasses.replace(result, poses=poses, warnings=warnings))
+        result = dataclasses.replace(result, poses=poses, warnings=warnings)
+        result = _finish(job, result, room, placed)
         if viewer is not None:
             viewer.show(result.without_doubtful(), Path("rerun"), images=not viewer.followed)
             viewer.close()
@@ -1289,7 +1305,8 @@ def refit(
         result = dataclasses.replace(
             result, poses=last.poses, edits=corrections, warnings=[*result.warnings, *warnings]
         )
-        return _finish(_Job(video, workspace, config), result)
+        with opened_map(config.map) as room:
+            return _finish(_Job(video, workspace, config), result, room)
 
 
 def _last_config(out: str | Path) -> Config:
@@ -1303,6 +1320,7 @@ KEPT = {
     "detect": "the frames detected so far",
     "poses": "the features and matches so far",
     "track": "the frames up to the last save",  # `collect_tracks` says how many
+    "map": "nothing",
     "objects": "nothing",
     "write": "the files that are complete",
 }
@@ -1350,7 +1368,7 @@ class _Job:
             kept = getattr(interruption, "__notes__", None) or [KEPT[stage]]
             interruption.add_note(f"in the stage {stage}, which keeps {kept[0]}")
             raise
-        self.seconds[stage] = time.monotonic() - started
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.monotonic() - started
         steps: dict[str, float] = {}
         for line in self.lines:
             steps[line.stage] = steps.get(line.stage, 0.0) + line.seconds
@@ -1460,10 +1478,26 @@ def _given_tracks(
     )
 
 
-def _finish(job: _Job, result: Result) -> Result:
-    """Link tracklets, fit one shape per object, and write the output folder."""
+def _place(
+    job: _Job, room: OpenMap, poses: Poses, models: list[Path]
+) -> tuple[Placed, list[Path]]:
+    """Place the cameras, and their COLMAP models, in the world of the map."""
+    with job.timed("map"):
+        placed = place_recording(room, poses, job.video, progress=job.progress)
+        folder = job.workspace.path("placed", job.video.fingerprint).with_suffix(".sparse")
+        return placed, move_models(models, poses, placed, lambda k: part_path(folder, k))
+
+
+def _finish(
+    job: _Job, result: Result, room: OpenMap | None = None, placed: Placed | None = None
+) -> Result:
+    """Link tracklets, fit one shape per object, and write the map and the output folder."""
     with job.timed("objects"):
         result = _fit_objects(job, result)
+    if room is not None:
+        with job.timed("map"):
+            embedder = f"{job.config.embed.model} {job.config.embed.head}"
+            result = finish_map(room, result, job.video, embedder, placed)
     warnings = [*result.warnings, *_warnings(job.config, result)]
     result = dataclasses.replace(result, warnings=warnings, out=job.workspace.out)
     with job.timed("write"):

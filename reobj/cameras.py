@@ -241,6 +241,8 @@ class Poses:
             a pose belongs to the component of the nearest frame with one.
         messages: warnings (frames without poses, and what to do about them).
         reading: how supplied poses were read: format, and the rule that matched their frames.
+        scale: metres per world unit and its relative standard deviation, given by a map; None:
+            estimated with the objects. map_id: of the map whose world this is; "": none.
     """
 
     camera: Camera
@@ -257,6 +259,8 @@ class Poses:
     part: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
     messages: tuple[str, ...] = ()
     reading: str = ""
+    scale: tuple[float, float] | None = None
+    map_id: str = ""
 
     def __post_init__(self) -> None:
         if len(self.part) != len(self.frame):
@@ -297,6 +301,7 @@ class Poses:
             self,
             **{k: getattr(self, k)[rows] for k in ("frame", "time_s", "cam_from_world", "status")},
             up_in_world=None if part else self.up_in_world,  # given in the world of component 0
+            scale=None if part else self.scale,
             points=self.points[kept],
             colors=self.colors[kept],
             visibility=np.column_stack([row_of[seen[:, 0]], np.searchsorted(kept, seen[:, 1])]),
@@ -319,6 +324,8 @@ def save_poses(path: Path, poses: Poses, **more: Any) -> None:
         "up": None if poses.up_in_world is None else poses.up_in_world.tolist(),
         "messages": poses.messages,
         "reading": poses.reading,
+        "scale": poses.scale,
+        "map_id": poses.map_id,
     }
     names = (
         "frame", "time_s", "cam_from_world", "status", "points", "colors", "visibility", "part"
@@ -338,6 +345,8 @@ def load_poses(path: Path) -> Poses:
         up_in_world=up,
         messages=tuple(facts["messages"]),
         reading=facts.get("reading", ""),
+        scale=None if facts.get("scale") is None else tuple(facts["scale"]),
+        map_id=facts.get("map_id", ""),
         **arrays,
     )
 

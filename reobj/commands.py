@@ -196,7 +196,7 @@ def make_parser(
 
 def _add_run(command: Any, name: str, text: str) -> None:
     sections = {
-        "run": ("input", "detect", "embed", "tracker", "poses", "objects", ""),
+        "run": ("input", "detect", "embed", "tracker", "poses", "objects", "map", ""),
         "track": ("input", "detect", "embed", "tracker", ""),
         "poses": ("input", "poses", ""),
     }[name]

@@ -72,14 +72,16 @@ def make_fit(config: ObjectsConfig, poses: Poses, class_names: Sequence[str]) ->
         raise ReobjError(f"--solver {config.solver}: expected {expected}")
     up = parse_up(config.up) if config.up else poses.up_in_world
     support = None if config.support == "auto" else config.support
+    given = None if poses.scale is None else quadrics.Scale(*poses.scale, "map")
     plain = quadrics.FitConfig(path_where_seen=int(poses.known.sum()) > FrameOptions().all_of)
 
     def fit(views: Views, classes: list[int], scene: Scene) -> quadrics.ObjectFits:
         names = [class_names[c] if c < len(class_names) else "" for c in classes]
+        scale = scene.scale or given
         fits = quadrics.fit_objects(
             views.boxes, views.img_from_world, views.image_size, names, priors,
             up=scene.up if up is None else up, support=support, score=views.score,
-            hidden=views.occluded, metric=poses.metric if scene.scale is None else scene.scale,
+            hidden=views.occluded, metric=poses.metric if scale is None else scale,
             known_size=known_size, floor=scene.floor, points=views.points,
             config=dataclasses.replace(plain, wrong_class=0) if scene.trusts_classes else plain,
         )  # fmt: skip

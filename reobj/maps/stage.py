@@ -1,0 +1,271 @@
+"""The map in a run: opened and locked, cameras placed in it, objects numbered, the file updated."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+import quadrics
+from reobj.cameras import Poses, import_pycolmap
+from reobj.files import Progress
+from reobj.maps.fusion import scale_of
+from reobj.maps.placement import (
+    ComponentPlacement,
+    ImageFeatures,
+    Placement,
+    PlacementOptions,
+    image_features,
+    place,
+    points_with_descriptors,
+)
+from reobj.maps.room_map import RoomMap, map_lock
+from reobj.maps.update import Recording, add_recording
+from reobj.results.changes import Changes
+from reobj.results.result import Result
+from reobj.sources.video import Video
+from reobj.types import ReobjError, option
+
+
+@dataclass(frozen=True, slots=True)
+class MapConfig:
+    """Map of the room, in which objects keep their numbers over several recordings."""
+
+    path: str = option(
+        "",
+        "map file: the recording is placed in it, its objects get the numbers they have there, and "
+        "the map is updated; it is made if it does not exist",
+        "--map",
+    )
+    frozen: bool = option(
+        False, "compare with the map only; do not change the file", "--map-frozen"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class OpenMap:
+    """The map of a run.
+
+    Attributes:
+        path: of the file. room: its content, or an empty map. frozen: the file is not changed.
+    """
+
+    path: Path
+    room: RoomMap
+    frozen: bool
+
+
+@contextlib.contextmanager
+def opened_map(config: MapConfig) -> Iterator[OpenMap | None]:
+    """Open the map of a run, and hold its lock unless it is frozen; None without a map.
+
+    Raises:
+        ReobjError: damaged, another kind of file, used by another run, or frozen and missing.
+    """
+    if not config.path:
+        if config.frozen:
+            raise ReobjError("--map-frozen without --map: give the map to compare with")
+        yield None
+        return
+    path = Path(config.path)
+    if config.frozen:
+        yield OpenMap(path, RoomMap.load(path), True)
+        return
+    with map_lock(path):
+        yield OpenMap(path, RoomMap.load(path) if path.exists() else RoomMap(), False)
+
+
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """Cameras of a recording in the world of its map.
+
+    Attributes:
+        poses: of the map's world, if the recording was placed (`placement.refused` is empty).
+        features: of some of its images. placement: None for the first recording of a map.
+        scale: metres per unit of the map, by supplied metric poses; None: not measured.
+    """
+
+    poses: Poses
+    features: tuple[ImageFeatures, ...]
+    placement: Placement | None
+    scale: quadrics.Scale | None = None
+
+
+def place_recording(
+    opened: OpenMap,
+    poses: Poses,
+    video: Video,
+    options: PlacementOptions | None = None,
+    progress: Callable[[str, int], Progress] = Progress,
+) -> Placed:
+    """Place the cameras of a recording in a map; the first recording defines the map's world."""
+    options = options or PlacementOptions()
+    features = tuple(image_features(poses, video, options, progress("map features", 0)))
+    room = opened.room
+    if not room.sessions:
+        return Placed(dataclasses.replace(poses, map_id=room.map_id), features, None)
+    with progress("map", 0) as line:
+        placement = place(poses, features, room.points, options, line.step)
+    if placement.refused:
+        return Placed(poses, features, placement)
+    known = scale_of(room)
+    scale = None
+    if poses.metric and not room.metric:
+        best = best_component(placement)
+        assert best.similarity is not None
+        sigma = float(np.sqrt(best.similarity.cov[6, 6]))
+        scale = quadrics.Scale(1 / best.similarity.scale, sigma, "poses")
+        known = scale
+    moved = dataclasses.replace(
+        placement.poses,
+        metric=room.metric and placement.poses.part_count == 1,
+        scale=None if known.source == "none" else (known.value, known.rel_sigma),
+        up_in_world=room.up,
+        map_id=room.map_id,
+    )
+    return Placed(moved, features, placement, scale)
+
+
+def best_component(placement: Placement) -> ComponentPlacement:
+    """Return the placed component with most images that agree."""
+    placed = [c for c in placement.components if c.similarity is not None]
+    return max(placed, key=lambda c: len(c.images))
+
+
+def move_models(
+    models: Sequence[Path], poses: Poses, placed: Placed, folder: Callable[[int], Path]
+) -> list[Path]:
+    """Move the COLMAP models of placed components into the world of the map.
+
+    The models of further components that were placed too are left out: a model is one component.
+
+    Args:
+        models: one a component of `poses`, before they were placed. folder: for the copy of a
+            component's model, by its number.
+    Returns:
+        the folders, one a component of `placed.poses`.
+    """
+    placement = placed.placement
+    if placement is None or placement.refused or not models:
+        return list(models)
+    pc = import_pycolmap()
+    found = list[Path]()
+    others = list[Path]()
+    most = 0
+    for k, model in enumerate(models):
+        similarity = placement.components[k].similarity
+        if similarity is None:
+            others.append(model)
+            continue
+        count = int((poses.part == k).sum())
+        if not model.is_dir() or count <= most:
+            continue
+        most = count
+        target = folder(k)
+        shutil.rmtree(target, ignore_errors=True)
+        target.mkdir(parents=True)
+        reconstruction = pc.Reconstruction(str(model))
+        rotation = pc.Rotation3d(similarity.rotation)
+        reconstruction.transform(pc.Sim3d(similarity.scale, rotation, similarity.translation))
+        reconstruction.write(str(target))
+        found = [target]
+    return [*found, *others]
+
+
+def finish_map(
+    opened: OpenMap, result: Result, video: Video, embedder: str, placed: Placed | None
+) -> Result:
+    """Number the objects of a recording, write the map, and return the result with `changes`.
+
+    Args:
+        placed: None: the cameras are those of the last run, with the points that the map has.
+    """
+    room = opened.room
+    name = Path(str(video.source)).name or str(video.source)
+    poses = result.poses
+    refused = ""
+    if poses is None or not poses.known.any():
+        refused = "the recording has no camera poses"
+    elif placed is not None and placed.placement is not None and placed.placement.refused:
+        refused = (
+            f"this is not the room of {opened.path.name}, or nothing in view matches it: "
+            f"{placed.placement.refused}"
+        )
+    elif poses.map_id != room.map_id:
+        refused = "its cameras were not placed in this map; run the video again with --map"
+    if refused:
+        text = f"map {opened.path}: {refused}; the objects have no numbers of the map"
+        if not room.sessions:
+            text = f"map {opened.path}: not made, {refused}"
+        tried = 0
+        if placed is not None and placed.placement is not None:
+            tried = sum(c.tried for c in placed.placement.components)
+        return dataclasses.replace(
+            result,
+            changes=Changes(str(opened.path), name, refused=refused, tried_frames=tried),
+            warnings=[*result.warnings, text],
+        )
+    new_room, numbered = add_recording(room, result, _recording(opened, result, video, name,
+                                                                embedder, placed))  # fmt: skip
+    if not opened.frozen:
+        new_room.save(opened.path)
+    return numbered
+
+
+def _recording(
+    opened: OpenMap,
+    result: Result,
+    video: Video,
+    name: str,
+    embedder: str,
+    placed: Placed | None,
+) -> Recording:
+    """Collect the facts of a recording; those of a refitted one are in the map."""
+    old = opened.room.session_of(video.fingerprint)
+    none = quadrics.Scale(1.0, np.inf, "none")
+    if placed is None:
+        scale = none
+        if old is not None:
+            scale = quadrics.Scale(old.metres_per_unit, old.scale_rel_sigma, old.scale_source)
+        return Recording(
+            opened.path, name, video.fingerprint, embedder,
+            np.zeros((7, 7)) if old is None else old.alignment_cov,
+            0 if old is None else old.localised_frames, 0 if old is None else old.tried_frames,
+            scale, None,
+        )  # fmt: skip
+    poses = placed.poses
+    points = points_with_descriptors(poses.of_part(0), _of_first_component(placed), 0)
+    if placed.placement is None:
+        own = result.world.scale or none
+        scale = quadrics.Scale(1.0, 0.0, "poses") if poses.metric else own
+        count = len(placed.features)
+        cov = np.zeros((7, 7))
+        return Recording(
+            opened.path, name, video.fingerprint, embedder, cov, count, count, scale, points
+        )
+    best = best_component(placed.placement)
+    assert best.similarity is not None
+    if old is not None and placed.scale is None:
+        scale = quadrics.Scale(old.metres_per_unit, old.scale_rel_sigma, old.scale_source)
+    else:
+        scale = placed.scale or none
+    return Recording(
+        opened.path, name, video.fingerprint, embedder, best.similarity.cov,
+        len(best.images), best.tried, scale, points,
+    )  # fmt: skip
+
+
+def _of_first_component(placed: Placed) -> list[ImageFeatures]:
+    """Return the features of images of the first component, by their row in it."""
+    rows = np.flatnonzero(placed.poses.part == 0)
+    row_of = {int(row): k for k, row in enumerate(rows)}
+    return [
+        dataclasses.replace(image, row=row_of[image.row])
+        for image in placed.features
+        if image.row in row_of
+    ]

@@ -1,0 +1,396 @@
+"""Give the objects of a recording their numbers in the map, and add the recording to the map."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import quadrics
+from reobj.cameras import Poses
+from reobj.maps.compare import Decision, FoundObject, Visibility, compare
+from reobj.maps.fusion import ObjectState, object_state, scale_of
+from reobj.maps.room_map import MapObject, MapPoints, Observation, RoomMap, Session
+from reobj.maps.visibility import shapes_of, visibility_of
+from reobj.results.changes import Change, Changes, Shape
+from reobj.results.result import Object, Result
+from reobj.types import Array, Floats, IntArray, unit_rows
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """Facts about a recording that is added to a map.
+
+    Attributes:
+        map_path: of the map's file, for changes.json. name: of the session. fingerprint: of the
+            video's content. embedder: key of the embedding model.
+        alignment_cov: (7, 7) of its placement, zeros for the first session.
+        localised_frames, tried_frames: images that agreed, that were compared.
+        scale: metres per unit of the map as this recording measured it; source "none": it did not.
+        points: with descriptors, in the world of the map; None: those of the map are kept.
+    """
+
+    map_path: Path
+    name: str
+    fingerprint: str
+    embedder: str
+    alignment_cov: Array
+    localised_frames: int
+    tried_frames: int
+    scale: quadrics.Scale
+    points: MapPoints | None
+
+
+def add_recording(room: RoomMap, result: Result, recording: Recording) -> tuple[RoomMap, Result]:
+    """Compare a recording with the map, number its objects, and add it as a session.
+
+    A session of the same video is replaced: its objects keep the numbers that they had.
+
+    Args:
+        result: its first component is in the world of the map.
+    Returns:
+        the new map; the result with the numbers of the map and with `changes`.
+    """
+    assert result.poses is not None
+    states = [object_state(found, room) for found in room.objects]
+    objects = [o for o in result.located if o.part == 0]
+    found = _found_objects(result, objects)
+    is_first = not room.sessions
+    visibility = visibility_of(states, result.poses, shapes_of(objects), result.looked)
+    metres = scale_of(room).value if room.sessions else recording.scale.value
+    decisions = compare(
+        states,
+        found,
+        visibility,
+        recording.alignment_cov,
+        metres,
+        any(s.embedder == recording.embedder for s in states),
+    )
+    numbers = _numbers(result, decisions, room, is_first)
+    old = room.session_of(recording.fingerprint)
+    number = room.next_session if old is None else old.number
+    session = _session(number, recording, result.poses)
+    observations = _observations(number, decisions, found, states, visibility)
+    sessions = (*(s for s in room.sessions if s.number != number), session)
+    points = room.points
+    if recording.points is not None:
+        marked = _on_objects(recording.points, result, objects, numbers)
+        marked = dataclasses.replace(marked, session=np.full(len(marked), number))
+        points = MapPoints.joined([points[points.session != number], marked])
+    new_room = dataclasses.replace(
+        room,
+        sessions=tuple(sorted(sessions, key=lambda s: s.number)),
+        objects=_with_observations(room, number, observations, numbers),
+        points=points,
+        metric=result.poses.metric if is_first else room.metric,
+        up=result.world.up_in_world if room.up is None else room.up,
+        next_id=max(room.next_id, max(numbers.values(), default=0) + 1),
+        next_session=max(room.next_session, number + 1),
+    )
+    changes = _changes(decisions, states, found, numbers, recording, scale_of(new_room))
+    return new_room, _renumbered(result, numbers, states, decisions, changes)
+
+
+# ---- Objects of the recording ------------------------------------------------------------------
+
+
+def _found_objects(result: Result, objects: Sequence[Object]) -> list[FoundObject]:
+    """Collect shape, classes and mean embeddings of objects."""
+    identity = result.tracks.track_id[result.embedding_row]
+    found = []
+    for o in objects:
+        rows = np.flatnonzero(identity == o.id)
+        count = max(o.views, 1)
+        found.append(
+            FoundObject(
+                o.id,
+                {name: count * share for name, share in o.classes.items()} or {o.class_name: count},
+                str(o.support),
+                _array(o.center, 3),
+                _array(o.half_axes, 3),
+                _array(o.quat_wxyz, 4),
+                np.full((9, 9), np.nan) if o.cov is None else o.cov,
+                _mean_unit(result.embeddings.foreground[rows]),
+                _mean_unit(result.embeddings.background[rows]),
+                o.views,
+                1.0 if o.confidence is None else o.confidence,
+                {},
+            )
+        )
+    return found
+
+
+def _array(values: Array | None, length: int) -> Array:
+    """Return the values of a located object, NaN for None."""
+    return np.full(length, np.nan) if values is None else values
+
+
+def _mean_unit(rows: Floats) -> Floats:
+    """Return the mean direction of rows (n, E); empty without rows."""
+    values = np.asarray(rows, np.float32)
+    if not values.size or not values.any():
+        return np.empty(0, np.float32)
+    return np.asarray(unit_rows(unit_rows(values).mean(0, keepdims=True))[0], np.float32)
+
+
+def _on_objects(
+    points: MapPoints, result: Result, objects: Sequence[Object], numbers: Mapping[int, int]
+) -> MapPoints:
+    """Mark points inside the ellipsoid of an object, enlarged by a tenth, with its number."""
+    object_id = np.zeros(len(points), np.int64)
+    shapes = shapes_of(objects)
+    best = np.full(len(points), 1.1**2)
+    for k, o in enumerate(objects):
+        inside = (points.xyz - shapes.center_in_world[k]) @ shapes.world_from_obj[k]
+        distance = ((inside / shapes.half_axes[k]) ** 2).sum(1)
+        nearer = distance < best
+        object_id[nearer] = numbers[o.id]
+        best[nearer] = distance[nearer]
+    return dataclasses.replace(points, object_id=object_id)
+
+
+# ---- Numbers -----------------------------------------------------------------------------------
+
+
+def _numbers(
+    result: Result, decisions: Sequence[Decision], room: RoomMap, is_first: bool
+) -> dict[int, int]:
+    """Return the number in the map of every identity of the result.
+
+    In the first session identities are the numbers. Otherwise objects that match keep theirs, and
+    all others get numbers that no object had.
+    """
+    identities = [o.id for o in result.objects]
+    if is_first:
+        return {identity: identity for identity in identities}
+    numbers = {d.found_id: d.map_id for d in decisions if d.found_id and d.map_id}
+    unused = room.next_id
+    for identity in identities:
+        if identity not in numbers:
+            numbers[identity] = unused
+            unused += 1
+    return numbers
+
+
+def _renumbered(
+    result: Result,
+    numbers: Mapping[int, int],
+    states: Sequence[ObjectState],
+    decisions: Sequence[Decision],
+    changes: Changes,
+) -> Result:
+    """Give tracks and objects the numbers of the map; leave out what the user deleted there."""
+    deleted = {s.id for s in states if s.deleted}
+    name_of = {s.id: s.class_name for s in states}
+    matched = {d.map_id for d in decisions if d.found_id and d.map_id}
+    identities, row = np.unique(result.tracks.track_id, return_inverse=True)
+    new = np.array([numbers.get(i, i) for i in identities.tolist()], np.int64)
+    track_id = new[row] if len(new) else result.tracks.track_id
+    kept = ~np.isin(track_id, list(deleted & matched))
+    objects = [
+        dataclasses.replace(
+            o,
+            id=numbers[o.id],
+            class_name=name_of[numbers[o.id]] if numbers[o.id] in matched else o.class_name,
+        )
+        for o in result.objects
+    ]
+    order = np.array(sorted(range(len(objects)), key=lambda k: objects[k].id), np.int64)
+    order = order[[objects[k].id not in deleted & matched for k in order.tolist()]] \
+        if len(order) else order  # fmt: skip
+    row_of = np.cumsum(kept) - 1
+    embedded = kept[result.embedding_row]
+    embeddings = dataclasses.replace(
+        result.embeddings,
+        foreground=result.embeddings.foreground[embedded],
+        background=result.embeddings.background[embedded],
+    )
+    return dataclasses.replace(
+        result,
+        tracks=dataclasses.replace(result.tracks, track_id=track_id)[kept],
+        objects=[objects[k] for k in order.tolist()],
+        fits=None if result.fits is None else _chosen(result.fits, order),
+        embeddings=embeddings,
+        embedding_row=row_of[result.embedding_row[embedded]],
+        changes=changes,
+    )
+
+
+def _chosen(fits: quadrics.ObjectFits, order: IntArray) -> quadrics.ObjectFits:
+    """Select fits by object."""
+    columns = ("size", "cov", "support", "rms_px", "status", "parallax_deg", "prior_share")
+    chosen = {name: getattr(fits, name)[order] for name in columns}
+    return dataclasses.replace(
+        fits,
+        ellipsoids=quadrics.Ellipsoids(
+            fits.ellipsoids.center_in_world[order],
+            fits.ellipsoids.half_axes[order],
+            fits.ellipsoids.world_from_obj[order],
+        ),
+        inlier=fits.inlier[:, order],
+        reason=[fits.reason[k] for k in order.tolist()],
+        **chosen,
+    )
+
+
+# ---- The new session ---------------------------------------------------------------------------
+
+
+def _session(number: int, recording: Recording, poses: Poses) -> Session:
+    """Describe the recording; at most 100 cameras spread over its first component."""
+    rows = np.flatnonzero(poses.measured & (poses.part == 0))
+    chosen = np.unique(np.linspace(0, max(len(rows) - 1, 0), min(100, len(rows))).round())
+    rows = rows[chosen.astype(np.int64)]
+    return Session(
+        number,
+        recording.name,
+        datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        recording.fingerprint,
+        recording.embedder,
+        poses.camera,
+        poses.cam_from_world[rows],
+        float(recording.scale.value),
+        float(recording.scale.rel_sigma) if np.isfinite(recording.scale.rel_sigma) else 0.0,
+        recording.scale.source,
+        recording.alignment_cov,
+        recording.localised_frames,
+        recording.tried_frames,
+    )
+
+
+def _observations(
+    session: int,
+    decisions: Sequence[Decision],
+    found: Sequence[FoundObject],
+    states: Sequence[ObjectState],
+    visibility: Visibility,
+) -> list[tuple[int, int, Observation]]:
+    """Return (number in the map, identity in the recording, observation) of every decision."""
+    found_of = {o.id: o for o in found}
+    row_of = {s.id: k for k, s in enumerate(states)}
+    rows = []
+    for d in decisions:
+        expected = int(visibility.expected[row_of[d.map_id]]) if d.map_id in row_of else 0
+        if not d.found_id:
+            unseen = Observation(session, d.kind, expected=expected, missed=expected)
+            rows.append((d.map_id, 0, unseen))
+            continue
+        o = found_of[d.found_id]
+        confidence = float(np.clip(o.confidence, 0.01, 0.99))
+        rows.append((
+            d.map_id,
+            d.found_id,
+            Observation(
+                session,
+                d.kind,
+                o.support,
+                o.center,
+                o.half_axes,
+                o.quat_wxyz,
+                o.cov,
+                o.classes,
+                o.foreground,
+                o.background,
+                o.views if len(o.foreground) else 0,
+                o.views,
+                expected=expected,
+                log_odds=float(np.log(confidence / (1 - confidence))),
+            ),
+        ))  # fmt: skip
+    return rows
+
+
+def _with_observations(
+    room: RoomMap,
+    session: int,
+    observations: Sequence[tuple[int, int, Observation]],
+    numbers: Mapping[int, int],
+) -> tuple[MapObject, ...]:
+    """Return the objects with the observations of a session instead of those that it had."""
+    objects = {
+        o.id: dataclasses.replace(
+            o, observations=tuple(x for x in o.observations if x.session != session)
+        )
+        for o in room.objects
+    }
+    for map_id, identity, observation in observations:
+        number = map_id or numbers[identity]
+        before = objects.get(number, MapObject(number, ()))
+        if not before.observations and observation.detected:
+            observation = dataclasses.replace(observation, status="new")
+        objects[number] = dataclasses.replace(
+            before, observations=(*before.observations, observation)
+        )
+    kept = [o for o in objects.values() if any(x.detected for x in o.observations)]
+    return tuple(sorted(kept, key=lambda o: o.id))
+
+
+# ---- What changed ------------------------------------------------------------------------------
+
+
+def _changes(
+    decisions: Sequence[Decision],
+    states: Sequence[ObjectState],
+    found: Sequence[FoundObject],
+    numbers: Mapping[int, int],
+    recording: Recording,
+    scale: quadrics.Scale,
+) -> Changes:
+    """List what stayed, moved, went and came."""
+    state_of = {s.id: s for s in states}
+    found_of = {o.id: o for o in found}
+    metres = scale.value if scale.source != "none" else None
+    lists: dict[str, list[Change]] = {kind: [] for kind in Changes.KINDS}
+    for d in decisions:
+        state = state_of.get(d.map_id)
+        if state is not None and state.deleted:
+            continue
+        o = found_of.get(d.found_id)
+        name = max(o.classes, key=lambda c: o.classes[c]) if o is not None else "object"
+        change = Change(
+            d.map_id or numbers[d.found_id],
+            name if state is None else state.class_name,
+            None if state is None else state.center,
+            None if o is None else o.center,
+            *_displacement(state, o, recording.alignment_cov, metres),
+            d.evidence,
+            tuple(c for c in d.candidates if c != d.map_id),
+            None if state is None else Shape(state.support, state.half_axes, state.quat_wxyz),
+        )
+        lists[d.kind].append(change)
+        if change.candidates:
+            lists["ambiguous"].append(change)
+    sigma = float(np.sqrt(np.diag(recording.alignment_cov)[3:6].sum()))
+    by_id: dict[str, Any] = {k: sorted(rows, key=lambda c: c.id) for k, rows in lists.items()}
+    changes = Changes(
+        str(recording.map_path),
+        recording.name,
+        localised_frames=recording.localised_frames,
+        tried_frames=recording.tried_frames,
+        sigma_m=None if metres is None else metres * sigma,
+    )
+    return dataclasses.replace(changes, **by_id)
+
+
+def _displacement(
+    state: ObjectState | None, found: FoundObject | None, alignment_cov: Array, metres: float | None
+) -> tuple[float | None, float | None]:
+    """Return the distance between the centres and its standard deviation, metres."""
+    if state is None or found is None or metres is None:
+        return None, None
+    offset = found.center - state.center
+    distance = float(np.linalg.norm(offset))
+    x, y, z = found.center
+    J = np.zeros((3, 7))
+    J[:, :3] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
+    J[:, 3:6] = np.eye(3)
+    J[:, 6] = found.center
+    cov = state.cov[:3, :3] + found.cov[:3, :3] + J @ alignment_cov @ J.T
+    along = offset / distance if distance > 0 else np.array([1.0, 0, 0])
+    sigma = float(np.sqrt(along @ cov @ along)) if np.isfinite(cov).all() else None
+    return metres * distance, None if sigma is None else metres * sigma

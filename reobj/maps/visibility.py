@@ -1,0 +1,165 @@
+"""How the cameras of a recording saw the places of the objects of a map."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+import quadrics
+from reobj.cameras import Poses, invert_rigid
+from reobj.maps.compare import Visibility
+from reobj.maps.fusion import ObjectState
+from reobj.results.result import Object
+from reobj.types import Array, BoolArray, IntArray
+from reobj.visible_points import VisiblePoints
+
+
+def shapes_of(states: Sequence[ObjectState] | Sequence[Object]) -> quadrics.Ellipsoids:
+    """Return the ellipsoids of objects, in the world of the map."""
+    wxyz = np.array([s.quat_wxyz for s in states]).reshape(-1, 4)
+    axes = Rotation.from_quat(wxyz[:, [1, 2, 3, 0]]).as_matrix() if len(states) else wxyz
+    return quadrics.Ellipsoids(
+        np.array([s.center for s in states]).reshape(-1, 3),
+        np.array([s.half_axes for s in states]).reshape(-1, 3),
+        axes.reshape(-1, 3, 3),
+    )
+
+
+def visibility_of(
+    states: Sequence[ObjectState],
+    poses: Poses,
+    nearer: quadrics.Ellipsoids,
+    looked: IntArray | None = None,
+    most_views: int = 200,
+    least_px: float = 12.0,
+    in_view: float = 0.7,
+    apart_deg: float = 10.0,
+) -> Visibility:
+    """Count the independent views in which each object would be seen, and those through it.
+
+    An object is expected in an image if most of its projection lies inside, is large enough, and
+    neither objects of the recording nor most of the sparse points in its outline lie nearer.
+
+    Args:
+        states: N objects of the map. poses: placed in the map; only its first component is used.
+        nearer: objects of the recording, which may occlude. looked: frames that the detector was
+            run on; None: all.
+        most_views: spread over the recording; more take longer.
+        least_px: shorter side of the projected box, of an image 640 px wide; detectors miss
+            smaller objects.
+        in_view: fraction of the projected box inside the image.
+        apart_deg: views of an object less than this apart fail together and count once.
+    """
+    shapes = shapes_of(states)
+    support = [s.support for s in states]
+    measured = poses.measured & (poses.part == 0)
+    if looked is not None:
+        measured &= np.isin(poses.frame, looked)
+    rows = np.flatnonzero(measured)
+    rows = rows[np.unique(np.linspace(0, len(rows) - 1, most_views).round().astype(int))] \
+        if len(rows) else rows  # fmt: skip
+    size = (poses.camera.width, poses.camera.height)
+    cameras = poses.camera.K @ poses.cam_from_world[rows]
+    centre = invert_rigid(poses.cam_from_world[rows])[:, :, 3]
+    visible = VisiblePoints(poses)
+    expected = np.zeros((len(rows), len(states)), bool)
+    through = np.zeros((len(rows), len(states)), bool)
+    for v, row in enumerate(rows.tolist()):
+        whole = quadrics.solid_boxes(shapes, support, cameras[v : v + 1])[0]  # (N, 4)
+        clipped = quadrics.clip_boxes(whole[None], size)[0]
+        ratio = _area(clipped) / np.maximum(_area(whole), 1e-9)
+        sides = (clipped[:, 2:] - clipped[:, :2]).min(1) * 640 / max(size)
+        with np.errstate(invalid="ignore"):
+            shown = np.flatnonzero((ratio >= in_view) & (sides >= least_px))
+        shown = shown[~_behind_objects(shapes[shown], clipped[shown], nearer, cameras[v])]
+        points = visible.in_frame(row)
+        occluded, seen_through = _points_around(
+            shapes[shown], clipped[shown], poses.points[points], cameras[v], centre[v]
+        )
+        expected[v, shown[~occluded]] = True
+        through[v, shown[seen_through & ~occluded]] = True
+    ray = shapes.center_in_world - centre[:, None]  # (V, N, 3)
+    ray = ray / np.linalg.norm(ray, axis=2, keepdims=True).clip(1e-9)
+    counts = [
+        np.array([_independent(ray[mask[:, k], k], apart_deg) for k in range(len(states))], float)
+        for mask in (expected, through)
+    ]
+    return Visibility(*counts)
+
+
+def _area(box: Array) -> Array:
+    """Return the areas (N,) of boxes (N, 4), 0 for NaN."""
+    side = np.nan_to_num(box[:, 2:] - box[:, :2]).clip(0)
+    return np.asarray(side[:, 0] * side[:, 1])
+
+
+def _behind_objects(
+    shapes: quadrics.Ellipsoids, box: Array, nearer: quadrics.Ellipsoids, camera: Array
+) -> BoolArray:
+    """Mark shapes (n,) whose box is covered for the most part by an object before them."""
+    if not len(shapes) or not len(nearer):
+        return np.zeros(len(shapes), bool)
+    depth = shapes.center_in_world @ camera[2, :3] + camera[2, 3]  # (n,)
+    front = depth - shapes.half_axes.max(1)
+    other_depth = nearer.center_in_world @ camera[2, :3] + camera[2, 3]  # (m,)
+    other = quadrics.solid_boxes(nearer, "box", camera[None])[0]  # (m, 4)
+    low = np.maximum(box[:, None, :2], other[None, :, :2])
+    high = np.minimum(box[:, None, 2:], other[None, :, 2:])
+    side = np.nan_to_num(high - low).clip(0)
+    covered = side[..., 0] * side[..., 1] / np.maximum(_area(box), 1e-9)[:, None]  # (n, m)
+    is_nearer = (other_depth[None] < front[:, None]) & (other_depth[None] > 0)
+    return np.asarray((is_nearer & (covered > 0.5)).any(1), bool)
+
+
+def _points_around(
+    shapes: quadrics.Ellipsoids, box: Array, points: Array, camera: Array, centre: Array
+) -> tuple[BoolArray, BoolArray]:
+    """Mark shapes that points occlude, and shapes through whose middle points behind are seen.
+
+    Args:
+        box: (n, 4) projected. points: (P, 3) that the image shows. centre: (3,) of the camera.
+    Returns:
+        occluded: (n,) at least five points lie in the middle of the box, most of them before the
+        object. through: (n,) at least two points lie behind it on rays through its middle, and
+        more than on it or before it.
+    """
+    occluded = np.zeros(len(shapes), bool)
+    through = np.zeros(len(shapes), bool)
+    projected = points @ camera[:, :3].T + camera[:, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        xy = projected[:, :2] / projected[:, 2:]
+    for k in range(len(shapes)):
+        middle = (box[k, :2] + box[k, 2:]) / 2
+        half = 0.7 * (box[k, 2:] - box[k, :2]) / 2  # beside it the ray may miss the object
+        inside = np.flatnonzero((np.abs(xy - middle) < half).all(1) & (projected[:, 2] > 0))
+        if not len(inside):
+            continue
+        scaled = shapes.world_from_obj[k] / shapes.half_axes[k]
+        start = (centre - shapes.center_in_world[k]) @ scaled
+        along = (points[inside] - centre) @ scaled  # the point is at 1
+        a = (along**2).sum(1)
+        b = along @ start
+        square = float(start @ start)
+        hit = b**2 - a * (square - 1)
+        root = np.sqrt(hit.clip(0))
+        enter = (-b - root) / a
+        leave = (-b + root) / a
+        crosses = (square - b**2 / a < 0.6**2) & (leave > 0)  # through its middle
+        behind = crosses & (leave < 1 - 0.05)  # errors of depth
+        before = crosses & (enter > 1 + 0.05)
+        others = crosses & ~behind
+        occluded[k] = before.sum() >= 5 and before.sum() > 0.5 * crosses.sum()
+        through[k] = behind.sum() >= 2 and behind.sum() > others.sum()
+    return occluded, through
+
+
+def _independent(ray: Array, apart_deg: float) -> int:
+    """Count views whose rays (n, 3) are at least some degrees from those counted before."""
+    count = 0
+    least = np.cos(np.radians(apart_deg))
+    while len(ray):
+        count += 1
+        ray = ray[ray @ ray[0] < least]
+    return count
