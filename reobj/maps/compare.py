@@ -387,7 +387,7 @@ class _Pairs:
         return np.where(agrees | self.recognised(), score + np.log(confidence), -np.inf)
 
     def recognised(self) -> BoolArray:
-        """Mark the pairs (N, M) whose own points agree, also if an object that looks alike has them.
+        """Mark the pairs (N, M) with own points, or points of an object that looks alike.
 
         (`few_inliers` give less than the margin.)
         """
@@ -526,7 +526,9 @@ def _losses(gain: Array, pairs: BoolArray) -> Array:
     score = np.zeros((n + m, n + m))
     score[:n, :m] = np.maximum(gain, IMPOSSIBLE)
     column = np.full(n + m, -1)
-    column[:n] = np.where(pairs.any(1), pairs.argmax(1), m + np.arange(n))
+    column[:n] = m + np.arange(n)
+    rows, columns = np.nonzero(pairs)
+    column[rows] = columns
     free = np.flatnonzero(~pairs.any(0))
     column[n + free] = free
     column[column < 0] = np.setdiff1d(np.arange(n + m), column)

@@ -32,10 +32,11 @@ def visibility_of(
     poses: Poses,
     nearer: quadrics.Ellipsoids,
     looked: IntArray | None = None,
-    most_views: int = 200,
+    most_views: int = 60,
     least_px: float = 12.0,
     in_view: float = 0.7,
     apart_deg: float = 10.0,
+    least_points: int = 3,
 ) -> Visibility:
     """Count the independent views in which each object would be seen, and those through it.
 
@@ -51,6 +52,8 @@ def visibility_of(
             smaller objects.
         in_view: fraction of the projected box inside the image.
         apart_deg: views of an object less than this apart fail together and count once.
+        least_points: different points behind an object, over all views, that show that it is
+            seen through; one or two may be wrong.
     """
     shapes = shapes_of(states)
     support = [s.support for s in states]
@@ -66,6 +69,8 @@ def visibility_of(
     visible = VisiblePoints(poses)
     expected = np.zeros((len(rows), len(states)), bool)
     through = np.zeros((len(rows), len(states)), bool)
+    around = np.zeros((len(rows), len(states)), bool)
+    behind: list[set[int]] = [set() for _ in states]
     for v, row in enumerate(rows.tolist()):
         whole = quadrics.solid_boxes(shapes, support, cameras[v : v + 1])[0]  # (N, 4)
         clipped = quadrics.clip_boxes(whole[None], size)[0]
@@ -75,18 +80,27 @@ def visibility_of(
             shown = np.flatnonzero((ratio >= in_view) & (sides >= least_px))
         shown = shown[~_behind_objects(shapes[shown], clipped[shown], nearer, cameras[v])]
         points = visible.in_frame(row)
-        occluded, seen_through = _points_around(
+        occluded, beside, seen = _points_around(
             shapes[shown], clipped[shown], poses.points[points], cameras[v], centre[v]
         )
         expected[v, shown[~occluded]] = True
-        through[v, shown[seen_through & ~occluded]] = True
+        around[v, shown[~occluded & beside]] = True
+        for k, inside in zip(shown.tolist(), seen, strict=True):
+            through[v, k] = bool(len(inside)) and expected[v, k]
+            behind[k].update(points[inside].tolist() if expected[v, k] else ())
+    through[:, [len(ids) < least_points for ids in behind]] = False
     ray = shapes.center_in_world - centre[:, None]  # (V, N, 3)
     ray = ray / np.linalg.norm(ray, axis=2, keepdims=True).clip(1e-9)
-    counts = [
-        np.array([_independent(ray[mask[:, k], k], apart_deg) for k in range(len(states))], float)
-        for mask in (expected, through)
-    ]
-    return Visibility(*counts)
+
+    def independent(mask: BoolArray) -> Array:
+        """Count the independent views (N,) among those marked (V, N)."""
+        counts = [_independent(ray[mask[:, k], k], apart_deg) for k in range(len(states))]
+        return np.array(counts, np.float64)
+
+    # one view of its surroundings may show them beside what stands before the object
+    return Visibility(
+        independent(expected), np.maximum(independent(through), independent(around) - 1)
+    )
 
 
 def _area(box: Array) -> Array:
@@ -115,25 +129,35 @@ def _behind_objects(
 
 def _points_around(
     shapes: quadrics.Ellipsoids, box: Array, points: Array, camera: Array, centre: Array
-) -> tuple[BoolArray, BoolArray]:
-    """Mark shapes that points occlude, and shapes through whose middle points behind are seen.
+) -> tuple[BoolArray, BoolArray, list[IntArray]]:
+    """Mark shapes that points occlude or surround, and find points behind shapes.
 
     Args:
         box: (n, 4) projected. points: (P, 3) that the image shows. centre: (3,) of the camera.
     Returns:
-        occluded: (n,) at least five points lie in the middle of the box, most of them before the
-        object. through: (n,) at least two points lie behind it on rays through its middle, and
-        more than on it or before it.
+        occluded: (n,) at least five points lie on rays through the middle of the object, most of
+        them before it. beside: (n,) at least three points lie in the box enlarged by its size on
+        each side, not nearer than the object, and no more lie before it: nothing large stands
+        there. behind: for each object the points (k,) behind it on rays through its
+        middle; none if as many lie on it or before it.
     """
     occluded = np.zeros(len(shapes), bool)
-    through = np.zeros(len(shapes), bool)
+    beside = np.zeros(len(shapes), bool)
+    through = [np.empty(0, np.int64) for _ in range(len(shapes))]
     projected = points @ camera[:, :3].T + camera[:, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
         xy = projected[:, :2] / projected[:, 2:]
     for k in range(len(shapes)):
         middle = (box[k, :2] + box[k, 2:]) / 2
-        half = 0.7 * (box[k, 2:] - box[k, :2]) / 2  # beside it the ray may miss the object
-        inside = np.flatnonzero((np.abs(xy - middle) < half).all(1) & (projected[:, 2] > 0))
+        side = box[k, 2:] - box[k, :2]
+        depth = projected[:, 2]
+        near = np.flatnonzero((np.abs(xy - middle) < 1.5 * side).all(1) & (depth > 0))
+        front = shapes.center_in_world[k] @ camera[2, :3] + camera[2, 3]
+        front -= float(shapes.half_axes[k].max())
+        beyond = int((depth[near] > front).sum())
+        beside[k] = beyond >= 3 and len(near) - beyond <= beyond
+        half = 0.7 * side / 2  # beside it the ray may miss the object
+        inside = np.flatnonzero((np.abs(xy - middle) < half).all(1) & (depth > 0))
         if not len(inside):
             continue
         scaled = shapes.world_from_obj[k] / shapes.half_axes[k]
@@ -151,8 +175,9 @@ def _points_around(
         before = crosses & (enter > 1 + 0.05)
         others = crosses & ~behind
         occluded[k] = before.sum() >= 5 and before.sum() > 0.5 * crosses.sum()
-        through[k] = behind.sum() >= 2 and behind.sum() > others.sum()
-    return occluded, through
+        if behind.sum() > others.sum():
+            through[k] = inside[behind]
+    return occluded, beside, through
 
 
 def _independent(ray: Array, apart_deg: float) -> int:

@@ -1,0 +1,400 @@
+"""Decisions about the objects of a map: stayed, moved, gone, not seen, new, and identical ones."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from reobj.maps.compare import (
+    CompareOptions,
+    Decision,
+    FoundObject,
+    Visibility,
+    _assigned,
+    _losses,
+    compare,
+    no_visibility,
+)
+from reobj.maps.fusion import ObjectState
+
+SIZES = {
+    "chair": (0.25, 0.25, 0.45),
+    "cup": (0.04, 0.04, 0.05),
+    "bed": (0.8, 1.0, 0.25),
+    "plant": (0.15, 0.15, 0.3),
+    "tv": (0.5, 0.05, 0.3),
+    "bottle": (0.04, 0.04, 0.13),
+}
+EXACT = np.zeros((7, 7))
+SIGMA_M = 0.03
+
+
+def unit(row: np.ndarray) -> np.ndarray:
+    return (row / np.linalg.norm(row)).astype(np.float32)
+
+
+def looks(seed: int) -> np.ndarray:
+    """Embedding of a model of an object: cosine about .5 to those of other models."""
+    common = np.eye(64)[0]
+    return unit(common + unit(np.random.default_rng(seed).normal(size=64) * (1 - common)))
+
+
+def shape_cov(sigma: float = SIGMA_M) -> np.ndarray:
+    return np.diag([sigma**2] * 3 + [0.08**2] * 3 + [0.1] * 3)
+
+
+def state(number: int, name: str, center: Sequence[float], **facts: object) -> ObjectState:
+    """A map object; every number has its own looks."""
+    known = ObjectState(
+        number, name, {name: 10.0}, True, False, "box", np.array(center, float),
+        np.array(SIZES[name]), np.array([1.0, 0, 0, 0]), shape_cov(), looks(number),
+        np.empty(0, np.float32), "m", 0.85, 4.0, 1,
+    )  # fmt: skip
+    return dataclasses.replace(known, **facts)
+
+
+def found(
+    source: ObjectState, identity: int, center: Sequence[float] | None = None, **facts: object
+) -> FoundObject:
+    """A detection of a map object, by default in its place."""
+    place = source.center if center is None else np.array(center, float)
+    seen = FoundObject(
+        identity, source.classes, "box", place, source.half_axes, source.quat_wxyz, shape_cov(),
+        source.foreground, source.background, 10, 0.95, {},
+    )  # fmt: skip
+    return dataclasses.replace(seen, **facts)
+
+
+def room() -> list[ObjectState]:
+    """Six different objects."""
+    names = ["chair", "cup", "bed", "plant", "tv", "bottle"]
+    places = [(1, 1, 0.4), (2, 1, 0.8), (4, 3, 0.3), (0.5, 3.5, 0.4), (3, 0.3, 1), (2.4, 1.2, 0.8)]
+    return [state(k + 1, n, p) for k, (n, p) in enumerate(zip(names, places, strict=True))]
+
+
+def chairs(*places: Sequence[float]) -> list[ObjectState]:
+    """Identical chairs, numbers 11, 12, ..."""
+    return [state(11 + k, "chair", place, foreground=looks(99)) for k, place in enumerate(places)]
+
+
+def seen(count: int, views: float = 6, through: float = 0) -> Visibility:
+    return Visibility(np.full(count, views), np.full(count, through))
+
+
+def decide(
+    states: Sequence[ObjectState],
+    detected: Sequence[FoundObject],
+    visibility: Visibility | None = None,
+    alignment_cov: np.ndarray = EXACT,
+    metres_per_unit: float = 1.0,
+) -> list[Decision]:
+    visibility = visibility or seen(len(states))
+    return compare(states, detected, visibility, alignment_cov, metres_per_unit, True)
+
+
+def summary(decisions: Sequence[Decision]) -> list[tuple[str, int, int]]:
+    return [(d.kind, d.map_id, d.found_id) for d in decisions]
+
+
+def all_found(states: Sequence[ObjectState]) -> list[FoundObject]:
+    return [found(s, 100 + s.id) for s in states]
+
+
+def test_objects_in_their_places_keep_their_numbers_whatever_the_order() -> None:
+    states = room()
+    decisions = decide(states, all_found(states)[::-1])
+    assert summary(decisions) == [("stayed", s.id, 100 + s.id) for s in states]
+    assert all(d.log_odds > 3 and d.candidates == () for d in decisions)
+
+
+def test_a_moved_object_with_its_looks_keeps_its_number() -> None:
+    states = room()
+    detected = all_found(states)
+    detected[3] = found(states[3], 104, (1.3, 3.1, 0.4))
+    visibility = Visibility(np.full(6, 6.0), np.array([0, 0, 0, 4.0, 0, 0]))
+    decisions = decide(states, detected, visibility)
+    assert summary(decisions)[3] == ("moved", 4, 104)
+    assert decisions[3].evidence.startswith("0.89 m from its place")
+    assert [d.kind for d in decisions].count("stayed") == 5
+
+
+def test_own_points_prove_a_move_that_looks_contradict() -> None:
+    """Another light changed the embedding; nobody looked at the old place."""
+    states = room()
+    detected = all_found(states)
+    visibility = Visibility(np.array([6, 6, 6, 0, 6, 6.0]), np.zeros(6))
+    strange = looks(500)
+    for inliers, expected in ((0, ("new", 0, 104)), (9, ("new", 0, 104)), (14, ("moved", 4, 104))):
+        detected[3] = found(
+            states[3],
+            104,
+            (3, 2, 0.4),
+            foreground=strange,
+            motion_of={4: inliers} if inliers else {},
+        )
+        assert expected in summary(decide(states, detected, visibility))
+
+
+def test_another_object_of_the_class_does_not_get_the_number_of_one_that_is_gone() -> None:
+    states = room()
+    detected = all_found(states)
+    detected[0] = found(
+        states[0], 101, (3, 2, 0.4), foreground=looks(500), half_axes=np.array([0.35, 0.3, 0.6])
+    )
+    visibility = Visibility(np.full(6, 6.0), np.array([5.0, 0, 0, 0, 0, 0]))
+    decisions = decide(states, detected, visibility)
+    assert summary(decisions)[0] == ("gone", 1, 0)
+    assert summary(decisions)[-1] == ("new", 0, 101)
+
+
+def test_gone_needs_views_and_something_seen_behind_the_place() -> None:
+    states = room()
+    detected = all_found(states)[1:]  # the chair is missing
+    others = [0.0] * 5
+
+    def chair(expected: float, through: float) -> Decision:
+        views = Visibility(np.array([expected, *[6.0] * 5]), np.array([through, *others]))
+        return decide(states, detected, views)[0]
+
+    assert chair(6, 3).kind == "gone" and chair(6, 3).log_odds > 3
+    assert chair(6, 0).kind == "not_seen" and "behind" in chair(6, 0).evidence
+    assert chair(1, 1).kind == "not_seen" and "too few" in chair(1, 1).evidence
+    assert chair(0, 0).kind == "not_seen" and "no view" in chair(0, 0).evidence
+
+
+def test_an_object_that_is_often_missed_is_not_gone() -> None:
+    states = room()
+    rare = [dataclasses.replace(states[0], detection_rate=0.2), *states[1:]]
+    views = Visibility(np.full(6, 6.0), np.array([5.0, 0, 0, 0, 0, 0]))
+    assert decide(states, all_found(states)[1:], views)[0].kind == "gone"
+    assert decide(rare, all_found(states)[1:], views)[0].kind == "not_seen"
+
+
+def test_nothing_that_no_view_passed_is_gone() -> None:
+    states = room()
+    decisions = compare(states, [], no_visibility(6), EXACT, 1.0, True)
+    assert summary(decisions) == [("not_seen", s.id, 0) for s in states]
+
+
+def test_a_new_object_is_new() -> None:
+    states = room()
+    new = found(state(50, "bottle", (4, 1, 0.8)), 150)
+    decisions = decide(states, [*all_found(states), new])
+    assert summary(decisions)[-1] == ("new", 0, 150)
+    assert len(decisions) == 7 and decisions[-1].candidates == ()
+    assert summary(decide([], [new])) == [("new", 0, 150)]
+    assert decide([], []) == []
+
+
+def test_an_uncertain_alignment_moves_no_object() -> None:
+    """All found objects are 25 cm beside their places; the alignment has a sigma of 20 cm."""
+    states = room()
+    shift = np.array([0.2, -0.15, 0])
+    detected = [found(s, 100 + s.id, s.center + shift) for s in states]
+    cov = np.diag([0, 0, 0, 0.04, 0.04, 0.04, 0.0])
+    assert [d.kind for d in decide(states, detected, alignment_cov=cov)] == ["stayed"] * 6
+    exact = [d.kind for d in decide(states, detected)]
+    assert exact.count("moved") >= 5  # the centre of a bed is uncertain by its size
+
+
+def test_what_stayed_refines_the_alignment() -> None:
+    """One object moved by 60 cm: three sigmas of the alignment alone."""
+    states = room()
+    shift = np.array([0.2, -0.15, 0])
+    detected = [found(s, 100 + s.id, s.center + shift) for s in states]
+    detected[3] = found(states[3], 104, states[3].center + shift + [0.6, 0, 0], motion_of={4: 20})
+    cov = np.diag([0, 0, 0, 0.04, 0.04, 0.04, 0.0])
+    decisions = decide(states, detected, alignment_cov=cov)
+    assert [d.kind for d in decisions] == ["stayed"] * 3 + ["moved"] + ["stayed"] * 2
+    assert decisions[3].evidence.startswith("0.6")
+
+
+def test_the_alignment_turns_about_the_origin_of_the_map() -> None:
+    """A rotation of 3 degrees and a scale of 4 % shift far objects by 20 cm, near ones by none."""
+    angle, scale = np.radians(3), 1.04
+    turn = np.array(
+        [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
+    )
+    states = room()
+    detected = [found(s, 100 + s.id, scale * turn @ s.center) for s in states]
+    cov = np.diag([0, 0, angle**2, 0, 0, 0, np.log(scale) ** 2])
+    decisions = decide(states, detected, alignment_cov=cov)
+    assert [d.kind for d in decisions] == ["stayed"] * 6
+    refined = [float(d.evidence.split(" m ")[0]) for d in decisions]
+    assert max(refined) < 0.06 < np.linalg.norm(detected[2].center - states[2].center)
+
+
+def test_decisions_do_not_depend_on_the_unit() -> None:
+    """A world in units of 25 cm."""
+    unit_m = 0.25
+    states = room()
+    detected = all_found(states)
+    detected[3] = found(states[3], 104, (1.3, 3.1, 0.4))
+
+    def scaled(objects: Sequence[ObjectState | FoundObject]) -> list:
+        lengths = np.array([1 / unit_m] * 3 + [1.0] * 6)
+        return [
+            dataclasses.replace(
+                o,
+                center=o.center / unit_m,
+                half_axes=o.half_axes / unit_m,
+                cov=o.cov * np.outer(lengths, lengths),
+            )
+            for o in objects
+        ]
+
+    cov = np.diag([1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-3, 1e-4])
+    to_units = np.array([1, 1, 1, 1 / unit_m, 1 / unit_m, 1 / unit_m, 1])
+    metric = decide(states, detected, alignment_cov=cov)
+    other = decide(
+        scaled(states), scaled(detected), None, cov * np.outer(to_units, to_units), unit_m
+    )
+    assert summary(other) == summary(metric)
+    assert np.allclose([d.log_odds for d in other], [d.log_odds for d in metric])
+
+
+def test_an_object_that_was_gone_gets_its_number_back() -> None:
+    states = room()
+    states[3] = dataclasses.replace(states[3], present=False)
+    assert summary(decide(states, all_found(states)))[3] == ("stayed", 4, 104)
+    elsewhere = all_found(states)
+    elsewhere[3] = found(states[3], 104, (3, 2, 0.4), motion_of={4: 20})
+    assert summary(decide(states, elsewhere))[3] == ("moved", 4, 104)
+    missing = [f for f in elsewhere if f.id != 104]
+    assert decide(states, missing, seen(6, 6, 3))[3].kind == "gone"
+    assert decide(states, missing, no_visibility(6))[3].kind == "not_seen"
+
+
+def test_a_deleted_object_absorbs_its_detection() -> None:
+    states = room()
+    states[3] = dataclasses.replace(states[3], deleted=True)
+    assert summary(decide(states, all_found(states)))[3] == ("stayed", 4, 104)
+
+
+def test_identical_chairs_in_their_places_keep_their_numbers() -> None:
+    states = [*room(), *chairs((1, 2, 0.4), (1.7, 2, 0.4), (2.4, 2, 0.4), (3.1, 2, 0.4))]
+    decisions = decide(states, all_found(states))
+    assert summary(decisions) == [("stayed", s.id, 100 + s.id) for s in states]
+
+
+def test_an_identical_chair_that_left_the_row_is_the_one_that_is_missing() -> None:
+    """Its points are those of all four chairs."""
+    states = [*room(), *chairs((1, 2, 0.4), (1.7, 2, 0.4), (2.4, 2, 0.4), (3.1, 2, 0.4))]
+    points = {11: 20, 12: 25, 13: 20, 14: 25}
+    detected = all_found(states)
+    detected[7] = found(states[7], 112, (2.0, 3.2, 0.4), motion_of=points)
+    views = Visibility(np.full(10, 6.0), np.array([0] * 7 + [5.0] + [0] * 2))
+    assert summary(decide(states, detected, views))[7] == ("moved", 12, 112)
+
+
+def test_swapped_identical_chairs_give_no_stolen_number() -> None:
+    """Both left their places, and nothing tells which is which: candidates, no number."""
+    states = [*room(), *chairs((1, 2, 0.4), (3, 2, 0.4))]
+    points = {11: 20, 12: 20}
+    detected = all_found(states)[:6]
+    for identity, place in ((111, (2, 3.2, 0.4)), (112, (2, 2.6, 0.4))):
+        detected.append(found(states[6], identity, place, motion_of=points))
+    views = Visibility(np.full(8, 6.0), np.array([0] * 6 + [5.0] * 2))
+    decisions = decide(states, detected, views)
+    assert summary(decisions)[6:] == [
+        ("gone", 11, 0), ("gone", 12, 0), ("new", 0, 111), ("new", 0, 112)
+    ]  # fmt: skip
+    assert decisions[8].candidates == decisions[9].candidates == (11, 12)
+
+
+def test_the_displacement_decides_between_identical_chairs() -> None:
+    """Each moved by 50 cm; exchanged they would have moved by 2 m."""
+    states = [*room(), *chairs((1, 2, 0.4), (3, 2, 0.4))]
+    points = {11: 20, 12: 20}
+    detected = all_found(states)[:6]
+    for identity, place in ((111, (1, 2.5, 0.4)), (112, (3, 2.5, 0.4))):
+        detected.append(found(states[6], identity, place, motion_of=points))
+    decisions = decide(states, detected)
+    assert summary(decisions)[6:] == [("moved", 11, 111), ("moved", 12, 112)]
+
+
+def test_chairs_between_two_places_are_ambiguous_and_the_shorter_way_wins() -> None:
+    """A blurred pair of chairs 20 cm apart: both numbers remain, with candidates."""
+    states = [*room(), *chairs((1, 2, 0.4), (1.2, 2, 0.4))]
+    wide = shape_cov(0.15)
+    detected = all_found(states)[:6]
+    for identity, x in ((112, 1.13), (111, 1.07)):
+        detected.append(found(states[6], identity, (x, 2, 0.4), cov=wide))
+    decisions = decide(states, detected)
+    assert summary(decisions)[6:] == [("stayed", 11, 111), ("stayed", 12, 112)]
+    assert (decisions[6].candidates, decisions[7].candidates) == ((12,), (11,))
+
+
+def test_a_class_that_changed_in_place_is_one_object_only_if_all_else_agrees() -> None:
+    states = room()
+    detected = all_found(states)
+    detected[1] = dataclasses.replace(detected[1], classes={"bottle": 10.0})
+    assert summary(decide(states, detected))[1] == ("stayed", 2, 102)
+    detected[1] = found(states[1], 102, (2.6, 0.6, 0.8), classes={"bottle": 10.0})
+    assert summary(decide(states, detected))[-1] == ("new", 0, 102)
+
+
+def test_another_embedding_model_is_not_compared() -> None:
+    states = room()
+    detected = [dataclasses.replace(f, foreground=looks(700 + f.id)) for f in all_found(states)]
+    arguments = (states, detected, seen(6), EXACT, 1.0)
+    plain = compare(states, all_found(states), seen(6), EXACT, 1.0, False)
+    assert [d.log_odds for d in compare(*arguments, False)] == [d.log_odds for d in plain]
+    assert [d.log_odds for d in compare(*arguments, True)] != [d.log_odds for d in plain]
+    bare = [dataclasses.replace(f, foreground=np.empty(0, np.float32)) for f in detected]
+    assert [d.log_odds for d in decide(states, bare)] == [d.log_odds for d in plain]
+
+
+def test_losses_are_those_of_solving_again_with_the_pair_forced() -> None:
+    rng = np.random.default_rng(3)
+    gain = rng.normal(0, 4, (5, 7))
+    gain[1, 2] = -np.inf
+    best = _assigned(gain)
+    loss = _losses(gain, best)
+    for i, j in np.ndindex(5, 7):
+        if np.isfinite(gain[i, j]):
+            rest = np.delete(np.delete(gain, i, 0), j, 1)
+            total = gain[i, j] + rest[_assigned(rest)].sum()
+            assert loss[i, j] == pytest.approx(gain[best].sum() - total, abs=1e-9)
+    for i in range(5):
+        rest = np.delete(gain, i, 0)
+        unmatched = gain[best].sum() - rest[_assigned(rest)].sum()
+        assert loss[i, -1] == pytest.approx(unmatched, abs=1e-9)
+
+
+def test_random_rooms_steal_no_number() -> None:
+    """Thirty rooms, a third of 12 objects changed; 3 cm of noise; some of the room not seen."""
+    rng = np.random.default_rng(11)
+    kept, stayed = 0, 0
+    for _ in range(30):
+        names = rng.choice(list(SIZES), 12)
+        grid = rng.permutation([(x, y, 0.5) for x in range(5) for y in range(4)])[:12]
+        states = [state(k + 1, n, p) for k, (n, p) in enumerate(zip(names, grid, strict=True))]
+        hidden = grid[:, 0] > 3.5
+        fate = np.array(["stayed"] * 8 + ["moved"] * 2 + ["gone"] * 2)
+        views = np.where(hidden, 0.0, 6)
+        through = np.where(hidden | (fate == "stayed"), 0.0, 4)
+        detected = []
+        for k in np.flatnonzero(~hidden & (fate != "gone")):
+            moved = np.array([0.5, 0.4, 0]) * (fate[k] == "moved")
+            place = states[k].center + moved + rng.normal(0, SIGMA_M, 3)
+            looked = unit(states[k].foreground + 0.09 * rng.normal(size=64))
+            detected.append(found(states[k], 100 + k + 1, place, foreground=looked))
+        decisions = decide(states, detected, Visibility(views, through))
+        assert all(d.found_id in (0, 100 + d.map_id) for d in decisions if d.map_id)
+        assert not any(d.kind == "gone" for d in decisions if d.map_id and hidden[d.map_id - 1])
+        assert all(fate[d.map_id - 1] != "stayed" for d in decisions if d.kind == "gone")
+        stayed += int((~hidden & (fate == "stayed")).sum())
+        kept += sum(d.kind == "stayed" and fate[d.map_id - 1] == "stayed" for d in decisions)
+    assert kept >= 0.98 * stayed
+
+
+def test_classes_have_their_mobility() -> None:
+    options = CompareOptions()
+    stay = [options.fate(name)[0] for name in ("Bed", "gadget", "chair", "cup")]
+    assert stay == sorted(stay, reverse=True) and len(set(stay)) == 4
+    fates = [options.fixed_fate, options.usual_fate, options.movable_fate, options.carried_fate]
+    assert np.allclose(np.sum([*fates, options.absent_fate], 1), 1)
