@@ -22,7 +22,7 @@ import quadrics
 from reobj import __version__
 from reobj.cameras import Camera
 from reobj.files import LockedError, load_npz, locked, save_npz
-from reobj.types import Array, Floats, IntArray, ReobjError
+from reobj.types import Array, Floats, IntArray, ReobjError, one_line
 
 HEADER = {"format": "reobj-map", "version": 1}
 # Dtypes in the file, and shapes of a row. float16 of a direction: 3e-4 rad; of a covariance it
@@ -458,7 +458,8 @@ def load_map(path: Path) -> RoomMap:
         check_map(room)
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         missing = "no " if isinstance(error, KeyError) else ""
-        raise ReobjError(f"{path}: damaged ({missing}{error}); use a copy of it") from error
+        fault = one_line(f"{missing}{error}")
+        raise ReobjError(f"{path}: damaged ({fault}); use a copy of it") from error
     return room
 
 
