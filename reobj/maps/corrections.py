@@ -6,12 +6,14 @@ All functions return a new map.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
+from reobj.files import spans
 from reobj.maps.fusion import CHI2_3, shapes_of
 from reobj.maps.room_map import MapObject, Observation, RoomMap, Session
-from reobj.types import CLASS_NAME_MAX, ReobjError
+from reobj.types import CLASS_NAME_MAX, ReobjError, visible_name
 
 
 def find_session(room: RoomMap, session: int | str) -> Session:
@@ -183,3 +185,47 @@ def _with(room: RoomMap, changed: MapObject, without: int = 0) -> RoomMap:
     """Replace an object by its number, and remove another one."""
     objects = [changed if o.id == changed.id else o for o in room.objects if o.id != without]
     return dataclasses.replace(room, objects=tuple(objects))
+
+
+def corrected(
+    room: RoomMap,
+    forgotten: Sequence[str] = (),
+    merges: Sequence[tuple[int, int]] = (),
+    renames: Sequence[tuple[int, str]] = (),
+    deleted: Sequence[int] = (),
+    undeleted: Sequence[int] = (),
+) -> tuple[RoomMap, list[str]]:
+    """Apply corrections in the order of the arguments.
+
+    Args:
+        forgotten: sessions, by number or name. merges: numbers to keep and to drop.
+        renames: numbers and names. deleted, undeleted: numbers.
+    Returns:
+        the new map, and a line for each correction.
+    Raises:
+        ReobjError: of the first correction that is not possible.
+    """
+    lines = []
+    for text in forgotten:
+        session = find_session(room, text)
+        left = forget(room, text)
+        lost = sorted({o.id for o in room.objects} - {o.id for o in left.objects})
+        line = f"forgotten: session {session.number} ({visible_name(session.name)})"
+        line += f", {len(room.points) - len(left.points)} points"
+        lines.append(line + (f", and what it alone saw: objects {spans(lost)}" if lost else ""))
+        room = left
+    for keep, drop in merges:
+        number = room.object(drop).id
+        room = merge(room, keep, drop)
+        lines.append(f"merged: object {number} into {room.object(keep).id}")
+    for number, name in renames:
+        room = rename(room, number, name)
+        found = room.object(number)
+        lines.append(f"renamed: object {found.id} is called {found.name}")
+    for number in deleted:
+        room = delete(room, number)
+        lines.append(f"deleted: object {room.object(number).id}")
+    for number in undeleted:
+        room = undelete(room, number)
+        lines.append(f"no longer deleted: object {room.object(number).id}")
+    return room, lines

@@ -115,8 +115,9 @@ class Session:
         camera: intrinsics. cam_from_map: (K, 3, 4) of frames that see the room, spread over it.
         metres_per_unit, scale_rel_sigma, scale_source: the scale of the map's world as this
             session measured it; source "none": it did not.
-        alignment_cov: (7, 7) of the rotation vector (rad, world axes), translation (map units) and
-            log scale that placed the session in the map; zeros for the first session.
+        alignment_cov: (7, 7) of the alignment of the session with the map: of the rotation vector
+            (rad), translation (map units) and log scale of a small similarity about the origin of
+            the map's world, applied after the alignment; zeros for the first session.
         localised_frames, tried_frames: that agreed with the map, that were compared.
     """
 

@@ -146,10 +146,7 @@ def read_changes(path: Path) -> Changes:
         if {key: data[key] for key in HEADER} != HEADER:
             raise ReobjError(f"{path}: expected format {HEADER['format']}, version "
                              f"{HEADER['version']}")  # fmt: skip
-        lists = {
-            kind: tuple(_change(entry) for entry in data[kind])
-            for kind in Changes.KINDS
-        }
+        lists = {kind: tuple(_change(entry) for entry in data[kind]) for kind in Changes.KINDS}
         names = {f.name for f in dataclasses.fields(Changes)} - {"map_path", *Changes.KINDS}
         facts = {name: data[name] for name in names}
         return Changes(map_path=data["map"], **facts, **lists)
