@@ -25,7 +25,7 @@ How it works (start reading at `run()`, then `track()`, then `Tracker.update()`)
 This file holds the Kalman filter, association, re-identification, the pipeline and the command
 line. The package `reobj` holds the rest: sources/ (video, detections, weights), appearance/
 (embeddings, gallery), tracking/ (assignment, linking), poses/ (cameras), objects/ (association and
-fit), results/ (files, pages).
+fit), results/ (files, pages), maps/ (maps of a room).
 
 Conventions: frames 0-based (1-based in MOT files); boxes `xyxy` in pixels, the top-left pixel spans
 [0, 1] and has its centre at (0.5, 0.5) as in COLMAP; `b_from_a` maps coordinates in a to b;
@@ -71,7 +71,9 @@ from reobj.appearance.sampling import SamplingLayout
 from reobj.cameras import Camera, Poses, checked_pose, viewing_rays
 from reobj.commands import SafeFormatter, make_parser, say, short_help, with_streams
 from reobj.files import Progress, atomic, load_cached, load_npz, part_path, save_npz, wrapped
-from reobj.maps.room_map import RoomMap
+from reobj.maps.corrections import corrected
+from reobj.maps.listing import MAP_EXPORTS, export_map, listing
+from reobj.maps.room_map import RoomMap, map_lock
 from reobj.maps.stage import (
     MapConfig,
     OpenMap,
@@ -1569,9 +1571,10 @@ def _write(job: _Job, result: Result) -> Result:
 def _parser() -> argparse.ArgumentParser:
     commands = {
         "run": _cmd_run, "track": _cmd_run, "poses": _cmd_poses, "objects": _cmd_objects,
-        "eval": _cmd_eval, "export": _cmd_export, "models": _cmd_models,
+        "eval": _cmd_eval, "export": _cmd_export, "map": _cmd_map,
+        "models": _cmd_models,
     }  # fmt: skip
-    return make_parser(Config(), commands, tuple(EXPORTS))
+    return make_parser(Config(), commands, tuple(EXPORTS), tuple(MAP_EXPORTS))
 
 
 def _cmd_run(args: argparse.Namespace) -> int:
@@ -1631,6 +1634,39 @@ def _cmd_eval(args: argparse.Namespace) -> int:
 def _cmd_export(args: argparse.Namespace) -> int:
     print(export(args.out, args.to, args.output))
     return 0
+
+
+def _cmd_map(args: argparse.Namespace) -> int:
+    path: Path = args.map
+    output: Path | None = args.output
+    if output is not None and args.export is None:
+        raise ReobjError(f"-o {output}: give --export too, one of {', '.join(MAP_EXPORTS)}")
+    if args.export is not None:
+        output = output or path.with_suffix(f".{args.export}")
+        if output.resolve() == path.resolve():
+            raise ReobjError(f"{output}: is the map; give another file with -o")
+    corrections = [
+        args.forget, args.merge, [(_object_number(number), name) for number, name in args.rename],
+        args.delete, args.undelete,
+    ]  # fmt: skip
+    room = RoomMap.load(path)
+    if any(corrections):
+        with map_lock(path):
+            room, lines = corrected(RoomMap.load(path), *corrections)
+            room.save(path)
+        print("\n".join(lines))
+    if output is not None:
+        print(export_map(room, args.export, output))
+    elif not any(corrections):
+        print(listing(room, path))
+    return 0
+
+
+def _object_number(text: str) -> int:
+    """Read the number of an object."""
+    if not text.isdecimal():
+        raise ReobjError(f"--rename {text}: expected the number of an object")
+    return int(text)
 
 
 def _cmd_models(args: argparse.Namespace) -> int:

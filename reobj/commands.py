@@ -135,12 +135,16 @@ class _Completion(argparse.Action):
 
 
 def make_parser(
-    config: Any, commands: Mapping[str, Command], exports: Sequence[str]
+    config: Any,
+    commands: Mapping[str, Command],
+    exports: Sequence[str],
+    map_exports: Sequence[str],
 ) -> argparse.ArgumentParser:
     """Make the parser of the tool.
 
     Args:
-        config: default options. commands: function of each command. exports: formats of `export`.
+        config: default options. commands: function of each command.
+        exports, map_exports: formats of `export`, and of `map --export`.
     """
 
     def command(name: str, text: str, example: str, *sections: str) -> Any:
@@ -186,6 +190,7 @@ def make_parser(
     add("out", help="output folder of an earlier `run`")
     add("--to", required=True, choices=exports, help="format to write")
     add("-o", "--output", help="file to write (default: in the output folder)")
+    _add_map(command, map_exports)
     text = "list, download and verify weights"
     add = command("models", text, "fast", "")
     add(
@@ -218,6 +223,25 @@ def _add_run(command: Any, name: str, text: str) -> None:
         add(
             "--show", action="store_true", help="show progress live in rerun's viewer (needs rerun)"
         )
+
+
+def _add_map(command: Any, exports: Sequence[str]) -> None:
+    text = "list what a map of a room holds, correct or export it"
+    add = command("map", text, "flat.map --merge 3 12 --rename 3 armchair")
+    add("map", type=Path, help="file of a map")
+    text = "remove what a session added; its number, or the name of its recording"
+    add("--forget", action="append", default=[], metavar="SESSION", help=text)
+    text = "join two objects that are one; the number DROP then means KEEP"
+    add("--merge", action="append", default=[], nargs=2, type=int, metavar=("KEEP", "DROP"),
+        help=text)  # fmt: skip
+    text = "give an object a class that later detections do not change"
+    add("--rename", action="append", default=[], nargs=2, metavar=("ID", "NAME"), help=text)
+    text = "mark an object as none: it is left out of results"
+    add("--delete", action="append", default=[], type=int, metavar="ID", help=text)
+    text = "undo --delete"
+    add("--undelete", action="append", default=[], type=int, metavar="ID", help=text)
+    add("--export", choices=exports, help="format to write the objects in")
+    add("-o", "--output", type=Path, help="file to write (default: beside the map)")
 
 
 def _add_tracks(add: Any) -> None:

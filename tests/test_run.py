@@ -692,7 +692,7 @@ def test_examples_in_docstrings(room: str) -> None:
     assert doctest.testmod(importlib.import_module(room)).failed == 0
 
 
-COMMANDS = ["", "run", "track", "poses", "objects", "eval", "export", "models"]
+COMMANDS = ["", "run", "track", "poses", "objects", "eval", "export", "map", "models"]
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -1080,6 +1080,10 @@ URL = "rtsp://me:w0rd@127.0.0.1:9/cam?pwd=w0rd"
         ["objects", URL],
         ["objects", URL, "--debug"],
         ["eval", URL, "--gt", URL],
+        ["map", URL],
+        ["map", "a.map", "--merge", "1", URL],
+        ["map", "a.map", "--rename", URL, URL],
+        ["map", "a.map", "-o", URL],
         ["models", URL],
     ],
 )

@@ -18,12 +18,32 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+import quadrics
 from reobj import __version__
 from reobj.cameras import Camera
 from reobj.files import LockedError, load_npz, locked, save_npz
-from reobj.types import Array, Floats, IntArray, ReobjError
+from reobj.types import Array, Floats, IntArray, ReobjError, one_line
 
 HEADER = {"format": "reobj-map", "version": 1}
+# Dtypes in the file, and shapes of a row. float16 of a direction: 3e-4 rad; of a covariance it
+# would lose sigmas below 2e-4 and, by rounded correlations, the small variances.
+POINTS: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {
+    "xyz": (np.dtype(np.float32), (3,)),
+    "descriptor": (np.dtype(np.uint8), (128,)),
+    "session": (np.dtype(np.int32), ()),
+    "object_id": (np.dtype(np.int32), ()),
+    "viewing_ray": (np.dtype(np.float16), (3,)),
+    "distance": (np.dtype(np.float32), ()),
+}
+OBSERVATIONS: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {
+    "center": (np.dtype(np.float64), (3,)),
+    "half_axes": (np.dtype(np.float32), (3,)),
+    "quat_wxyz": (np.dtype(np.float32), (4,)),
+    "cov": (np.dtype(np.float32), (9, 9)),
+}
+LOWER = np.tril_indices(9)  # entries of a covariance in the file
+UNIT = 1.001  # largest component of a unit vector, rounded to float16
+STATUSES = ("new", "stayed", "moved", "gone", "not_seen")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,8 +115,9 @@ class Session:
         camera: intrinsics. cam_from_map: (K, 3, 4) of frames that see the room, spread over it.
         metres_per_unit, scale_rel_sigma, scale_source: the scale of the map's world as this
             session measured it; source "none": it did not.
-        alignment_cov: (7, 7) of the rotation vector (rad, world axes), translation (map units) and
-            log scale that placed the session in the map; zeros for the first session.
+        alignment_cov: (7, 7) of the alignment of the session with the map: of the rotation vector
+            (rad), translation (map units) and log scale of a small similarity about the origin of
+            the map's world, applied after the alignment; zeros for the first session.
         localised_frames, tried_frames: that agreed with the map, that were compared.
     """
 
@@ -217,28 +238,166 @@ class RoomMap:
         return load_map(Path(path))
 
 
+# ---- Checks ------------------------------------------------------------------------------------
+
+
+def check_map(room: RoomMap) -> None:
+    """Refuse a map whose content is inconsistent or not finite.
+
+    Raises:
+        ValueError: names the fault.
+    """
+    _expect(isinstance(room.map_id, str), f"map_id {room.map_id!r}")
+    _expect(isinstance(room.metric, bool), f"metric {room.metric!r}")
+    _expect(_whole(room.next_id, 1), f"next_id {room.next_id!r}")
+    _expect(_whole(room.next_session, 1), f"next_session {room.next_session!r}")
+    _expect(room.up is None or _unit(room.up, 3), f"up {room.up}")
+    for session in room.sessions:
+        _check_session(session, room.next_session)
+    numbers = [session.number for session in room.sessions]
+    _expect(len(set(numbers)) == len(numbers), f"two sessions of one number: {numbers}")
+    for found in room.objects:
+        _check_object(found, set(numbers), room.next_id)
+    ids = [found.id for found in room.objects]
+    _expect(len(set(ids)) == len(ids), "two objects of one number")
+    for old, kept in room.merged.items():
+        known = _whole(old, 1, room.next_id) and old not in ids and kept in ids
+        _expect(known, f"object {old!r} merged into {kept!r}")
+    _check_points(room.points, numbers, ids)
+
+
+def _expect(valid: bool, fault: str) -> None:
+    if not valid:
+        raise ValueError(fault)
+
+
+def _whole(value: Any, least: int = 0, below: int = 1 << 31) -> bool:
+    """Test for a whole number in a range; True and False are none."""
+    return type(value) is int and least <= value < below
+
+
+def _number(value: Any, least: float = -np.inf) -> bool:
+    """Test for a finite number of at least `least`."""
+    return isinstance(value, int | float) and bool(np.isfinite(value)) and value >= least
+
+
+def _unit(vector: Array, size: int) -> bool:
+    """Test for a vector of length 1, up to the rounding of float32."""
+    return np.shape(vector) == (size,) and bool(abs(np.linalg.norm(vector) - 1) < 1e-5)
+
+
+def _bounded(values: npt.NDArray[Any], most: float = 1e30) -> bool:
+    """Test for finite numbers of at most `most`; default: float32 holds them."""
+    return bool((np.abs(values) <= most).all())  # False for NaN
+
+
+def _is_cov(cov: Array, size: int) -> bool:
+    """Test for a finite square matrix whose diagonal is not negative."""
+    right = np.shape(cov) == (size, size) and _bounded(cov)
+    return right and bool((np.diag(cov) >= 0).all())
+
+
+def _check_session(session: Session, next_session: int) -> None:
+    """Refuse an invalid session."""
+    where = f"session {session.number!r}: "
+    _expect(_whole(session.number, 1, next_session), f"{where}next is {next_session}")
+    for name in ("name", "date", "fingerprint", "embedder"):
+        _expect(isinstance(getattr(session, name), str), f"{where}{name} is no text")
+    camera = session.camera
+    sides = _whole(camera.width, 1) and _whole(camera.height, 1)
+    params = all(_number(value) for value in camera.params)
+    _expect(isinstance(camera.model, str) and sides and params, f"{where}camera {camera}")
+    cameras = session.cam_from_map
+    right = cameras.ndim == 3 and cameras.shape[1:] == (3, 4) and bool(np.isfinite(cameras).all())
+    _expect(right, f"{where}cam_from_map {cameras.shape}")
+    scale = (session.metres_per_unit, session.scale_rel_sigma, session.scale_source)
+    known = session.scale_source in ("poses", "priors", "known_size", "none")
+    positive = _number(session.metres_per_unit, np.nextafter(0, 1))
+    _expect(positive and known and _number(session.scale_rel_sigma, 0), f"{where}scale {scale}")
+    _expect(_is_cov(session.alignment_cov, 7), f"{where}alignment_cov")
+    for name in ("localised_frames", "tried_frames"):
+        _expect(_whole(getattr(session, name)), f"{where}{name}")
+
+
+def _check_object(found: MapObject, sessions: set[int], next_id: int) -> None:
+    """Refuse an invalid object."""
+    where = f"object {found.id!r}: "
+    _expect(_whole(found.id, 1, next_id), f"{where}next_id is {next_id}")
+    _expect(isinstance(found.name, str) and found.name.isprintable(), f"{where}name")
+    _expect(isinstance(found.deleted, bool), f"{where}deleted is {found.deleted!r}")
+    _expect(any(o.detected for o in found.observations), f"{where}never detected")
+    seen = [o.session for o in found.observations]
+    _expect(len(set(seen)) == len(seen), f"{where}two observations in a session")
+    for o in found.observations:
+        _expect(o.session in sessions, f"{where}no session {o.session!r}")
+        _check_observation(o, f"{where}session {o.session}: ")
+
+
+def _check_observation(o: Observation, where: str) -> None:
+    """Refuse an invalid observation."""
+    _expect(o.status in STATUSES, f"{where}status {o.status!r}")
+    kinds = quadrics.SUPPORTS if o.status in ("new", "stayed", "moved") else ("",)
+    _expect(o.support in kinds, f"{where}{o.status}, shape {o.support!r}")
+    if o.detected:
+        _expect(np.shape(o.center) == (3,) and bool(np.isfinite(o.center).all()), f"{where}center")
+        sizes = np.shape(o.half_axes) == (3,) and _bounded(o.half_axes)
+        _expect(sizes and bool((np.float32(o.half_axes) > 0).all()), f"{where}half_axes")
+        _expect(_unit(o.quat_wxyz, 4), f"{where}quat_wxyz")
+        _expect(_is_cov(o.cov, 9), f"{where}cov")
+    named = all(isinstance(n, str) and n.isprintable() for n in o.classes)
+    _expect(named and all(_number(w, 0) for w in o.classes.values()), f"{where}classes")
+    for name in ("embedded", "views", "expected", "missed"):
+        _expect(_whole(getattr(o, name)), f"{where}{name}")
+    _expect(o.missed <= o.expected, f"{where}missed {o.missed} of {o.expected}")
+    _expect(_number(o.log_odds), f"{where}log_odds")
+    for name in Observation.EMBEDDINGS:
+        mean = getattr(o, name)
+        _expect(mean.ndim == 1 and _bounded(mean, UNIT), f"{where}{name}")
+
+
+def _check_points(points: MapPoints, sessions: Sequence[int], ids: Sequence[int]) -> None:
+    """Refuse invalid points."""
+    for name, (kind, shape) in POINTS.items():
+        values = getattr(points, name)
+        right = values.shape == (len(points), *shape) and values.dtype.kind == kind.kind
+        _expect(right, f"points: {name} is an array {values.shape} of {values.dtype}")
+        most = UNIT if name == "viewing_ray" else 1e30
+        _expect(kind.kind != "f" or _bounded(values, most), f"points: {name} out of range")
+    _expect(bool(np.isin(points.session, sessions).all()), "points of unknown sessions")
+    _expect(bool(np.isin(points.object_id, [0, *ids]).all()), "points of unknown objects")
+
+
 # ---- File --------------------------------------------------------------------------------------
 
 
 def save_map(path: Path, room: RoomMap) -> None:
-    """Write a map as npz, atomically; for the content see `RoomMap`."""
-    arrays: dict[str, Any] = {}
-    for f in dataclasses.fields(MapPoints):
-        values = getattr(room.points, f.name)
-        small = {"viewing_ray": np.float16, "distance": np.float32, "xyz": np.float32}
-        arrays[f"points_{f.name}"] = values.astype(small.get(f.name, values.dtype))
-    observations = [o for found in room.objects for o in found.observations]
-    for name in Observation.ARRAYS:
-        shape = np.shape(getattr(Observation(0, ""), name))
-        values = np.array([getattr(o, name) for o in observations]).reshape(-1, *shape)
-        arrays[f"observation_{name}"] = values.astype(np.float32 if name == "cov" else np.float64)
+    """Write a map as npz, atomically; for the content see `RoomMap`. Same map, same bytes.
+
+    Raises:
+        ValueError: `check_map` found a fault, so that the file could not be read again.
+    """
+    check_map(room)
+    origin = _origin(room.points.xyz)
+    columns = {f.name: getattr(room.points, f.name) for f in dataclasses.fields(MapPoints)}
+    columns["xyz"] = columns["xyz"] - origin
+    arrays: dict[str, Any] = {"points_origin": origin}
+    arrays |= {f"points_{name}": columns[name].astype(POINTS[name][0]) for name in POINTS}
+    objects = sorted(room.objects, key=lambda found: found.id)
+    rows = [o for found in objects for o in sorted(found.observations, key=lambda o: o.session)]
+    for name, (kind, shape) in OBSERVATIONS.items():
+        values = np.array([getattr(o, name) for o in rows], np.float64).reshape(-1, *shape)
+        values = values[:, LOWER[0], LOWER[1]] if name == "cov" else values
+        arrays[f"observation_{name}"] = values.astype(kind)
     for name in Observation.EMBEDDINGS:
-        rows = [np.asarray(getattr(o, name), np.float16) for o in observations]
-        arrays[f"observation_{name}"] = np.concatenate([np.empty(0, np.float16), *rows])
-        arrays[f"observation_{name}_length"] = np.array([len(r) for r in rows], np.int64)
-    for session in room.sessions:
+        means = [np.asarray(getattr(o, name), np.float16) for o in rows]
+        arrays[f"observation_{name}"] = np.concatenate([np.empty(0, np.float16), *means])
+        arrays[f"observation_{name}_length"] = np.array([len(m) for m in means], np.int32)
+    sessions = sorted(room.sessions, key=lambda session: session.number)
+    for session in sessions:
         for name in Session.ARRAYS:
-            arrays[f"session{session.number}_{name}"] = getattr(session, name)
+            arrays[f"session{session.number}_{name}"] = np.asarray(
+                getattr(session, name), np.float64
+            )
     facts = {
         **HEADER,
         "reobj_track": __version__,
@@ -247,34 +406,66 @@ def save_map(path: Path, room: RoomMap) -> None:
         "up": None if room.up is None else room.up.tolist(),
         "next_id": room.next_id,
         "next_session": room.next_session,
-        "merged": {str(old): kept for old, kept in room.merged.items()},
-        "sessions": [_without_arrays(s, Session.ARRAYS) for s in room.sessions],
+        "merged": {str(old): room.merged[old] for old in sorted(room.merged)},
+        "sessions": [_without_arrays(s, Session.ARRAYS) for s in sessions],
         "objects": [
             {
                 "id": found.id, "name": found.name, "deleted": found.deleted,
-                "observations": [
-                    _without_arrays(o, (*Observation.ARRAYS, *Observation.EMBEDDINGS))
-                    for o in found.observations
-                ],
+                "observations": len(found.observations),
             }
-            for found in room.objects
+            for found in objects
+        ],
+        "observations": [
+            _without_arrays(o, (*Observation.ARRAYS, *Observation.EMBEDDINGS)) for o in rows
         ],
     }  # fmt: skip
     save_npz(path, arrays, **facts)
+
+
+def _origin(xyz: Array) -> Array:
+    """Return the point (3,) to which the stored points are relative: a multiple of 1024.
+
+    In float32 coordinates of a map projection have a resolution of .5 m. The origin of a room near
+    that of its world is 0.
+    """
+    middle = np.median(xyz, 0) if len(xyz) else np.zeros(3)
+    return np.asarray(np.round(middle / 1024) * 1024 + 0.0)  # + 0: no -0
 
 
 def _without_arrays(record: Any, arrays: Sequence[str]) -> dict[str, Any]:
     """Return the fields of a dataclass that are not stored as arrays."""
     values = {f.name: getattr(record, f.name) for f in dataclasses.fields(record)}
     kept = {k: v for k, v in values.items() if k not in arrays}
+    if "classes" in kept:
+        kept["classes"] = dict(sorted(kept["classes"].items()))
     return {k: dataclasses.asdict(v) if isinstance(v, Camera) else v for k, v in kept.items()}
 
 
 def load_map(path: Path) -> RoomMap:
     """Read a map; for the errors see `RoomMap.load`."""
+    if path.is_dir():
+        raise ReobjError(f"{path}: is a folder, but a map is a file")
     if not path.is_file():
         raise ReobjError(f"{path}: no such map; `run VIDEO -o OUT --map {path}` makes it")
-    arrays, facts = load_npz(path)
+    try:
+        arrays, facts = load_npz(path, sealed=True)
+    except ReobjError:
+        _, facts = load_npz(path)
+        _check_header(path, facts)
+        raise
+    _check_header(path, facts)
+    try:
+        room = _decoded(arrays, facts)
+        check_map(room)
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        missing = "no " if isinstance(error, KeyError) else ""
+        fault = one_line(f"{missing}{error}")
+        raise ReobjError(f"{path}: damaged ({fault}); use a copy of it") from error
+    return room
+
+
+def _check_header(path: Path, facts: dict[str, Any]) -> None:
+    """Refuse other files and other versions."""
     if facts.get("format") != HEADER["format"]:
         raise ReobjError(f"{path}: not a map of reobj_track; another file was given")
     if facts.get("version") != HEADER["version"]:
@@ -283,46 +474,26 @@ def load_map(path: Path) -> RoomMap:
             f"{HEADER['version']}; it was written by reobj_track {facts.get('reobj_track')}: "
             "update the tool"
         )
-    arrays, facts = load_npz(path, sealed=True)
-    try:
-        return _decoded(arrays, facts)
-    except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise ReobjError(f"{path}: damaged ({error}); use a copy of it") from error
 
 
 def _decoded(arrays: dict[str, Any], facts: dict[str, Any]) -> RoomMap:
     """Build a map from the content of its file."""
-    columns = {f.name: arrays[f"points_{f.name}"] for f in dataclasses.fields(MapPoints)}
-    for name in ("xyz", "viewing_ray", "distance"):
-        columns[name] = columns[name].astype(np.float64)
-    sessions = tuple(
-        Session(
-            **entry
-            | {"camera": _camera(entry["camera"])}
-            | {name: arrays[f"session{entry['number']}_{name}"] for name in Session.ARRAYS}
-        )
-        for entry in facts["sessions"]
-    )
-    ends = {
-        name: np.cumsum(arrays[f"observation_{name}_length"]) for name in Observation.EMBEDDINGS
-    }
-    objects = []
-    row = 0
-    for entry in facts["objects"]:
-        observations = []
-        for fields in entry["observations"]:
-            values = {n: arrays[f"observation_{n}"][row].astype(np.float64)
-                      for n in Observation.ARRAYS}  # fmt: skip
-            for name, end in ends.items():
-                start = end[row] - arrays[f"observation_{name}_length"][row]
-                values[name] = arrays[f"observation_{name}"][start : end[row]].astype(np.float32)
-            observations.append(Observation(**fields, **values))
-            row += 1
-        objects.append(MapObject(entry["id"], tuple(observations), entry["name"], entry["deleted"]))
+    columns = {}
+    for name, (stored, shape) in POINTS.items():
+        kind = {"f": np.float64, "i": np.int64, "u": np.uint8}[stored.kind]
+        columns[name] = _column(arrays, f"points_{name}", stored, shape).astype(kind)
+    columns["xyz"] += _column(arrays, "points_origin", np.dtype(np.float64), ())
     return RoomMap(
         map_id=facts["map_id"],
-        sessions=sessions,
-        objects=tuple(objects),
+        sessions=tuple(
+            Session(
+                **entry
+                | {"camera": _camera(entry["camera"])}
+                | {name: arrays[f"session{entry['number']}_{name}"] for name in Session.ARRAYS}
+            )
+            for entry in facts["sessions"]
+        ),
+        objects=_decoded_objects(facts["objects"], _decoded_observations(arrays, facts)),
         points=MapPoints(**columns),
         metric=facts["metric"],
         up=None if facts["up"] is None else np.array(facts["up"], np.float64),
@@ -330,6 +501,54 @@ def _decoded(arrays: dict[str, Any], facts: dict[str, Any]) -> RoomMap:
         next_session=facts["next_session"],
         merged={int(old): kept for old, kept in facts["merged"].items()},
     )
+
+
+def _column(
+    arrays: dict[str, Any], name: str, kind: np.dtype[Any], shape: tuple[int, ...]
+) -> npt.NDArray[Any]:
+    """Return an array of the file (N, *shape), of the dtype it is written with."""
+    values = arrays[name]
+    if values.dtype != kind or values.shape[1:] != shape or values.ndim != 1 + len(shape):
+        raise ValueError(f"{name} is an array {values.shape} of {values.dtype}")
+    return np.asarray(values)
+
+
+def _decoded_observations(arrays: dict[str, Any], facts: dict[str, Any]) -> list[Observation]:
+    """Build the observations of all objects, in the order of the file."""
+    values: dict[str, Any] = {}
+    for name, (kind, shape) in OBSERVATIONS.items():
+        stored = (len(LOWER[0]),) if name == "cov" else shape
+        values[name] = _column(arrays, f"observation_{name}", kind, stored).astype(np.float64)
+    cov = np.empty((len(values["cov"]), 9, 9))
+    cov[:, LOWER[0], LOWER[1]] = values["cov"]
+    cov[:, LOWER[1], LOWER[0]] = values["cov"]
+    values["cov"] = cov
+    for name in Observation.EMBEDDINGS:
+        means = _column(arrays, f"observation_{name}", np.dtype(np.float16), ())
+        length = _column(arrays, f"observation_{name}_length", np.dtype(np.int32), ())
+        if (length < 0).any() or length.sum() != len(means):
+            raise ValueError(f"{len(means)} values of {name}, {length.sum()} expected")
+        values[name] = np.split(means.astype(np.float32), np.cumsum(length))[:-1]
+    if any(len(column) != len(facts["observations"]) for column in values.values()):
+        raise ValueError(f"arrays of other lengths than {len(facts['observations'])} observations")
+    rows = (dict(zip(values, row, strict=True)) for row in zip(*values.values(), strict=True))
+    return [Observation(**f, **r) for f, r in zip(facts["observations"], rows, strict=True)]
+
+
+def _decoded_objects(
+    entries: list[dict[str, Any]], observations: list[Observation]
+) -> tuple[MapObject, ...]:
+    """Distribute the observations to the objects."""
+    objects = []
+    row = 0
+    for entry in entries:
+        end = row + entry["observations"]
+        rows = tuple(observations[row:end])
+        objects.append(MapObject(entry["id"], rows, entry["name"], entry["deleted"]))
+        row = end
+    if row != len(observations):
+        raise ValueError(f"{len(observations)} observations, {row} expected")
+    return tuple(objects)
 
 
 def _camera(entry: dict[str, Any]) -> Camera:

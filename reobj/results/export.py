@@ -301,14 +301,14 @@ def export_csv(result: Result, path: Path) -> None:
             for name in vectors:
                 row += _numbers(getattr(o, name), 3)
             row += [*_numbers(o.quat_wxyz, 4), o.views, o.frames_seen, len(o.visits), o.part]
-            table.writerow([_cell(value) for value in row])
+            table.writerow([formula_safe(value) for value in row])
 
 
 def _numbers(values: Array | None, count: int) -> list[float | None]:
     return [None] * count if values is None else values.tolist()
 
 
-def _cell(value: Any) -> Any:
+def formula_safe(value: Any) -> Any:
     """Protect text from evaluation as a formula (CWE-1236: = + - @, tab, carriage return)."""
     return f"'{value}" if isinstance(value, str) and value[:1] in tuple("=+-@\t\r") else value
 

@@ -1,0 +1,459 @@
+"""The map file: what is written is read, all else is refused in one line; corrections."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import multiprocessing
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from map_worlds import a_map, a_session, observed, random_map, some_points, true_shape
+
+from reobj.files import load_npz, save_npz
+from reobj.maps import room_map
+from reobj.maps.corrections import delete, forget, merge, rename, undelete
+from reobj.maps.fusion import object_state
+from reobj.maps.room_map import MapObject, MapPoints, Observation, RoomMap, map_lock
+from reobj.types import ReobjError
+
+HERE = true_shape()
+THERE = true_shape(center=(-2, 0, 0.5))
+
+
+@pytest.fixture(scope="module")
+def room() -> RoomMap:
+    """Three objects in three sessions, one moved, one gone; names, merged numbers, points."""
+    found = random_map(3, 3, 50, 8)
+    objects = list(found.objects)
+    rows = objects[1].observations
+    gone = Observation(2, "gone", expected=6, missed=6, log_odds=-3.5)
+    objects[1] = MapObject(2, (rows[0], gone, Observation(3, "not_seen")), "armchair", True)
+    rows = objects[2].observations
+    objects[2] = MapObject(5, (*rows[:2], dataclasses.replace(rows[2], status="moved")))
+    points = dataclasses.replace(found.points, object_id=found.points.object_id % 3)
+    return dataclasses.replace(
+        found, objects=tuple(objects), points=points, next_id=6, merged={4: 5, 3: 5}
+    )
+
+
+@pytest.fixture(scope="module")
+def saved(room: RoomMap, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("maps") / "flat.map"
+    room.save(path)
+    return path
+
+
+def assert_same(a: Any, b: Any, rtol: float = 1e-6) -> None:
+    """Compare dataclasses, tuples, dicts, arrays and plain values."""
+    assert type(a) is type(b)
+    if dataclasses.is_dataclass(a):
+        for f in dataclasses.fields(a):
+            at = 1e-3 if f.name in ("foreground", "background", "viewing_ray") else rtol
+            assert_same(getattr(a, f.name), getattr(b, f.name), at)
+    elif isinstance(a, tuple):
+        assert len(a) == len(b)
+        for one, other in zip(a, b, strict=True):
+            assert_same(one, other, rtol)
+    elif isinstance(a, np.ndarray):
+        assert a.dtype == b.dtype
+        np.testing.assert_allclose(a, b, rtol=rtol, atol=rtol * np.nanmax(np.abs(a), initial=1e-9))
+    else:
+        assert a == b
+
+
+def test_what_is_written_is_read(room: RoomMap, saved: Path) -> None:
+    assert_same(room, RoomMap.load(saved))
+
+
+def test_empty_map_is_written_and_read(tmp_path: Path) -> None:
+    RoomMap(map_id="x").save(tmp_path / "a.map")
+    assert_same(RoomMap(map_id="x"), RoomMap.load(tmp_path / "a.map"))
+
+
+def test_same_map_gives_the_same_bytes(room: RoomMap, saved: Path, tmp_path: Path) -> None:
+    """Also after reading, and whatever the order of objects, sessions and classes."""
+    RoomMap.load(saved).save(tmp_path / "a.map")
+    other = dataclasses.replace(
+        room,
+        objects=room.objects[::-1],
+        sessions=room.sessions[::-1],
+        merged=dict(reversed(room.merged.items())),
+    )
+    other.save(tmp_path / "b.map")
+    assert (tmp_path / "a.map").read_bytes() == saved.read_bytes()
+    assert (tmp_path / "b.map").read_bytes() == saved.read_bytes()
+
+
+def test_map_far_from_the_origin_keeps_its_coordinates(room: RoomMap, tmp_path: Path) -> None:
+    """Poses in a map projection: float32 would have a resolution of .5 m."""
+    far = room.points.xyz + np.array([500_000.0, 5_400_000.0, 300.0])
+    path = tmp_path / "far.map"
+    dataclasses.replace(room, points=dataclasses.replace(room.points, xyz=far)).save(path)
+    found = RoomMap.load(path)
+    np.testing.assert_allclose(found.points.xyz, far, rtol=0, atol=1e-4)
+    found.save(tmp_path / "again.map")
+    assert (tmp_path / "again.map").read_bytes() == path.read_bytes()
+
+
+def test_covariance_in_the_file_has_the_precision_of_the_fusion(tmp_path: Path) -> None:
+    """Half of the sigmas are 1e-4 of the others; float16 would lose them."""
+    sigma = np.array([1.0, 1e-4, 1.0, 1e-4, 0.1, 1e-4, 0.1, 1e-4, 0.1])
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(9, 9)))[0]
+    cov = turn * sigma**2 @ turn.T
+    made = a_map([[dataclasses.replace(observed(1, "new", HERE), cov=(cov + cov.T) / 2)]])
+    made.save(tmp_path / "a.map")
+    read = RoomMap.load(tmp_path / "a.map")
+    before = object_state(made.objects[0], made).cov
+    after = object_state(read.objects[0], read).cov
+    scale = np.sqrt(np.outer(np.diag(before), np.diag(before)))
+    np.testing.assert_allclose(after / scale, before / scale, atol=1e-5)
+
+
+# ---- Damaged and foreign files ----
+
+
+def refusal(path: Path) -> str:
+    with pytest.raises(ReobjError) as caught:
+        RoomMap.load(path)
+    text = str(caught.value)
+    assert text.startswith(str(path)) and "\n" not in text and len(text) < 800
+    return text
+
+
+def test_missing_file_and_folder(tmp_path: Path) -> None:
+    assert "no such map; `run VIDEO -o OUT --map" in refusal(tmp_path / "flat.map")
+    assert "is a folder, but a map is a file" in refusal(tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"", b"solid", b"PK\x03\x04", b"\x00" * 2000])
+def test_files_of_another_kind(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "a.map").write_bytes(content)
+    assert "damaged, or no npz file" in refusal(tmp_path / "a.map")
+
+
+def test_other_npz_files(tmp_path: Path) -> None:
+    path = tmp_path / "a.map"
+    np.savez(path.open("wb"), rows=np.arange(3))
+    assert "not a map of reobj_track" in refusal(path)
+    save_npz(path, {}, format="reobj-tracks", version=1)
+    assert "not a map of reobj_track" in refusal(path)
+    np.savez(path.open("wb"), rows=np.array([{}], object))
+    assert "damaged" in refusal(path)
+
+
+def test_newer_map(saved: Path, tmp_path: Path) -> None:
+    arrays, facts = load_npz(saved)
+    save_npz(tmp_path / "a.map", arrays, **facts | {"version": 2, "reobj_track": "9.1"})
+    text = refusal(tmp_path / "a.map")
+    assert "a map of format 2, this version reads 1; it was written by reobj_track 9.1" in text
+    np.savez((tmp_path / "a.map").open("wb"), metadata=json.dumps(facts | {"version": 2}))
+    assert "a map of format 2" in refusal(tmp_path / "a.map")
+
+
+@pytest.fixture(scope="module")
+def spoiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("spoiled") / "a.map"
+
+
+@given(st.data())
+def test_flipped_bytes_are_found(
+    room: RoomMap, saved: Path, spoiled: Path, data: st.DataObject
+) -> None:
+    """The same map is read, where the bytes mean nothing, or one line says that it is damaged."""
+    content = bytearray(saved.read_bytes())
+    places = st.integers(0, len(content) - 1) | st.integers(-1500, -1)  # headers are at the end
+    for place in data.draw(st.lists(places, min_size=1, max_size=4)):
+        content[place] ^= data.draw(st.integers(1, 255))
+    spoiled.write_bytes(content)
+    try:
+        found = RoomMap.load(spoiled)
+    except ReobjError as error:
+        assert "\n" not in str(error)
+    else:
+        assert_same(room, found)
+
+
+@given(st.integers(0, 100_000))
+def test_truncated_files_are_found(saved: Path, spoiled: Path, length: int) -> None:
+    content = saved.read_bytes()
+    spoiled.write_bytes(content[: length % len(content)])
+    refusal(spoiled)
+
+
+def of_points(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[..., None]:
+    def spoil(arrays: dict[str, Any], facts: dict[str, Any]) -> None:
+        arrays[name] = change(arrays[name])
+
+    return spoil
+
+
+def of_facts(*keys: str | int, value: Any) -> Callable[..., None]:
+    def spoil(arrays: dict[str, Any], facts: dict[str, Any]) -> None:
+        entry: Any = facts
+        for key in keys[:-1]:
+            entry = entry[key]
+        entry[keys[-1]] = value
+
+    return spoil
+
+
+def with_first(value: float) -> Callable[[np.ndarray], np.ndarray]:
+    def change(values: np.ndarray) -> np.ndarray:
+        values = values.copy()
+        values.reshape(-1)[0] = value
+        return values
+
+    return change
+
+
+INCONSISTENT = {
+    "points of other lengths": (of_points("points_xyz", lambda v: v[:-1]), "points: "),
+    "points without a column": (lambda a, f: a.pop("points_xyz"), "no 'points_xyz'"),
+    "points of two columns": (of_points("points_xyz", lambda v: v[:, :2]), r"\(50, 2\)"),
+    "points in float64": (of_points("points_xyz", np.float64), "float64"),
+    "a point at infinity": (of_points("points_xyz", with_first(np.inf)), "xyz out of range"),
+    "a long ray": (of_points("points_viewing_ray", with_first(2)), "viewing_ray out of range"),
+    "a point's session": (of_points("points_session", with_first(9)), "unknown sessions"),
+    "a point's object": (of_points("points_object_id", with_first(3)), "unknown objects"),
+    "NaN in a covariance": (of_points("observation_cov", with_first(np.nan)), "1: cov"),
+    "negative variance": (of_points("observation_cov", with_first(-1)), "1: cov"),
+    "no size": (of_points("observation_half_axes", with_first(0)), "half_axes"),
+    "no rotation": (of_points("observation_quat_wxyz", with_first(3)), "quat_wxyz"),
+    "no place": (of_points("observation_center", with_first(np.nan)), "center"),
+    "fewer centres": (of_points("observation_center", lambda v: v[:-1]), "observations"),
+    "a longer embedding": (of_points("observation_foreground_length", with_first(9)), "foreground"),
+    "a negative length": (of_points("observation_foreground_length", with_first(-1)), "foreground"),
+    "NaN in an embedding": (of_points("observation_background", with_first(np.nan)), "background"),
+    "a session's cameras": (of_points("session2_cam_from_map", lambda v: v[0]), "cam_from_map"),
+    "an alignment": (of_points("session2_alignment_cov", lambda v: v[:6, :6]), "alignment_cov"),
+    "no sessions": (of_facts("sessions", value=[]), "no session 1"),
+    "sessions as text": (of_facts("sessions", value="abc"), "damaged"),
+    "unknown field": (of_facts("sessions", 0, "colour", value=1), "colour"),
+    "number of a session": (of_facts("next_session", value=3), "session 3: next is 3"),
+    "sessions of one number": (of_facts("sessions", 1, "number", value=1), "two sessions of one"),
+    "no scale": (of_facts("sessions", 0, "metres_per_unit", value=0.0), "scale"),
+    "scale of NaN": (of_facts("sessions", 0, "metres_per_unit", value=float("nan")), "scale"),
+    "source of the scale": (of_facts("sessions", 0, "scale_source", value="guess"), "scale"),
+    "a camera": (of_facts("sessions", 0, "camera", "width", value=-1), "camera"),
+    "a camera as a list": (of_facts("sessions", 0, "camera", value=[]), "damaged"),
+    "a name": (of_facts("sessions", 0, "name", value=3), "name is no text"),
+    "a count": (of_facts("sessions", 0, "tried_frames", value=1.5), "tried_frames"),
+    "objects of one number": (of_facts("objects", 1, "id", value=1), "two objects of one number"),
+    "number not given": (of_facts("next_id", value=5), "object 5: next_id is 5"),
+    "a huge number": (of_facts("objects", 1, "id", value=10**3000), "next_id"),
+    "an object's name": (of_facts("objects", 1, "name", value="a\nb"), "object 2: name"),
+    "deleted": (of_facts("objects", 1, "deleted", value=1), "deleted is 1"),
+    "observations": (of_facts("objects", 1, "observations", value=4), "9 observations, 10"),
+    "an observation's session": (of_facts("observations", 0, "session", value=7), "no session 7"),
+    "twice in a session": (of_facts("observations", 1, "session", value=1), "two observations"),
+    "a status": (of_facts("observations", 0, "status", value="seen"), "status 'seen'"),
+    "a shape of a gone object": (of_facts("observations", 0, "status", value="gone"), "gone, sha"),
+    "a kind of shape": (of_facts("observations", 0, "support", value="torus"), "torus"),
+    "classes": (of_facts("observations", 0, "classes", value={"a": -1}), "classes"),
+    "class names": (of_facts("observations", 0, "classes", value={"\x1b": 1}), "classes"),
+    "more missed than expected": (of_facts("observations", 0, "missed", value=99), "missed 99"),
+    "log odds": (of_facts("observations", 0, "log_odds", value=float("inf")), "log_odds"),
+    "views": (of_facts("observations", 0, "views", value=True), "views"),
+    "up": (of_facts("up", value=[0, 0, 2]), "up"),
+    "metric": (of_facts("metric", value=None), "metric"),
+    "merged into nothing": (of_facts("merged", "4", value=3), "object 3|object 4"),
+    "merged and there": (of_facts("merged", "1", value=5), "object 1 merged into 5"),
+    "merged as a list": (of_facts("merged", value=[1]), "damaged"),
+}
+
+
+@pytest.mark.parametrize("name", INCONSISTENT)
+def test_inconsistent_content_is_refused(name: str, saved: Path, tmp_path: Path) -> None:
+    """Written with a right digest, by another program."""
+    spoil, expected = INCONSISTENT[name]
+    arrays, facts = load_npz(saved)
+    spoil(arrays, facts)
+    save_npz(tmp_path / "a.map", arrays, **facts)
+    assert re.search(expected, refusal(tmp_path / "a.map"))
+
+
+def test_map_that_could_not_be_read_is_not_written(room: RoomMap, saved: Path) -> None:
+    content = saved.read_bytes()
+    with pytest.raises(ValueError, match="two objects of one number"):
+        dataclasses.replace(room, objects=room.objects + room.objects[:1]).save(saved)
+    assert saved.read_bytes() == content
+
+
+# ---- Lock ----
+
+
+def _try_lock(path: Path, answer: Any) -> None:
+    try:
+        with map_lock(path):
+            answer.put("taken")
+    except ReobjError as error:
+        answer.put(str(error))
+
+
+def test_second_run_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "flat.map"
+    context = multiprocessing.get_context("spawn")
+    answer = context.SimpleQueue()
+
+    def second() -> str:
+        other = context.Process(target=_try_lock, args=(path, answer))
+        other.start()
+        other.join()
+        return str(answer.get())
+
+    with map_lock(path):
+        assert "another run is updating this map; wait for it" in second()
+    assert second() == "taken"
+
+
+# ---- Corrections ----
+
+
+def statuses(found: MapObject) -> list[tuple[int, str]]:
+    return [(o.session, o.status) for o in found.observations]
+
+
+def test_forgotten_session_leaves_neither_observations_nor_points(room: RoomMap) -> None:
+    for session in (3, "3", "day3.mp4"):
+        left = forget(room, session)
+        assert [s.number for s in left.sessions] == [1, 2] and left.next_session == 4
+        assert {o.session for found in left.objects for o in found.observations} == {1, 2}
+        assert set(left.points.session) == {1, 2}
+        room_map.check_map(left)
+
+
+def test_object_of_the_forgotten_session_alone_disappears(tmp_path: Path) -> None:
+    """Its number is not used again, its points stay for localisation, its merged numbers go."""
+    made = a_map(
+        [[observed(1, "new", HERE)], [observed(2, "new", THERE), Observation(3, "not_seen")]],
+        next_id=9,
+        merged={7: 2},
+        next_session=4,
+        sessions=tuple(a_session(k) for k in (1, 2, 3)),
+    )
+    points = dataclasses.replace(some_points(2, 1, []), object_id=np.array([1, 2]))
+    left = forget(dataclasses.replace(made, points=points), 2)
+    assert [found.id for found in left.objects] == [1] and left.next_id == 9
+    assert left.merged == {} and left.points.object_id.tolist() == [1, 0]
+    left.save(tmp_path / "a.map")
+
+
+def test_all_sessions_can_be_forgotten(room: RoomMap, tmp_path: Path) -> None:
+    for session in (1, 2, 3):
+        room = forget(room, session)
+    assert room.objects == () and len(room.points) == 0 and room.next_id == 6
+    assert room.up is not None
+    room.save(tmp_path / "a.map")
+    assert_same(room, RoomMap.load(tmp_path / "a.map"))
+
+
+@pytest.mark.parametrize(
+    ("before", "session", "after"),
+    [
+        ("new stayed moved stayed", 3, "new stayed moved"),
+        ("new stayed moved stayed", 1, "new moved stayed"),
+        ("new stayed moved stayed", 4, "new stayed moved"),
+        ("new moved gone stayed", 2, "new gone moved"),
+        ("new not_seen gone stayed", 1, "new"),
+        ("new moved not_seen stayed", 3, "new moved stayed"),
+    ],
+)
+def test_status_after_a_forgotten_session(before: str, session: int, after: str) -> None:
+    """An object is never fused with a place that it had left."""
+    rows = [
+        observed(k, status, HERE) if status in ("new", "stayed", "moved") else
+        Observation(k, status) for k, status in enumerate(before.split(), 1)
+    ]  # fmt: skip
+    sessions = tuple(a_session(k) for k in range(1, 5))
+    (left,) = forget(a_map([rows], sessions=sessions), session).objects
+    assert " ".join(o.status for o in left.observations) == after
+
+
+def test_unknown_sessions_are_named() -> None:
+    sessions = (a_session(1), a_session(2), a_session(3, name="day1.mp4"))
+    room = RoomMap(sessions=sessions, next_session=4)
+    with pytest.raises(ReobjError, match=r"no session 'x' in the map; it has 1 \(day1.mp4\), 2 \("):
+        forget(room, "x")
+    with pytest.raises(ReobjError, match=r"2 sessions are called 'day1.mp4'; give a number: 1 "):
+        forget(room, "day1.mp4")
+    with pytest.raises(ReobjError, match="it has none"):
+        forget(RoomMap(), 1)
+
+
+def test_merged_object_has_the_observations_of_both() -> None:
+    """Seen under another number after it had moved: one object that moved."""
+    first = [observed(1, "new", HERE), Observation(2, "gone"), Observation(3, "gone")]
+    second = [observed(2, "new", THERE, classes={"sofa": 1.0}), observed(3, "stayed", THERE)]
+    made = a_map([first, second, [observed(1, "new", HERE)]], merged={9: 2}, next_id=10)
+    points = dataclasses.replace(some_points(3, 1, []), object_id=np.array([2, 3, 0]))
+    made = rename(dataclasses.replace(made, points=points), 2, "armchair")
+    joined = merge(made, 1, 2)
+    assert [found.id for found in joined.objects] == [1, 3]
+    assert statuses(joined.objects[0]) == [(1, "new"), (2, "moved"), (3, "stayed")]
+    assert joined.objects[0].name == "armchair" and joined.merged == {9: 1, 2: 1}
+    assert joined.points.object_id.tolist() == [1, 3, 0]
+    assert joined.object(2).id == joined.object(9).id == 1
+    np.testing.assert_allclose(object_state(joined.objects[0], joined).center, THERE["center"])
+    room_map.check_map(joined)
+
+
+def test_merged_duplicates_of_one_session() -> None:
+    """Two objects at one place: the observation of more views counts; nothing moved."""
+    near = true_shape(center=(1.02, 2, 0.5))
+    first = [observed(1, "new", HERE, views=4), Observation(2, "not_seen")]
+    second = [observed(1, "new", near, views=7, classes={"sofa": 2.0}), observed(2, "stayed", near)]
+    (found,) = merge(a_map([first, second]), 1, 2).objects
+    assert statuses(found) == [(1, "new"), (2, "stayed")]
+    assert found.observations[0].views == 7
+    assert found.observations[0].classes == {"chair": 5.0, "sofa": 2.0}
+    (other,) = merge(a_map([first, [observed(2, "new", near)]]), 1, 2).objects
+    assert statuses(other) == [(1, "new"), (2, "stayed")]  # 2 cm is no move
+
+
+def test_merge_takes_the_word_of_the_object_that_was_seen_last() -> None:
+    """Its place was not seen in session 3; at the earlier place there was nothing."""
+    first = [observed(1, "new", HERE), Observation(2, "gone"), Observation(3, "gone")]
+    second = [observed(2, "new", THERE), Observation(3, "not_seen")]
+    sessions = tuple(a_session(k) for k in (1, 2, 3))
+    (found,) = merge(a_map([first, second], sessions=sessions), 1, 2).objects
+    assert statuses(found) == [(1, "new"), (2, "moved"), (3, "not_seen")]
+
+
+def test_merge_of_unknown_or_same_objects() -> None:
+    made = a_map([[observed(1, "new", HERE)], [observed(1, "new", THERE)]])
+    with pytest.raises(ReobjError, match="no object 7 in the map; it has 1, 2"):
+        merge(made, 1, 7)
+    with pytest.raises(ReobjError, match="objects 2 and 2 are the same"):
+        merge(made, 2, 2)
+    with pytest.raises(ReobjError, match="objects 1 and 2 are the same: 1"):
+        merge(merge(made, 1, 2), 1, 2)
+
+
+def test_renamed_and_deleted_objects(tmp_path: Path) -> None:
+    made = a_map([[observed(1, "new", HERE)], [observed(1, "new", THERE)]])
+    changed = delete(rename(made, 2, " armchair "), 2)
+    changed.save(tmp_path / "a.map")
+    read = RoomMap.load(tmp_path / "a.map")
+    assert [(o.id, o.name, o.deleted) for o in read.objects] == [
+        (1, "", False), (2, "armchair", True),
+    ]  # fmt: skip
+    assert not undelete(read, 2).objects[1].deleted
+    for name in ("", "  ", "a\x1bb", "x" * 201):
+        with pytest.raises(ReobjError, match="is no name of an object"):
+            rename(made, 2, name)
+    for change in (delete, undelete):
+        with pytest.raises(ReobjError, match="no object 3 in the map"):
+            change(made, 3)
+
+
+def test_joined_tables_of_points() -> None:
+    made = some_points(5, 1, [])
+    joined = MapPoints.joined([made[:2], MapPoints.empty(), made[2:]])
+    assert_same(made, joined)
