@@ -748,6 +748,41 @@ def test_gone_objects_are_in_the_video(chairs: rt.Result, tmp_path: Path) -> Non
     assert [near(picture, GONE, 40).sum() for picture in others] == [0, 0]
 
 
+def test_marks_are_in_the_video(chairs: rt.Result, tmp_path: Path) -> None:
+    video = rt.Video(frames(tmp_path / "f", 1, SIZE))
+    (marked,), _ = overlay_of(changed(chairs), video, tmp_path / "a.mp4")
+    (plain,), _ = overlay_of(chairs, video, tmp_path / "b.mp4")
+    for color in (MOVED, NEW):
+        assert near(marked, color, 40).sum() > 300 > 10 * near(plain, color, 40).sum()
+
+
+def test_gone_objects_are_shifted_with_their_world(chairs: rt.Result, tmp_path: Path) -> None:
+    """A world far from its origin: the outline is at the same pixels."""
+    shift = np.array([5e5, 4e6, 100.0])
+    near_origin = changed(chairs)
+    cams = chairs.poses.cam_from_world.copy()
+    cams[:, :, 3] -= cams[:, :, :3] @ shift
+    (lamp, _) = near_origin.changes.gone
+    moved_lamp = dataclasses.replace(lamp, before=lamp.before + shift)
+    far = dataclasses.replace(
+        near_origin,
+        objects=[dataclasses.replace(o, center=o.center + shift) for o in chairs.objects],
+        poses=dataclasses.replace(chairs.poses, cam_from_world=cams),
+        changes=Changes("flat.map", "tuesday", gone=(moved_lamp,)),
+        fits=None,
+    )
+    video = rt.Video(frames(tmp_path / "f", 1, SIZE))
+    bounds = []
+    for result in (near_origin, far):
+        overlay = Overlay(result, tmp_path / "o.mp4", video)
+        overlay.close(False)
+        solids, camera, pose = overlay.gone[0]
+        assert np.abs(solids[9]).max() < 100
+        bounds.append(outline_of(camera, pose, solids[9]))
+    np.testing.assert_allclose(bounds[1].max(0), bounds[0].max(0), atol=1e-3)
+    np.testing.assert_allclose(bounds[1].min(0), bounds[0].min(0), atol=1e-3)
+
+
 def test_outlines_of_objects_out_of_view_are_not_drawn() -> None:
     points = surface_points("box") * 0.3
     assert outline_of(PINHOLE, STILL, points + np.array([0, 0, 4.0])) is not None
