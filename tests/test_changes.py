@@ -65,6 +65,17 @@ def test_entries_have_the_documented_keys(tmp_path: Path) -> None:
     assert data["gone"][0]["to"] is None and data["new"][0]["from"] is None
 
 
+def test_centres_far_from_the_origin_are_exact(tmp_path: Path) -> None:
+    """Map projections: to a millionth of the size, also if the shape is unknown."""
+    far = np.array([5e5 + 0.123, 4e6 + 0.456, 100.789])
+    for shape in (SHAPE, None):
+        change = Change(6, "chair", far, far + 0.5, before_shape=shape)
+        write_changes(tmp_path / "changes.json", Changes("a.map", "b", moved=(change,)))
+        (found,) = read_changes(tmp_path / "changes.json").moved
+        np.testing.assert_allclose(found.before, far, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(found.after, far + 0.5, rtol=0, atol=1e-6)
+
+
 def test_the_summary_counts_the_changes() -> None:
     assert room_changes().summary() == (
         "map flat.map: 1 stayed, 1 moved (chair 6 by 0.56 m), 1 gone (lamp 9), 1 new (cup 12), "

@@ -13,8 +13,12 @@ from simulated import SIZE, chair_solids, fitted, tracks_of, walk
 
 import quadrics
 import reobj_track as rt
+from reobj.results.changes import Change, Changes, Shape
 from reobj.results.overlay import (
+    CHANGE_COLORS,
     Overlay,
+    _former_surface,
+    change_label,
     draw_ellipses,
     draw_legend,
     draw_tracks,
@@ -22,7 +26,9 @@ from reobj.results.overlay import (
     ellipse_of_dual_conic,
     film_layers,
     image_points,
+    outline_of,
     place_labels,
+    surface_points,
     wireframes,
 )
 from reobj.results.result import VideoInfo
@@ -634,3 +640,159 @@ def test_labels_are_beside_their_boxes() -> None:
     crowd = place_labels(range(9), np.tile(size, (9, 1)), np.tile(box, (9, 1)), (320, 240), {})
     for x, y in (spot for spot in crowd if spot):
         assert 100 - 50 <= x <= 160 and 80 - 17 <= y <= 140
+
+
+# ---- Changes since a map ----
+
+MOVED, NEW, GONE = (CHANGE_COLORS[kind] for kind in ("moved", "new", "gone"))
+
+
+def changed(chairs: rt.Result, support: str = "box") -> rt.Result:
+    """Chair 1 stayed, 2 moved, 3 is new; lamp 9 stood behind them and is gone."""
+    lamp = Shape(support, np.array([0.2, 0.3, 0.5]), np.array([np.cos(0.3), 0, 0, np.sin(0.3)]))
+    one, two, three = (o.center for o in chairs.objects)
+    changes = Changes(
+        "flat.map", "tuesday",
+        stayed=(Change(1, "chair", one, one, 0.0, 0.02),),
+        moved=(Change(2, "chair", two + 0.4, two, 0.693, 0.02),),
+        new=(Change(3, "chair", None, three),),
+        gone=(Change(9, "lamp", np.array([0.2, 1.2, 0.5]), None, before_shape=lamp),
+              Change(8, "cup", np.array([0.2, 1.2, 0.5]))),  # without a shape: not drawn
+    )  # fmt: skip
+    return dataclasses.replace(chairs, changes=changes)
+
+
+def near(image: np.ndarray, color: tuple[int, int, int], spread: int = 70) -> np.ndarray:
+    """Pixels of about a colour: the video is compressed."""
+    return (np.abs(image.astype(int) - color) <= spread).all(-1)
+
+
+def test_labels_name_the_change(chairs: rt.Result, tmp_path: Path) -> None:
+    video = rt.Video(frames(tmp_path / "f", 1, SIZE))
+    result = changed(chairs)
+    overlay = Overlay(result, tmp_path / "o.mp4", video)
+    overlay.close(False)
+    assert overlay.labels == {
+        1: "1 chair", 2: "2 chair, moved 0.69 m", 3: "3 chair, new", 8: "8 cup, gone",
+        9: "9 lamp, gone",
+    }  # fmt: skip
+    assert overlay.marks == {2: MOVED, 3: NEW, 8: GONE, 9: GONE}
+    assert [kind for kind, _ in overlay.legend] == ["box", "solid", "thin", "moved", "new", "gone"]
+    boxes = Overlay(result, tmp_path / "o.mp4", video, "boxes")
+    boxes.close(False)
+    assert [kind for kind, _ in boxes.legend] == ["box", "moved", "new"] and boxes.gone == {}
+    unscaled = dataclasses.replace(result.changes.moved[0], distance_m=None)
+    assert change_label("moved", unscaled) == ", moved" and change_label("stayed", unscaled) == ""
+
+
+def test_changed_objects_have_a_second_outline() -> None:
+    """Around the box, in the colour of the change; the label has this colour too."""
+    image = grey(300, 200)
+    row = one_row((60, 60, 160, 150))
+    draw_tracks(image, row, {3: "3 chair"}, 1.0, marks={3: MOVED})
+    columns = np.flatnonzero(near(image[100], MOVED, 90))
+    np.testing.assert_allclose(columns[[0, -1]], [56, 164], atol=1.5)
+    columns = np.flatnonzero(near(image[100], object_color(3), 60))
+    np.testing.assert_allclose(columns[[0, -1]], [60, 160], atol=1.5)
+    assert near(image[40:60, 60:110], MOVED, 5).mean() > 0.4
+    plain = grey(300, 200)
+    draw_tracks(plain, row, {3: "3 chair"}, 1.0, marks={4: MOVED})
+    assert not near(plain, MOVED, 5).any()
+
+
+@pytest.mark.parametrize("support", ["box", "cylinder", "ellipsoid"])
+def test_gone_objects_have_a_dashed_outline_with_a_label(
+    chairs: rt.Result, tmp_path: Path, support: str
+) -> None:
+    """Its bounds are those of the projected solid; chairs are not drawn here."""
+    result = changed(chairs, support)
+    lamp = result.changes.gone[0]
+    axes = Rotation.from_quat(lamp.before_shape.quat_wxyz[[1, 2, 3, 0]]).as_matrix()
+    solid = quadrics.Ellipsoids(lamp.before[None], lamp.before_shape.half_axes[None], axes[None])
+    poses = walk()
+    true = quadrics.solid_boxes(solid, support, poses.camera.K @ poses.cam_from_world[:1])[0, 0]
+    bare = dataclasses.replace(result, objects=[], fits=None, tracks=rt.Tracks.empty())
+    overlay = Overlay(bare, tmp_path / "o.mp4", rt.Video(frames(tmp_path / "f", 1, SIZE)))
+    overlay.close(False)
+    image = grey(*SIZE)
+    bounds = overlay._draw_gone(image, 0)
+    assert list(bounds) == [9]
+    found = drawn_in(image, GONE, 25)
+    np.testing.assert_allclose(found, true, atol=2.5)
+    np.testing.assert_allclose(bounds[9], true, atol=1.5)
+    gaps = np.abs(image[round(true[1]) : round(true[3])].astype(int) - 127).max(2) > 40
+    assert 0.2 < gaps.any(1).mean()
+    # a dashed line covers about half of the outline
+    hull = outline_of(poses.camera, poses.cam_from_world[0], _former_surface(lamp))
+    solid_line = grey(*SIZE)
+    cv2.polylines(solid_line, [hull.round().astype(np.int32)], True, GONE, 1, cv2.LINE_AA)
+    share = (image != 127).any(2).sum() / (solid_line != 127).any(2).sum()
+    assert 0.35 < share < 0.75
+    draw_tracks(image, rt.Tracks.empty(), overlay.labels, 1.0, marks=overlay.marks, gone=bounds)
+    x1, y1, *_ = bounds[9]
+    assert near(image[y1 - 17 : y1, x1 : x1 + 60], GONE, 5).mean() > 0.5
+
+
+def test_gone_objects_are_in_the_video(chairs: rt.Result, tmp_path: Path) -> None:
+    """And not in one of a run without a map, nor in components that were not placed in it."""
+    result = dataclasses.replace(changed(chairs), objects=[], fits=None)
+    for name in "abc":
+        (tmp_path / name).mkdir()
+    with_gone, _ = solid_pixels(result, tmp_path / "a", 1)
+    elsewhere = dataclasses.replace(result.changes, components=(1,))
+    others = [
+        solid_pixels(dataclasses.replace(result, changes=changes), tmp_path / name, 1)[0][0]
+        for name, changes in (("b", None), ("c", elsewhere))
+    ]
+    assert near(with_gone[0], GONE, 40).sum() > 300  # with the label
+    assert [near(picture, GONE, 40).sum() for picture in others] == [0, 0]
+
+
+def test_marks_are_in_the_video(chairs: rt.Result, tmp_path: Path) -> None:
+    video = rt.Video(frames(tmp_path / "f", 1, SIZE))
+    (marked,), _ = overlay_of(changed(chairs), video, tmp_path / "a.mp4")
+    (plain,), _ = overlay_of(chairs, video, tmp_path / "b.mp4")
+    for color in (MOVED, NEW):
+        assert near(marked, color, 40).sum() > 300 > 10 * near(plain, color, 40).sum()
+
+
+def test_gone_objects_are_shifted_with_their_world(chairs: rt.Result, tmp_path: Path) -> None:
+    """A world far from its origin: the outline is at the same pixels."""
+    shift = np.array([5e5, 4e6, 100.0])
+    near_origin = changed(chairs)
+    cams = chairs.poses.cam_from_world.copy()
+    cams[:, :, 3] -= cams[:, :, :3] @ shift
+    (lamp, _) = near_origin.changes.gone
+    moved_lamp = dataclasses.replace(lamp, before=lamp.before + shift)
+    far = dataclasses.replace(
+        near_origin,
+        objects=[dataclasses.replace(o, center=o.center + shift) for o in chairs.objects],
+        poses=dataclasses.replace(chairs.poses, cam_from_world=cams),
+        changes=Changes("flat.map", "tuesday", gone=(moved_lamp,)),
+        fits=None,
+    )
+    video = rt.Video(frames(tmp_path / "f", 1, SIZE))
+    bounds = []
+    for result in (near_origin, far):
+        overlay = Overlay(result, tmp_path / "o.mp4", video)
+        overlay.close(False)
+        solids, camera, pose = overlay.gone[0]
+        assert np.abs(solids[9]).max() < 100
+        bounds.append(outline_of(camera, pose, solids[9]))
+    np.testing.assert_allclose(bounds[1].max(0), bounds[0].max(0), atol=1e-3)
+    np.testing.assert_allclose(bounds[1].min(0), bounds[0].min(0), atol=1e-3)
+
+
+def test_outlines_of_objects_out_of_view_are_not_drawn() -> None:
+    points = surface_points("box") * 0.3
+    assert outline_of(PINHOLE, STILL, points + np.array([0, 0, 4.0])) is not None
+    for center in ([0, 0, -4.0], [0, 0, 0.1], [3.0, 0, 4.0]):
+        assert outline_of(PINHOLE, STILL, points + center) is None, center
+
+
+def test_the_legend_shows_the_colours_of_changes() -> None:
+    image = grey(300, 100)
+    draw_legend(image, [("moved", "a"), ("new", "b"), ("gone", "c")])
+    rows = [image[30 + 20 * k : 50 + 20 * k, 8:40] for k in range(3)]
+    for row, color in zip(rows, (MOVED, NEW, GONE), strict=True):
+        assert [near(r, color, 30).any() for r in rows] == [r is row for r in rows]

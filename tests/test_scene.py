@@ -30,6 +30,7 @@ import reobj.results.scene as scene
 import reobj_track as rt
 from reobj.cameras import invert_rigid
 from reobj.files import decimals
+from reobj.results.changes import Change, Changes, Shape
 from reobj.results.result import VideoInfo
 from reobj.results.scene import Pictures, diverse_rows, page_text, write_pictures, write_scene
 from reobj.types import object_color
@@ -803,6 +804,228 @@ def test_without_webgl_the_list_remains(browser: Browser, page: Path) -> None:
     assert "no WebGL" in browser.eval("$('why').innerText")
     browser.eval("here[1].row.click()")
     assert "width" in browser.eval("$('panel').innerText") and complaints(browser) == []
+
+
+# ---- Changes since a map ----
+
+EIGHTH_TURN = np.array([np.cos(np.pi / 8), 0, 0, np.sin(np.pi / 8)])
+
+
+def changes_of_walk(objects: list[rt.Object]) -> Changes:
+    """The chair moved, the second object stayed, the suitcase is new, two of the map are absent."""
+    chair, second, suitcase = objects[:3]
+    shape = Shape("box", chair.half_axes, EIGHTH_TURN)
+    lamp = Shape("cylinder", np.array([0.2, 0.2, 0.5]), np.array([1.0, 0, 0, 0]))
+    return Changes(
+        "flat.map", "tuesday", "", 20, 24, sigma_m=0.01,
+        stayed=(Change(2, second.class_name, second.center, second.center, 0.0, 0.02),),
+        moved=(Change(1, "chair", chair.center + np.array([0, 1.0, 0]), chair.center, 1.0, 0.034,
+                      "12 own points agree", (9,), shape),),
+        gone=(Change(9, EVIL, np.array([1.0, 1.0, 0.5]), None, evidence="seen through in 3 views",
+                     before_shape=lamp),),
+        new=(Change(3, "suitcase", None, suitcase.center),),
+        not_seen=(Change(7, "bowl", np.array([-1.0, 1.0, 0.5]), None, before_shape=lamp),),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def changed_page(page: Path) -> Path:
+    """The page of the small scene after a run with a map."""
+    result = rt.Result.load(page.parent)
+    changes = changes_of_walk(result.objects)
+    out = page.parent.parent / "changed"
+    out.mkdir()
+    video = rt.Video(page.parent.parent / "frames")
+    write_pictures(dataclasses.replace(result, changes=changes), out, video, overlay="none")
+    return out / "scene.html"
+
+
+def test_an_arrow_leads_from_the_ghost_to_the_moved_object(
+    browser: Browser, changed_page: Path
+) -> None:
+    """Ghost: the former shape at the former place; the tip of the arrow is the present centre."""
+    browser.open(changed_page)
+    moved = browser.eval("""(g => ({ at: g.at, to: g.object.at, shown: g.group.visible,
+        wire: g.group.parts.wire.visible, dashed: g.group.parts.wire.material.dashed,
+        matrix: g.group.matrix.elements, arrow: g.arrow.map(n => n.visible),
+        start: [...g.arrow[0].geometry.attributes.instanceStart.array],
+        tip: new THREE.Vector3(0, .5, 0).applyMatrix4(g.arrow[1].matrix).toArray() }))
+        (ghosts.find(g => g.kind === "moved"))""")
+    assert np.subtract(moved["at"], moved["to"]) @ np.subtract(moved["at"], moved["to"]) == (
+        pytest.approx(1, abs=1e-5)
+    )
+    np.testing.assert_allclose(moved["start"][:3], moved["at"], atol=1e-5)
+    np.testing.assert_allclose(moved["tip"], moved["to"], atol=1e-5)
+    assert moved["shown"] and moved["wire"] and moved["dashed"] and moved["arrow"] == [True] * 2
+    half = data_of(changed_page)["objects"][0]["half_axes"]
+    columns = np.array(moved["matrix"]).reshape(4, 4)[:3, :3]
+    np.testing.assert_allclose(np.linalg.norm(columns, axis=1), half, rtol=1e-5)
+    turned = columns[0] @ browser.eval("level.turn([Math.SQRT1_2, Math.SQRT1_2, 0])")
+    assert turned == pytest.approx(half[0], rel=1e-5)  # the former rotation, 45 degrees
+    drawn = browser.eval("draw(); [former.children.length, former.parent === root]")
+    assert drawn == [5, True]  # three ghosts, shaft and tip
+    before = browser.send("Page.captureScreenshot")["data"]
+    browser.eval("$('names').click()")
+    browser.settle()
+    with_arrow = browser.send("Page.captureScreenshot")["data"]
+    browser.eval("ghosts.forEach(g => g.arrow.forEach(n => { n.material.opacity = 0; })); redraw()")
+    browser.settle()
+    assert len({before, with_arrow, browser.send("Page.captureScreenshot")["data"]}) == 3
+    assert complaints(browser) == []
+
+
+def test_gone_and_new_objects_are_marked(browser: Browser, changed_page: Path) -> None:
+    browser.open(changed_page)
+    labels = """[...$('labels').children].map(l => [l.textContent, l.className])
+        .filter(([, name]) => name).sort()"""
+    marked = [["chair 1 moved 1.00 m", "moved"], [f"{EVIL} 9 gone", "gone"],
+              ["suitcase 3 new", "new"]]  # fmt: skip
+    assert browser.eval(labels) == sorted(marked)
+    halos = "(draw(), solid.map(o => [o.id, o.group.parts.halo.visible]))"
+    assert browser.eval(halos) == [[1, True], [2, False], [3, True]]
+    gone = "ghosts.find(g => g.kind === 'gone')"
+    assert browser.eval(f"[{gone}.group.visible, {gone}.group.parts.wire.visible]") == [True, True]
+    red, green, blue = browser.eval(f"{gone}.color")
+    assert max(red, green, blue) - min(red, green, blue) < 20  # grey
+    assert browser.eval("ghosts.find(g => g.kind === 'not_seen').group.visible") is False
+    browser.eval("$('names').click(); draw()")  # labels could lie above
+    x, y = browser.eval(f"""(r => [...project({gone}.at).slice(0, 2), r.left, r.top])(
+        $('view').getBoundingClientRect()).reduce((s, v, i) => (s[i % 2] += v, s), [0, 0])""")
+    browser.click(x, y)
+    assert browser.eval("state.ghost?.id") == 9 and browser.eval("state.selected") is None
+    text = browser.eval("$('panel').innerText")
+    assert f"{EVIL} 9" in text and "seen through in 3 views" in text
+    browser.press("Escape")
+    assert browser.eval("[state.ghost, $('panel').innerText]") == [None, ""]
+    browser.eval("select(here[0])")
+    text = browser.eval("$('panel').innerText")
+    assert "moved 1.00 ± 0.03 m" in text and "12 own points agree" in text
+    assert "may also be\n9" in text
+    assert browser.eval("window.hacked") is None and complaints(browser) == []
+
+
+def test_the_list_shows_and_filters_changes(browser: Browser, changed_page: Path) -> None:
+    browser.open(changed_page)
+    rows = """[...document.querySelectorAll('.row')].filter(r => !r.hidden)
+        .map(r => [+r.querySelector('b').textContent.split(' ').at(-1),
+                   r.querySelector('.kind')?.textContent || ''])"""
+    every = [[1, "moved 1.00 m"], [9, "gone"], [3, "new"], [2, ""], [4, ""]]
+    assert browser.eval(rows) == every
+    assert browser.eval("$('since').innerText") == (
+        f"map flat.map: 1 stayed, 1 moved (chair 1 by 1.00 m), 1 gone ({EVIL} 9), "
+        "1 new (suitcase 3), 1 not seen"
+    )
+    chips = "[...document.querySelectorAll('#kinds label')]"
+    assert browser.eval(f"{chips}.map(l => l.innerText)") == [
+        "moved 1", "gone 1", "new 1", "stayed 1", "not seen 1"
+    ]  # fmt: skip
+
+    def click(kind: str) -> None:
+        browser.eval(f"{chips}.find(l => l.innerText.startsWith('{kind}'))"
+                     ".querySelector('input').click()")  # fmt: skip
+        browser.settle()
+
+    visible = "[solid, ghosts].map(list => list.filter(o => o.group.visible).map(o => o.id))"
+    assert browser.eval(visible) == [[1, 2, 3], [1, 9]]
+    click("stayed")
+    click("not seen")
+    assert browser.eval(rows) == [*every[:3], [7, "not seen"], [4, ""]]
+    assert browser.eval(visible) == [[1, 3], [1, 9, 7]]
+    click("moved")  # with its ghost and arrow
+    assert browser.eval(visible) == [[3], [9, 7]]
+    click("gone")
+    assert browser.eval(visible) == [[3], [7]]
+    browser.eval("$('search').value = 'not seen'; $('search').oninput()")
+    assert browser.eval(rows) == [[7, "not seen"]]
+    browser.eval("$('search').value = ''; $('search').oninput(); $('changes').click()")
+    browser.settle()  # off: like a page without a map
+    assert browser.eval(rows) == [[1, ""], [3, ""], [2, ""], [4, ""]]
+    assert browser.eval(visible) == [[1, 2, 3], []]
+    assert browser.eval("$('kinds').hidden") is True
+    assert browser.eval("[...$('labels').children].every(l => !l.className)") is True
+    assert complaints(browser) == []
+
+
+def test_ghosts_follow_corrections(browser: Browser, changed_page: Path) -> None:
+    """A deleted object leaves its former place without an arrow; a merged one keeps its change."""
+    browser.open(changed_page)
+    browser.eval("edit(edits.merge(objects[0], objects[1]))")
+    assert browser.eval("ghosts.map(g => [g.id, g.object?.id ?? null, g.arrow.length])") == [
+        [1, 1, 2], [9, None, 0], [7, None, 0]
+    ]  # fmt: skip
+    browser.eval("undo(); edit(edits.delete(objects[0]))")
+    assert browser.eval("ghosts.map(g => g.id)") == [9, 7]
+    browser.eval("undo()")
+    assert browser.eval("ghosts.map(g => g.id)") == [1, 9, 7]
+    assert complaints(browser) == []
+
+
+def test_changes_are_shown_on_a_phone_and_without_webgl(
+    browser: Browser, changed_page: Path
+) -> None:
+    browser.open(changed_page, 390, 844, phone=True)
+    assert browser.eval("document.documentElement.scrollWidth") <= 390
+    assert browser.eval("$('view').clientHeight") > 240
+    browser.picture(SCREENSHOTS / "changes-phone.png")
+    source = "HTMLCanvasElement.prototype.getContext = () => null"
+    script = browser.send("Page.addScriptToEvaluateOnNewDocument", source=source)
+    browser.open(changed_page)
+    browser.send("Page.removeScriptToEvaluateOnNewDocument", **script)
+    browser.eval("ghosts.find(g => g.kind === 'gone').row.click()")
+    assert "seen through in 3 views" in browser.eval("$('panel').innerText")
+    assert complaints(browser) == []
+
+
+def test_a_refused_map_is_named(browser: Browser, page: Path, tmp_path: Path) -> None:
+    result = rt.Result.load(page.parent)
+    changes = Changes("flat.map", "tuesday", "3 of 24 frames agree with it", 3, 24)
+    video = rt.Video(page.parent.parent / "frames")
+    refused = dataclasses.replace(result, changes=changes)
+    write_scene(refused, Pictures(refused, video), tmp_path / "scene.html", video)
+    browser.open(tmp_path / "scene.html")
+    assert browser.eval("$('since').innerText") == (
+        "map flat.map: not placed; 3 of 24 frames agree with it"
+    )
+    hidden = "[$('kinds'), $('changes-label')].map(e => e.hidden)"
+    assert browser.eval(f"[ghosts.length, {hidden}]") == [0, [True, True]]
+    assert complaints(browser) == []
+
+
+def test_ghosts_are_shifted_with_their_world(tmp_path: Path, browser: Browser) -> None:
+    """A world far from its origin: the page subtracts the same origin from former places."""
+    shift = np.array([5e5, 4e6, 100.0])
+    poses = poses_of_walk()
+    result = fitted(tracks_of_walk(poses), poses, names=NAMES)
+    result.objects[:3] = [
+        dataclasses.replace(o, center=o.center + shift) for o in result.objects[:3]
+    ]
+    cams = poses.cam_from_world.copy()
+    cams[:, :, 3] -= cams[:, :, :3] @ shift
+    far = dataclasses.replace(poses, cam_from_world=cams, points=poses.points + shift)
+    changes = changes_of_walk(result.objects)
+    result = dataclasses.replace(result, poses=far, fits=None, changes=changes)
+    write_scene(result, Pictures(result, VIDEO), tmp_path / "scene.html", VIDEO)
+    assert np.linalg.norm(data_of(tmp_path / "scene.html")["parts"][0]["origin"]) > 1e6
+    browser.open(tmp_path / "scene.html")
+    browser.eval("draw()")
+    gap = browser.eval("(g => Math.hypot(...add(g.at, g.object.at, -1)))(ghosts[0])")
+    assert gap == pytest.approx(1, abs=1e-3)
+
+
+def test_without_a_map_the_page_has_no_changes(browser: Browser, page: Path) -> None:
+    assert "changes" not in data_of(page)
+    browser.open(page)
+    shown = "['since', 'kinds', 'changes-label'].map(id => $(id).offsetParent === null)"
+    assert browser.eval(shown) == [True] * 3
+    assert browser.eval("[former.children.length, $('sort').value, $('labels').innerHTML]")[:2] == [
+        0, "id"
+    ]  # fmt: skip
+    assert browser.eval("document.querySelectorAll('.kind').length") == 0
+
+
+def test_sources_of_the_map_page_are_small(page: Path, changed_page: Path) -> None:
+    """The data of five changes take less than 5 kB."""
+    assert 500 < changed_page.stat().st_size - page.stat().st_size < 5000
 
 
 # ---- Without a browser ----

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from reobj.files import atomic, load_json, rounded, significant
+from reobj.files import atomic, load_json, numbers, rounded
 from reobj.results.entries import decode
 from reobj.types import Array, ReobjError
 
@@ -33,7 +33,7 @@ class Shape:
 
     def to_json(self) -> dict[str, Any]:
         """Return the `from_shape` of changes.json."""
-        axes = {k: significant(getattr(self, k)).tolist() for k in ("half_axes", "quat_wxyz")}
+        axes = {k: numbers(getattr(self, k)) for k in ("half_axes", "quat_wxyz")}
         return {"support": self.support, **axes}
 
 
@@ -72,14 +72,20 @@ class Change:
         return {
             "id": self.id,
             "class": self.class_name,
-            "from": None if self.before is None else significant(self.before).tolist(),
-            "to": None if self.after is None else significant(self.after).tolist(),
+            "from": self._rounded(self.before),
+            "to": self._rounded(self.after),
             "distance_m": rounded(self.distance_m, 4),
             "sigma_m": rounded(self.sigma_m, 4),
             "evidence": self.evidence,
             "candidates": list(self.candidates),
             "from_shape": None if self.before_shape is None else self.before_shape.to_json(),
         }
+
+    def _rounded(self, center: Array | None) -> list[float] | None:
+        """Round a centre as in objects.json, where the size is known."""
+        if center is None or self.before_shape is None:
+            return None if center is None else center.tolist()
+        return numbers(center, 2 * float(self.before_shape.half_axes.max()))
 
     def fault(self, kind: str) -> str:
         """Describe what is missing or contradictory in a change of a kind; "" if nothing is."""
