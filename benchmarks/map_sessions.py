@@ -186,7 +186,8 @@ def main() -> None:
     total["not seen, called gone"] = sum(row["not seen, called gone"] for row in rows)
     total["refused"] = sum(bool(row["refused"]) for row in rows)
     print(json.dumps(total))
-    (args.out / "map_sessions.json").write_text(json.dumps({"rows": rows, "total": total}, indent=1))
+    text = json.dumps({"rows": rows, "total": total}, indent=1)
+    (args.out / "map_sessions.json").write_text(text)
 
 
 if __name__ == "__main__":

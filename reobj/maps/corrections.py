@@ -13,6 +13,7 @@ import numpy as np
 from reobj.files import spans
 from reobj.maps.fusion import CHI2_3, shapes_of
 from reobj.maps.room_map import MapObject, Observation, RoomMap, Session
+from reobj.results.edits import Edits
 from reobj.types import CLASS_NAME_MAX, ReobjError, visible_name
 
 
@@ -185,6 +186,26 @@ def _with(room: RoomMap, changed: MapObject, without: int = 0) -> RoomMap:
     """Replace an object by its number, and remove another one."""
     objects = [changed if o.id == changed.id else o for o in room.objects if o.id != without]
     return dataclasses.replace(room, objects=tuple(objects))
+
+
+def with_edits(room: RoomMap, edits: Edits) -> RoomMap:
+    """Apply the corrections of the viewer to the objects of the map, by their numbers.
+
+    A split has no number of the map yet. Edits of objects that the map does not have, and those
+    that were applied before, change nothing.
+    """
+    for edit in edits.edits if edits.map_id == room.map_id else ():
+        ids = {o.id for o in room.objects} | set(room.merged)
+        numbers = [edit.object.id] + ([] if edit.other is None else [edit.other.id])
+        if not ids.issuperset(numbers):
+            continue
+        if edit.do == "rename":
+            room = rename(room, edit.object.id, edit.class_name)
+        elif edit.do == "delete":
+            room = delete(room, edit.object.id)
+        elif edit.do == "merge" and len({room.object(number).id for number in numbers}) == 2:
+            room = merge(room, *numbers)
+    return room
 
 
 def corrected(

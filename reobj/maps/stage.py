@@ -14,6 +14,7 @@ import numpy as np
 import quadrics
 from reobj.cameras import Poses, import_pycolmap
 from reobj.files import Progress
+from reobj.maps.corrections import with_edits
 from reobj.maps.fusion import scale_of
 from reobj.maps.placement import (
     ComponentPlacement,
@@ -186,7 +187,7 @@ def finish_map(
         placed: None: the cameras are those of the last run, with the points that the map has.
     """
     room = opened.room
-    name = Path(str(video.source)).name or str(video.source)
+    name = session_name(video)
     poses = result.poses
     refused = ""
     if poses is None or not poses.known.any():
@@ -210,11 +211,25 @@ def finish_map(
             changes=Changes(str(opened.path), name, refused=refused, tried_frames=tried),
             warnings=[*result.warnings, text],
         )
-    new_room, numbered = add_recording(room, result, _recording(opened, result, video, name,
-                                                                embedder, placed))  # fmt: skip
+    if result.edits is not None:
+        room = with_edits(room, result.edits)
+    recording = _recording(opened, result, video, name, embedder, placed)
+    new_room, numbered = add_recording(room, result, recording)
     if not opened.frozen:
         new_room.save(opened.path)
     return numbered
+
+
+def session_name(video: Video) -> str:
+    """Name a recording by its file, and by the part of it that is read."""
+    name = Path(str(video.source)).name or str(video.source)
+    part = video.config
+    return f"{name} {part.start}-{part.stop or ''}" if part.start or part.stop else name
+
+
+def session_key(video: Video) -> str:
+    """Identify a recording: the content of its file, and the part of it that is read."""
+    return f"{video.fingerprint} {video.config.start}-{video.config.stop}"
 
 
 def _recording(
@@ -226,14 +241,14 @@ def _recording(
     placed: Placed | None,
 ) -> Recording:
     """Collect the facts of a recording; those of a refitted one are in the map."""
-    old = opened.room.session_of(video.fingerprint)
+    old = opened.room.session_of(session_key(video))
     none = quadrics.Scale(1.0, np.inf, "none")
     if placed is None:
         scale = none
         if old is not None:
             scale = quadrics.Scale(old.metres_per_unit, old.scale_rel_sigma, old.scale_source)
         return Recording(
-            opened.path, name, video.fingerprint, embedder,
+            opened.path, name, session_key(video), embedder,
             np.zeros((7, 7)) if old is None else old.alignment_cov,
             0 if old is None else old.localised_frames, 0 if old is None else old.tried_frames,
             scale, None,
@@ -246,7 +261,7 @@ def _recording(
         count = len(placed.features)
         cov = np.zeros((7, 7))
         return Recording(
-            opened.path, name, video.fingerprint, embedder, cov, count, count, scale, points
+            opened.path, name, session_key(video), embedder, cov, count, count, scale, points
         )
     best = best_component(placed.placement)
     assert best.similarity is not None
@@ -255,7 +270,7 @@ def _recording(
     else:
         scale = placed.scale or none
     return Recording(
-        opened.path, name, video.fingerprint, embedder, best.similarity.cov,
+        opened.path, name, session_key(video), embedder, best.similarity.cov,
         len(best.images), best.tried, scale, points,
     )  # fmt: skip
 

@@ -80,12 +80,14 @@ class Edits:
     Attributes:
         edits: parsed. entries: as in the file. path: of the file, for messages.
         kept: stored by an earlier fit; they may not match the current result.
+        map_id: of the map whose numbers the edits' objects have; "": none.
     """
 
     edits: tuple[Edit, ...]
     entries: list[dict[str, Any]]
     path: Path
     kept: bool = False
+    map_id: str = ""
 
 
 def read_edits(path: str | Path) -> Edits:
@@ -109,7 +111,7 @@ def read_edits(path: str | Path) -> Edits:
         except (KeyError, TypeError, ValueError) as error:
             fault = f"{path}, edit {number}: {error if str(error) else 'cannot be read'}"
             raise ReobjError(f"{fault}; expected {_expected(entry)}") from error
-    return Edits(tuple(edits), data["edits"], path)
+    return Edits(tuple(edits), data["edits"], path, map_id=str(data.get("map", "")))
 
 
 def _expected(entry: Any) -> str:
@@ -152,7 +154,7 @@ def write_edits(folder: Path, edits: Edits | None) -> None:
     """Write edits into a new folder of results, for later fits; no file for an empty list."""
     if edits is None or not edits.edits:
         return
-    data = HEADER | {"edits": edits.entries}
+    data = HEADER | {"map": edits.map_id, "edits": edits.entries}
     with atomic(folder / OutputFile.EDITS) as part:
         part.write_text(json.dumps(data, indent=1) + "\n")
 

@@ -211,6 +211,7 @@ def write_scene(
         "doubtful": doubtful,
         "size": {"width": result.video.width, "height": result.video.height},
         "edits": [] if result.edits is None else result.edits.entries,
+        "map": "" if result.poses is None else result.poses.map_id,
         "why_flat": _why_flat(result),
         "steps": {"frame": steps.tolist(), "seconds": seconds, "part": of_part.tolist()},
         **_scene_cameras(result, steps, np.array(origins)),

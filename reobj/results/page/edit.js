@@ -114,7 +114,7 @@ function fillEdits() {
       "Save edits.json"));
 }
 
-const editsFile = () => JSON.stringify({ format: "reobj-edits", version: 1,
+const editsFile = () => JSON.stringify({ format: "reobj-edits", version: 1, map: S.map,
   edits: [...S.edits.filter((_, i) => !takenBack.has(i)), ...pending] }, null, 1) + "\n";
 
 function save() {
