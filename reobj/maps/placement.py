@@ -416,8 +416,9 @@ def _refined(
 ) -> Similarity:
     """Minimise the reprojection errors of the map's points in the moved cameras.
 
-    The covariance is that of M-estimation with one cluster an image ("sandwich"): the errors of an
-    image have common causes, such as the deformation of its reconstruction.
+    The covariance is that of independent errors, times the ratio by which errors common to an image
+    (such as the deformation of a reconstruction) raise the variance on average: that of the
+    estimator with one cluster an image, which alone needs many more images than parameters.
     """
     image = np.repeat(np.arange(len(images)), [len(im.point) for im in images])
     points = xyz[np.concatenate([im.point for im in images])]  # (n, 3) in the map
@@ -448,19 +449,22 @@ def _refined(
 
     spread = float(np.linalg.norm(points - origin, axis=1).mean())
     scales = np.array([1, 1, 1, spread, spread, spread, 1.0])
-    loss_px = 2.0 * max(poses.camera.width, poses.camera.height) / 640
+    loss_px = 1.0 * max(poses.camera.width, poses.camera.height) / 640
     fit = least_squares(
-        residual, np.zeros(7), loss="cauchy", f_scale=loss_px, x_scale=scales, max_nfev=50
+        residual, np.zeros(7), loss="soft_l1", f_scale=loss_px, x_scale=scales, max_nfev=50
     )
-    J = fit.jac.reshape(-1, 2, 7)  # weighted by the loss
+    J = fit.jac.reshape(-1, 2, 7)  # of the second order approximation of the loss
     error = residual(fit.x).reshape(-1, 2)
-    weight = 1 / np.sqrt(1 + (error**2).sum(1, keepdims=True) / loss_px**2)
-    gradient = np.einsum("nij,ni->nj", J, error * weight)  # (n, 7)
+    bent = 1 + (error / loss_px) ** 2
+    # soft_l1: the derivative of the loss, and the plain Jacobian
+    gradient = np.einsum("nij,ni->nj", J, error / np.sqrt(bent) * bent**0.75)  # (n, 7)
     of_image = np.zeros((len(images), 7))
     np.add.at(of_image, image, gradient)
     bread = np.linalg.pinv(np.einsum("nij,nik->jk", J, J))
-    few = len(images) / max(len(images) - 2, 1)  # each image has common errors; few: underestimated
-    cov = few * bread @ (of_image.T @ of_image) @ bread
+    independent = float((gradient**2).sum() / max((J**2).sum(), 1e-300))  # px^2
+    common = float(np.trace(bread @ of_image.T @ of_image)) / 7  # px^2
+    few = len(images) / max(len(images) - 1, 1)
+    cov = bread * max(independent, few * common)
     scale, rotation, translation = moved(fit.x)
     # from a correction about `origin` to one about the origin of the map's world
     about = np.eye(7)

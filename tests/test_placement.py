@@ -1,0 +1,214 @@
+"""Placement of a recording in a map: points with descriptors, PnP, one similarity a component."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from reobj.cameras import Camera, Poses, invert_rigid
+from reobj.maps.placement import (
+    ImageFeatures,
+    PlacementOptions,
+    Similarity,
+    place,
+    points_with_descriptors,
+)
+from reobj.maps.room_map import MapPoints
+
+CAMERA = Camera("PINHOLE", 640, 480, (520.0, 520.0, 320.0, 240.0))
+SCALE = 0.4  # session units of a map unit
+TURN = Rotation.from_euler("zyx", [2.0, 0.3, -0.4]).as_matrix()
+SHIFT = np.array([3.0, -2.0, 0.7])
+
+
+def descriptors(rng, count):
+    """Random descriptors of the norm of RootSIFT, uint8."""
+    values = rng.gamma(0.3, size=(count, 128))
+    return np.minimum(512 * np.sqrt(values / values.sum(1, keepdims=True)), 255).astype(np.uint8)
+
+
+def room(rng, count=900):
+    """Points on the walls of a room of 5 x 4 x 2.5 m, as a map that a walk observed."""
+    xyz = rng.uniform([-2.5, -2, 0], [2.5, 2, 2.5], (count, 3))
+    wall = rng.integers(0, 2, count)
+    xyz[wall == 0, 0] = np.where(rng.random((wall == 0).sum()) < 0.5, -2.5, 2.5)
+    xyz[wall == 1, 1] = np.where(rng.random((wall == 1).sum()) < 0.5, -2, 2)
+    centre = np.array([0, 0, 1.4])
+    ray = xyz - centre
+    distance = np.linalg.norm(ray, axis=1)
+    return MapPoints(
+        xyz, descriptors(rng, count), np.ones(count, np.int64), np.zeros(count, np.int64),
+        ray / distance[:, None], distance,
+    )  # fmt: skip
+
+
+def walk(count=16, radius=0.6):
+    """Poses in the map of cameras on a circle, looking outwards."""
+    poses = []
+    for a in np.linspace(0, 2 * np.pi, count, endpoint=False):
+        forward = np.array([np.cos(a), np.sin(a), 0])
+        rotation = np.stack([np.cross(forward, [0, 0, 1.0]), [0, 0, -1.0], forward])
+        centre = np.array([radius * np.cos(a), radius * np.sin(a), 1.4 + 0.1 * np.sin(3 * a)])
+        poses.append(np.column_stack([rotation, -rotation @ centre]))
+    return np.array(poses)
+
+
+def recording(rng, points, cam_from_map, noise_px=0.5, outliers=100, parts=None):
+    """Poses in a session's own world, and features of every image with wrong ones among them."""
+    to_session = Similarity(
+        SCALE, TURN.T, -SCALE * TURN.T @ SHIFT, np.zeros((7, 7))
+    )  # of map_from_session
+    count = len(cam_from_map)
+    session = to_session.poses(cam_from_map)
+    features = []
+    visibility = []
+    for row, pose in enumerate(cam_from_map):
+        in_cam = points.xyz @ pose[:, :3].T + pose[:, 3]
+        xy = in_cam[:, :2] / in_cam[:, 2:] @ CAMERA.K[:2, :2].T + CAMERA.K[:2, 2]
+        seen = np.flatnonzero((in_cam[:, 2] > 0.1) & ((xy > 0) & (xy < (640, 480))).all(1))
+        again = seen[rng.random(len(seen)) < 0.6]
+        found = points.descriptor[again].astype(float) + rng.normal(0, 6, (len(again), 128))
+        wrong = rng.uniform(0, (640, 480), (outliers, 2))
+        features.append(ImageFeatures(
+            row,
+            np.concatenate([xy[again] + rng.normal(0, noise_px, (len(again), 2)), wrong]),
+            np.concatenate([found.clip(0, 255).astype(np.uint8), descriptors(rng, outliers)]),
+        ))  # fmt: skip
+        visibility += [(row, k) for k in again]
+    poses = Poses(
+        CAMERA, np.arange(count), np.arange(count) / 10.0, session, np.full(count, "keyframe"),
+        "pycolmap", points=to_session.apply(points.xyz), visibility=np.array(visibility),
+        colors=np.zeros((len(points), 3), np.uint8),
+        part=np.zeros(count, np.int64) if parts is None else parts,
+    )  # fmt: skip
+    return poses, features
+
+
+def test_a_recording_is_moved_as_a_whole_into_the_map():
+    rng = np.random.default_rng(0)
+    points = room(rng)
+    truth = walk()
+    poses, features = recording(rng, points, truth)
+    placement = place(poses, features, points)
+    assert placement.refused == ""
+    np.testing.assert_allclose(placement.poses.cam_from_world, truth, atol=0.01)
+    np.testing.assert_allclose(placement.poses.points, points.xyz, atol=0.02)
+    (component,) = placement.components
+    assert component.similarity.scale == pytest.approx(1 / SCALE, rel=0.003)
+    assert len(component.images) == component.tried == len(truth)
+
+
+def test_errors_agree_with_the_covariance():
+    """Of rotation, translation and scale, over twenty recordings."""
+    squares = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        points = room(rng, 500)
+        poses, features = recording(rng, points, walk(10), noise_px=1.5)
+        (component,) = place(poses, features, points).components
+        found = component.similarity
+        truth = Similarity(1 / SCALE, TURN, SHIFT, np.zeros((7, 7)))
+        turn = truth.rotation @ found.rotation.T  # the correction that leads to the truth
+        grow = truth.scale / found.scale
+        moved = truth.translation - grow * turn @ found.translation
+        error = np.array([*Rotation.from_matrix(turn).as_rotvec(), *moved, np.log(grow)])
+        squares.append(error @ np.linalg.solve(component.similarity.cov, error))
+    assert 3 < np.median(squares) < 25  # 6.3 of seven degrees of freedom; ten images: rough
+
+
+def test_another_room_is_refused():
+    rng = np.random.default_rng(1)
+    poses, features = recording(rng, room(rng), walk())
+    placement = place(poses, features, room(rng))
+    assert placement.refused.startswith("0 of 16 images match points of the map, 5 are needed")
+    assert placement.poses is poses
+
+
+def test_a_mirrored_room_is_refused():
+    """The same descriptors at mirrored positions: no rigid camera sees them so."""
+    rng = np.random.default_rng(2)
+    points = room(rng)
+    poses, features = recording(rng, points, walk())
+    mirrored = dataclasses.replace(points, xyz=points.xyz * (-1, 1, 1))
+    assert "images" in place(poses, features, mirrored).refused
+
+
+def test_two_equal_rooms_are_refused():
+    """Of a repeated office half of the images match one copy, half the other."""
+    rng = np.random.default_rng(3)
+    points = room(rng)
+    copy = dataclasses.replace(points, xyz=points.xyz + (8.0, 0, 0))
+    poses, features = recording(rng, points, walk())
+    left = np.arange(len(points)) % 2 == 0
+    for image in features[::2]:  # their features are those of the copy only
+        image.descriptor[:] = image.descriptor[:, ::-1]
+    copy = dataclasses.replace(copy, descriptor=copy.descriptor[:, ::-1].copy())
+    placement = place(poses, features, MapPoints.joined([points, copy]))
+    assert placement.refused == "two positions in the map are alike (8 and 8 images)"
+    assert left.any()
+
+
+def test_a_point_that_the_map_has_twice_is_no_rival_of_itself():
+    """After two sessions every point is there twice, a centimetre apart."""
+    rng = np.random.default_rng(4)
+    points = room(rng)
+    again = dataclasses.replace(
+        points, xyz=points.xyz + rng.normal(0, 0.005, points.xyz.shape),
+        session=np.full(len(points), 2),
+    )  # fmt: skip
+    poses, features = recording(rng, points, walk())
+    placement = place(poses, features, MapPoints.joined([points, again]))
+    assert placement.refused == "" and len(placement.components[0].images) == 16
+
+
+def test_components_are_placed_one_by_one_and_become_one():
+    """The second one has its own scale; a third one of another room stays as it is."""
+    rng = np.random.default_rng(5)
+    points = room(rng)
+    truth = walk(21)
+    parts = np.repeat([0, 1, 2], 7)
+    poses, features = recording(rng, points, truth, parts=parts)
+    other = Similarity(3.0, TURN, SHIFT, np.zeros((7, 7)))
+    cam = poses.cam_from_world.copy()
+    cam[7:14] = other.poses(cam[7:14])
+    poses = dataclasses.replace(poses, cam_from_world=cam)
+    for image in features[14:]:
+        image.descriptor[:] = descriptors(rng, len(image.descriptor))
+    placement = place(poses, features, points)
+    assert placement.refused == ""
+    assert placement.poses.part.tolist() == [0] * 14 + [1] * 7
+    np.testing.assert_allclose(placement.poses.cam_from_world[:14], truth[:14], atol=0.02)
+    np.testing.assert_array_equal(placement.poses.cam_from_world[14:], cam[14:])
+    reason = placement.components[2].reason
+    assert reason == "0 of 7 images match points of the map, 4 are needed"
+
+
+def test_few_images_that_agree_are_not_enough():
+    rng = np.random.default_rng(6)
+    points = room(rng)
+    poses, features = recording(rng, points, walk(20))
+    for image in features[4:]:
+        image.descriptor[:] = descriptors(rng, len(image.descriptor))
+    assert place(poses, features, points).refused.startswith("4 of 20 images")
+    enough = PlacementOptions(frames=4)
+    assert place(poses, features, points, enough).refused == ""
+
+
+def test_points_are_described_by_the_mean_of_their_keypoints():
+    rng = np.random.default_rng(7)
+    points = room(rng, 300)
+    truth = walk(12)
+    poses, features = recording(rng, points, truth, noise_px=0.2, outliers=0)
+    made = points_with_descriptors(poses, features, 3)
+    seen = np.unique(poses.visibility[:, 1])
+    assert len(made) == len(seen) and set(made.session) == {3}
+    np.testing.assert_allclose(made.xyz, poses.points[seen])
+    a = made.descriptor / np.linalg.norm(made.descriptor, axis=1, keepdims=True)
+    b = points.descriptor[seen] / np.linalg.norm(points.descriptor[seen], axis=1, keepdims=True)
+    assert np.median((a * b).sum(1)) > 0.98
+    centre = invert_rigid(poses.cam_from_world)[:, :, 3]
+    nearest = np.linalg.norm(made.xyz[:, None] - centre, axis=2).min(1)
+    assert (made.distance > nearest - 1e-9).all()
