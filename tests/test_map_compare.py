@@ -233,8 +233,8 @@ def test_the_alignment_turns_about_the_origin_of_the_map() -> None:
 
 def test_an_uncertain_scale_moves_no_object() -> None:
     states = room()
-    detected = [found(s, 100 + s.id, 1.06 * s.center) for s in states]
-    cov = np.diag([0, 0, 0, 0, 0, 0, 0.05**2])
+    detected = [found(s, 100 + s.id, 1.12 * s.center) for s in states]
+    cov = np.diag([0, 0, 0, 0, 0, 0, 0.1**2])
     assert [d.kind for d in decide(states, detected, alignment_cov=cov)] == ["stayed"] * 6
 
 
