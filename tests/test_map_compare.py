@@ -15,6 +15,7 @@ from reobj.maps.compare import (
     Visibility,
     _assigned,
     _losses,
+    _Pairs,
     compare,
     no_visibility,
 )
@@ -196,6 +197,9 @@ def test_an_uncertain_alignment_moves_no_object() -> None:
     detected = [found(s, 100 + s.id, s.center + shift) for s in states]
     cov = np.diag([0, 0, 0, 0.04, 0.04, 0.04, 0.0])
     assert [d.kind for d in decide(states, detected, alignment_cov=cov)] == ["stayed"] * 6
+    lone = decide([states[1]], [detected[1]], alignment_cov=cov)
+    assert summary(lone) == [("stayed", 2, 102)]
+    assert decide([states[1]], [detected[1]])[0].kind != "stayed"
     exact = [d.kind for d in decide(states, detected)]
     assert exact.count("moved") >= 5  # the centre of a bed is uncertain by its size
 
@@ -213,18 +217,25 @@ def test_what_stayed_refines_the_alignment() -> None:
 
 
 def test_the_alignment_turns_about_the_origin_of_the_map() -> None:
-    """A rotation of 3 degrees and a scale of 4 % shift far objects by 20 cm, near ones by none."""
-    angle, scale = np.radians(3), 1.04
-    turn = np.array(
-        [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
-    )
+    """A session turned by 6 degrees about the middle of the room: rotation and shift correlate."""
+    angle = np.radians(6)
+    cos, sin = np.cos(angle), np.sin(angle)
+    turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+    middle = np.array([2.5, 2, 0.5])
     states = room()
-    detected = [found(s, 100 + s.id, scale * turn @ s.center) for s in states]
-    cov = np.diag([0, 0, angle**2, 0, 0, 0, np.log(scale) ** 2])
-    decisions = decide(states, detected, alignment_cov=cov)
+    detected = [found(s, 100 + s.id, middle + turn @ (s.center - middle)) for s in states]
+    error = np.array([0, 0, angle, *(angle * np.array([middle[1], -middle[0], 0])), 0])
+    decisions = decide(states, detected, alignment_cov=np.outer(error, error))
     assert [d.kind for d in decisions] == ["stayed"] * 6
-    refined = [float(d.evidence.split(" m ")[0]) for d in decisions]
-    assert max(refined) < 0.06 < np.linalg.norm(detected[2].center - states[2].center)
+    left = [float(d.evidence.split(" m ")[0]) for d in decisions]
+    assert max(left) < 0.03 < 0.15 < np.linalg.norm(detected[2].center - states[2].center)
+
+
+def test_an_uncertain_scale_moves_no_object() -> None:
+    states = room()
+    detected = [found(s, 100 + s.id, 1.12 * s.center) for s in states]
+    cov = np.diag([0, 0, 0, 0, 0, 0, 0.1**2])
+    assert [d.kind for d in decide(states, detected, alignment_cov=cov)] == ["stayed"] * 6
 
 
 def test_decisions_do_not_depend_on_the_unit() -> None:
@@ -266,6 +277,8 @@ def test_an_object_that_was_gone_gets_its_number_back() -> None:
     missing = [f for f in elsewhere if f.id != 104]
     assert decide(states, missing, seen(6, 6, 3))[3].kind == "gone"
     assert decide(states, missing, no_visibility(6))[3].kind == "not_seen"
+    assert decide(states, missing, seen(6, 1, 1))[3].kind == "gone"  # it was gone before
+    assert decide(room(), missing, seen(6, 1, 1))[3].kind == "not_seen"
 
 
 def test_a_deleted_object_absorbs_its_detection() -> None:
@@ -303,6 +316,42 @@ def test_swapped_identical_chairs_give_no_stolen_number() -> None:
         ("gone", 11, 0), ("gone", 12, 0), ("new", 0, 111), ("new", 0, 112)
     ]  # fmt: skip
     assert decisions[8].candidates == decisions[9].candidates == (11, 12)
+
+
+def test_points_of_an_identical_chair_in_its_place_do_not_exchange_the_numbers() -> None:
+    states = [*room(), *chairs((1, 2, 0.4), (1.6, 2, 0.4))]
+    detected = all_found(states)[:6]
+    detected.append(found(states[6], 111, motion_of={12: 25}))
+    detected.append(found(states[7], 112, motion_of={11: 25}))
+    assert summary(decide(states, detected))[6:] == [("stayed", 11, 111), ("stayed", 12, 112)]
+
+
+def test_a_displacement_less_than_half_as_long_is_needed() -> None:
+    """62 cm against 122 cm: more probable by three nats, and yet no number."""
+    states = [*room(), *chairs((1, 2, 0.4), (2.05, 2, 0.4))]
+    points = {11: 20, 12: 20}
+    detected = all_found(states)[:6]
+    for identity, x in ((111, 1), (112, 2.05)):
+        detected.append(found(states[6], identity, (x, 2.62, 0.4), motion_of=points))
+    decisions = decide(states, detected)
+    assert summary(decisions)[-2:] == [("new", 0, 111), ("new", 0, 112)]
+    assert 11 in decisions[-2].candidates and 12 in decisions[-1].candidates
+
+
+def test_a_moved_object_has_its_size_and_looks_unless_its_points_agree() -> None:
+    chair = state(1, "chair", (1, 1, 0.4))
+    large = found(chair, 101, (3, 2, 0.4), half_axes=chair.half_axes * 2)
+    for seen_now, possible in (
+        (found(chair, 101, (3, 2, 0.4)), True),
+        (large, False),
+        (dataclasses.replace(large, motion_of={1: 14}), True),
+        (found(chair, 101, (3, 2, 0.4), foreground=-chair.foreground), False),
+        (found(chair, 101, (3, 2, 0.4), classes={"plant": 9.0}), False),
+    ):
+        pairs = _Pairs([chair], [seen_now], seen(1), CompareOptions())
+        pairs.place(EXACT, 1.0)
+        pairs.compare_appearance(same_embedder=True)
+        assert np.isfinite(pairs.moved(near=True)[0, 0]) == possible
 
 
 def test_the_displacement_decides_between_identical_chairs() -> None:
