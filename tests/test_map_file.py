@@ -222,6 +222,11 @@ def with_first(value: float) -> Callable[[np.ndarray], np.ndarray]:
     return change
 
 
+def shift_length(length: np.ndarray) -> np.ndarray:
+    """Lengths of the same sum, the first one negative."""
+    return length + np.eye(2, len(length), dtype=length.dtype).T @ np.array([-9, 9], length.dtype)
+
+
 INCONSISTENT = {
     "points of other lengths": (of_points("points_xyz", lambda v: v[:-1]), "points: "),
     "points without a column": (lambda a, f: a.pop("points_xyz"), "no 'points_xyz'"),
@@ -239,7 +244,7 @@ INCONSISTENT = {
     "fewer centres": (of_points("observation_center", lambda v: v[:-1]), "observations"),
     "a longer embedding": (of_points("observation_foreground_length", with_first(9)), "foreground"),
     "a negative length": (
-        of_points("observation_foreground_length", lambda v: v + [-9, 9, *[0] * (len(v) - 2)]),
+        of_points("observation_foreground_length", shift_length),
         "values of foreground",
     ),
     "NaN in an embedding": (of_points("observation_background", with_first(np.nan)), "background"),
