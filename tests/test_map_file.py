@@ -157,6 +157,15 @@ def test_newer_map(saved: Path, tmp_path: Path) -> None:
     assert "a map of format 2" in refusal(tmp_path / "a.map")
 
 
+def test_content_that_was_changed_without_its_digest(saved: Path, tmp_path: Path) -> None:
+    """A zip file that is sound, edited by hand."""
+    with np.load(saved) as file:
+        arrays = dict(file)
+    arrays["points_xyz"][0, 0] += 0.1
+    np.savez((tmp_path / "a.map").open("wb"), **arrays)
+    assert "does not match its digest" in refusal(tmp_path / "a.map")
+
+
 @pytest.fixture(scope="module")
 def spoiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("spoiled") / "a.map"
@@ -213,6 +222,11 @@ def with_first(value: float) -> Callable[[np.ndarray], np.ndarray]:
     return change
 
 
+def shift_length(length: np.ndarray) -> np.ndarray:
+    """Lengths of the same sum, the first one negative."""
+    return length + np.eye(2, len(length), dtype=length.dtype).T @ np.array([-9, 9], length.dtype)
+
+
 INCONSISTENT = {
     "points of other lengths": (of_points("points_xyz", lambda v: v[:-1]), "points: "),
     "points without a column": (lambda a, f: a.pop("points_xyz"), "no 'points_xyz'"),
@@ -229,7 +243,10 @@ INCONSISTENT = {
     "no place": (of_points("observation_center", with_first(np.nan)), "center"),
     "fewer centres": (of_points("observation_center", lambda v: v[:-1]), "observations"),
     "a longer embedding": (of_points("observation_foreground_length", with_first(9)), "foreground"),
-    "a negative length": (of_points("observation_foreground_length", with_first(-1)), "foreground"),
+    "a negative length": (
+        of_points("observation_foreground_length", shift_length),
+        "values of foreground",
+    ),
     "NaN in an embedding": (of_points("observation_background", with_first(np.nan)), "background"),
     "a session's cameras": (of_points("session2_cam_from_map", lambda v: v[0]), "cam_from_map"),
     "an alignment": (of_points("session2_alignment_cov", lambda v: v[:6, :6]), "alignment_cov"),
