@@ -76,19 +76,26 @@ def assign(row: IntArray, column: IntArray, cost: Array) -> IntArray:
     Args:
         row, column: (M,) possible pairs, in the order of rows. cost: (M,) below 1e3.
     Returns:
-        numbers of the matched pairs.
+        numbers of the matched pairs, ascending.
     """
-    # pairs without a rival need no solver
     rival = (np.bincount(row)[row] > 1) | (np.bincount(column)[column] > 1)
     if not rival.any():
         return np.arange(len(row))
+    matched = ~rival  # need no solver
     some = np.flatnonzero(rival)
-    rows, columns = (np.flatnonzero(np.bincount(x[some])) for x in (row, column))
-    r = np.searchsorted(rows, row[some])
-    c = np.searchsorted(columns, column[some])
-    pair = np.full((len(rows), len(columns)), -1)
-    pair[r, c] = some
-    costs = np.full(pair.shape, 1e3)
-    costs[r, c] = cost[some]
-    found = pair[linear_sum_assignment(costs)]
-    return np.concatenate([np.flatnonzero(~rival), found[found >= 0]])
+    r = _ranks(row[some])
+    c = _ranks(column[some])
+    # columns first: scipy copies and transposes a matrix with more rows than columns, and a frame
+    # usually has more tracks than detections
+    costs = np.full((c.max() + 1, r.max() + 1), 1e3)
+    costs[c, r] = cost[some]
+    solved, row_of_solved = linear_sum_assignment(costs)
+    row_of = np.full(len(costs), -1)
+    row_of[solved] = row_of_solved
+    matched[some] = row_of[c] == r
+    return np.flatnonzero(matched)
+
+
+def _ranks(values: IntArray) -> IntArray:
+    """Number the distinct values (N,), none below 0, from 0 in ascending order."""
+    return np.asarray((np.bincount(values) > 0).cumsum()[values] - 1, np.int64)
