@@ -42,11 +42,14 @@ def touching(center: Array, radius: Array, xyxy: Array) -> tuple[IntArray, IntAr
     Returns:
         track, detection: (M,) rows, in the order of tracks, then of detections.
     """
-    low = (center - radius)[..., None]  # (2, T, 1)
-    high = (center + radius)[..., None]
-    corners = np.ascontiguousarray(xyxy.T)[:, None]  # (4, 1, D)
-    touch = (corners[:2] <= high) & (corners[2:] >= low)  # (2, T, D)
-    return np.divmod(np.flatnonzero(touch[0] & touch[1]), max(len(xyxy), 1))
+    left, top = (center - radius)[..., None]  # (T, 1) each
+    right, bottom = (center + radius)[..., None]
+    x1, y1, x2, y2 = np.ascontiguousarray(xyxy.T)  # (D,) each
+    touch = x1 <= right  # (T, D)
+    touch &= x2 >= left
+    touch &= y1 <= bottom
+    touch &= y2 >= top
+    return np.divmod(np.flatnonzero(touch), max(len(xyxy), 1))
 
 
 def ambiguous_pairs(
