@@ -310,7 +310,8 @@ def kalman_update(mean: Array, cov: Array, box: Array, noise: Array) -> tuple[Ar
     new_cov = cov.copy()
     new_mean[..., 0] += gain * residual
     new_mean[..., 1] += velocity_gain * residual
-    new_cov[..., :2] *= (1 - gain)[..., None]
+    new_cov[..., 0] *= 1 - gain
+    new_cov[..., 1] *= 1 - gain
     new_cov[..., 2] -= velocity_gain * p01
     return new_mean, new_cov
 
@@ -624,7 +625,7 @@ class Tracker:
         track_of = self._confirm(frame, track_of)
         tracks = self._report(frame, track_of)
         self._retire()
-        self._add_views(frame, tracks[tracks.track_id > 0])
+        self._add_views(frame, tracks)
         return tracks
 
     @property
@@ -769,8 +770,8 @@ class Tracker:
         tracks.interval[track_of[rows]] = ends
         tracks.size[track_of[rows]] = size
 
-    def _add_views(self, frame: FrameContext, confirmed: Tracks) -> None:
-        """Add the boxes of this frame as views of their objects; refit ellipsoids periodically.
+    def _add_views(self, frame: FrameContext, tracks: Tracks) -> None:
+        """Add the boxes of confirmed tracks as views of their objects; refit periodically.
 
         Also refit when at least half of the identities in view have enough new views, as after a
         large camera motion.
@@ -778,6 +779,7 @@ class Tracker:
         view = frame.img_from_world
         if view is None:
             return
+        confirmed = tracks[tracks.track_id > 0]
         identity = confirmed.track_id - 1
         self.ellipsoid_map.add(frame.number, identity, confirmed.xyxy, view)
         due = self.ellipsoid_map.due

@@ -12,6 +12,7 @@ from front_door.room import CAMERA, FEW, ROOM
 from simulated import SIZE, finished, fitted, tracks_of, unlinked, walk
 
 import reobj_track as rt
+from reobj.files import locked
 from reobj.results.workspace import Workspace
 
 try:
@@ -26,15 +27,33 @@ else:  # the same cases each time, within a minute; `--hypothesis-profile long` 
 os.environ["REOBJ_RAISE"] = "1"  # an internal error while drawing fails the test
 
 
+@pytest.fixture
+def no_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Supplied poses get no triangulated points, so that no child process is started."""
+    monkeypatch.setattr("reobj.poses.stage.triangulate", lambda poses, *_, **__: poses)
+
+
 @pytest.fixture(scope="session")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Output folder: every third frame of the first half of the example room, true cameras."""
-    out = tmp_path_factory.mktemp("room") / "out"
+    """Output folder: every third frame of the first half of the example room, true cameras.
+
+    Made by one worker for all of them. Copy it before you change it.
+    """
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "room"
+    folder.mkdir(exist_ok=True)
+    with locked(folder / "lock", wait_s=600):
+        if not (folder / "done").exists():
+            make_room(folder / "out")
+            (folder / "done").touch()
+    return folder / "out"
+
+
+def make_room(out: Path) -> None:
     args = ("--detections", ROOM / "detections.npz", "--poses", ROOM / "poses.txt")
     off = ("--set", "output.overlay=0", "--set", "output.scene=0")
     args = ("run", ROOM / "room.mp4", "-o", out, *args, "--camera", CAMERA, *FEW, *off)
     assert rt.main([str(a) for a in args]) == 0
-    return out
 
 
 @pytest.fixture(scope="session")

@@ -117,6 +117,7 @@ def test_finished_means_same_files_and_options(tmp_path: Path) -> None:
     assert batch.finished(first) is None and not (tmp_path / "a" / batch.MARKER).exists()
 
 
+@pytest.mark.usefixtures("no_points")
 def test_the_summary_equals_the_results_of_the_run(tmp_path: Path) -> None:
     """With true cameras of the clip, which are in metres, for 25 of its first 30 frames."""
     lines = (ROOM / "poses.txt").read_text().splitlines(keepends=True)

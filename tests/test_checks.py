@@ -43,7 +43,7 @@ MISTAKES = {
 @pytest.mark.parametrize("kind", ["orbit", "walk", "pan", "forward", "still"])
 def test_right_poses_raise_no_alarm(kind, noise_px):
     cams = motion(kind)
-    for seed in range(20):
+    for seed in range(10):
         tracks = box_tracks(cams, noise_px, seed)
         assert check_poses(supplied(cams), tracks) is None
         assert check_poses(supplied(cams), tracks[:4]) is None

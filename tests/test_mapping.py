@@ -95,12 +95,12 @@ def test_points_have_the_colour_of_their_pixels(walk):
     assert set(model.obs_point[same]) == set(range(len(model.points)))
 
 
-def test_the_same_seed_gives_the_same_bytes(walk, tmp_path):
+def test_another_seed_gives_other_bytes(walk, tmp_path):
+    """The same seed gives the same bytes: `test_a_killed_run_resumes`."""
     images, _, folder, *_ = walk
-    for seed, same in ((0, True), (7, False)):
-        run(tmp_path / str(seed), images, seed=seed)
-        found = (tmp_path / str(seed) / "sparse" / "points3D.bin").read_bytes()
-        assert ((folder / "sparse" / "points3D.bin").read_bytes() == found) == same
+    run(tmp_path, images, seed=7)
+    found = (tmp_path / "sparse" / "points3D.bin").read_bytes()
+    assert (folder / "sparse" / "points3D.bin").read_bytes() != found
 
 
 def test_calibration_starts_from_the_focal_guess_and_leaves_it(walk, tmp_path):
@@ -363,8 +363,9 @@ def test_the_child_starts_from_any_folder(walk, tmp_path, monkeypatch):
     (tmp_path / "theirs" / "reobj" / "__init__.py").write_text("raise SystemExit(4)")
     monkeypatch.chdir(tmp_path / "here")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path / "theirs"))
-    messages, model = run(Path("out"), walk[0])  # a relative folder
-    assert messages == [] and len(model.names) == 8
+    messages, _ = run(Path("out"), walk[0][:3])  # a relative folder
+    assert not [text for text in messages if "stopped" in text]
+    assert Path("out/mapping/messages.json").exists()  # the job was done
 
 
 def test_the_users_pythonpath_reaches_the_child(walk, tmp_path, monkeypatch):
@@ -440,12 +441,19 @@ def test_with_more_keyframes_only_new_work_is_done(walk, tmp_path):
         totals.append((stage, total))
         return Progress(stage, total)
 
-    run(tmp_path, walk[0][::2], ids=range(1, 9, 2), progress=note)
+    def until_mapping(stage, total):
+        if stage.startswith("mapping"):
+            raise KeyboardInterrupt
+        return note(stage, total)
+
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, walk[0][::2], ids=range(1, 9, 2), progress=until_mapping)
     messages, model = run(tmp_path, walk[0], progress=note)
     found = [entry for entry in totals if not entry[0].startswith("mapping")]
     assert found == [("features", 4), ("match", 6), ("features", 4), ("match", 22)]
     assert messages == [] and ate_percent(model.cam_from_world, truth_of(model, walk[1])) < 1.0
-    run(tmp_path, walk[0][::-1], progress=note)  # other images under the same ids
+    with pytest.raises(KeyboardInterrupt):  # other images under the same ids
+        run(tmp_path, walk[0][::-1], progress=until_mapping)
     again = [entry for entry in totals if not entry[0].startswith("mapping")]
     assert again[4:] == [("features", 8), ("match", 28)]
 

@@ -894,7 +894,9 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
         output=rt.OutputConfig(overlay="none", scene=False),
     )
     source = images(base / "images", 24)
-    rt.run(source, base / "out", config, detections=base / "det.csv")
+    with pytest.MonkeyPatch.context() as patch:  # no child process
+        patch.setattr(stage, "triangulate", lambda poses, *_, **__: poses)
+        rt.run(source, base / "out", config, detections=base / "det.csv")
     return base / "out"
 
 

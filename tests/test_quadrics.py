@@ -434,8 +434,8 @@ def points_outside(
 def test_fits_with_points_are_minima_of_the_documented_cost() -> None:
     """As above: of 30 points around each object some lie outside, four of them far."""
     rng = np.random.default_rng(32)
-    boxes, cams, truth, priors, names = syn.scenes(160, 8, 60, 0.02, "box", rng)
-    spread = rng.uniform(-1, 1, (160, 30, 3)) * np.linspace(0.7, 1.1, 30)[:, None]
+    boxes, cams, truth, priors, names = syn.scenes(80, 8, 60, 0.02, "box", rng)
+    spread = rng.uniform(-1, 1, (80, 30, 3)) * np.linspace(0.7, 1.1, 30)[:, None]
     points = truth.center_in_world[:, None] + np.einsum(
         "oij,opj->opi", truth.world_from_obj, spread * truth.half_axes[:, None]
     )
@@ -444,7 +444,7 @@ def test_fits_with_points_are_minima_of_the_documented_cost() -> None:
     config = q.FitConfig(edge_noise_px=400, edge_noise_rel=0, correlation_deg=0, iterations=300)
     plain, fits = (q.fit_objects(*given, up=UP, points=p, config=config) for p in (None, points))
     steps, moves = [], 1e-5 * np.eye(9)
-    for k in range(0, 160, 8):
+    for k in range(0, 80, 4):
         solids = fits.ellipsoids
         solid = (solids.center_in_world[k], solids.half_axes[k], solids.world_from_obj[k])
         prior = np.asarray(priors.log_mean[k])
@@ -1108,9 +1108,8 @@ def test_sfmo_reports_insufficient_input(shape: tuple[int, int]) -> None:
 def test_psfmo_estimates_the_noise_of_the_ellipses() -> None:
     """Its noise variance, alone and with cameras, rises with rotation error and with size error."""
     for sweep in ([(0, 0.02), (10, 0.02), (30, 0.02)], [(2, 0.0), (2, 0.1), (2, 0.3)]):
-        variance = np.array([[syn.thesis_trial(*s, seed)[4:] for seed in (0, 1)] for s in sweep])
-        mean = variance.mean(1)  # (3, 2)
-        assert (mean > 0).all() and (mean[1:] > 2 * mean[:-1]).all()
+        variance = np.array([syn.thesis_trial(*s, seed=0)[4:] for s in sweep])  # (3, 2)
+        assert (variance > 0).all() and (variance[1:] > 2 * variance[:-1]).all()
 
 
 def test_psfmo_prior_helps_where_least_squares_is_weak() -> None:
@@ -1200,33 +1199,32 @@ def ratio_scene(views: int, arc: float, size_error: float, seed: int):
 
 def test_psfmo_agrees_with_the_plain_one() -> None:
     """Prior of a^2, its axes' order, EM until it converges, noise with the posterior's trace."""
-    for seed in range(2):
-        _, cams, dual_c, priors = ratio_scene(4, 40, 0.1, seed)
-        ours = q.fit_psfmo(None, priors, priors.names, cams, dual_c, iterations=200)
-        soon = q.fit_psfmo(None, priors, priors.names, cams, dual_c)
-        center = -dual_c[..., :2, 2] / -dual_c[..., 2:, 2]
-        conic = -dual_c / dual_c[..., 2:, 2:]
-        for k in range(10):
-            solid = ours.ellipsoids[k]
-            block = conic[:, k, :2, :2] + center[:, k, :, None] * center[:, k, None]
-            rows = block.reshape(4, 4)[:, [0, 1, 3]]
-            given = (rows, cams, solid.center_in_world[0], solid.world_from_obj[0])
-            size_cov = np.zeros((3, 3))
-            size_cov[:2, :2] = priors.ratio_cov[k]
-            found = {}
-            for order in itertools.permutations(range(3)):
-                difference = np.eye(3)[list(order[:2])] - np.eye(3)[order[2]]
-                size = np.append(priors.ratio_mean[k], 0.0)
-                prior = (difference @ size, difference @ size_cov @ difference.T)
-                found[order] = plain_psfmo(*given, *prior)
-            order = max(found, key=lambda x: found[x][0])
-            likelihood, half, noise = found[order]
-            assert tuple(ours.permutation[k]) == order
-            assert np.allclose(solid.half_axes[0], half, rtol=2e-3), (seed, k)
-            assert ours.noise[k] == pytest.approx(noise, rel=2e-3)
-            assert ours.log_likelihood[k] == pytest.approx(likelihood, abs=0.02)
-        change = np.abs(np.log(soon.ellipsoids.half_axes / ours.ellipsoids.half_axes))
-        assert np.mean(change.max(1) < 1e-3) >= 0.8  # the default number of steps converges
+    _, cams, dual_c, priors = ratio_scene(4, 40, 0.1, seed=0)
+    ours = q.fit_psfmo(None, priors, priors.names, cams, dual_c, iterations=200)
+    soon = q.fit_psfmo(None, priors, priors.names, cams, dual_c)
+    center = -dual_c[..., :2, 2] / -dual_c[..., 2:, 2]
+    conic = -dual_c / dual_c[..., 2:, 2:]
+    for k in range(10):
+        solid = ours.ellipsoids[k]
+        block = conic[:, k, :2, :2] + center[:, k, :, None] * center[:, k, None]
+        rows = block.reshape(4, 4)[:, [0, 1, 3]]
+        given = (rows, cams, solid.center_in_world[0], solid.world_from_obj[0])
+        size_cov = np.zeros((3, 3))
+        size_cov[:2, :2] = priors.ratio_cov[k]
+        found = {}
+        for order in itertools.permutations(range(3)):
+            difference = np.eye(3)[list(order[:2])] - np.eye(3)[order[2]]
+            size = np.append(priors.ratio_mean[k], 0.0)
+            prior = (difference @ size, difference @ size_cov @ difference.T)
+            found[order] = plain_psfmo(*given, *prior)
+        order = max(found, key=lambda x: found[x][0])
+        likelihood, half, noise = found[order]
+        assert tuple(ours.permutation[k]) == order
+        assert np.allclose(solid.half_axes[0], half, rtol=2e-3), k
+        assert ours.noise[k] == pytest.approx(noise, rel=2e-3)
+        assert ours.log_likelihood[k] == pytest.approx(likelihood, abs=0.02)
+    change = np.abs(np.log(soon.ellipsoids.half_axes / ours.ellipsoids.half_axes))
+    assert np.mean(change.max(1) < 1e-3) >= 0.8  # the default number of steps converges
 
 
 def test_psfmo_estimates_the_noise() -> None:

@@ -42,11 +42,14 @@ def touching(center: Array, radius: Array, xyxy: Array) -> tuple[IntArray, IntAr
     Returns:
         track, detection: (M,) rows, in the order of tracks, then of detections.
     """
-    low = (center - radius)[..., None]  # (2, T, 1)
-    high = (center + radius)[..., None]
-    corners = np.ascontiguousarray(xyxy.T)[:, None]  # (4, 1, D)
-    touch = (corners[:2] <= high) & (corners[2:] >= low)  # (2, T, D)
-    return np.divmod(np.flatnonzero(touch[0] & touch[1]), max(len(xyxy), 1))
+    left, top = (center - radius)[..., None]  # (T, 1) each
+    right, bottom = (center + radius)[..., None]
+    x1, y1, x2, y2 = np.ascontiguousarray(xyxy.T)  # (D,) each
+    touch = x1 <= right  # (T, D)
+    touch &= x2 >= left
+    touch &= y1 <= bottom
+    touch &= y2 >= top
+    return np.divmod(np.flatnonzero(touch), max(len(xyxy), 1))
 
 
 def ambiguous_pairs(
@@ -76,19 +79,26 @@ def assign(row: IntArray, column: IntArray, cost: Array) -> IntArray:
     Args:
         row, column: (M,) possible pairs, in the order of rows. cost: (M,) below 1e3.
     Returns:
-        numbers of the matched pairs.
+        numbers of the matched pairs, ascending.
     """
-    # pairs without a rival need no solver
     rival = (np.bincount(row)[row] > 1) | (np.bincount(column)[column] > 1)
     if not rival.any():
         return np.arange(len(row))
+    matched = ~rival  # need no solver
     some = np.flatnonzero(rival)
-    rows, columns = (np.flatnonzero(np.bincount(x[some])) for x in (row, column))
-    r = np.searchsorted(rows, row[some])
-    c = np.searchsorted(columns, column[some])
-    pair = np.full((len(rows), len(columns)), -1)
-    pair[r, c] = some
-    costs = np.full(pair.shape, 1e3)
-    costs[r, c] = cost[some]
-    found = pair[linear_sum_assignment(costs)]
-    return np.concatenate([np.flatnonzero(~rival), found[found >= 0]])
+    r = _ranks(row[some])
+    c = _ranks(column[some])
+    # columns first: scipy copies and transposes a matrix with more rows than columns, and a frame
+    # usually has more tracks than detections
+    costs = np.full((c.max() + 1, r.max() + 1), 1e3)
+    costs[c, r] = cost[some]
+    solved, row_of_solved = linear_sum_assignment(costs)
+    row_of = np.full(len(costs), -1)
+    row_of[solved] = row_of_solved
+    matched[some] = row_of[c] == r
+    return np.flatnonzero(matched)
+
+
+def _ranks(values: IntArray) -> IntArray:
+    """Number the distinct values (N,), none below 0, from 0 in ascending order."""
+    return np.asarray((np.bincount(values) > 0).cumsum()[values] - 1, np.int64)

@@ -26,6 +26,9 @@ ROOM = ROOT / "examples" / "room"
 CAMERA = "492.756788421,492.756788421,320,240"  # of examples/room/camera.txt
 SMALL = ("--set", "poses.size_px=320")  # images that points and own cameras are made of: quick
 FEW = ("--every", 3, "--stop", 120, *SMALL)  # frames of the clip that are enough for most
+# The shortest clip on which `assert_right` holds: for tests of how a file is read
+SHORTEST = ("--every", 4, "--stop", 64, "--set", "poses.size_px=160")
+SHORTEST_FRAMES = range(0, 64, 4)
 DETECTIONS = ("--detections", ROOM / "detections.npz")
 POSES = ("--poses", ROOM / "poses.txt", "--camera", CAMERA)
 

@@ -104,6 +104,7 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.usefixtures("no_points")
 @pytest.mark.parametrize("write", [row[0] for row in FORMATS], ids=lambda w: w.__name__)
 def test_poses_in_every_format(
     pictures: Path, tmp_path: Path, write: Callable[[Path, np.ndarray], Path]

@@ -33,6 +33,8 @@ from front_door.room import (
     FEW,
     ROOM,
     ROOT,
+    SHORTEST,
+    SHORTEST_FRAMES,
     SMALL,
     assert_right,
     cli,
@@ -218,13 +220,14 @@ def small_detector() -> Path:
 # ---- Expected results ----
 
 SUPPLIED = f"--poses poses.txt --camera {CAMERA}"
-SHORT = " ".join(map(str, FEW))
 QUICKLY = " ".join(SMALL)
 PLAIN = "--set output.overlay=none --set output.scene=0"
+LONG = f"{' '.join(map(str, FEW))} {PLAIN}"
+SHORT = f"{' '.join(map(str, SHORTEST))} {PLAIN}"
 
 
 def right(desk: Path) -> None:
-    assert_right(desk / "out")
+    assert_right(desk / "out", SHORTEST_FRAMES)
 
 
 def right_identities(desk: Path) -> None:
@@ -327,7 +330,7 @@ SHOWN = {
         recording, nothing, "--offline", code=2, says="--detector fast"
     ),
     TOOL + "run phone.mp4 -o out --detector fast": Shown(
-        recording, detected, f"--every 6 --stop 120 {SUPPLIED} {QUICKLY}"
+        recording, detected, f"--every 6 --stop 120 {SUPPLIED} {QUICKLY} {PLAIN}"
     ),
     TOOL + "run phone.mp4 -o out --detections det.json": Shown(
         recording, right, f"{SHORT} {SUPPLIED}"
@@ -336,7 +339,7 @@ SHOWN = {
         colmap_model, right, f"--detections det.npz {SHORT} --metric"
     ),
     TOOL + "track phone.mp4 -o out": Shown(
-        recording, right_identities, f"--detections det.npz {SHORT}"
+        recording, right_identities, f"--detections det.npz {LONG}"
     ),
     TOOL + "objects out --known-size chair=0.82m": Shown(output, scaled, PLAIN, folder="out"),
     TOOL + "eval out --gt gt.txt": Shown(output, evaluated, folder="out"),
@@ -351,7 +354,7 @@ SHOWN = {
         NAMED | {"PATH": "poses.txt"},
     ),
     TOOL + 'run -o OUT --detections FILE --poses FILE --camera "MODEL WIDTH HEIGHT PARAMS"': Shown(
-        recording, right_without_images, SHORT,
+        recording, right_without_images, LONG,
         {"OUT": "out", "--detections FILE": "--detections det.npz",
          "--poses FILE": "--poses poses.txt",
          "MODEL WIDTH HEIGHT PARAMS": "PINHOLE 640 480 " + CAMERA.replace(",", " ")},
@@ -361,16 +364,16 @@ SHOWN = {
         output, evaluated_in_3d, "", {"[": "", "]": "", "OUT": "out"}, "out"
     ),
     TOOL + "run recording/rgbd --poses recording/metadata -o out": Shown(
-        record3d, posed, f"--detections six.csv {PLAIN}"
+        record3d, posed, f"--detections six.csv {QUICKLY} {PLAIN}"
     ),
     TOOL + "run export/keyframes/corrected_images --poses export -o out": Shown(
-        polycam, posed, f"--detections six.csv {PLAIN}"
+        polycam, posed, f"--detections six.csv {QUICKLY} {PLAIN}"
     ),
     TOOL + 'run "export/frame_*.jpg" --poses export -o out': Shown(
-        scanner_app, posed, f"--detections six.csv {PLAIN}"
+        scanner_app, posed, f"--detections six.csv {QUICKLY} {PLAIN}"
     ),
     TOOL + "run phone.mp4 -o out --detector mine.onnx --set detect.class_names=names.txt": Shown(
-        mine, detected, f"--every 6 --stop 120 {SUPPLIED} {QUICKLY}"
+        mine, detected, f"--every 6 --stop 120 {SUPPLIED} {QUICKLY} {PLAIN}"
     ),
     "python benchmarks/failure_gallery.py OUT... --gt gt.txt... -o gallery.jpg": Shown(
         output, nothing, "", {"OUT...": "out", "gt.txt...": "gt.txt"}, "out"
@@ -471,8 +474,8 @@ def test_documented_command(
 # ---- Python outside the tutorials ----
 
 QUICK = rt.Config(
-    input=rt.InputConfig(every=3, stop=120),
-    poses=rt.PosesConfig(mode="poses.txt", camera=CAMERA, size_px=320),
+    input=rt.InputConfig(every=4, stop=64),
+    poses=rt.PosesConfig(mode="poses.txt", camera=CAMERA, size_px=160),
     output=rt.OutputConfig(overlay="none", scene=False),
 )
 
@@ -502,9 +505,9 @@ def test_python_in_readme(desk: Path, capsys: pytest.CaptureFixture[str]) -> Non
         code = code.replace(old, new)
     scope: dict[str, Any] = {"FEW": QUICK.input, "QUICK": QUICK, "detector": "det.npz"}
     exec(compile(code, "README.md", "exec"), scope)
-    assert_right(desk / "out")
+    assert_right(desk / "out", SHORTEST_FRAMES)
     lines = capsys.readouterr().out.splitlines()
-    assert sum(line.split()[0].isdigit() for line in lines) >= 40 + 22
+    assert sum(line.split()[0].isdigit() for line in lines) >= 16 + 14
     assert len(scope["result"].objects) == len(info(desk / "out")["objects"])
 
 

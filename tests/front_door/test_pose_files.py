@@ -192,6 +192,7 @@ def test_photos_from_0_beside_names_from_1(tmp_path: Path) -> None:
     assert_right(poses, ALL[:-1])
 
 
+@pytest.mark.usefixtures("no_points")
 @pytest.mark.parametrize(("first", "stop"), [(1, 0), (0, 24)])
 def test_boxes_resolve_the_numbering_of_blank_images(tmp_path: Path, first: int, stop: int) -> None:
     """Also for an excerpt of the video: the numbers are those of the source."""
