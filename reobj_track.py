@@ -1482,9 +1482,7 @@ def _given_tracks(
     )
 
 
-def _place(
-    job: _Job, room: OpenMap, poses: Poses, models: list[Path]
-) -> tuple[Placed, list[Path]]:
+def _place(job: _Job, room: OpenMap, poses: Poses, models: list[Path]) -> tuple[Placed, list[Path]]:
     """Place the cameras, and their COLMAP models, in the world of the map."""
     with job.timed("map"):
         placed = place_recording(room, poses, job.video, progress=job.progress)

@@ -534,9 +534,7 @@ def place(
     return Placement(_joined(poses, components, placed), tuple(components))
 
 
-def _joined(
-    poses: Poses, components: Sequence[ComponentPlacement], placed: Sequence[int]
-) -> Poses:
+def _joined(poses: Poses, components: Sequence[ComponentPlacement], placed: Sequence[int]) -> Poses:
     """Move the placed components into the world of the map, as one component, the first."""
     cam_from_world = poses.cam_from_world.copy()
     points = poses.points.copy()
