@@ -21,6 +21,7 @@ from rendering.sessions import (
     SessionOptions,
     Sightings,
     by_identity,
+    change_entries,
     make_sessions,
     mirrored,
 )
@@ -260,6 +261,24 @@ def test_changes_are_the_difference_of_the_truths_of_the_sessions(written: Path)
             assert np.exp(1j * entry["turn_rad"]) == pytest.approx(turn, abs=1e-5)
             assert entry["state"] == ("moved" if shift > 0.01 else "stayed")
     assert states >= {"stayed", "moved", "gone", "new"}
+
+
+def test_an_object_that_comes_back_is_returned_and_not_new(made) -> None:
+    whole = made[1][0].room
+    without = replace(whole, objects=whole.objects[:-1])
+    seen = [Sightings(SessionOptions(), made[1][0].config, room) for room in (whole, without)]
+    rooms = [whole, without, whole]
+    sightings = [seen[0], seen[1], seen[0]]
+    last = whole.objects[-1].identity
+
+    def state(session: int, reference: int, chosen=rooms) -> str:
+        entries = change_entries(chosen, session, reference, sightings)
+        return {entry["id"]: entry["state"] for entry in entries}[last]
+
+    assert state(1, 0) == "gone"
+    assert state(2, 1) == "returned"
+    assert state(2, 0) == "stayed"
+    assert state(2, 1, [without, without, whole]) == "new"
 
 
 def test_frames_seen_are_those_of_the_mot_truth(written: Path) -> None:
