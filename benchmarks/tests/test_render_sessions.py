@@ -24,6 +24,8 @@ from rendering.sessions import (
     change_entries,
     make_sessions,
     mirrored,
+    only,
+    session_path,
 )
 
 SMALL = RoomConfig(
@@ -152,6 +154,13 @@ def test_camera_keeps_clear_of_furniture(made) -> None:
             assert not (local < item.size_m / 2 + 0.15).all(1).any()
 
 
+def test_a_room_without_a_free_path_is_refused(made) -> None:
+    session = made[1][0]
+    everywhere = np.array([[[-9.0, -9.0, 1.2], [9.0, 9.0, 1.9]]])
+    with pytest.raises(ValueError, match="no camera path keeps clear"):
+        session_path(session.room, everywhere, session.config, whole=True)
+
+
 def test_mirrored_room_gives_mirrored_pictures(made) -> None:
     session = made[1][0]
     other = mirrored(session.room)
@@ -210,11 +219,27 @@ def test_a_place_is_seen_when_the_object_that_stands_there_is(made) -> None:
     sightings = Sightings(SessionOptions(), config, session.room)
     for item in session.room.objects:
         sightings.expect(0, session.room, item.index)
+    table = next(o for o in session.room.objects if o.class_name == "dining table")
+    shifts = np.array([[6.5, 0, 0], [-6.5, 0, 0], [0, 6.5, 0], [0, -6.5, 0]])  # behind each wall
+    for number, shift in enumerate(shifts, start=1):
+        ghost = only(session.room, table.index)
+        parts = ghost.surfaces
+        frame = parts.world_from_patch + np.pad(shift[:, None], ((0, 0), (3, 0)))
+        parts = replace(
+            parts, world_from_patch=frame, corners_in_world=parts.corners_in_world + shift
+        )
+        place = replace(table, index=0, center_in_world=table.center_in_world + shift)
+        outline = (ghost.outline_in_world[0] + shift,)
+        sightings.ghosts[number, table.identity] = replace(
+            ghost, surfaces=parts, objects=(place,), outline_in_world=outline
+        )
+        sightings.places[number, table.identity] = 0
     for frame in render_clip(session.room, config, session.cameras):
         sightings.watch(frame)
     counts = np.array([[sightings.objects[i], sightings.places[0, i]] for i in sightings.objects])
     assert counts[:, 0].max() >= 8 and (counts[:, 0] == 0).sum() < len(counts) / 2
     assert np.abs(counts[:, 0] - counts[:, 1]).max() <= 2
+    assert [sightings.places[number, table.identity] for number in (1, 2, 3, 4)] == [0, 0, 0, 0]
 
 
 @pytest.fixture(scope="module")
