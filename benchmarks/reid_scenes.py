@@ -149,7 +149,7 @@ def render_scene(config: Any, folder: Path, every: int) -> None:
             item = room.objects[k]
             rows.append({
                 "row": f, "xyxy": found.xyxy[i], "name": item.class_name, "sight": sight[i],
-                "model": item.twin_group, "identity": item.index + 1,
+                "model": item.twin_group, "identity": item.identity,
                 "visibility": frame.truth.visibility[k], "run": rr.run_lengths(found.masks[i]),
             })  # fmt: skip
     lengths = [len(r["run"]) for r in rows]

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from rendering.config import Array, Color, Image, Rng, RoomConfig
-from rendering.light import bake_light
+from rendering.light import DEFAULT_LIGHTING, Lighting, bake_light
 from rendering.models import Model, Part, Placement, box, furniture_models, moved, quad, rotation_z
 from rendering.plans import (
     fixed_furniture,
@@ -276,13 +276,15 @@ def grid_points(size: tuple[float, float, float]) -> tuple[Array, tuple[int, int
 
 def reachable(size: tuple[float, float, float], boxes: Array, doors: Walls) -> Array:
     """(rows, columns) distance in m to furniture and walls of the cells that can be walked to from
-    the first door; 0 elsewhere, and everywhere if another door cannot be reached.
+    the first door; 0 elsewhere, and everywhere if another door cannot be reached. Without doors,
+    the cells of the largest connected free area.
     """
     points, (columns, rows) = grid_points(size)
     distance = box_distances(points, boxes).reshape(rows, columns)
     free = (distance >= CLEARANCE_M).astype(np.uint8)
     _, labels = cv2.connectedComponents(free, connectivity=4)
-    found = set()
+    areas = np.bincount(labels.ravel())[1:]  # label 0 is not free
+    found = set() if doors or not len(areas) else {int(areas.argmax()) + 1}
     for side, y in doors.items():
         spot = (side * (size[0] / 2 - ENTRY_M), y)
         nearest = int(np.linalg.norm(points - spot, axis=1).argmin())
@@ -395,6 +397,14 @@ def room_textures(
     return textures
 
 
+def model_windows(
+    config: RoomConfig, model: Model, rects: dict[str, tuple[int, int, int, int]], group: int
+) -> list[list[float]]:
+    """Texture piece (x, y, w, h) in the atlas of every part; the same for the same twin group."""
+    rng = np.random.default_rng([config.seed, 24, group])
+    return [texture_window(p, rects[p.texture], config.texels_per_m, rng) for p in model.parts]
+
+
 def room_surfaces(
     config: RoomConfig,
     index: int,
@@ -402,6 +412,7 @@ def room_surfaces(
     models: dict[str, tuple[str, Model]],
     looks: tuple[dict[str, tuple[int, int, int, int]], dict[str, list[list[float]]]],
     numbers: dict[str, int],
+    lighting: Lighting = DEFAULT_LIGHTING,
 ) -> Room:
     """Surfaces, light and objects of one room in its own frame, without its atlas.
 
@@ -429,11 +440,7 @@ def room_surfaces(
         key, model = models[placement.model]
         group = numbers.setdefault(key, len(numbers))
         if key not in windows_of:
-            own_rng = np.random.default_rng([config.seed, 24, group])
-            windows_of[key] = [
-                texture_window(p, rects[p.texture], config.texels_per_m, own_rng)
-                for p in model.parts
-            ]
+            windows_of[key] = model_windows(config, model, rects, group)
         truth, own, outline = place_object(len(placed), placement, model, group)
         placed.append((truth, outline))
         owners += [truth.index] * len(own)
@@ -442,7 +449,7 @@ def room_surfaces(
     surfaces, height = build_surfaces(parts, owners, windows)
     extent = (plan.size_m[0] + WALL_M, *plan.size_m[1:])  # the lining of the doors is lit too
     rng = np.random.default_rng([config.seed, 25, index])
-    light = bake_light(surfaces, extent, height, config.light_rays, rng, len(shell))
+    light = bake_light(surfaces, extent, height, config.light_rays, rng, len(shell), lighting)
     truths = tuple(truth for truth, _ in placed)
     return Room(plan.size_m, truths, surfaces, (), light, tuple(o for _, o in placed))
 
@@ -528,7 +535,12 @@ def join_rooms(
         light_row += len(room.light)
         pieces.append(part)
         objects += [
-            replace(o, index=o.index + len(objects), center_in_world=o.center_in_world + offset)
+            replace(
+                o,
+                index=o.index + len(objects),
+                identity=o.index + len(objects) + 1,
+                center_in_world=o.center_in_world + offset,
+            )
             for o in room.objects
         ]
         outlines += [outline + offset for outline in room.outline_in_world]

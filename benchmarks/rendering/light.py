@@ -8,8 +8,24 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rendering.config import Array, Rng
+from rendering.config import Array, Color, Rng
+from rendering.models import rotation_z
 from rendering.surfaces import Surfaces, apply, surface_points
+
+
+@dataclass(frozen=True, slots=True)
+class Lighting:
+    """Strength, colour and direction of the light sources; defaults: a day with lamps on."""
+
+    lamp: Color = (5.2, 6.0, 6.6)  # radiance of the ceiling panels
+    window: Color = (4.6, 4.2, 3.8)  # radiance of the window
+    panel_gains: tuple[float, ...] = ()  # relative, of the first panels; 1 for those without
+    ambient: float = 1.0  # relative
+    window_turn_rad: float = 0.0  # about z: direction of most daylight against the window's normal
+    window_focus: float = 1.0  # exponent of the cosine to that direction; 1: a diffuse sky
+
+
+DEFAULT_LIGHTING = Lighting()
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,14 +83,20 @@ def light_samples(surfaces: Surfaces) -> tuple[Array, Array, list[slice]]:
 
 
 def lamp_light(
-    points: Array, normals: Array, lamp: tuple[Array, Array], voxels: Voxels, rays: int, rng: Rng
+    points: Array,
+    normals: Array,
+    lamp: tuple[Array, Array, float],
+    voxels: Voxels,
+    rays: int,
+    rng: Rng,
 ) -> Array:
     """(N,) fraction of a rectangular lamp's light that arrives: cosines, distance, shadow.
 
     Args:
-        lamp: (3, 4) frame of the emitting quad and its (3,) unit direction.
+        lamp: (3, 4) frame of the emitting quad, (3,) unit direction of most of its light, and the
+            exponent of the cosine to that direction.
     """
-    frame, direction = lamp
+    frame, direction, focus = lamp
     total = np.zeros(len(points))
     steps = (
         np.arange(1, 44) * 0.06
@@ -90,7 +112,7 @@ def lamp_light(
         ray /= distance[:, None]
         value = (
             np.maximum((ray * normals).sum(1), 0)
-            * np.maximum(-ray @ direction, 0)
+            * np.maximum(-ray @ direction, 0) ** focus
             * area
             / (distance**2 + 0.3)
         )
@@ -131,6 +153,7 @@ def bake_light(
     rays: int,
     rng: Rng,
     shell: int = 6,
+    lighting: Lighting = DEFAULT_LIGHTING,
 ) -> npt.NDArray[np.float32]:
     """Irradiance of every patch: ceiling panels (warm), window (cool), ambient; the first `shell`
     patches (walls, floor, ceiling) cast no shadow.
@@ -139,21 +162,33 @@ def bake_light(
     voxels = voxelize(surfaces, size, shell)
     opened = ambient_open(points, normals, voxels, size, rng)
     up = 0.5 + 0.5 * normals[:, 2:]  # (N, 1)
-    total = opened[:, None] * (
-        up * [0.22, 0.205, 0.19] + (1 - up) * [0.12, 0.15, 0.19]
+    total = (
+        lighting.ambient
+        * opened[:, None]
+        * (up * [0.22, 0.205, 0.19] + (1 - up) * [0.12, 0.15, 0.19])
     )  # (N, 3) BGR
+    gains = np.ones(len(surfaces.kind))  # relative, of the emitting patches
+    panel_gains = iter(lighting.panel_gains)
     for lamp in np.nonzero(surfaces.emission >= 1)[0]:
         frame = surfaces.world_from_patch[lamp]
         is_window = abs(frame[2, 2]) < 0.5
-        color = np.array([4.6, 4.2, 3.8]) if is_window else np.array([5.2, 6.0, 6.6])
-        arrived = lamp_light(points, normals, (frame, -frame[:, 2]), voxels, rays, rng)
-        total += arrived[:, None] * color
+        color = np.array(lighting.window if is_window else lighting.lamp)
+        usual = DEFAULT_LIGHTING.window if is_window else DEFAULT_LIGHTING.lamp
+        gain = 1.0 if is_window else next(panel_gains, 1.0)
+        gains[lamp] = gain * color.mean() / np.mean(usual)
+        direction = -frame[:, 2]
+        focus = 1.0
+        if is_window:
+            direction = rotation_z(lighting.window_turn_rad) @ direction
+            focus = lighting.window_focus
+        arrived = lamp_light(points, normals, (frame, direction, focus), voxels, rays, rng)
+        total += gain * arrived[:, None] * color
     light = np.zeros((height, 512, 3), np.float32)
     for i, part in enumerate(slices):
         x, y, w, h = surfaces.light_rect[i].astype(int)
         block = total[part].reshape(h, w, 3).astype(np.float32)
         if surfaces.emission[i] > 0:
-            block[:] = surfaces.emission[i]
+            block[:] = surfaces.emission[i] * gains[i]
         light[y : y + h, x : x + w] = cv2.GaussianBlur(
             block, (3, 3), 0.8, borderType=cv2.BORDER_REPLICATE
         )

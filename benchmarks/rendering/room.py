@@ -115,7 +115,12 @@ def rooms_in_a_row(room: Room, count: int) -> Room:
         part["owner"] = np.where(part["owner"] < 0, -1, part["owner"] + first)
         surfaces.append(part)
         objects += [
-            replace(o, index=o.index + first, center_in_world=o.center_in_world + shift)
+            replace(
+                o,
+                index=o.index + first,
+                identity=o.index + first + 1,
+                center_in_world=o.center_in_world + shift,
+            )
             for o in room.objects
         ]
         outlines += [outline + shift for outline in room.outline_in_world]

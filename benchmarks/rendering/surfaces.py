@@ -37,7 +37,8 @@ class Surfaces:
 class RoomObject:
     """The truth about one object."""
 
-    index: int  # 0-based; the identity in MOT files is index + 1
+    index: int  # 0-based, in the order of the room's objects
+    identity: int  # in gt_mot.txt and gt_objects.json; index + 1 unless sessions share numbers
     class_name: str
     class_id: int  # COCO-80
     twin_group: int  # objects of one model share it: they look the same
@@ -250,6 +251,7 @@ def place_object(
     parts = [moved(part, rotation, offset) for part in model.parts]
     truth = RoomObject(
         index=index,
+        identity=index + 1,
         class_name=model.class_name,
         class_id=COCO_NAMES.index(model.class_name),
         twin_group=twin_group,

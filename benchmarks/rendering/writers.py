@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -19,7 +19,7 @@ from rendering.camera import camera_matrix
 from rendering.config import COCO_NAMES, Array, DetectorConfig, Image, RoomConfig
 from rendering.detector import FrameDetections, simulate_detections
 from rendering.ground_truth import FrameTruth
-from rendering.photograph import render_clip
+from rendering.photograph import Frame, render_clip
 from rendering.room import make_room
 from rendering.surfaces import Room
 
@@ -75,7 +75,7 @@ def mot_lines(frame: int, truth: FrameTruth, room: Room, size: tuple[int, int]) 
         if truth.visibility[item.index] >= 0.1 and min(x1 - x0, y1 - y0) >= 8:
             box_text = f"{x0:.2f},{y0:.2f},{x1 - x0:.2f},{y1 - y0:.2f}"  # pixels as in tracks.txt
             tail = f"1,{item.class_id},{truth.visibility[item.index]:.3f}"
-            lines.append(f"{frame + 1},{item.index + 1},{box_text},{tail}")
+            lines.append(f"{frame + 1},{item.identity},{box_text},{tail}")
     return lines
 
 
@@ -104,7 +104,7 @@ def objects_json(room: Room, config: RoomConfig) -> dict[str, Any]:
     """The truth about all objects, for `gt_objects.json`."""
     objects = [
         {
-            "id": item.index + 1,
+            "id": item.identity,
             "class": item.class_name,
             "class_id": item.class_id,
             "twin_group": item.twin_group,
@@ -199,14 +199,34 @@ def write_clip(
     crf: int | None = None,
 ) -> dict[str, int]:
     """Render a clip into a folder, with all truth files."""
+    return write_room(out, make_room(config), config, detector, png=png, crf=crf)
+
+
+def write_room(
+    out: Path,
+    room: Room,
+    config: RoomConfig,
+    detector: DetectorConfig,
+    cameras: Array | None = None,
+    watch: Callable[[Frame], None] | None = None,
+    png: bool = False,
+    crf: int | None = None,
+) -> dict[str, int]:
+    """Render a clip of a room that exists into a folder, with all truth files.
+
+    Args:
+        cameras: cam_from_world (F, 3, 4); the path of the config by default.
+        watch: called with every frame.
+    """
     out.mkdir(parents=True, exist_ok=True)
-    room = make_room(config)
     size = (config.width, config.height)
     mot: list[str] = []
     tum: list[str] = []
     found: list[PackedDetections] = []
     writer = VideoSink(out / "room.mp4", config, crf)
-    for frame in render_clip(room, config):
+    for frame in render_clip(room, config, cameras):
+        if watch:
+            watch(frame)
         writer.write(frame.image)
         if png:
             cv2.imwrite(str(out / f"frame_{frame.index:05d}.png"), frame.image)
