@@ -566,8 +566,7 @@ class _Verdicts:
     Attributes:
         stayed, moved: (N, M) gains. near: (N, M) the larger one. far: the same if all moves were
             equally probable: only the identity counts.
-        loss: (N + 1, M + 1) see `_losses`. matched: (N, M) bool: pairs of the best assignment, or
-            of one that is as probable with shorter displacements.
+        loss: (N + 1, M + 1) see `_losses`. matched: (N, M) bool: pairs of the best assignment.
     """
 
     def __init__(self, pairs: _Pairs) -> None:
@@ -578,7 +577,7 @@ class _Verdicts:
         self.far = np.maximum(self.stayed, pairs.gain(pairs.moved(near=False)))
         best = _assigned(self.near)
         self.loss = _losses(self.near, best)
-        self.matched = self._shortest(best)
+        self.matched = best
 
     def decisions(self) -> list[Decision]:
         """Return one decision per map object, then one per new object."""
@@ -590,22 +589,6 @@ class _Verdicts:
         ]
         new = [self._new(j) for j, f in enumerate(self.pairs.found) if f.id not in known]
         return [*of_map, *new]
-
-    def _shortest(self, best: BoolArray) -> BoolArray:
-        """Return the best assignment, or one within the margin that has shorter displacements.
-
-        Both match the same objects.
-        """
-        length = self.pairs.distance
-        chosen = best
-        for i, j in np.argwhere(best).tolist():
-            if self._lead(i, j) >= self.options.margin:
-                continue
-            rival = _without(self.near, i, j)
-            same = (rival.any(0) == best.any(0)).all() and (rival.any(1) == best.any(1)).all()
-            if same and length[rival].sum() < length[chosen].sum():
-                chosen = rival
-        return chosen
 
     def _lead(self, i: int, j: int) -> float:
         """Return how much a pair is better than all others of the map object, in nats."""

@@ -41,7 +41,8 @@ def visibility_of(
     """Count the independent views in which each object would be seen, and those through it.
 
     An object is expected in an image if most of its projection lies inside, is large enough, and
-    neither objects of the recording nor most of the sparse points in its outline lie nearer.
+    neither objects of the recording nor most of the sparse points in its outline lie nearer. Views
+    say nothing about an object whose centre is less certain than its mean half axis.
 
     Args:
         states: N objects of the map. poses: placed in the map; only its first component is used.
@@ -89,6 +90,9 @@ def visibility_of(
             through[v, k] = bool(len(inside)) and expected[v, k]
             behind[k].update(points[inside].tolist() if expected[v, k] else ())
     through[:, [len(ids) < least_points for ids in behind]] = False
+    spread = np.array([np.linalg.eigvalsh(s.cov[:3, :3])[-1] for s in states])
+    vague = ~(np.sqrt(spread) < shapes.half_axes.mean(1)) if len(states) else np.empty(0, bool)
+    expected[:, vague] = through[:, vague] = around[:, vague] = False
     ray = shapes.center_in_world - centre[:, None]  # (V, N, 3)
     ray = ray / np.linalg.norm(ray, axis=2, keepdims=True).clip(1e-9)
 
