@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 import quadrics
 from reobj.cameras import Poses
@@ -81,7 +82,7 @@ def add_recording(room: RoomMap, result: Result, recording: Recording) -> tuple[
     if recording.points is not None:
         marked = _on_objects(recording.points, result, objects, numbers)
         marked = dataclasses.replace(marked, session=np.full(len(marked), number))
-        points = MapPoints.joined([points[points.session != number], marked])
+        points = _with_new_points(points[points.session != number], marked)
     new_room = dataclasses.replace(
         room,
         sessions=tuple(sorted(sessions, key=lambda s: s.number)),
@@ -152,6 +153,32 @@ def _on_objects(
         object_id[nearer] = numbers[o.id]
         best[nearer] = distance[nearer]
     return dataclasses.replace(points, object_id=object_id)
+
+
+def _with_new_points(
+    old: MapPoints, new: MapPoints, near: float = 0.01, alike: float = 0.85, most: int = 40_000
+) -> MapPoints:
+    """Add points that the map does not have yet.
+
+    Args:
+        near: distance of an old point from a new one that may be the same, over that from the
+            cameras. alike: least cosine of their descriptors; in another light a point gets
+            another descriptor, and is added.
+        most: points of the map (about 5 MB); of the new ones a part spread over them is added.
+    """
+    if len(old) and len(new):
+        neighbours = cKDTree(old.xyz).query_ball_point(new.xyz, near * new.distance)
+        count = np.array([len(rows) for rows in neighbours])
+        of_new = np.repeat(np.arange(len(new)), count)
+        of_old = np.concatenate([np.empty(0, np.int64), *map(np.array, neighbours)]).astype(int)
+        a = unit_rows(new.descriptor.astype(np.float32))[of_new]
+        b = unit_rows(old.descriptor.astype(np.float32))[of_old]
+        known = of_new[(a * b).sum(1) > alike]
+        new = new[np.setdiff1d(np.arange(len(new)), known)]
+    room = max(most - len(old), 0)
+    if len(new) > room:
+        new = new[np.linspace(0, len(new) - 1, room).round().astype(np.int64)]
+    return MapPoints.joined([old, new])
 
 
 # ---- Numbers -----------------------------------------------------------------------------------
