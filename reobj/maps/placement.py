@@ -50,7 +50,7 @@ class PlacementOptions:
     """
 
     size_px: int = 640
-    images: int = 60
+    images: int = 40
     ratio: float = 0.8
     elsewhere: float = 0.03
     error_px: float = 6.0
@@ -80,16 +80,17 @@ class ImageFeatures:
 def image_features(
     poses: Poses, video: Video, options: PlacementOptions, line: Progress, most: int = 200
 ) -> list[ImageFeatures]:
-    """Extract RootSIFT features of images spread over the keyframes of each component.
+    """Extract RootSIFT features of every second keyframe, of all of few.
 
-    Without observed points: over all frames.
+    Every second one shows .95 to .98 of the sparse points (measured on four recordings). Without
+    observed points: of images spread over all frames.
 
     Args:
         most: images; more cover long recordings more densely and take longer.
     """
     rows = np.unique(poses.visibility[:, 0])
     rows = rows[poses.measured[rows]] if len(rows) else np.arange(len(poses.frame))
-    step = max(1, -(-len(rows) // most))
+    step = max(2 if len(rows) > options.images else 1, -(-len(rows) // most))
     row_of = {int(poses.frame[row]): int(row) for row in rows[::step]}
     size = np.array(video.size, np.float64)
 
