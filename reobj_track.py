@@ -1246,7 +1246,7 @@ def run(
     video = open_video(source, config.input, config.poses, tracks or detections, config.detect)
     with Workspace(out, overwrite) as workspace, opened_map(config.map) as room:
         workspace.bind(video, overwrite)
-        job = _Job(video, workspace, config)
+        job = _Job(video, workspace, dataclasses.replace(config, map=config.map.absolute()))
         viewer = Viewer(VideoInfo.of(video)) if show else None
         in_3d = in_3d and config.poses.mode != "none"
         readings = supplied_poses(video, config.poses) if in_3d else []
@@ -1309,7 +1309,7 @@ def refit(
         result = dataclasses.replace(
             result, poses=last.poses, edits=corrections, warnings=[*result.warnings, *warnings]
         )
-        with opened_map(config.map) as room:
+        with opened_map(config.map, must_exist=True) as room:
             return _finish(_Job(video, workspace, config), result, room)
 
 

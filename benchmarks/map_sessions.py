@@ -71,7 +71,7 @@ def run_session(session: Path, out: Path, room: Path) -> dict[str, float]:
     if done.returncode:
         sys.exit(f"{session}: {done.stderr}")
     line = next(x for x in done.stdout.splitlines() if x.startswith("seconds:"))
-    stages = re.findall(r"(\w+) ([\d.]+)(?: \(|,|$)", re.sub(r"\([^)]*\)", "", line))
+    stages = re.findall(r"(\w+) ([\d.]+)", re.sub(r"\([^)]*\)", "", line))
     return {name: float(value) for name, value in stages}
 
 

@@ -47,6 +47,10 @@ class MapConfig:
         False, "compare with the map only; do not change the file", "--map-frozen"
     )
 
+    def absolute(self) -> MapConfig:
+        """Return the options with the absolute path, to be found from any folder."""
+        return dataclasses.replace(self, path=str(Path(self.path).absolute()) if self.path else "")
+
 
 @dataclass(frozen=True, slots=True)
 class OpenMap:
@@ -62,11 +66,13 @@ class OpenMap:
 
 
 @contextlib.contextmanager
-def opened_map(config: MapConfig) -> Iterator[OpenMap | None]:
+def opened_map(config: MapConfig, must_exist: bool = False) -> Iterator[OpenMap | None]:
     """Open the map of a run, and hold its lock unless it is frozen; None without a map.
 
+    Args:
+        must_exist: also if it is not frozen; otherwise a missing map begins empty.
     Raises:
-        ReobjError: damaged, another kind of file, used by another run, or frozen and missing.
+        ReobjError: damaged, another kind of file, used by another run, or missing.
     """
     if not config.path:
         if config.frozen:
@@ -74,6 +80,11 @@ def opened_map(config: MapConfig) -> Iterator[OpenMap | None]:
         yield None
         return
     path = Path(config.path)
+    if must_exist and not path.exists():
+        raise ReobjError(
+            f"{path}: this map of the last run is missing; restore it, or name another one by "
+            "--set map.path=FILE (empty: none)"
+        )
     if config.frozen:
         yield OpenMap(path, RoomMap.load(path), True)
         return
