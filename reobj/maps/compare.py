@@ -56,12 +56,15 @@ class Visibility:
 
     Attributes:
         expected: (N,) independent views in which the object would be in the image and unoccluded.
-        seen_through: (N,) of those, views with a sparse point behind the object on a ray through
-            its middle.
+        seen_through: (N,) of those, views that show what is behind the object (sparse points on
+            rays through its middle), or views besides a first one that show its surroundings.
+        vague: (N,) the position in the map is too uncertain to know what a view shows; None: of
+            no object.
     """
 
     expected: Array
     seen_through: Array
+    vague: BoolArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -646,7 +649,9 @@ class _Verdicts:
             (self.loss[i, :-1] < self.options.margin) & (self.stayed[i] >= self.moved[i])
         )
         gone = there < self.options.gone_log_odds and through > 0 and not len(similar)
-        if expected == 0:
+        if view.vague is not None and view.vague[i]:
+            evidence = "its position in the map is too uncertain"
+        elif expected == 0:
             evidence = "no view passed its place"
         elif len(similar):
             found = self.pairs.found[int(similar[0])]

@@ -33,7 +33,7 @@ def visibility_of(
     nearer: quadrics.Ellipsoids,
     looked: IntArray | None = None,
     most_views: int = 60,
-    least_px: float = 12.0,
+    least_px: float = 16.0,
     in_view: float = 0.7,
     apart_deg: float = 10.0,
     least_points: int = 3,
@@ -49,7 +49,7 @@ def visibility_of(
         nearer: objects of the recording, which may occlude. looked: frames that the detector was
             run on; None: all.
         most_views: spread over the recording; more take longer.
-        least_px: shorter side of the projected box, of an image 640 px wide; detectors miss
+        least_px: root of the area of the projected box in an image 640 px wide; detectors miss
             smaller objects.
         in_view: fraction of the projected box inside the image.
         apart_deg: views of an object less than this apart fail together and count once.
@@ -76,7 +76,7 @@ def visibility_of(
         whole = quadrics.solid_boxes(shapes, support, cameras[v : v + 1])[0]  # (N, 4)
         clipped = quadrics.clip_boxes(whole[None], size)[0]
         ratio = _area(clipped) / np.maximum(_area(whole), 1e-9)
-        sides = (clipped[:, 2:] - clipped[:, :2]).min(1) * 640 / max(size)
+        sides = np.sqrt(_area(clipped)) * 640 / max(size)
         with np.errstate(invalid="ignore"):
             shown = np.flatnonzero((ratio >= in_view) & (sides >= least_px))
         shown = shown[~_behind_objects(shapes[shown], clipped[shown], nearer, cameras[v])]
@@ -102,9 +102,8 @@ def visibility_of(
         return np.array(counts, np.float64)
 
     # one view of its surroundings may show them beside what stands before the object
-    return Visibility(
-        independent(expected), np.maximum(independent(through), independent(around) - 1)
-    )
+    seen_through = np.maximum(independent(through), independent(around) - 1)
+    return Visibility(independent(expected), seen_through, vague)
 
 
 def _area(box: Array) -> Array:
