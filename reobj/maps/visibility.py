@@ -11,6 +11,7 @@ import quadrics
 from reobj.cameras import Poses, invert_rigid
 from reobj.maps.compare import Visibility
 from reobj.maps.fusion import ObjectState
+from reobj.objects.occlusion import entry_depths
 from reobj.results.result import Object
 from reobj.types import Array, BoolArray, IntArray
 from reobj.visible_points import VisiblePoints
@@ -115,19 +116,15 @@ def _area(box: Array) -> Array:
 def _behind_objects(
     shapes: quadrics.Ellipsoids, box: Array, nearer: quadrics.Ellipsoids, camera: Array
 ) -> BoolArray:
-    """Mark shapes (n,) whose box is covered for the most part by an object before them."""
+    """Mark shapes (n,) before which other objects cover half of their box or more."""
     if not len(shapes) or not len(nearer):
         return np.zeros(len(shapes), bool)
-    depth = shapes.center_in_world @ camera[2, :3] + camera[2, 3]  # (n,)
-    front = depth - shapes.half_axes.max(1)
-    other_depth = nearer.center_in_world @ camera[2, :3] + camera[2, 3]  # (m,)
-    other = quadrics.solid_boxes(nearer, "box", camera[None])[0]  # (m, 4)
-    low = np.maximum(box[:, None, :2], other[None, :, :2])
-    high = np.minimum(box[:, None, 2:], other[None, :, 2:])
-    side = np.nan_to_num(high - low).clip(0)
-    covered = side[..., 0] * side[..., 1] / np.maximum(_area(box), 1e-9)[:, None]  # (n, m)
-    is_nearer = (other_depth[None] < front[:, None]) & (other_depth[None] > 0)
-    return np.asarray((is_nearer & (covered > 0.5)).any(1), bool)
+    front = shapes.center_in_world @ camera[2, :3] + camera[2, 3] - shapes.half_axes.max(1)
+    step = np.array([0.2, 0.5, 0.8])  # of the box: 9 rays
+    grid = np.stack(np.meshgrid(step, step), -1).reshape(1, -1, 2)
+    points = box[:, None, :2] + grid * (box[:, None, 2:] - box[:, None, :2])  # (n, 9, 2)
+    entry = entry_depths(points.reshape(-1, 2), camera, nearer).reshape(len(shapes), 9, -1)
+    return np.asarray((entry.min(2) < front[:, None]).mean(1) >= 0.5, bool)
 
 
 def _points_around(

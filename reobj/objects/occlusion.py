@@ -73,7 +73,7 @@ def _occluded_by_nearer(views: Views, ellipsoids: quadrics.Ellipsoids) -> BoolAr
         aside |= (outline[v, :, 2:] < points.min((0, 1, 2, 3))).any(1)
         candidates = np.flatnonzero(~aside)  # (N,) shapes that some of the rays may hit
         depth = shapes.center_in_world @ camera[2, :3] + camera[2, 3]  # (S,)
-        entry = _entry_depths(points.reshape(-1, 2), camera, shapes[candidates])
+        entry = entry_depths(points.reshape(-1, 2), camera, shapes[candidates])
         entry = entry.reshape(*points.shape[:4], -1)  # (2, D, 4, P, N)
         itself = candidates == column[groups, None]  # (D, N)
         entry = np.where(itself[:, None, None], np.inf, entry)
@@ -98,7 +98,7 @@ def _beside_edges(box: Array) -> Array:
     return np.stack(found)
 
 
-def _entry_depths(points: Array, camera: Array, boxes: quadrics.Ellipsoids) -> Array:
+def entry_depths(points: Array, camera: Array, boxes: quadrics.Ellipsoids) -> Array:
     """Return the depths (K, S) where rays of image points (K, 2) enter boxes; inf: no hit."""
     inverse = np.linalg.inv(camera[:, :3])
     ray = np.column_stack([points, np.ones(len(points))]) @ inverse.T  # (K, 3), of depth 1
