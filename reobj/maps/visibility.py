@@ -116,14 +116,23 @@ def _area(box: Array) -> Array:
 def _behind_objects(
     shapes: quadrics.Ellipsoids, box: Array, nearer: quadrics.Ellipsoids, camera: Array
 ) -> BoolArray:
-    """Mark shapes (n,) before which other objects cover half of their box or more."""
+    """Mark shapes (n,) before which other objects cover half of their box or more.
+
+    An object whose box contains the centre of a shape is no occluder: the shape itself, or a couch
+    on which it lies.
+    """
     if not len(shapes) or not len(nearer):
         return np.zeros(len(shapes), bool)
-    front = shapes.center_in_world @ camera[2, :3] + camera[2, 3] - shapes.half_axes.max(1)
+    depth = shapes.center_in_world @ camera[2, :3] + camera[2, 3]  # (n,)
+    front = depth - np.linalg.norm(shapes.half_axes, axis=1)
     step = np.array([0.2, 0.5, 0.8])  # of the box: 9 rays
     grid = np.stack(np.meshgrid(step, step), -1).reshape(1, -1, 2)
     points = box[:, None, :2] + grid * (box[:, None, 2:] - box[:, None, :2])  # (n, 9, 2)
     entry = entry_depths(points.reshape(-1, 2), camera, nearer).reshape(len(shapes), 9, -1)
+    offset = shapes.center_in_world[:, None] - nearer.center_in_world  # (n, m, 3)
+    inside = np.abs(np.einsum("nmi,mij->nmj", offset, nearer.world_from_obj))
+    contains = (inside < 1.1 * nearer.half_axes).all(2)  # (n, m)
+    entry = np.where(contains[:, None], np.inf, entry)
     return np.asarray((entry.min(2) < front[:, None]).mean(1) >= 0.5, bool)
 
 
