@@ -1,0 +1,230 @@
+"""A recording is compared with the map, numbered, and added to it."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from simulated import chair_solids, fitted, tracks_of, walk
+
+import quadrics
+import reobj_track as rt
+from reobj.maps.corrections import delete, forget, with_edits
+from reobj.maps.fusion import object_state
+from reobj.maps.room_map import MapPoints, RoomMap
+from reobj.maps.update import Recording, add_recording
+from reobj.maps.visibility import shapes_of, visibility_of
+from reobj.results.edits import BoxRef, Edit, Edits
+
+
+def recording(name: str, **changes: object) -> Recording:
+    """A recording without features, perfectly aligned."""
+    fields = Recording(
+        Path("room.map"), name, f"content of {name}", "reobj", np.diag([1e-8] * 7), 20, 20,
+        quadrics.Scale(1.0, 0.0, "poses"), None,
+    )  # fmt: skip
+    return dataclasses.replace(fields, **changes)  # type: ignore[arg-type]
+
+
+def wall_behind(poses: rt.Poses, count: int = 400) -> rt.Poses:
+    """The poses with points on a wall 2 m behind the chairs, which all frames observe."""
+    rng = np.random.default_rng(1)
+    points = np.column_stack(
+        [rng.uniform(-4, 4, count), np.full(count, 2.0), rng.uniform(0, 2, count)]
+    )
+    row, point = np.divmod(np.arange(len(poses.frame) * count), count)
+    return dataclasses.replace(
+        poses, points=points, colors=np.zeros((count, 3), np.uint8),
+        visibility=np.column_stack([row, point]),
+    )  # fmt: skip
+
+
+def seen(chairs: list[int], numbers: list[int] | None = None, wall: bool = False) -> rt.Result:
+    """A recording of some of the three chairs; their identities are `numbers`, or 1, 2, ..."""
+    poses = walk(24)
+    tracks = tracks_of(poses)
+    tracks = tracks[np.isin(tracks.detection_index, chairs)]
+    names = numbers or list(range(1, len(chairs) + 1))
+    identity = np.zeros(3, np.int64)
+    identity[chairs] = names
+    track_id = identity[tracks.detection_index]
+    tracks = dataclasses.replace(tracks, track_id=track_id, tracklet_id=track_id)
+    result = fitted(tracks, wall_behind(poses) if wall else poses)
+    row = np.arange(len(tracks))
+    looks = rt.Embeddings(*(np.ones((len(row), n), np.float16) for n in (8, 4)))  # identical
+    return dataclasses.replace(result, embeddings=looks, embedding_row=row)
+
+
+def moved_by(result: rt.Result, number: int, offset: list[float]) -> rt.Result:
+    """The recording with one object elsewhere."""
+    objects = [
+        dataclasses.replace(o, center=o.center + offset) if o.id == number else o
+        for o in result.objects
+    ]
+    return dataclasses.replace(result, objects=objects)
+
+
+@pytest.fixture(scope="module")
+def monday() -> RoomMap:
+    room, result = add_recording(RoomMap(), seen([0, 1, 2]), recording("monday"))
+    assert [o.id for o in result.objects] == [1, 2, 3]
+    assert [c.id for c in result.changes.new] == [1, 2, 3]
+    return room
+
+
+def test_the_first_recording_gives_its_numbers_to_the_map(monday):
+    assert [o.id for o in monday.objects] == [1, 2, 3] and monday.next_id == 4
+    assert monday.metric and monday.sessions[0].name == "monday"
+    for found, center in zip(monday.objects, chair_solids().center_in_world, strict=True):
+        state = object_state(found, monday)
+        np.testing.assert_allclose(state.center, center, atol=0.04)
+        assert state.class_name == "chair" and state.present
+
+
+def test_objects_that_stayed_get_their_numbers_in_tracks_objects_and_fits(monday):
+    """The tracker numbered them in another order, and from 7 on."""
+    tuesday = seen([0, 1, 2], numbers=[9, 7, 8])
+    room, result = add_recording(monday, tuesday, recording("tuesday"))
+    assert [c.id for c in result.changes.stayed] == [1, 2, 3]
+    assert [o.id for o in result.objects] == [1, 2, 3]
+    chair = result.tracks.detection_index  # column of the chair
+    np.testing.assert_array_equal(result.tracks.track_id, chair + 1)
+    centers = result.fits.ellipsoids.center_in_world
+    np.testing.assert_allclose(centers, [o.center for o in result.objects], atol=1e-4)
+    assert room.next_id == 4 and len(room.sessions) == 2
+    before, after = (object_state(m.objects[0], m) for m in (monday, room))
+    assert np.trace(after.cov[:3, :3]) < 0.7 * np.trace(before.cov[:3, :3])
+
+
+def test_a_moved_object_keeps_its_number(monday):
+    tuesday = moved_by(seen([0, 1, 2], numbers=[3, 1, 2]), 3, [-0.6, 0.4, 0])
+    room, result = add_recording(monday, tuesday, recording("tuesday"))
+    (change,) = result.changes.moved
+    assert change.id == 1 and change.distance_m == pytest.approx(np.hypot(0.6, 0.4), abs=0.03)
+    assert 0 < change.sigma_m < 0.1
+    assert change.before_shape.support == "box"
+    state = object_state(room.objects[0], room)
+    np.testing.assert_allclose(state.center, change.after, atol=0.02)
+
+
+def test_what_is_seen_through_is_gone_and_gets_its_number_back(monday):
+    room, result = add_recording(monday, seen([0, 2], wall=True), recording("tuesday"))
+    assert [c.id for c in result.changes.gone] == [2]
+    assert not object_state(room.objects[1], room).present
+    room, result = add_recording(room, seen([0, 1, 2]), recording("friday"))
+    assert [o.id for o in result.objects] == [1, 2, 3]
+    assert object_state(room.objects[1], room).present
+
+
+def test_without_points_behind_it_an_object_is_not_called_gone(monday):
+    _, result = add_recording(monday, seen([0, 2]), recording("tuesday"))
+    assert [c.id for c in result.changes.not_seen] == [2] and not result.changes.gone
+
+
+def test_new_objects_and_forgotten_ones_get_numbers_that_nobody_had(monday):
+    room, _ = add_recording(RoomMap(), seen([0, 1]), recording("monday"))
+    room, result = add_recording(room, seen([0, 1, 2]), recording("tuesday"))
+    assert [c.id for c in result.changes.new] == [3]
+    room = forget(room, "tuesday")
+    assert [o.id for o in room.objects] == [1, 2]
+    _, result = add_recording(room, seen([0, 1, 2]), recording("friday"))
+    assert [c.id for c in result.changes.new] == [4]
+
+
+def test_the_same_recording_again_replaces_its_session(monday):
+    """Its objects keep their numbers, also with another detector; nothing counts twice."""
+    again, result = add_recording(monday, seen([2, 0, 1], numbers=[1, 2, 3]), recording("monday"))
+    assert [c.id for c in result.changes.stayed] == [1, 2, 3]
+    assert len(again.sessions) == 1 and again.next_id == 4
+    assert [len(o.observations) for o in again.objects] == [1, 1, 1]
+    assert [o.observations[0].status for o in again.objects] == ["new"] * 3
+
+
+def test_a_deleted_object_stays_out_of_later_results(monday):
+    room = delete(monday, 2)
+    room, result = add_recording(room, seen([0, 1, 2], numbers=[3, 1, 2]), recording("tuesday"))
+    assert [o.id for o in result.objects] == [1, 3]
+    assert set(result.tracks.track_id) == {1, 3} and len(result.fits) == 2
+    assert room.object(2).deleted and result.changes.of_objects().keys() == {1, 3}
+
+
+def test_corrections_of_the_viewer_reach_the_map_once(monday):
+    edits = (
+        Edit("rename", BoxRef(0, (0.0, 0, 1, 1), 1), class_name="armchair"),
+        Edit("delete", BoxRef(0, (0.0, 0, 1, 1), 3)),
+        Edit("rename", BoxRef(0, (0.0, 0, 1, 1), 77), class_name="table"),  # not in the map
+    )
+    ours = Edits(edits, [], Path("edits.json"), map_id=monday.map_id)
+    room = with_edits(with_edits(monday, ours), ours)
+    assert room.object(1).name == "armchair" and room.object(3).deleted
+    assert with_edits(monday, dataclasses.replace(ours, map_id="another")) is monday
+    _, result = add_recording(room, seen([0, 1, 2]), recording("tuesday"))
+    assert [(o.id, o.class_name) for o in result.objects] == [(1, "armchair"), (2, "chair")]
+
+
+def test_known_points_are_not_added_again():
+    rng = np.random.default_rng(2)
+    count = 300
+    descriptor = rng.integers(0, 100, (count, 128)).astype(np.uint8)
+    xyz = rng.uniform(-2, 2, (count, 3))
+    points = MapPoints(
+        xyz, descriptor, np.zeros(count, np.int64), np.zeros(count, np.int64),
+        np.tile([0, 0, 1.0], (count, 1)), np.full(count, 2.0),
+    )  # fmt: skip
+    room, _ = add_recording(RoomMap(), seen([0]), recording("monday", points=points))
+    other = rng.integers(0, 100, (100, 128)).astype(np.uint8)
+    again = dataclasses.replace(points, xyz=xyz + 0.002)
+    again.descriptor[:100] = descriptor[:100]
+    again = dataclasses.replace(again, descriptor=np.concatenate([other, descriptor[100:]]))
+    room, _ = add_recording(room, seen([0]), recording("tuesday", points=again))
+    assert len(room.points) == count + 100  # a hundred look different today
+    assert np.bincount(room.points.session).tolist() == [0, count, 100]
+    center = chair_solids().center_in_world[0]
+    on = np.linalg.norm(room.points.xyz - center, axis=1) < 0.25
+    assert (room.points.object_id[on] == 1).all()
+
+
+# ---- Visibility --------------------------------------------------------------------------------
+
+
+def test_views_less_than_ten_degrees_apart_count_once(monday):
+    """The walk is an arc of 120 degrees around the chairs."""
+    states = [object_state(o, monday) for o in monday.objects]
+    found = visibility_of(states, walk(60), quadrics.Ellipsoids(*(np.empty(s) for s in
+                          ((0, 3), (0, 3), (0, 3, 3)))))  # fmt: skip
+    assert (found.expected >= 10).all() and (found.expected <= 16).all()
+    assert not found.seen_through.any()
+
+
+def test_an_object_behind_another_one_is_not_expected(monday):
+    states = [object_state(o, monday) for o in monday.objects[:1]]
+    cupboard = quadrics.Ellipsoids(
+        np.array([[-1.1, -1.2, 1.0]]), np.array([[2.5, 0.2, 1.0]]), np.eye(3)[None]
+    )
+    poses = walk(24, 40.0)
+    free = quadrics.Ellipsoids(*(a + 50 for a in (cupboard.center_in_world,)),
+                               cupboard.half_axes, cupboard.world_from_obj)  # fmt: skip
+    assert visibility_of(states, poses, free).expected[0] > 2
+    assert visibility_of(states, poses, cupboard).expected[0] == 0
+    itself = shapes_of(states)
+    assert visibility_of(states, poses, itself).expected[0] > 2
+
+
+def test_points_before_an_object_occlude_it(monday):
+    states = [object_state(o, monday) for o in monday.objects]
+    none = quadrics.Ellipsoids(*(np.empty(s) for s in ((0, 3), (0, 3), (0, 3, 3))))
+    behind = wall_behind(walk(24), 2000)
+    before = dataclasses.replace(behind, points=behind.points * (1, 0, 1) + (0, -1.0, 0))
+    assert (visibility_of(states, behind, none).seen_through > 3).all()
+    assert (visibility_of(states, before, none).expected < 5).all()
+
+
+def test_an_uncertain_place_says_nothing(monday):
+    state = object_state(monday.objects[0], monday)
+    cov = state.cov.copy()
+    cov[:3, :3] += np.eye(3)
+    none = quadrics.Ellipsoids(*(np.empty(s) for s in ((0, 3), (0, 3), (0, 3, 3))))
+    found = visibility_of([dataclasses.replace(state, cov=cov)], wall_behind(walk(24)), none)
+    assert found.expected[0] == 0 and found.vague[0]
