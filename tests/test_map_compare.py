@@ -12,6 +12,7 @@ from reobj.maps.compare import (
     CompareOptions,
     Decision,
     FoundObject,
+    PointMotion,
     Visibility,
     _assigned,
     _losses,
@@ -67,6 +68,19 @@ def found(
         source.foreground, source.background, 10, 0.95, {},
     )  # fmt: skip
     return dataclasses.replace(seen, **facts)
+
+
+def motions(
+    states: Sequence[ObjectState], center: Sequence[float], inliers: dict[int, int]
+) -> dict[int, PointMotion]:
+    """Motions onto a found object, with the number of inliers of each map object."""
+    return {
+        s.id: PointMotion(
+            inliers[s.id], 3, np.eye(3, 4), np.array(center) - s.center, 1e-4 * np.eye(3)
+        )
+        for s in states
+        if s.id in inliers
+    }
 
 
 def room() -> list[ObjectState]:
@@ -128,13 +142,13 @@ def test_own_points_prove_a_move_that_looks_contradict() -> None:
     detected = all_found(states)
     visibility = Visibility(np.array([6, 6, 6, 0, 6, 6.0]), np.zeros(6))
     strange = looks(500)
-    for inliers, expected in ((0, ("new", 0, 104)), (9, ("new", 0, 104)), (14, ("moved", 4, 104))):
+    for inliers, expected in ((0, ("new", 0, 104)), (5, ("new", 0, 104)), (7, ("moved", 4, 104))):
         detected[3] = found(
             states[3],
             104,
             (3, 2, 0.4),
             foreground=strange,
-            motion_of={4: inliers} if inliers else {},
+            motion_of=motions(states, (3, 2, 0.4), {4: inliers}) if inliers else {},
         )
         assert expected in summary(decide(states, detected, visibility))
 
@@ -209,11 +223,32 @@ def test_what_stayed_refines_the_alignment() -> None:
     states = room()
     shift = np.array([0.2, -0.15, 0])
     detected = [found(s, 100 + s.id, s.center + shift) for s in states]
-    detected[3] = found(states[3], 104, states[3].center + shift + [0.6, 0, 0], motion_of={4: 20})
+    place = states[3].center + shift + [0.6, 0, 0]
+    detected[3] = found(states[3], 104, place, motion_of=motions(states, place, {4: 20}))
     cov = np.diag([0, 0, 0, 0.04, 0.04, 0.04, 0.0])
     decisions = decide(states, detected, alignment_cov=cov)
     assert [d.kind for d in decisions] == ["stayed"] * 3 + ["moved"] + ["stayed"] * 2
     assert decisions[3].evidence.startswith("0.6")
+
+
+def test_enough_own_points_give_the_displacement() -> None:
+    """The centre is uncertain by 30 cm; the points show where the object is."""
+    states = room()
+    detected = all_found(states)
+    there = states[3].center
+    x = np.array([1.0, 0, 0])
+    wide = shape_cov(0.3)
+    for place, points_at, inliers, kind, distance in (
+        (there + x * 0.5, there, 14, "stayed", "0.00 m"),
+        (there + x * 0.5, there, 5, "stayed", "0.50 m"),
+        (there + x * 0.1, there + x * 0.6, 14, "moved", "0.60 m"),
+    ):
+        recognised = motions(states, points_at, {4: inliers})
+        detected[3] = found(states[3], 104, place, cov=wide, motion_of=recognised)
+        decision = decide(states, detected)[3]
+        assert (decision.kind, decision.map_id, decision.found_id) == (kind, 4, 104)
+        assert decision.evidence.startswith(distance)
+        assert f"{inliers} of its points recognised in 3 images" in decision.evidence
 
 
 def test_the_alignment_turns_about_the_origin_of_the_map() -> None:
@@ -272,7 +307,8 @@ def test_an_object_that_was_gone_gets_its_number_back() -> None:
     states[3] = dataclasses.replace(states[3], present=False)
     assert summary(decide(states, all_found(states)))[3] == ("stayed", 4, 104)
     elsewhere = all_found(states)
-    elsewhere[3] = found(states[3], 104, (3, 2, 0.4), motion_of={4: 20})
+    place = (3, 2, 0.4)
+    elsewhere[3] = found(states[3], 104, place, motion_of=motions(states, place, {4: 20}))
     assert summary(decide(states, elsewhere))[3] == ("moved", 4, 104)
     missing = [f for f in elsewhere if f.id != 104]
     assert decide(states, missing, seen(6, 6, 3))[3].kind == "gone"
@@ -298,7 +334,8 @@ def test_an_identical_chair_that_left_the_row_is_the_one_that_is_missing() -> No
     states = [*room(), *chairs((1, 2, 0.4), (1.7, 2, 0.4), (2.4, 2, 0.4), (3.1, 2, 0.4))]
     points = {11: 20, 12: 25, 13: 20, 14: 25}
     detected = all_found(states)
-    detected[7] = found(states[7], 112, (2.0, 3.2, 0.4), motion_of=points)
+    place = (2.0, 3.2, 0.4)
+    detected[7] = found(states[7], 112, place, motion_of=motions(states, place, points))
     views = Visibility(np.full(10, 6.0), np.array([0] * 7 + [5.0] + [0] * 2))
     assert summary(decide(states, detected, views))[7] == ("moved", 12, 112)
 
@@ -309,7 +346,8 @@ def test_swapped_identical_chairs_give_no_stolen_number() -> None:
     points = {11: 20, 12: 20}
     detected = all_found(states)[:6]
     for identity, place in ((111, (2, 3.2, 0.4)), (112, (2, 2.6, 0.4))):
-        detected.append(found(states[6], identity, place, motion_of=points))
+        recognised = motions(states, place, points)
+        detected.append(found(states[6], identity, place, motion_of=recognised))
     views = Visibility(np.full(8, 6.0), np.array([0] * 6 + [5.0] * 2))
     decisions = decide(states, detected, views)
     assert summary(decisions)[6:] == [
@@ -321,8 +359,9 @@ def test_swapped_identical_chairs_give_no_stolen_number() -> None:
 def test_points_of_an_identical_chair_in_its_place_do_not_exchange_the_numbers() -> None:
     states = [*room(), *chairs((1, 2, 0.4), (1.6, 2, 0.4))]
     detected = all_found(states)[:6]
-    detected.append(found(states[6], 111, motion_of={12: 25}))
-    detected.append(found(states[7], 112, motion_of={11: 25}))
+    for here, other in ((6, 7), (7, 6)):
+        recognised = motions(states, states[here].center, {states[other].id: 25})
+        detected.append(found(states[here], states[here].id + 100, motion_of=recognised))
     assert summary(decide(states, detected))[6:] == [("stayed", 11, 111), ("stayed", 12, 112)]
 
 
@@ -332,7 +371,9 @@ def test_a_displacement_less_than_half_as_long_is_needed() -> None:
     points = {11: 20, 12: 20}
     detected = all_found(states)[:6]
     for identity, x in ((111, 1), (112, 2.05)):
-        detected.append(found(states[6], identity, (x, 2.62, 0.4), motion_of=points))
+        place = (x, 2.62, 0.4)
+        recognised = motions(states, place, points)
+        detected.append(found(states[6], identity, place, motion_of=recognised))
     decisions = decide(states, detected)
     assert summary(decisions)[-2:] == [("new", 0, 111), ("new", 0, 112)]
     assert 11 in decisions[-2].candidates and 12 in decisions[-1].candidates
@@ -344,7 +385,7 @@ def test_a_moved_object_has_its_size_and_looks_unless_its_points_agree() -> None
     for seen_now, possible in (
         (found(chair, 101, (3, 2, 0.4)), True),
         (large, False),
-        (dataclasses.replace(large, motion_of={1: 14}), True),
+        (dataclasses.replace(large, motion_of=motions([chair], (3, 2, 0.4), {1: 14})), True),
         (found(chair, 101, (3, 2, 0.4), foreground=-chair.foreground), False),
         (found(chair, 101, (3, 2, 0.4), classes={"plant": 9.0}), False),
     ):
@@ -360,7 +401,8 @@ def test_the_displacement_decides_between_identical_chairs() -> None:
     points = {11: 20, 12: 20}
     detected = all_found(states)[:6]
     for identity, place in ((111, (1, 2.5, 0.4)), (112, (3, 2.5, 0.4))):
-        detected.append(found(states[6], identity, place, motion_of=points))
+        recognised = motions(states, place, points)
+        detected.append(found(states[6], identity, place, motion_of=recognised))
     decisions = decide(states, detected)
     assert summary(decisions)[6:] == [("moved", 11, 111), ("moved", 12, 112)]
 

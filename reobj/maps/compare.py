@@ -22,6 +22,24 @@ IMPOSSIBLE = -1e9  # nats; finite, for the solver
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class PointMotion:
+    """Rigid motion of a map object, by its points recognised on an object of the recording.
+
+    Attributes:
+        inliers: different points of the map object that follow it. images: that agree on it.
+        new_from_old: (3, 4), in the world of the map; the identity: the points are where they were.
+        shift: (3,) of the centre of the map object. cov: (3, 3) of the shift, without the
+            uncertainty of the alignment of the recording.
+    """
+
+    inliers: int
+    images: int
+    new_from_old: Array
+    shift: Array
+    cov: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class FoundObject:
     """An object of the recording, in the world of the map.
 
@@ -30,8 +48,7 @@ class FoundObject:
         support, center, half_axes, quat_wxyz, cov: shape as in `reobj.maps.room_map.Observation`.
         foreground, background: mean unit embeddings; empty: none.
         views: detections. confidence: probability that it exists.
-        motion_of: numbers of map objects whose own points were recognised on this object, with the
-            number of inliers of the rigid motion that they agree on.
+        motion_of: motions of map objects whose points were recognised on this object, by number.
     """
 
     id: int
@@ -45,7 +62,7 @@ class FoundObject:
     background: Floats
     views: int
     confidence: float
-    motion_of: dict[int, int]
+    motion_of: dict[int, PointMotion]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,8 +140,9 @@ class CompareOptions:
         least_appearance: least appearance log likelihood ratio of a moved object whose own points
             were not recognised, in nats.
         few_inliers, many_inliers: log likelihood ratio per inlier of the object's own points, below
-            and from `enough_inliers` on; `inliers_limit`: the largest, in nats. (Wrong motions had
-            at most 9 inliers.)
+            and from `enough_inliers` on, which also give the displacement; `inliers_limit`: the
+            largest, in nats. (Of 8,500 pairs of different objects, in five pairs of recordings and
+            across them, none had a wrong motion of 5 or more points.)
         margin: in nats, below which two explanations are equally probable (3: design).
         looks_margin, size_margin: in nats, by which "moved" must exceed every other explanation if
             its own points were not recognised: with appearance, and with size and class alone. (A
@@ -167,7 +185,7 @@ class CompareOptions:
     least_appearance: float = 0.0
     few_inliers: float = 0.25
     many_inliers: float = 0.75
-    enough_inliers: int = 12
+    enough_inliers: int = 6
     inliers_limit: float = 15.0
     margin: float = 3.0
     looks_margin: float = 4.0
@@ -235,7 +253,8 @@ class _Pairs:
             with those of the background.
         inliers: (N, M) of the motion of the map object's own points on the found object.
         size_square: (N, M) squared Mahalanobis distance of the sizes.
-        distance, sigmas: (N, M) displacement in metres and in standard deviations.
+        distance, sigmas: (N, M) displacement in metres and in standard deviations, of the points if
+            enough were recognised, otherwise of the centres.
         position: (N, M) log density of the found centre if the object stayed.
         fate: (N, 3) probabilities: stayed, moved, taken away. missed: (N,) probability that an
             object in its place is not detected. reach: share of the room that was seen.
@@ -273,8 +292,10 @@ class _Pairs:
             options.class_kept * self.overlap + (1 - options.class_kept) * confused
         )
         self.size_score, self.size_square = _size_agreement(states, found, options)
-        inliers = np.array([[f.motion_of.get(s.id, 0) for f in found] for s in states])
-        self.inliers = inliers.reshape(self.overlap.shape)
+        self.inliers = np.zeros(self.overlap.shape, np.int64)
+        for i, j in np.ndindex(self.inliers.shape):
+            motion = found[j].motion_of.get(states[i].id)
+            self.inliers[i, j] = 0 if motion is None else motion.inliers
         enough = self.inliers >= options.enough_inliers
         per_inlier = np.where(enough, options.many_inliers, options.few_inliers)
         self.points = np.minimum(per_inlier * self.inliers, options.inliers_limit)
@@ -294,13 +315,17 @@ class _Pairs:
         n, options = len(center), self.options
         variance = np.maximum(floor[:n, None], floor[None, n:]) ** 2 + options.position_floor_m**2
         own = center_cov[:, None] + other_cov[None] + variance[..., None, None] * np.eye(3)
+        between = other[None] - center[:, None]  # (N, M, 3)
+        for i, j in np.argwhere(self.inliers >= options.enough_inliers).tolist():
+            motion = self.found[j].motion_of[self.states[i].id]
+            between[i, j] = motion.shift * unit
+            own[i, j] = motion.cov * unit**2 + options.position_floor_m**2 * np.eye(3)
         everything = np.concatenate([center, other])
         self.room = float(np.prod(np.ptp(everything, axis=0) + 1.0)) if len(everything) else 1.0
         update = np.zeros(7)
         for _ in range(3):
             jacobian = _alignment_jacobian(other)  # (M, 3, 7)
-            moved = other + jacobian @ update
-            difference = moved[None] - center[:, None]  # (N, M, 3)
+            difference = between + jacobian @ update  # (N, M, 3)
             total = own + jacobian @ cov @ jacobian.swapaxes(1, 2)
             self.position, square = _log_normal(difference, total)
             self.distance = np.linalg.norm(difference, axis=2)
@@ -309,7 +334,7 @@ class _Pairs:
             if not len(rows):
                 break
             update, cov = _refined_alignment(
-                jacobian[columns], (other[columns] - center[rows]), own[rows, columns],
+                jacobian[columns], between[rows, columns], own[rows, columns],
                 alignment_cov * np.outer(to_metres, to_metres),
             )  # fmt: skip
 
@@ -688,8 +713,12 @@ class _Verdicts:
             "appearance": appearance,
         }
         text = ", ".join(f"{name} {value:+.1f}" for name, value in terms.items())
-        points = pairs.inliers[i, j]
-        own = f", {points} of its points recognised" if points else ""
+        motion = pairs.found[j].motion_of.get(pairs.states[i].id)
+        own = ""
+        if motion is not None:
+            own = f", {motion.inliers} of its points recognised in {motion.images} images"
+            if motion.inliers >= self.options.enough_inliers:
+                own += ", which give the displacement"
         place = f"{pairs.distance[i, j]:.2f} m from its place ({pairs.sigmas[i, j]:.1f} sigma)"
         return f"{place}; log likelihood ratios: {text}{own}"
 

@@ -151,7 +151,7 @@ def points_with_descriptors(
         gap, keypoint = cKDTree(image.xy).query(xy)
         seen = seen[gap < near_px]
         keypoint = keypoint[gap < near_px]
-        sums[seen] += _unit(image.descriptor[keypoint])
+        sums[seen] += unit_descriptors(image.descriptor[keypoint])
         away = poses.points[seen] - centre[image.row]
         length = np.linalg.norm(away, axis=1)
         ray[seen] += away / length[:, None]
@@ -159,7 +159,7 @@ def points_with_descriptors(
         number[seen] += 1
     kept = np.argsort(-number, kind="stable")[:most]
     kept = np.sort(kept[number[kept] > 0])
-    mean = _unit(sums[kept]) * 512
+    mean = unit_descriptors(sums[kept]) * 512
     rays = ray[kept] / np.linalg.norm(ray[kept], axis=1, keepdims=True).clip(1e-9)
     return MapPoints(
         poses.points[kept],
@@ -171,7 +171,7 @@ def points_with_descriptors(
     )
 
 
-def _unit(rows: npt.NDArray[np.generic]) -> Floats:
+def unit_descriptors(rows: npt.NDArray[np.generic]) -> Floats:
     """Scale descriptors to unit length."""
     values = rows.astype(np.float32)
     return np.asarray(values / np.linalg.norm(values, axis=1, keepdims=True).clip(1e-9))
@@ -211,7 +211,7 @@ class PointMatcher:
     def __init__(self, points: MapPoints, options: PlacementOptions) -> None:
         self.points = points
         self.options = options
-        self.descriptor = _unit(points.descriptor)
+        self.descriptor = unit_descriptors(points.descriptor)
 
     def match(self, image: ImageFeatures) -> tuple[IntArray, IntArray]:
         """Return rows of features (n,) and of points (n,) that match by the ratio test.
@@ -222,7 +222,7 @@ class PointMatcher:
         few = 6  # best points of a feature, among which one elsewhere is looked for
         if len(image.xy) < 2 or len(self.points) <= few:
             return np.empty(0, np.int64), np.empty(0, np.int64)
-        cosine = _unit(image.descriptor) @ self.descriptor.T  # (n, N)
+        cosine = unit_descriptors(image.descriptor) @ self.descriptor.T  # (n, N)
         best = np.argpartition(-cosine, few, axis=1)[:, :few]  # (n, few)
         value = np.take_along_axis(cosine, best, 1)
         order = np.argsort(-value, axis=1)

@@ -282,7 +282,7 @@ def _recording(
         scale = placed.scale or none
     return Recording(
         opened.path, name, session_key(video), embedder, best.similarity.cov,
-        len(best.images), best.tried, scale, points,
+        len(best.images), best.tried, scale, points, placed.features,
     )  # fmt: skip
 
 

@@ -14,8 +14,10 @@ from scipy.spatial import cKDTree
 
 import quadrics
 from reobj.cameras import Poses
-from reobj.maps.compare import Decision, FoundObject, Visibility, compare
+from reobj.maps.compare import CompareOptions, Decision, FoundObject, Visibility, compare
 from reobj.maps.fusion import ObjectState, object_state, scale_of
+from reobj.maps.motion import point_motions
+from reobj.maps.placement import ImageFeatures
 from reobj.maps.room_map import MapObject, MapPoints, Observation, RoomMap, Session
 from reobj.maps.visibility import shapes_of, visibility_of
 from reobj.results.changes import Change, Changes, Shape
@@ -34,6 +36,7 @@ class Recording:
         localised_frames, tried_frames: images that agreed, that were compared.
         scale: metres per unit of the map as this recording measured it; source "none": it did not.
         points: with descriptors, in the world of the map; None: those of the map are kept.
+        features: of some of its images, in which the points of map objects are recognised.
     """
 
     map_path: Path
@@ -45,6 +48,7 @@ class Recording:
     tried_frames: int
     scale: quadrics.Scale
     points: MapPoints | None
+    features: tuple[ImageFeatures, ...] = ()
 
 
 def add_recording(room: RoomMap, result: Result, recording: Recording) -> tuple[RoomMap, Result]:
@@ -60,7 +64,7 @@ def add_recording(room: RoomMap, result: Result, recording: Recording) -> tuple[
     assert result.poses is not None
     states = [object_state(found, room) for found in room.objects]
     objects = [o for o in result.located if o.part == 0]
-    found = _found_objects(result, objects)
+    found = _with_motions(_found_objects(result, objects), states, result, room, recording)
     is_first = not room.sessions
     visibility = visibility_of(states, result.poses, shapes_of(objects), result.looked)
     metres = scale_of(room).value if room.sessions else recording.scale.value
@@ -124,6 +128,25 @@ def _found_objects(result: Result, objects: Sequence[Object]) -> list[FoundObjec
             )
         )
     return found
+
+
+def _with_motions(
+    found: Sequence[FoundObject],
+    states: Sequence[ObjectState],
+    result: Result,
+    room: RoomMap,
+    recording: Recording,
+) -> list[FoundObject]:
+    """Add the motions of map objects whose points the images of the recording show."""
+    assert result.poses is not None
+    old = room.session_of(recording.fingerprint)
+    points = room.points if old is None else room.points[room.points.session != old.number]
+    motions = point_motions(
+        points, states, found, recording.features, result.poses, result.tracks, room.up
+    )
+    return [
+        dataclasses.replace(o, motion_of=of_map) for o, of_map in zip(found, motions, strict=True)
+    ]
 
 
 def _array(values: Array | None, length: int) -> Array:
@@ -407,17 +430,23 @@ def _changes(
 def _displacement(
     state: ObjectState | None, found: FoundObject | None, alignment_cov: Array, metres: float | None
 ) -> tuple[float | None, float | None]:
-    """Return the distance between the centres and its standard deviation, metres."""
+    """Return the displacement and its standard deviation, metres: of points, or of the centres."""
     if state is None or found is None or metres is None:
         return None, None
-    offset = found.center - state.center
+    motion = found.motion_of.get(state.id)
+    if motion is not None and motion.inliers >= CompareOptions().enough_inliers:
+        offset = motion.shift
+        own = motion.cov
+    else:
+        offset = found.center - state.center
+        own = state.cov[:3, :3] + found.cov[:3, :3]
     distance = float(np.linalg.norm(offset))
     x, y, z = found.center
     J = np.zeros((3, 7))
     J[:, :3] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
     J[:, 3:6] = np.eye(3)
     J[:, 6] = found.center
-    cov = state.cov[:3, :3] + found.cov[:3, :3] + J @ alignment_cov @ J.T
+    cov = own + J @ alignment_cov @ J.T
     along = offset / distance if distance > 0 else np.array([1.0, 0, 0])
     sigma = float(np.sqrt(along @ cov @ along)) if np.isfinite(cov).all() else None
     return metres * distance, None if sigma is None else metres * sigma

@@ -1,0 +1,390 @@
+"""Motion of map objects, by their points that images of the recording show on a found object.
+
+The keypoints in the boxes of a found object are matched to the points of a map object. Matches that
+agree with the old place are evidence that it stayed. The others give the pose of the cameras, as
+one rig, relative to the points at their old place: that pose is the rigid motion of the object. At
+least two images must agree with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+import quadrics
+from reobj.cameras import Camera, Poses, import_pycolmap
+from reobj.maps.compare import FoundObject, PointMotion
+from reobj.maps.fusion import ObjectState
+from reobj.maps.placement import ImageFeatures, unit_descriptors
+from reobj.maps.room_map import MapPoints
+from reobj.maps.visibility import shapes_of
+from reobj.types import Array, BoolArray, Floats, IntArray, Tracks
+
+
+@dataclass(frozen=True, slots=True)
+class MotionOptions:
+    """When points of a map object that are recognised give its motion.
+
+    Attributes:
+        ratio: largest ratio of the angles to the best point of the map object and to the best other
+            point: of the background, of an object of another class, or of the same object at
+            another place of it. (Objects of the same class do not compete: the points of identical
+            instances have the same descriptors.)
+        angle: largest angle between descriptors, radians.
+        own_spread: of the largest half axis: points of an object nearer to each other do not
+            compete.
+        error_px: largest error of an inlier, px of an image 640 px wide, as in the placement.
+        images: of a found object that are compared, those with its largest boxes.
+        points: least different points of a map object. inliers: least in an image that agrees.
+        agreeing: least images that agree.
+        trials: of RANSAC; enough for 15 % of inliers (1 - .15^3)^2000 = .1 %.
+        bottom: share of the height over the lower end of the object, below which its points may
+            belong to what it stands on.
+    """
+
+    ratio: float = 0.85
+    angle: float = 0.9
+    own_spread: float = 0.25
+    error_px: float = 6.0
+    images: int = 16
+    points: int = 5
+    inliers: int = 3
+    agreeing: int = 2
+    trials: int = 2000
+    bottom: float = 0.15
+
+
+def point_motions(
+    points: MapPoints,
+    states: Sequence[ObjectState],
+    found: Sequence[FoundObject],
+    features: Sequence[ImageFeatures],
+    poses: Poses,
+    tracks: Tracks,
+    up: Array | None,
+    options: MotionOptions | None = None,
+) -> list[dict[int, PointMotion]]:
+    """Find the motions of map objects by their points.
+
+    Args:
+        points: of the map. states, found: objects of the map and of the recording.
+        features: of images of the recording, native pixels. poses: in the world of the map.
+        tracks: boxes of the found objects, native pixels.
+        up: (3,) unit vector against gravity in the map; None: unknown.
+    Returns:
+        for each found object, the motions of map objects onto it, by their number.
+    """
+    options = options or MotionOptions()
+    search = _Search(points, states, up, options)
+    motions: list[dict[int, PointMotion]] = [{} for _ in found]
+    if not search.usable:
+        return motions
+    views = _views(found, features, poses, tracks, options)
+    matches: dict[tuple[int, int], list[_View]] = {}
+    for image, boxes in views:
+        for k, j, view in search.match(image, boxes, poses):
+            matches.setdefault((k, j), []).append(view)
+    for (k, j), of_pair in sorted(matches.items()):
+        motion = _motion(states[k], found[j], of_pair, poses.camera, options)
+        if motion is not None:
+            motions[j][states[k].id] = motion
+    return motions
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _View:
+    """Matches of one map object in the box of a found object.
+
+    Attributes:
+        pose: (3, 4) cam_from_map. xy: (n, 2) native pixels. point: (n,) rows of the map's points;
+        xyz: (n, 3). still: (n,) bool: it agrees with the old place. above: (n,) bool: not near the
+            lower end of the object.
+    """
+
+    pose: Array
+    xy: Array
+    point: IntArray
+    xyz: Array
+    still: BoolArray
+    above: BoolArray
+
+
+# ---- Matches -----------------------------------------------------------------------------------
+
+
+def _views(
+    found: Sequence[FoundObject],
+    features: Sequence[ImageFeatures],
+    poses: Poses,
+    tracks: Tracks,
+    options: MotionOptions,
+) -> list[tuple[ImageFeatures, list[tuple[int, Array]]]]:
+    """Choose the images of each found object; return images with the (row, box) of objects."""
+    usable = [f for f in features if poses.measured[f.row] and poses.part[f.row] == 0]
+    image_of = {int(poses.frame[f.row]): k for k, f in enumerate(usable)}
+    chosen: dict[int, list[tuple[int, Array]]] = {}
+    for j, o in enumerate(found):
+        rows = np.flatnonzero(tracks.track_id == o.id)
+        rows = rows[[int(frame) in image_of for frame in tracks.frame[rows]]] if len(rows) else rows
+        area = np.prod(tracks.xyxy[rows, 2:] - tracks.xyxy[rows, :2], axis=1)
+        for row in rows[np.argsort(-area, kind="stable")[: options.images]].tolist():
+            image = image_of[int(tracks.frame[row])]
+            chosen.setdefault(image, []).append((j, tracks.xyxy[row]))
+    return [(usable[k], chosen[k]) for k in sorted(chosen)]
+
+
+class _Search:
+    """Matches keypoints to the points of each map object.
+
+    Attributes:
+        usable: rows of map objects with enough points.
+    """
+
+    def __init__(
+        self,
+        points: MapPoints,
+        states: Sequence[ObjectState],
+        up: Array | None,
+        options: MotionOptions,
+    ) -> None:
+        self.options = options
+        row_of = {s.id: k for k, s in enumerate(states)}
+        owner = np.array([row_of.get(int(i), -1) for i in points.object_id], np.int64)
+        order = np.argsort(owner, kind="stable")
+        self.points = points[order]
+        self.owner = owner[order]
+        self.descriptor = unit_descriptors(self.points.descriptor)
+        shapes = shapes_of(states)
+        # an object that moved has points at its earlier places too: they are of no use
+        inside = _scaled_radius(self.points.xyz, self.owner, shapes) < 1.1**2
+        self.above = _above_bottom(self.points.xyz, self.owner, shapes, up, options.bottom)
+        self.own = [np.flatnonzero((self.owner == k) & inside) for k in range(len(states))]
+        self.usable = [k for k, rows in enumerate(self.own) if len(rows) >= options.points]
+        names = [set(s.classes) for s in states]
+        self.group, self.first = np.unique(self.owner, return_index=True)
+        self.rivals = np.array(
+            [[g < 0 or not names[k] & names[g] for g in self.group] for k in range(len(states))]
+        ).reshape(len(states), len(self.group))  # fmt: skip
+        self.apart = options.own_spread * np.array([s.half_axes.max() for s in states])
+
+    def match(
+        self, image: ImageFeatures, boxes: Sequence[tuple[int, Array]], poses: Poses
+    ) -> list[tuple[int, int, _View]]:
+        """Match the keypoints in the boxes of an image.
+
+        Args:
+            boxes: row of a found object and its box (4,).
+        Returns:
+            row of the map object, row of the found object, matches.
+        """
+        options = self.options
+        corners = np.array([box for _, box in boxes])  # (B, 4)
+        xy = image.xy[None]
+        above = xy >= corners[:, None, :2]  # (B, n, 2)
+        in_box = np.asarray((above & (xy <= corners[:, None, 2:])).all(2), bool)  # (B, n)
+        chosen = np.flatnonzero(in_box.any(0))
+        in_box = in_box[:, chosen]
+        xy = np.asarray(image.xy[chosen], np.float64)
+        if not len(chosen):
+            return []
+        cosine = unit_descriptors(image.descriptor[chosen]) @ self.descriptor.T  # (n, N)
+        best_of_group = np.maximum.reduceat(cosine, self.first, axis=1)  # (n, G)
+        pose = poses.cam_from_world[image.row]
+        views = []
+        for k in self.usable:
+            rival = np.where(self.rivals[k], best_of_group, -1.0).max(1)
+            feature, point = self._of_object(k, cosine, rival)
+            if len(feature) < options.inliers:
+                continue
+            xyz = self.points.xyz[point]
+            error = _errors(xyz, xy[feature], pose, poses.camera)
+            still = error < _limit(poses.camera, options)
+            for b, (j, _) in enumerate(boxes):
+                here = in_box[b, feature]
+                if here.sum() >= options.inliers:
+                    views.append((k, j, _View(
+                        pose, xy[feature[here]], point[here], xyz[here], still[here],
+                        self.above[point[here]],
+                    )))  # fmt: skip
+        return views
+
+    def _of_object(self, k: int, cosine: Floats, rival: Floats) -> tuple[IntArray, IntArray]:
+        """Match features to the points of a map object; each point keeps its best feature.
+
+        Args:
+            rival: (n,) best cosine of the points of others.
+        """
+        rows = self.own[k]
+        own = cosine[:, rows]
+        best = own.argmax(1)
+        value = own[np.arange(len(own)), best]
+        xyz = self.points.xyz[rows]
+        apart = np.linalg.norm(xyz[:, None] - xyz[None], axis=2) > self.apart[k]
+        rival = np.maximum(rival, np.where(apart[best], own, -1.0).max(1))
+        angle = np.arccos(value.clip(-1, 1))
+        other = np.arccos(rival.clip(-1, 1))
+        good = np.flatnonzero((angle < self.options.ratio * other) & (angle < self.options.angle))
+        nearest = good[np.argsort(angle[good], kind="stable")]
+        _, first = np.unique(best[nearest], return_index=True)
+        feature = np.sort(nearest[first])
+        return feature, rows[best[feature]]
+
+
+def _scaled_radius(xyz: Array, owner: IntArray, shapes: quadrics.Ellipsoids) -> Array:
+    """Return squared distances (N,) in half axes of the owner; infinite without an owner."""
+    radius = np.full(len(xyz), np.inf)
+    rows = np.flatnonzero(owner >= 0)
+    k = owner[rows]
+    offset = xyz[rows] - shapes.center_in_world[k]
+    scaled = np.einsum("ni,nij->nj", offset, shapes.world_from_obj[k]) / shapes.half_axes[k]
+    radius[rows] = (scaled**2).sum(1)
+    return radius
+
+
+def _above_bottom(
+    xyz: Array, owner: IntArray, shapes: quadrics.Ellipsoids, up: Array | None, share: float
+) -> BoolArray:
+    """Mark points (N,) that are above a share of the height of their object; all without `up`."""
+    above = np.ones(len(xyz), bool)
+    if up is None:
+        return above
+    rows = np.flatnonzero(owner >= 0)
+    k = owner[rows]
+    height = (xyz[rows] - shapes.center_in_world[k]) @ up
+    axes = np.einsum("i,nij->nj", up, shapes.world_from_obj) * shapes.half_axes
+    half = np.linalg.norm(axes, axis=1)[k]  # of the ellipsoid along `up`
+    above[rows] = height > (2 * share - 1) * half
+    return above
+
+
+def _errors(xyz: Array, xy: Array, cam_from_map: Array, camera: Camera) -> Array:
+    """Return reprojection errors (n,) in native pixels; infinite behind the camera."""
+    in_cam = xyz @ cam_from_map[:, :3].T + cam_from_map[:, 3]
+    error = np.full(len(xyz), np.inf)
+    front = in_cam[:, 2] > 0
+    projected = np.asarray(camera.to_pycolmap().img_from_cam(in_cam[front]), np.float64)
+    error[front] = np.linalg.norm(projected.reshape(-1, 2) - xy[front], axis=1)
+    return np.asarray(np.nan_to_num(error, nan=np.inf))
+
+
+def _limit(camera: Camera, options: MotionOptions) -> float:
+    """Return the largest error of an inlier in native pixels."""
+    return options.error_px * max(max(camera.width, camera.height) / 640, 1.0)
+
+
+# ---- Motion ------------------------------------------------------------------------------------
+
+
+def _motion(
+    state: ObjectState,
+    found: FoundObject,
+    views: Sequence[_View],
+    camera: Camera,
+    options: MotionOptions,
+) -> PointMotion | None:
+    """Return the motion of a map object that most points follow; None: no images agree."""
+    still = _stayed(state, found, views, camera, options)
+    moved = _moved(state, found, views, camera, options)
+    if still is None or moved is None:
+        return still or moved
+    return max(still, moved, key=lambda m: m.inliers)
+
+
+def _stayed(
+    state: ObjectState,
+    found: FoundObject,
+    views: Sequence[_View],
+    camera: Camera,
+    options: MotionOptions,
+) -> PointMotion | None:
+    """Count the points of an object that are where they were."""
+    of_view = [v.point[v.still & v.above] for v in views]
+    of_view = [rows for rows in of_view if len(rows) >= options.inliers]
+    if len(of_view) < options.agreeing or not _coincide(state.center, state, found):
+        return None
+    count = len(np.unique(np.concatenate(of_view)))
+    if count < options.points:
+        return None
+    camera_at = np.array([-v.pose[:, :3].T @ v.pose[:, 3] for v in views])
+    distance = float(np.median(np.linalg.norm(camera_at - state.center, axis=1)))
+    # a smaller displacement is not told from none: uniform within the limit of the error
+    sigma = _limit(camera, options) / camera.K[0, 0] * distance / np.sqrt(3)
+    return PointMotion(
+        count, len(of_view), np.eye(3, 4), np.zeros(3), float(sigma) ** 2 * np.eye(3)
+    )
+
+
+def _moved(
+    state: ObjectState,
+    found: FoundObject,
+    views: Sequence[_View],
+    camera: Camera,
+    options: MotionOptions,
+) -> PointMotion | None:
+    """Find the motion of the points that are not where they were, from all images at once.
+
+    The images are a rig of cameras with known poses in the map: its pose relative to the points at
+    their old place is the motion.
+    """
+    pc = import_pycolmap()
+    kept = [view for view in views if (~view.still).sum() >= options.inliers]
+    if len(kept) < options.agreeing:
+        return None
+    moving = [~view.still for view in kept]
+    image = np.repeat(np.arange(len(kept)), [int(m.sum()) for m in moving])  # (n,)
+    point = np.concatenate([v.point[m] for v, m in zip(kept, moving, strict=True)])
+    if len(np.unique(point)) < options.points:
+        return None
+    xyz = np.concatenate([v.xyz[m] for v, m in zip(kept, moving, strict=True)])
+    xy = np.concatenate([v.xy[m] for v, m in zip(kept, moving, strict=True)])
+    ransac = {"max_error": _limit(camera, options), "random_seed": 0,
+              "max_num_trials": options.trials}  # fmt: skip
+    estimate = pc.estimate_and_refine_generalized_absolute_pose(
+        xy, xyz - state.center, image,
+        [pc.Rigid3d(v.pose) for v in kept], [camera.to_pycolmap()] * len(kept),
+        estimation_options=ransac, return_covariance=True,
+    )  # fmt: skip
+    if estimate is None:
+        return None
+    motion = np.array(estimate["rig_from_world"].matrix(), np.float64)  # about the object's centre
+    moved = motion[:, 3].copy()
+    motion[:, 3] -= motion[:, :3] @ state.center
+    if not np.isfinite(motion).all() or not _coincide(moved, state, found):
+        return None
+    inlier = np.asarray(estimate["inlier_mask"], bool)
+    agrees = np.bincount(image[inlier], minlength=len(kept)) >= options.inliers  # (L,)
+    count = len(np.unique(point[inlier & agrees[image]]))
+    if agrees.sum() < options.agreeing or count < options.points:
+        return None
+    error = np.concatenate([
+        _errors(v.xyz[m], v.xy[m], _composed(v.pose, motion), camera)
+        for v, m in zip(kept, moving, strict=True)
+    ])  # fmt: skip
+    variance = float((error[inlier] ** 2).mean() / 2)  # of a coordinate, px^2
+    # the error of a point of the map is common to all images of it
+    repeated = float(inlier.sum() / len(np.unique(point[inlier])))
+    cov = np.asarray(estimate["covariance"], np.float64)[3:, 3:] * variance * repeated
+    return PointMotion(count, int(agrees.sum()), motion, moved - state.center, cov)
+
+
+def _composed(cam_from_map: Array, motion: Array) -> Array:
+    """Return the pose (3, 4) of a camera relative to the map before a motion (3, 4)."""
+    turn = cam_from_map[:, :3] @ motion[:, :3]
+    return np.column_stack([turn, cam_from_map[:, :3] @ motion[:, 3] + cam_from_map[:, 3]])
+
+
+def _coincide(center: Array, state: ObjectState, found: FoundObject) -> bool:
+    """Return whether a map object with its centre there is the found object, not one beside it.
+
+    The centres are nearer than the largest half axis of the smaller object; uncertainty at most
+    doubles it. (The points of a cup on a table are in the box of the table.)
+    """
+    offset = center - found.center
+    distance = float(np.linalg.norm(offset))
+    reach = min(float(state.half_axes.max()), float(found.half_axes.max()))
+    along = offset / max(distance, 1e-9)
+    variance = float(along @ (found.cov[:3, :3] + state.cov[:3, :3]) @ along)
+    sigma = np.sqrt(max(variance, 0.0)) if np.isfinite(variance) else 0.0
+    return bool(distance < reach + min(2 * sigma, reach))

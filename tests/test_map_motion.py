@@ -1,0 +1,284 @@
+"""Motion of map objects by their points: moved, stayed, identical, on a table, replaced."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from map_worlds import CAMERA, a_map, observed, true_shape
+from scipy.spatial.transform import Rotation
+
+import quadrics
+from reobj.cameras import Poses
+from reobj.maps.compare import FoundObject, PointMotion
+from reobj.maps.fusion import ObjectState, object_state
+from reobj.maps.motion import point_motions
+from reobj.maps.placement import ImageFeatures
+from reobj.maps.room_map import MapPoints
+from reobj.maps.update import Recording, _displacement, _with_motions
+from reobj.types import Array, Tracks
+
+HALF = np.array([0.15, 0.12, 0.2])
+PLACE = np.array([0.6, 3.0, 0.9])
+ELSEWHERE = np.array([-0.7, 3.0, 0.9])
+LAMP = np.array([1.2, 3.4, 0.9])
+TURN = Rotation.from_euler("z", 35, degrees=True).as_matrix()
+X = np.array([1.0, 0, 0])
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def descriptors(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Random descriptors of the norm of RootSIFT."""
+    values = rng.gamma(0.3, size=(count, 128))
+    return np.minimum(512 * np.sqrt(values / values.sum(1, keepdims=True)), 255).astype(np.uint8)
+
+
+def surface(rng: np.random.Generator, count: int) -> Array:
+    """Points (count, 3) of an ellipsoid about the origin, not below three quarters of its depth."""
+    ray = rng.normal(size=(count, 3))
+    ray[:, 2] = np.abs(ray[:, 2]) - 0.3
+    return ray / np.linalg.norm(ray, axis=1, keepdims=True) * HALF
+
+
+def poses(count: int = 8) -> Poses:
+    """Cameras 1.3 m high on an arc, looking along y."""
+    cams = []
+    for a in np.linspace(-0.35, 0.35, count):
+        forward = np.array([np.sin(a), np.cos(a), -0.12])
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, UP)
+        right /= np.linalg.norm(right)
+        rotation = np.stack([right, np.cross(forward, right), forward])
+        cams.append(np.column_stack([rotation, -rotation @ [-1.5 * np.sin(a), 0, 1.3]]))
+    known = {name: np.full(count, value) for name, value in (("measured", True), ("known", True))}
+    return SimpleNamespace(  # type: ignore[return-value]
+        camera=CAMERA, cam_from_world=np.array(cams), frame=10 * np.arange(count),
+        part=np.zeros(count, np.int64), **known,
+    )  # fmt: skip
+
+
+class World:
+    """A room with a background, and objects that are put somewhere and seen by eight cameras.
+
+    Attributes:
+        points: of the map. states: its objects. seen: (position now, descriptor) of what is there.
+    """
+
+    def __init__(self, seed: int = 0) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.poses = poses()
+        wall = self.rng.uniform([-3, 5, 0], [3, 6, 2.5], (300, 3))
+        self.xyz, self.code = [wall], [descriptors(self.rng, 300)]
+        self.owner = [np.zeros(300, np.int64)]
+        self.seen = [(wall, self.code[0])]
+        self.states: list[ObjectState] = []
+        self.found: list[FoundObject] = []
+
+    def add(
+        self, name: str, center: Array, code: np.ndarray | None = None, half: Array = HALF
+    ) -> tuple[Array, np.ndarray]:
+        """Add an object with 40 points to the map; return them, about its centre."""
+        shape = true_shape(center=center, half_axes=half, yaw_deg=0)
+        room = a_map([[observed(1, "new", shape, classes={name: 9.0})]])
+        number = len(self.states) + 1
+        self.states.append(dataclasses.replace(object_state(room.objects[0], room), id=number))
+        points = surface(np.random.default_rng(5), 40) * half / HALF
+        code = descriptors(self.rng, 40) if code is None else code
+        self.tag(number, points + center, code)
+        return points, code
+
+    def tag(self, number: int, xyz: Array, code: np.ndarray) -> None:
+        """Add points of the map that are tagged with an object."""
+        self.xyz.append(xyz)
+        self.code.append(code)
+        self.owner.append(np.full(len(xyz), number))
+
+    def put(self, points: Array, code: np.ndarray, center: Array, turn: Array = TURN) -> None:
+        """Let the recording show points about a centre."""
+        self.seen.append((points @ turn.T + center, code))
+
+    def find(self, name: str, center: Array, half: Array = HALF) -> FoundObject:
+        """Add a found object with its centre 2 cm off."""
+        none = np.empty(0, np.float32)
+        self.found.append(FoundObject(
+            101 + len(self.found), {name: 9.0}, "box", center + 0.02 * X, half,
+            np.array([1.0, 0, 0, 0]), np.diag([3e-4] * 3 + [0.01] * 6), none, none, 9, 0.9, {},
+        ))  # fmt: skip
+        return self.found[-1]
+
+    @property
+    def points(self) -> MapPoints:
+        xyz, owner = np.concatenate(self.xyz), np.concatenate(self.owner)
+        ray = xyz - [0, 0, 1.3]
+        distance = np.linalg.norm(ray, axis=1)
+        return MapPoints(
+            xyz, np.concatenate(self.code), np.ones(len(xyz), np.int64), owner,
+            ray / distance[:, None], distance,
+        )  # fmt: skip
+
+    def features(self) -> list[ImageFeatures]:
+        """Keypoints with .5 px of noise and 40 wrong ones in each image."""
+        xyz = np.concatenate([p for p, _ in self.seen])
+        code = np.concatenate([c for _, c in self.seen])
+        images = []
+        for row, cam in enumerate(self.poses.cam_from_world):
+            xy = self.project(xyz, cam) + self.rng.normal(0, 0.5, (len(xyz), 2))
+            inside = ((xy > 0) & (xy < (640, 480))).all(1)
+            xy = np.concatenate([xy[inside], self.rng.uniform(0, 480, (40, 2))])
+            noisy = (code[inside] + self.rng.normal(0, 5, (inside.sum(), 128))).clip(0, 255)
+            of_all = np.concatenate([noisy.astype(np.uint8), descriptors(self.rng, 40)])
+            images.append(ImageFeatures(row, xy, of_all))
+        return images
+
+    @staticmethod
+    def project(xyz: Array, cam: Array) -> Array:
+        in_cam = xyz @ cam[:, :3].T + cam[:, 3]
+        return np.asarray((in_cam @ CAMERA.K.T)[:, :2] / in_cam[:, 2:])
+
+    def tracks(self) -> Tracks:
+        """Boxes of the found objects, as those of their shapes."""
+        rows: list[Any] = []
+        for o in self.found:
+            shape = quadrics.Ellipsoids(o.center[None], 1.1 * o.half_axes[None], np.eye(3)[None])
+            for row, cam in enumerate(self.poses.cam_from_world):
+                box = quadrics.solid_boxes(shape, "box", (CAMERA.K @ cam)[None])[0, 0]
+                rows.append([self.poses.frame[row], o.id, *box])
+        table = np.array(rows)
+        ids = table[:, 1].astype(np.int64)
+        frame = table[:, 0].astype(np.int64)
+        return Tracks(frame, ids, ids, table[:, 2:], np.ones(len(ids)), ids * 0, ids * 0 - 1)
+
+    def motions(self, images: Sequence[int] = range(8)) -> list[dict[int, PointMotion]]:
+        features = [f for f in self.features() if f.row in images]
+        return point_motions(
+            self.points, self.states, self.found, features, self.poses, self.tracks(), UP
+        )
+
+
+def moved_world() -> World:
+    """An object that moved by 1.3 m and turned by 35 degrees, and one that stayed."""
+    world = World()
+    points, code = world.add("radio", PLACE)
+    still, other = world.add("lamp", LAMP)
+    world.put(points, code, ELSEWHERE)
+    world.put(still, other, LAMP, np.eye(3))
+    world.find("radio", ELSEWHERE)
+    world.find("lamp", LAMP)
+    return world
+
+
+def test_points_of_a_moved_object_give_its_motion_and_those_of_another_that_it_stayed() -> None:
+    radio, lamp = moved_world().motions()
+    assert set(radio) == {1} and set(lamp) == {2}
+    motion = radio[1]
+    assert motion.inliers >= 30 and motion.images == 8
+    assert motion.shift == pytest.approx(ELSEWHERE - PLACE, abs=0.01)
+    assert np.allclose(motion.new_from_old[:, :3], TURN, atol=0.03)
+    error = motion.shift - (ELSEWHERE - PLACE)
+    assert error @ np.linalg.solve(motion.cov, error) < 25
+    assert lamp[2].inliers >= 20 and not lamp[2].shift.any()
+    assert 0.005 < np.sqrt(lamp[2].cov[0, 0]) < 0.05  # 6 px at 3 m: 3.6 cm
+
+
+def test_one_image_is_too_few() -> None:
+    assert moved_world().motions([3]) == [{}, {}]
+    assert set(moved_world().motions([2, 5])[0]) == {1}
+
+
+def test_an_object_with_few_points_has_no_motion() -> None:
+    world = moved_world()
+    world.xyz[1], world.code[1], world.owner[1] = (
+        table[1][:4] for table in (world.xyz, world.code, world.owner)
+    )
+    assert world.motions()[0] == {}
+
+
+def test_table_points_at_the_foot_are_no_evidence_for_what_replaced_the_object() -> None:
+    """Points of the table lie inside the enlarged ellipsoid of the object and are tagged too."""
+    world = World()
+    world.add("radio", PLACE)
+    foot = PLACE + np.column_stack(
+        [world.rng.uniform(-0.05, 0.05, (12, 2)), np.full(12, -1.02 * HALF[2])]
+    )
+    code = descriptors(world.rng, 12)
+    world.tag(1, foot, code)
+    world.seen.append((foot, code))
+    world.put(surface(world.rng, 40), descriptors(world.rng, 40), PLACE)  # another radio
+    world.find("radio", PLACE)
+    assert world.motions() == [{}]
+
+
+def test_table_points_do_not_hide_a_short_move_of_the_object_on_it() -> None:
+    world = World()
+    points, code = world.add("radio", PLACE)
+    foot = PLACE + np.column_stack(
+        [world.rng.uniform(-0.05, 0.05, (30, 2)), np.full(30, -1.02 * HALF[2])]
+    )
+    world.tag(1, foot, descriptors(world.rng, 30))
+    world.seen.append((foot, world.code[-1]))
+    world.put(points, code, PLACE + 0.25 * X)
+    world.find("radio", PLACE + 0.25 * X)
+    assert world.motions()[0][1].shift == pytest.approx([0.25, 0, 0], abs=0.01)
+
+
+def test_what_stands_on_a_moved_table_is_not_the_table() -> None:
+    """The box of the table shows the points of the radio on it."""
+    world = World()
+    points, code = world.add("radio", PLACE)
+    world.put(points, code, ELSEWHERE)
+    table = np.array([0.7, 0.5, 0.45])
+    world.find("table", ELSEWHERE - [0, 0, table[2]], table)
+    assert world.motions() == [{}]
+    world.find("radio", ELSEWHERE)
+    assert [set(m) for m in world.motions()] == [set(), {1}]
+
+
+@pytest.mark.parametrize(("other", "known"), [("radio", {1, 2}), ("lamp", set())])
+def test_identical_instances_do_not_compete_and_objects_of_other_classes_do(
+    other: str, known: set[int]
+) -> None:
+    world = World()
+    points, code = world.add("radio", PLACE)
+    world.add(other, LAMP, code)
+    world.put(points, code, ELSEWHERE)
+    world.find("radio", ELSEWHERE)
+    assert set(world.motions()[0]) == known
+
+
+def test_an_object_that_had_moved_before_is_matched_by_the_points_at_its_last_place() -> None:
+    world = World()
+    points, code = world.add("radio", PLACE)
+    world.tag(1, points + PLACE + [-1.6, 0.5, 0], code)  # before
+    world.put(points, code, ELSEWHERE)
+    world.find("radio", ELSEWHERE)
+    motion = world.motions()[0][1]
+    assert motion.shift == pytest.approx(ELSEWHERE - PLACE, abs=0.01)
+
+
+def test_a_recording_is_compared_with_the_points_of_the_other_sessions() -> None:
+    """Run again, its points of the first time are not those of the object at its place before."""
+    world = moved_world()
+    room = dataclasses.replace(a_map([[observed(1, "new", true_shape())]]), points=world.points)
+    result: Any = SimpleNamespace(poses=world.poses, tracks=world.tracks())
+    recording: Any = SimpleNamespace(features=tuple(world.features()), fingerprint="another")
+    found = _with_motions(world.found, world.states, result, room, recording)
+    assert set(found[0].motion_of) == {1}
+    recording.fingerprint = room.sessions[0].fingerprint
+    assert [o.motion_of for o in _with_motions(world.found, world.states, result, room, recording)
+            ] == [{}, {}]  # fmt: skip
+    assert Recording.__dataclass_fields__["features"].default == ()
+
+
+def test_the_displacement_is_that_of_the_points() -> None:
+    world = moved_world()
+    state, found = world.states[0], world.found[0]
+    known = PointMotion(9, 4, np.eye(3, 4), np.array([0, 0.3, 0.4]), np.diag([1, 4e-4, 4e-4]))
+    measured = dataclasses.replace(found, motion_of={1: known})
+    assert _displacement(state, measured, np.zeros((7, 7)), 2.0) == pytest.approx((1.0, 0.04))
+    few = dataclasses.replace(found, motion_of={1: dataclasses.replace(known, inliers=5)})
+    between = 2 * np.linalg.norm(found.center - state.center)
+    assert _displacement(state, few, np.zeros((7, 7)), 2.0)[0] == pytest.approx(between)
