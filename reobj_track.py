@@ -110,6 +110,7 @@ from reobj.poses.stage import (
 from reobj.poses.supplied.imageless import open_video
 from reobj.poses.supplied.interpretation import PoseReading
 from reobj.poses.supplied.readers import read_poses
+from reobj.results.changes import Change, Changes
 from reobj.results.checkpoint import Checkpoint
 from reobj.results.edits import kept_edits, read_edits
 from reobj.results.evaluation import evaluate, score_report
@@ -172,13 +173,14 @@ from reobj.types import (
 )
 
 __all__ = [
-    "COCO_NAMES", "Camera", "Config", "CropEmbedder", "DetectConfig", "DetectionSource",
-    "Detections", "EmbedConfig", "Embedder", "Embeddings", "Frame", "InputConfig", "LinkEvent",
-    "MatchingOptions", "Object", "ObjectsConfig", "OnnxDetector", "OutputConfig", "Part", "Poses",
-    "PosesConfig", "ReobjError", "Result", "RoomMap", "SamplingLayout", "Tracker", "TrackerConfig",
-    "Tracks", "Video", "World", "__version__", "estimate_poses", "evaluate", "export",
-    "list_models", "main", "model_path", "open_detections", "read_detections", "read_poses",
-    "read_tracks", "refit", "run", "track", "write_detections_npz",
+    "COCO_NAMES", "Camera", "Change", "Changes", "Config", "CropEmbedder", "DetectConfig",
+    "DetectionSource", "Detections", "EmbedConfig", "Embedder", "Embeddings", "Frame",
+    "InputConfig", "LinkEvent", "MapConfig", "MatchingOptions", "Object", "ObjectsConfig",
+    "OnnxDetector", "OutputConfig", "Part", "Poses", "PosesConfig", "ReobjError", "Result",
+    "RoomMap", "SamplingLayout", "Tracker", "TrackerConfig", "Tracks", "Video", "World",
+    "__version__", "estimate_poses", "evaluate", "export", "list_models", "main", "model_path",
+    "open_detections", "read_detections", "read_poses", "read_tracks", "refit", "run", "track",
+    "write_detections_npz",
 ]  # fmt: skip
 
 # ---- Configuration -----------------------------------------------------------------------------
@@ -1220,6 +1222,8 @@ def run(
     *,
     detections: str | Path | Callable[[Image], Any] | None = None,
     tracks: str | Path | None = None,
+    map: str | Path | None = None,
+    map_frozen: bool = False,
     in_3d: bool = True,
     overwrite: bool = False,
     show: bool = False,
@@ -1233,13 +1237,16 @@ def run(
         detections: file of recorded detections, or a callable image -> detections; default:
             config.detect.model.
         tracks: file of identities, instead of detector, tracker and linker.
+        map: map of the room, in which objects keep their numbers over several recordings; it is
+            made if it does not exist. map_frozen: do not change the file. They replace config.map.
         in_3d: False for 2D identities only. show: show progress in rerun's viewer.
     Returns:
-        Result; if the reconstruction fails, it has a warning and no cameras and ellipsoids.
+        Result; if the reconstruction fails, it has a warning and no cameras and ellipsoids. With a
+        map, `Result.changes` is what changed in the room.
     Raises:
         ReobjError: invalid input; the message says what to do.
     """
-    config = config or Config()
+    config = _with_map(config or Config(), map, map_frozen)
     if config.threads:
         cv2.setNumThreads(config.threads)
     _check_objects(config.objects)
@@ -1288,6 +1295,8 @@ def refit(
 ) -> Result:
     """Link and fit the tracks of an output folder again, by default with its last options.
 
+    The map of the room is one of these options.
+
     Args:
         tracks: file of identities that replace the tracks.
         edits: file of corrections that replace those of the folder.
@@ -1311,6 +1320,15 @@ def refit(
         )
         with opened_map(config.map) as room:
             return _finish(_Job(video, workspace, config), result, room)
+
+
+def _with_map(config: Config, path: str | Path | None, frozen: bool) -> Config:
+    """Return the options with the map that the arguments of `run` give, if they give one."""
+    if path is None and not frozen:
+        return config
+    return dataclasses.replace(
+        config, map=MapConfig(config.map.path if path is None else str(path), frozen)
+    )
 
 
 def _last_config(out: str | Path) -> Config:
