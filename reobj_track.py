@@ -100,6 +100,7 @@ from reobj.options import (
     write_config,
 )
 from reobj.poses.estimate import PosesConfig, estimate_poses
+from reobj.poses.intrinsics import parse_camera
 from reobj.poses.stage import (
     poses_key,
     reconstruct_cached,
@@ -1273,7 +1274,7 @@ def run(
         elif in_3d and not video.is_live:
             poses, models = _reconstructed_cameras(job, boxes, class_names)
         placed = None
-        if room is not None and poses is not None and poses.known.any():
+        if room is not None and poses is not None and (poses.known.any() or room.room.sessions):
             placed, models = _place(job, room, poses, models)
             poses = placed.poses
         if not tracks:
@@ -1503,7 +1504,8 @@ def _given_tracks(
 def _place(job: _Job, room: OpenMap, poses: Poses, models: list[Path]) -> tuple[Placed, list[Path]]:
     """Place the cameras, and their COLMAP models, in the world of the map."""
     with job.timed("map"):
-        placed = place_recording(room, poses, job.video, progress=job.progress)
+        camera = parse_camera(job.config.poses.camera, job.video.size)
+        placed = place_recording(room, poses, job.video, progress=job.progress, camera=camera)
         folder = job.workspace.path("placed", job.video.fingerprint).with_suffix(".sparse")
         return placed, move_models(models, poses, placed, lambda k: part_path(folder, k))
 
