@@ -100,6 +100,7 @@ from reobj.options import (
     write_config,
 )
 from reobj.poses.estimate import PosesConfig, estimate_poses
+from reobj.poses.intrinsics import parse_camera
 from reobj.poses.stage import (
     poses_key,
     reconstruct_cached,
@@ -110,6 +111,7 @@ from reobj.poses.stage import (
 from reobj.poses.supplied.imageless import open_video
 from reobj.poses.supplied.interpretation import PoseReading
 from reobj.poses.supplied.readers import read_poses
+from reobj.results.changes import Change, Changes
 from reobj.results.checkpoint import Checkpoint
 from reobj.results.edits import kept_edits, read_edits
 from reobj.results.evaluation import evaluate, score_report
@@ -172,13 +174,14 @@ from reobj.types import (
 )
 
 __all__ = [
-    "COCO_NAMES", "Camera", "Config", "CropEmbedder", "DetectConfig", "DetectionSource",
-    "Detections", "EmbedConfig", "Embedder", "Embeddings", "Frame", "InputConfig", "LinkEvent",
-    "MatchingOptions", "Object", "ObjectsConfig", "OnnxDetector", "OutputConfig", "Part", "Poses",
-    "PosesConfig", "ReobjError", "Result", "RoomMap", "SamplingLayout", "Tracker", "TrackerConfig",
-    "Tracks", "Video", "World", "__version__", "estimate_poses", "evaluate", "export",
-    "list_models", "main", "model_path", "open_detections", "read_detections", "read_poses",
-    "read_tracks", "refit", "run", "track", "write_detections_npz",
+    "COCO_NAMES", "Camera", "Change", "Changes", "Config", "CropEmbedder", "DetectConfig",
+    "DetectionSource", "Detections", "EmbedConfig", "Embedder", "Embeddings", "Frame",
+    "InputConfig", "LinkEvent", "MapConfig", "MatchingOptions", "Object", "ObjectsConfig",
+    "OnnxDetector", "OutputConfig", "Part", "Poses", "PosesConfig", "ReobjError", "Result",
+    "RoomMap", "SamplingLayout", "Tracker", "TrackerConfig", "Tracks", "Video", "World",
+    "__version__", "estimate_poses", "evaluate", "export", "list_models", "main", "model_path",
+    "open_detections", "read_detections", "read_poses", "read_tracks", "refit", "run", "track",
+    "write_detections_npz",
 ]  # fmt: skip
 
 # ---- Configuration -----------------------------------------------------------------------------
@@ -1220,6 +1223,8 @@ def run(
     *,
     detections: str | Path | Callable[[Image], Any] | None = None,
     tracks: str | Path | None = None,
+    map: str | Path | None = None,
+    map_frozen: bool = False,
     in_3d: bool = True,
     overwrite: bool = False,
     show: bool = False,
@@ -1233,13 +1238,16 @@ def run(
         detections: file of recorded detections, or a callable image -> detections; default:
             config.detect.model.
         tracks: file of identities, instead of detector, tracker and linker.
+        map: map of the room, in which objects keep their numbers over several recordings; it is
+            made if it does not exist. map_frozen: do not change the file. They replace config.map.
         in_3d: False for 2D identities only. show: show progress in rerun's viewer.
     Returns:
-        Result; if the reconstruction fails, it has a warning and no cameras and ellipsoids.
+        Result; if the reconstruction fails, it has a warning and no cameras and ellipsoids. With a
+        map, `Result.changes` is what changed in the room.
     Raises:
         ReobjError: invalid input; the message says what to do.
     """
-    config = config or Config()
+    config = _with_map(config or Config(), map, map_frozen)
     if config.threads:
         cv2.setNumThreads(config.threads)
     _check_objects(config.objects)
@@ -1266,7 +1274,7 @@ def run(
         elif in_3d and not video.is_live:
             poses, models = _reconstructed_cameras(job, boxes, class_names)
         placed = None
-        if room is not None and poses is not None and poses.known.any():
+        if room is not None and poses is not None and (poses.known.any() or room.room.sessions):
             placed, models = _place(job, room, poses, models)
             poses = placed.poses
         if not tracks:
@@ -1287,6 +1295,8 @@ def refit(
     edits: str | Path | None = None,
 ) -> Result:
     """Link and fit the tracks of an output folder again, by default with its last options.
+
+    The map of the room is one of these options.
 
     Args:
         tracks: file of identities that replace the tracks.
@@ -1311,6 +1321,15 @@ def refit(
         )
         with opened_map(config.map, must_exist=True) as room:
             return _finish(_Job(video, workspace, config), result, room)
+
+
+def _with_map(config: Config, path: str | Path | None, frozen: bool) -> Config:
+    """Return the options with the map that the arguments of `run` give, if they give one."""
+    if path is None and not frozen:
+        return config
+    return dataclasses.replace(
+        config, map=MapConfig(config.map.path if path is None else str(path), frozen)
+    )
 
 
 def _last_config(out: str | Path) -> Config:
@@ -1485,7 +1504,8 @@ def _given_tracks(
 def _place(job: _Job, room: OpenMap, poses: Poses, models: list[Path]) -> tuple[Placed, list[Path]]:
     """Place the cameras, and their COLMAP models, in the world of the map."""
     with job.timed("map"):
-        placed = place_recording(room, poses, job.video, progress=job.progress)
+        camera = parse_camera(job.config.poses.camera, job.video.size)
+        placed = place_recording(room, poses, job.video, progress=job.progress, camera=camera)
         folder = job.workspace.path("placed", job.video.fingerprint).with_suffix(".sparse")
         return placed, move_models(models, poses, placed, lambda k: part_path(folder, k))
 

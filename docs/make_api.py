@@ -16,8 +16,9 @@ from typing import Any
 PAGE = Path(__file__).parent / "api.md"
 DEFAULT = 24  # characters of a default value that is shown
 INTERNAL = set(
-    "cached cameras_text cells cut flush from_json frozen keep_embeddings load_tracked look maps "
-    "masked run_conv_block save_tracked span_text to_json trained updated write_objects".split()
+    "cached cameras_text cells cut fault flush from_json frozen keep_embeddings load_tracked "
+    "look maps masked run_conv_block save_tracked span_text to_json trained updated "
+    "write_objects".split()
 )  # methods for the tool itself
 
 HEAD = """# Python reference
@@ -38,13 +39,14 @@ The module `quadrics.py` needs numpy alone. [How it works](quadrics.md).
 GROUPS = {
     "reobj_track": {
         "The whole chain": "run refit Result Object World Part LinkEvent evaluate export",
+        "Map of a room": "RoomMap Changes Change",
         "Tracker": "track Tracker Tracks Detections Embeddings Frame Video",
         "Detectors and files": "OnnxDetector DetectionSource open_detections read_detections "
         "read_tracks write_detections_npz list_models model_path COCO_NAMES",
         "Appearance": "Embedder CropEmbedder SamplingLayout",
         "Cameras": "Camera Poses estimate_poses read_poses",
         "Options": "Config InputConfig DetectConfig EmbedConfig TrackerConfig MatchingOptions "
-        "PosesConfig ObjectsConfig OutputConfig",
+        "PosesConfig ObjectsConfig OutputConfig MapConfig",
         "Errors, command line": "ReobjError main",
     },
     "quadrics": {

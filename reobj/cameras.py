@@ -231,7 +231,7 @@ class Poses:
         time_s: (F,) seconds.
         cam_from_world: (F, 3, 4), NaN where there is no pose.
         status: (F,) "keyframe", "pnp", "interpolated", "supplied" or "none".
-        source: "pycolmap", "user" or "none".
+        source: "pycolmap", "user", "map" (located by the points of a map) or "none".
         metric: True when world units are metres.
         up_in_world: (3,) unit vector against gravity, or None if unknown.
         points: (N, 3) sparse points in world; colors (N, 3) uint8 RGB.

@@ -187,7 +187,7 @@ class LocatedImage:
     Attributes:
         row: of the frame in the poses. cam_from_map: (3, 4).
         xy: (n, 2) native pixels of its inliers. point: (n,) rows of the map's points.
-        depth: median depth of these.
+        depth: median depth of these. focal: focal length with which it was located, px.
         matches: before PnP. in_view: points of the map that the image should show again: in it,
             seen from a similar direction and distance before.
     """
@@ -197,6 +197,7 @@ class LocatedImage:
     xy: Array
     point: IntArray
     depth: float
+    focal: float
     matches: int
     in_view: int
 
@@ -240,27 +241,49 @@ class PointMatcher:
 
     def locate(self, image: ImageFeatures, camera: Camera) -> LocatedImage | None:
         """Locate an image by PnP on its matches; None with too few inliers."""
+        return self.solve(image, *self.match(image), camera)
+
+    def solve(
+        self,
+        image: ImageFeatures,
+        feature: IntArray,
+        point: IntArray,
+        camera: Camera,
+        free_focal: bool = False,
+    ) -> LocatedImage | None:
+        """Locate an image by PnP on given matches; None with too few inliers.
+
+        Args:
+            feature, point: (n,) rows of features and points, from `match`.
+            free_focal: estimate the focal length too; that of the camera is not used.
+        """
         options = self.options
-        feature, point = self.match(image)
         if len(feature) < options.inliers:
             return None
         xy = image.xy[feature]
         xyz = self.points.xyz[point]
         scale = max(camera.width, camera.height) / options.size_px
         ransac = {"max_error": options.error_px * max(scale, 1.0), "random_seed": 0}
+        lens = camera.to_pycolmap()
         estimate = import_pycolmap().estimate_and_refine_absolute_pose(
-            xy, xyz, camera.to_pycolmap(), estimation_options={"ransac": ransac}
+            xy,
+            xyz,
+            lens,  # gets the estimated focal length
+            estimation_options={"ransac": ransac, "estimate_focal_length": free_focal},
+            refinement_options={"refine_focal_length": free_focal},
         )
         if estimate is None:
             return None
+        focal = float(lens.mean_focal_length())
         pose = np.asarray(estimate["cam_from_world"].matrix(), np.float64)
         inlier = np.asarray(estimate["inlier_mask"], bool)
         depth = xyz @ pose[2, :3] + pose[2, 3]
-        inlier &= depth > 0
+        away = xyz - invert_rigid(pose)[:, 3]  # a surface is seen from one side only
+        inlier &= (depth > 0) & ((away * self.points.viewing_ray[point]).sum(1) > 0)
         if inlier.sum() < options.inliers or not np.isfinite(pose).all():
             return None
         return LocatedImage(
-            image.row, pose, xy[inlier], point[inlier], float(np.median(depth[inlier])),
+            image.row, pose, xy[inlier], point[inlier], float(np.median(depth[inlier])), focal,
             len(feature), int(self.in_view(pose, camera).sum()),
         )  # fmt: skip
 
@@ -357,7 +380,7 @@ def place_component(
     if rival >= max(2, options.rival * len(agreeing)):
         reason = f"two positions in the map are alike ({len(agreeing)} and {rival} images)"
         return ComponentPlacement(None, tuple(agreeing), len(tried), reason)
-    similarity = _refined(guess, poses, agreeing, matcher.points.xyz)
+    similarity = refine_similarity(guess, poses, agreeing, matcher.points.xyz)
     support = float(np.median([len(im.point) / max(im.in_view, 1) for im in agreeing]))
     return ComponentPlacement(similarity, tuple(agreeing), len(tried), support=support)
 
@@ -412,7 +435,7 @@ def _agreement(
     return guess, good[best], rival
 
 
-def _refined(
+def refine_similarity(
     guess: Similarity, poses: Poses, images: Sequence[LocatedImage], xyz: Array
 ) -> Similarity:
     """Minimise the reprojection errors of the map's points in the moved cameras.

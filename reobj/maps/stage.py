@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 import quadrics
-from reobj.cameras import Poses, import_pycolmap
+from reobj.cameras import Camera, Poses, import_pycolmap
 from reobj.files import Progress
 from reobj.maps.corrections import with_edits
 from reobj.maps.fusion import scale_of
@@ -26,6 +26,7 @@ from reobj.maps.placement import (
     points_with_descriptors,
 )
 from reobj.maps.room_map import RoomMap, map_lock
+from reobj.maps.single_frames import locate_frames, locate_rest
 from reobj.maps.update import Recording, add_recording
 from reobj.results.changes import Changes
 from reobj.results.result import Result
@@ -114,15 +115,28 @@ def place_recording(
     video: Video,
     options: PlacementOptions | None = None,
     progress: Callable[[str, int], Progress] = Progress,
+    camera: Camera | None = None,
 ) -> Placed:
-    """Place the cameras of a recording in a map; the first recording defines the map's world."""
+    """Place the cameras of a recording in a map; the first recording defines the map's world.
+
+    The frames of a recording without poses are located in the map one by one.
+
+    Args:
+        camera: intrinsics that the user gave; None: unknown.
+    """
     options = options or PlacementOptions()
     features = tuple(image_features(poses, video, options, progress("map features", 0)))
     room = opened.room
     if not room.sessions:
         return Placed(dataclasses.replace(poses, map_id=room.map_id), features, None)
     with progress("map", 0) as line:
-        placement = place(poses, features, room.points, options, line.step)
+        if poses.known.any():
+            placement = place(poses, features, room.points, options, line.step)
+        else:
+            points = room.points
+            placement = locate_frames(poses, features, points, camera, options, report=line.step)
+    if not placement.refused and placement.poses.source == "map":
+        placement = _all_frames(placement, video, progress)
     if placement.refused:
         return Placed(poses, features, placement)
     known = scale_of(room)
@@ -141,6 +155,23 @@ def place_recording(
         map_id=room.map_id,
     )
     return Placed(moved, features, placement, scale)
+
+
+def _all_frames(
+    placement: Placement, video: Video, progress: Callable[[str, int], Progress]
+) -> Placement:
+    """Locate the frames between the images that were located one by one; say how many there are."""
+    with progress("pnp", len(placement.poses.frame)) as line:
+        poses = locate_rest(placement, video, line)
+    (component,) = placement.components
+    message = (
+        "the recording alone could not be reconstructed: "
+        f"{len(component.images)} of {component.tried} images were located in the map one by one"
+    )
+    between = int(poses.known.sum()) - len(component.images)
+    if between:
+        message += f", and {between} frames between them"
+    return dataclasses.replace(placement, poses=dataclasses.replace(poses, messages=(message,)))
 
 
 def best_component(placement: Placement) -> ComponentPlacement:
@@ -201,13 +232,13 @@ def finish_map(
     name = session_name(video)
     poses = result.poses
     refused = ""
-    if poses is None or not poses.known.any():
-        refused = "the recording has no camera poses"
-    elif placed is not None and placed.placement is not None and placed.placement.refused:
+    if placed is not None and placed.placement is not None and placed.placement.refused:
         refused = (
             f"this is not the room of {opened.path.name}, or nothing in view matches it: "
             f"{placed.placement.refused}"
         )
+    elif poses is None or not poses.known.any():
+        refused = "the recording has no camera poses"
     elif poses.map_id != room.map_id:
         refused = "its cameras were not placed in this map; run the video again with --map"
     if refused:
@@ -265,7 +296,9 @@ def _recording(
             scale, None,
         )  # fmt: skip
     poses = placed.poses
-    points = points_with_descriptors(poses.of_part(0), _of_first_component(placed), 0)
+    points = None  # of a recording located by the map's points: it has no others
+    if poses.source != "map":
+        points = points_with_descriptors(poses.of_part(0), _of_first_component(placed), 0)
     if placed.placement is None:
         own = result.world.scale or none
         scale = quadrics.Scale(1.0, 0.0, "poses") if poses.metric else own

@@ -19,7 +19,7 @@ from reobj.maps.fusion import ObjectState, object_state, scale_of
 from reobj.maps.motion import point_motions
 from reobj.maps.placement import ImageFeatures
 from reobj.maps.room_map import MapObject, MapPoints, Observation, RoomMap, Session
-from reobj.maps.visibility import shapes_of, visibility_of
+from reobj.maps.visibility import shapes_of, visibility_of, without_unlocated
 from reobj.results.changes import Change, Changes, Shape
 from reobj.results.result import Object, Result
 from reobj.types import Array, Floats, IntArray, unit_rows
@@ -67,6 +67,9 @@ def add_recording(room: RoomMap, result: Result, recording: Recording) -> tuple[
     found = _with_motions(_found_objects(result, objects), states, result, room, recording)
     is_first = not room.sessions
     visibility = visibility_of(states, result.poses, shapes_of(objects), result.looked)
+    tracked = result.tracks
+    others = tracked[~np.isin(tracked.track_id, [o.id for o in result.located])]
+    visibility = without_unlocated(visibility, states, result.poses, others)
     metres = scale_of(room).value if room.sessions else recording.scale.value
     decisions = compare(
         states,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,7 +14,7 @@ from reobj.maps.compare import Visibility
 from reobj.maps.fusion import ObjectState
 from reobj.objects.occlusion import entry_depths
 from reobj.results.result import Object
-from reobj.types import Array, BoolArray, IntArray
+from reobj.types import Array, BoolArray, IntArray, Tracks, rows_by
 from reobj.visible_points import VisiblePoints
 
 
@@ -105,6 +106,43 @@ def visibility_of(
     # one view of its surroundings may show them beside what stands before the object
     seen_through = np.maximum(independent(through), independent(around) - 1)
     return Visibility(independent(expected), seen_through, vague)
+
+
+def without_unlocated(
+    visibility: Visibility,
+    states: Sequence[ObjectState],
+    poses: Poses,
+    boxes: Tracks,
+    least_iou: float = 0.3,
+) -> Visibility:
+    """Return the visibility without places where something was detected that has no shape.
+
+    An object that is detected in too few views for a shape is not gone.
+
+    Args:
+        states: N objects of the map. poses: placed in the map.
+        boxes: detections that belong to no object with a shape, native pixels.
+        least_iou: of such a box with a projected object (as low scores in the tracker).
+    """
+    unknown = np.zeros(len(states), bool)
+    row_of = np.full(int(poses.frame.max(initial=-1)) + 2, -1)
+    placed = np.flatnonzero(poses.measured & (poses.part == 0))
+    row_of[poses.frame[placed]] = placed
+    boxes = boxes[row_of[boxes.frame.clip(max=len(row_of) - 1)] >= 0]  # the last: none
+    shapes = shapes_of(states)
+    support = [s.support for s in states]
+    size = (poses.camera.width, poses.camera.height)
+    for rows in rows_by(boxes.frame) if len(states) else []:
+        pose = poses.cam_from_world[row_of[boxes.frame[rows[0]]]]
+        projected = quadrics.solid_boxes(shapes, support, (poses.camera.K @ pose)[None])
+        clipped = quadrics.clip_boxes(projected, size)[0]  # (N, 4)
+        iou = quadrics.box_iou(clipped[:, None], boxes.xyxy[rows])
+        unknown |= (iou >= least_iou).any(1)
+    return dataclasses.replace(
+        visibility,
+        expected=np.where(unknown, 0, visibility.expected),
+        seen_through=np.where(unknown, 0, visibility.seen_through),
+    )
 
 
 def _area(box: Array) -> Array:
