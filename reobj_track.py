@@ -73,6 +73,7 @@ from reobj.commands import SafeFormatter, make_parser, say, short_help, with_str
 from reobj.files import Progress, atomic, load_cached, load_npz, part_path, save_npz, wrapped
 from reobj.maps.corrections import corrected
 from reobj.maps.listing import MAP_EXPORTS, export_map, listing
+from reobj.maps.placement import PlacementOptions
 from reobj.maps.room_map import RoomMap, map_lock
 from reobj.maps.stage import (
     MapConfig,
@@ -1309,7 +1310,7 @@ def refit(
         result = dataclasses.replace(
             result, poses=last.poses, edits=corrections, warnings=[*result.warnings, *warnings]
         )
-        with opened_map(config.map) as room:
+        with opened_map(config.map, exists=True) as room:
             return _finish(_Job(video, workspace, config), result, room)
 
 
@@ -1485,7 +1486,8 @@ def _given_tracks(
 def _place(job: _Job, room: OpenMap, poses: Poses, models: list[Path]) -> tuple[Placed, list[Path]]:
     """Place the cameras, and their COLMAP models, in the world of the map."""
     with job.timed("map"):
-        placed = place_recording(room, poses, job.video, progress=job.progress)
+        options = PlacementOptions(size_px=job.config.poses.size_px)
+        placed = place_recording(room, poses, job.video, options, job.progress)
         folder = job.workspace.path("placed", job.video.fingerprint).with_suffix(".sparse")
         return placed, move_models(models, poses, placed, lambda k: part_path(folder, k))
 
