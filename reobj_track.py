@@ -73,6 +73,7 @@ from reobj.commands import SafeFormatter, make_parser, say, short_help, with_str
 from reobj.files import Progress, atomic, load_cached, load_npz, part_path, save_npz, wrapped
 from reobj.maps.corrections import corrected
 from reobj.maps.listing import MAP_EXPORTS, export_map, listing
+from reobj.maps.placement import PlacementOptions
 from reobj.maps.room_map import RoomMap, map_lock
 from reobj.maps.stage import (
     MapConfig,
@@ -1505,7 +1506,8 @@ def _place(job: _Job, room: OpenMap, poses: Poses, models: list[Path]) -> tuple[
     """Place the cameras, and their COLMAP models, in the world of the map."""
     with job.timed("map"):
         camera = parse_camera(job.config.poses.camera, job.video.size)
-        placed = place_recording(room, poses, job.video, progress=job.progress, camera=camera)
+        options = PlacementOptions(size_px=job.config.poses.size_px)
+        placed = place_recording(room, poses, job.video, options, job.progress, camera)
         folder = job.workspace.path("placed", job.video.fingerprint).with_suffix(".sparse")
         return placed, move_models(models, poses, placed, lambda k: part_path(folder, k))
 

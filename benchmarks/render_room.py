@@ -6,7 +6,8 @@
 writes `room.mp4`, `detections.npz` (detector-like boxes with masks), `gt_mot.txt`,
 `gt_objects.json`, `poses.txt` (TUM) and `camera.txt` (COLMAP). Needs numpy and OpenCV only; same
 seed, same bytes (the video file itself depends on the codec of the OpenCV build). The clip in
-`examples/room` was made with `--seed 0 --frames 240 --crf 21`.
+`examples/room` was made with `--seed 0 --frames 240 --crf 21`, that in `examples/room_later` with
+`--seed 0 --plan later --path orbit --frames 60 --crf 26 --own-world`.
 
 How it works:
   1. `make_room`: a seeded floor plan (`--plan varied --path tour`: another room, other sets of
@@ -136,6 +137,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     add("--texels", type=float, default=base.texels_per_m, help="texture resolution per metre")
     add("--crf", type=int, help="write H.264 of this quality with PyAV (pip install av), e.g. 26")
+    add("--own-world", action="store_true", help="poses in a world that begins at the first camera")
     add("--png", action="store_true", help="also write every frame as PNG")
     return parser
 
@@ -167,7 +169,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         shutter=args.shutter,
         texels_per_m=args.texels,
     )
-    print(json.dumps(write_clip(args.out, config, DetectorConfig(), args.png, args.crf)))
+    counts = write_clip(
+        args.out, config, DetectorConfig(), args.png, args.crf, own_world=args.own_world
+    )
+    print(json.dumps(counts))
     return 0
 
 

@@ -128,11 +128,33 @@ def check_training(folder: Path) -> None:
     assert (folder / "trained/reobj.onnx").is_file() and objects(folder / "out")
 
 
+def check_map(folder: Path) -> None:
+    """The page says what the commands say, and what the room's truth is."""
+    changes = json.loads((folder / "tuesday/changes.json").read_text())
+    (moved,) = changes["moved"]
+    before, after = (
+        {o["id"]: np.array(o["center"]) for o in json.loads(path.read_text())["objects"]}
+        for path in (ROOM / "gt_objects.json", ROOM.with_name("room_later") / "gt_objects.json")
+    )
+    true = np.linalg.norm(after[6] - before[6])
+    assert moved["class"] == "bowl" and abs(moved["distance_m"] - true) < 0.03
+    assert f"{true:.3f}"[1:] in (TUTORIALS / "same_room.md").read_text()
+    text = rt.Result.load(folder / "tuesday").summary()
+    said = next(p for p in text.split("\nmap ")[1:]).split("\ncameras")[0]
+    shown = re.search(
+        r"^    map (flat.map: (?:.*\n)+?)\n", (TUTORIALS / "same_room.md").read_text(), re.M
+    )
+    assert shown and said.split() == shown[1].split()
+    rows = (folder / "flat.csv").read_text()
+    assert "fruit bowl" in rows
+
+
 Step = Callable[[Path], None]
 PAGES: dict[str, tuple[Step, Step]] = {
     "phone_video": (nothing, check_phone),
     "scannet_scene": (scannet, check_scannet),
     "ar_poses": (arkit, check_ar),
+    "same_room": (nothing, check_map),
     "own_detector": (nothing, check_detector),
     "training": (nothing, check_training),
 }

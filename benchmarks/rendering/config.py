@@ -41,6 +41,7 @@ PATHS = {
 }
 PLANS = {
     "home": "the plan of examples/room",
+    "later": "the same room when objects have moved, gone and come, as in examples/room_later",
     "varied": "another room for every seed",
     "corridor": "CORRIDOR_ROOMS rooms of the home plan in a row that look the same",
 }

@@ -49,11 +49,14 @@ def make_room(config: RoomConfig) -> Room:
     w, d, h = (side * (1 + float(rng.uniform(-1, 1)) * config.room_jitter) for side in sides)
     size = (w, d, h)
     models = furniture_models(rng)
+    gone: tuple[int, ...] = ()
     if varied:
         models = varied_models(rng, models)
         plan, fixed = varied_plan(config, rng, size)
     else:
         plan = limit_placements(home_plan(config, rng, size), config)
+        if config.plan == "later":
+            plan, gone = later_plan(plan)
         fixed = wall_pictures(size, rng) + fixed_furniture(size)
     placed = [
         place_object(i, placement, models[placement.model], list(models).index(placement.model))
@@ -70,6 +73,13 @@ def make_room(config: RoomConfig) -> Room:
     windows = object_windows(
         parts, owners, rects, config, rng, [truth.twin_group for truth, _, _ in placed]
     )
+    shown = [part for part, owner in enumerate(owners) if owner not in gone]
+    placed = [found for found in placed if found[0].index not in gone]
+    parts = [parts[part] for part in shown]
+    windows = [windows[part] for part in shown]
+    new_index = {truth.index: index for index, (truth, _, _) in enumerate(placed)}
+    owners = [new_index.get(owners[part], -1) for part in shown]
+    placed = [(replace(t, index=index), *rest) for index, (t, *rest) in enumerate(placed)]
     surfaces, light_height = build_surfaces(parts, owners, windows)
     light = bake_light(surfaces, size, light_height, config.light_rays, rng)
     return Room(
@@ -89,6 +99,19 @@ def home_plan(config: RoomConfig, rng: Rng, size: tuple[float, float, float]) ->
         + lounge_placements(rng, size)
         + shelf_placements(size)
     )
+
+
+def later_plan(plan: list[Placement]) -> tuple[list[Placement], tuple[int, ...]]:
+    """The home plan on another day: a chair and the bowl moved, a bottle is gone, a ball is new.
+
+    Returns: the placements, in their order, new ones last; indices of those that are gone.
+    """
+    chair, bowl, bottle = 4, 5, 8
+    later = list(plan)
+    later[chair] = replace(plan[chair], position=(-2.75, -0.05, 0.0), yaw_rad=0.9)
+    x, y, z = plan[bowl].position
+    later[bowl] = replace(plan[bowl], position=(x - 0.29, y - 0.13, z))
+    return [*later, Placement("ball", (-0.75, -1.5, 0.0))], (bottle,)
 
 
 CORRIDOR_ROOMS = 3  # chosen: two wrong positions for every view

@@ -19,6 +19,7 @@ from rendering.camera import camera_matrix
 from rendering.config import COCO_NAMES, Array, DetectorConfig, Image, RoomConfig
 from rendering.detector import FrameDetections, simulate_detections
 from rendering.ground_truth import FrameTruth
+from rendering.models import rotation_z
 from rendering.photograph import Frame, render_clip
 from rendering.room import make_room
 from rendering.surfaces import Room
@@ -98,6 +99,16 @@ def tum_line(seconds: float, cam_from_world: Array) -> str:
     rotation = cam_from_world[:, :3].T
     center = -rotation @ cam_from_world[:, 3]
     return f"{seconds:.6f} " + " ".join(f"{v:.9f}" for v in (*center, *quaternion_xyzw(rotation)))
+
+
+def world_of_camera(cam_from_world: Array) -> Array:
+    """room_from_world (4, 4) of a world at a camera (3, 4): x is its heading, z is up."""
+    forward = cam_from_world[2, :3]
+    heading = np.arctan2(forward[1], forward[0])
+    world = np.eye(4)
+    world[:3, :3] = rotation_z(float(heading))
+    world[:3, 3] = -cam_from_world[:, :3].T @ cam_from_world[:, 3]
+    return world
 
 
 def objects_json(room: Room, config: RoomConfig) -> dict[str, Any]:
@@ -197,9 +208,15 @@ def write_clip(
     detector: DetectorConfig,
     png: bool = False,
     crf: int | None = None,
+    own_world: bool = False,
 ) -> dict[str, int]:
-    """Render a clip into a folder, with all truth files."""
-    return write_room(out, make_room(config), config, detector, png=png, crf=crf)
+    """Render a clip into a folder, with all truth files.
+
+    Args:
+        own_world: write poses in a world with its origin at the first camera, which looks along x.
+    """
+    room = make_room(config)
+    return write_room(out, room, config, detector, png=png, crf=crf, own_world=own_world)
 
 
 def write_room(
@@ -211,13 +228,16 @@ def write_room(
     watch: Callable[[Frame], None] | None = None,
     png: bool = False,
     crf: int | None = None,
+    own_world: bool = False,
 ) -> dict[str, int]:
     """Render a clip of a room that exists into a folder, with all truth files.
 
     Args:
         cameras: cam_from_world (F, 3, 4); the path of the config by default.
         watch: called with every frame.
+        own_world: write poses in a world with its origin at the first camera, which looks along x.
     """
+    world = np.eye(4)  # room_from_world
     out.mkdir(parents=True, exist_ok=True)
     size = (config.width, config.height)
     mot: list[str] = []
@@ -235,7 +255,9 @@ def write_room(
             pack_detections(simulate_detections(room, frame.truth, frame.instance, detector, rng))
         )
         mot += mot_lines(frame.index, frame.truth, room, size)
-        tum.append(tum_line(frame.index / config.fps, frame.cam_from_world))
+        if own_world and not tum:
+            world = world_of_camera(frame.cam_from_world)
+        tum.append(tum_line(frame.index / config.fps, frame.cam_from_world @ world))
         show_progress(frame.index + 1, config.frames)
     writer.close()
     save_detections(out / "detections.npz", found, size)

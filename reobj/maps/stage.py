@@ -40,13 +40,11 @@ class MapConfig:
 
     path: str = option(
         "",
-        "map file: the recording is placed in it, its objects get the numbers they have there, and "
-        "the map is updated; it is made if it does not exist",
+        "map of the room: cameras and objects get its world and its numbers, changes are reported, "
+        "and the file is updated; it is made if it does not exist",
         "--map",
     )
-    frozen: bool = option(
-        False, "compare with the map only; do not change the file", "--map-frozen"
-    )
+    frozen: bool = option(False, "compare with --map only: the file is not changed", "--map-frozen")
 
     def absolute(self) -> MapConfig:
         """Return the options with the absolute path, to be found from any folder."""
@@ -225,6 +223,8 @@ def finish_map(
 ) -> Result:
     """Number the objects of a recording, write the map, and return the result with `changes`.
 
+    A map that cannot be written is a warning, as results are written after it.
+
     Args:
         placed: None: the cameras are those of the last run, with the points that the map has.
     """
@@ -242,9 +242,9 @@ def finish_map(
     elif poses.map_id != room.map_id:
         refused = "its cameras were not placed in this map; run the video again with --map"
     if refused:
-        text = f"map {opened.path}: {refused}; the objects have no numbers of the map"
+        text = f"map {opened.path}: {refused}; the map is unchanged, the objects lack its numbers"
         if not room.sessions:
-            text = f"map {opened.path}: not made, {refused}"
+            text = f"map {opened.path}: not made: {refused}"
         tried = 0
         if placed is not None and placed.placement is not None:
             tried = sum(c.tried for c in placed.placement.components)
@@ -257,8 +257,13 @@ def finish_map(
         room = with_edits(room, result.edits)
     recording = _recording(opened, result, video, name, embedder, placed)
     new_room, numbered = add_recording(room, result, recording)
-    if not opened.frozen:
+    if opened.frozen:
+        return numbered
+    try:
         new_room.save(opened.path)
+    except ReobjError as error:
+        text = f"map {error}; the results are complete, but the map lacks this recording"
+        return dataclasses.replace(numbered, warnings=[*numbered.warnings, text])
     return numbered
 
 

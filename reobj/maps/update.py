@@ -54,7 +54,8 @@ class Recording:
 def add_recording(room: RoomMap, result: Result, recording: Recording) -> tuple[RoomMap, Result]:
     """Compare a recording with the map, number its objects, and add it as a session.
 
-    A session of the same video is replaced: its objects keep the numbers that they had.
+    A session of the same video is replaced: its objects keep their numbers, and what happened to
+    them since the sessions before it.
 
     Args:
         result: its first component is in the world of the map.
@@ -62,7 +63,16 @@ def add_recording(room: RoomMap, result: Result, recording: Recording) -> tuple[
         the new map; the result with the numbers of the map and with `changes`.
     """
     assert result.poses is not None
-    states = [object_state(found, room) for found in room.objects]
+    old = room.session_of(recording.fingerprint)
+    number = room.next_session if old is None else old.number
+    own = {
+        o.id: x for o in room.objects for x in o.observations if x.session == number and x.detected
+    }
+    states = [
+        object_state(dataclasses.replace(o, observations=(own[o.id],)) if o.id in own else o, room)
+        for o in room.objects
+    ]
+    before = _states_before(room, number)
     objects = [o for o in result.located if o.part == 0]
     found = _with_motions(_found_objects(result, objects), states, result, room, recording)
     is_first = not room.sessions
@@ -79,9 +89,9 @@ def add_recording(room: RoomMap, result: Result, recording: Recording) -> tuple[
         metres,
         any(s.embedder == recording.embedder for s in states),
     )
+    if old is not None:
+        decisions = _as_before(decisions, before, own)
     numbers = _numbers(result, decisions, room, is_first)
-    old = room.session_of(recording.fingerprint)
-    number = room.next_session if old is None else old.number
     session = _session(number, recording, result.poses)
     observations = _observations(number, decisions, found, states, visibility)
     sessions = (*(s for s in room.sessions if s.number != number), session)
@@ -90,18 +100,54 @@ def add_recording(room: RoomMap, result: Result, recording: Recording) -> tuple[
         marked = _on_objects(recording.points, result, objects, numbers)
         marked = dataclasses.replace(marked, session=np.full(len(marked), number))
         points = _with_new_points(points[points.session != number], marked)
+    map_objects = _with_observations(room, number, observations, numbers, own)
+    known = np.isin(points.object_id, [o.id for o in map_objects])
+    points = dataclasses.replace(points, object_id=np.where(known, points.object_id, 0))
     new_room = dataclasses.replace(
         room,
         sessions=tuple(sorted(sessions, key=lambda s: s.number)),
-        objects=_with_observations(room, number, observations, numbers),
+        objects=map_objects,
         points=points,
         metric=result.poses.metric if is_first else room.metric,
         up=result.world.up_in_world if room.up is None else room.up,
         next_id=max(room.next_id, max(numbers.values(), default=0) + 1),
         next_session=max(room.next_session, number + 1),
     )
-    changes = _changes(decisions, states, found, numbers, recording, scale_of(new_room))
+    names = {s.id: s.class_name for s in states if not s.deleted}
+    changes = _changes(decisions, before, names, found, numbers, recording, scale_of(new_room))
     return new_room, _renumbered(result, numbers, states, decisions, changes)
+
+
+def _states_before(room: RoomMap, session: int) -> dict[int, ObjectState]:
+    """Return the states of the objects that were detected before a session, by number."""
+    known = {}
+    for found in room.objects:
+        rows = tuple(o for o in found.observations if o.session < session)
+        if any(o.detected for o in rows):
+            known[found.id] = object_state(dataclasses.replace(found, observations=rows), room)
+    return known
+
+
+def _as_before(
+    decisions: Sequence[Decision],
+    before: Mapping[int, ObjectState],
+    own: Mapping[int, Observation],
+) -> list[Decision]:
+    """Return decisions about a session that the map has, relative to the sessions before it.
+
+    Args:
+        decisions: by comparison with the map, which has the session. before: states before it.
+        own: the session's earlier observations, by number.
+    """
+    kept = []
+    for d in decisions:
+        kind = d.kind
+        if d.found_id and d.map_id in own:
+            kind = own[d.map_id].status
+        elif d.found_id and d.map_id not in before:
+            kind = "new"
+        kept.append(dataclasses.replace(d, kind=kind))
+    return kept
 
 
 # ---- Objects of the recording ------------------------------------------------------------------
@@ -363,8 +409,14 @@ def _with_observations(
     session: int,
     observations: Sequence[tuple[int, int, Observation]],
     numbers: Mapping[int, int],
+    own: Mapping[int, Observation],
 ) -> tuple[MapObject, ...]:
-    """Return the objects with the observations of a session instead of those that it had."""
+    """Return the objects with the observations of a session instead of those that it had.
+
+    Args:
+        own: that it had, by number. They are kept for deleted objects that are not detected, as
+            corrections of the recording delete their tracks.
+    """
     objects = {
         o.id: dataclasses.replace(
             o, observations=tuple(x for x in o.observations if x.session != session)
@@ -374,6 +426,11 @@ def _with_observations(
     for map_id, identity, observation in observations:
         number = map_id or numbers[identity]
         before = objects.get(number, MapObject(number, ()))
+        if before.deleted and number in own and not observation.detected:
+            observation = own[number]
+        known = any(x.detected and x.session < session for x in before.observations)
+        if not observation.detected and not known:
+            continue  # it says nothing before the first detection
         if not before.observations and observation.detected:
             observation = dataclasses.replace(observation, status="new")
         objects[number] = dataclasses.replace(
@@ -388,26 +445,31 @@ def _with_observations(
 
 def _changes(
     decisions: Sequence[Decision],
-    states: Sequence[ObjectState],
+    before: Mapping[int, ObjectState],
+    names: Mapping[int, str],
     found: Sequence[FoundObject],
     numbers: Mapping[int, int],
     recording: Recording,
     scale: quadrics.Scale,
 ) -> Changes:
-    """List what stayed, moved, went and came."""
-    state_of = {s.id: s for s in states}
+    """List what stayed, moved, went and came.
+
+    Args:
+        before: objects of the map before this recording, by number. names: of all that are not
+            deleted.
+    """
     found_of = {o.id: o for o in found}
     metres = scale.value if scale.source != "none" else None
     lists: dict[str, list[Change]] = {kind: [] for kind in Changes.KINDS}
     for d in decisions:
-        state = state_of.get(d.map_id)
-        if state is not None and state.deleted:
+        state = before.get(d.map_id)
+        if d.map_id and (d.map_id not in names or (state is None and not d.found_id)):
             continue
         o = found_of.get(d.found_id)
         name = max(o.classes, key=lambda c: o.classes[c]) if o is not None else "object"
         change = Change(
             d.map_id or numbers[d.found_id],
-            name if state is None else state.class_name,
+            names.get(d.map_id, name),
             None if state is None else state.center,
             None if o is None else o.center,
             *_displacement(state, o, recording.alignment_cov, metres),
