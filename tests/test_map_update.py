@@ -136,7 +136,8 @@ def test_new_objects_and_forgotten_ones_get_numbers_that_nobody_had(monday):
 def test_the_same_recording_again_replaces_its_session(monday):
     """Its objects keep their numbers, also with another detector; nothing counts twice."""
     again, result = add_recording(monday, seen([2, 0, 1], numbers=[1, 2, 3]), recording("monday"))
-    assert [c.id for c in result.changes.stayed] == [1, 2, 3]
+    assert [c.id for c in result.changes.new] == [1, 2, 3]  # as against the sessions before it
+    assert [o.id for o in result.objects] == [1, 2, 3]
     assert len(again.sessions) == 1 and again.next_id == 4
     assert [len(o.observations) for o in again.objects] == [1, 1, 1]
     assert [o.observations[0].status for o in again.objects] == ["new"] * 3

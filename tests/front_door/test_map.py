@@ -10,7 +10,6 @@ from __future__ import annotations
 import errno
 import json
 import shutil
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -331,6 +330,6 @@ def test_a_missing_map_of_an_output_folder(desk: Path, capsys: pytest.CaptureFix
     (desk / "flat.map").unlink()
     before = (desk / "tuesday" / "objects.json").read_bytes()
     text = one_line(capsys, "objects", desk / "tuesday", "--set", f"map.path={desk}/flat.map")
-    assert "no such map" in text and "--set map.path=" in text
+    assert "is missing" in text and "--set map.path=" in text
     assert (desk / "tuesday" / "objects.json").read_bytes() == before
     assert not (desk / "flat.map").exists()
