@@ -216,13 +216,13 @@ def test_table_points_do_not_hide_a_short_move_of_the_object_on_it() -> None:
     world = World()
     points, code = world.add("radio", PLACE)
     foot = PLACE + np.column_stack(
-        [world.rng.uniform(-0.05, 0.05, (30, 2)), np.full(30, -1.02 * HALF[2])]
+        [world.rng.uniform(-0.05, 0.05, (60, 2)), np.full(60, -1.02 * HALF[2])]
     )
-    world.tag(1, foot, descriptors(world.rng, 30))
+    world.tag(1, foot, descriptors(world.rng, 60))
     world.seen.append((foot, world.code[-1]))
-    world.put(points, code, PLACE + 0.25 * X)
-    world.find("radio", PLACE + 0.25 * X)
-    assert world.motions()[0][1].shift == pytest.approx([0.25, 0, 0], abs=0.01)
+    world.put(points, code, PLACE + 0.1 * X)
+    world.find("radio", PLACE + 0.1 * X)
+    assert world.motions()[0][1].shift == pytest.approx([0.1, 0, 0], abs=0.01)
 
 
 def test_what_stands_on_a_moved_table_is_not_the_table() -> None:
