@@ -139,7 +139,7 @@ def test_a_photo_of_one_wall_needs_the_intrinsics():
 def test_the_sigma_of_the_focal_length_agrees_with_its_errors():
     ratios = []
     for seed in range(12):
-        world, _, poses, features = unposed(seed, count=3, points=2500, depth=0.4, noise_px=1.0)
+        world, _, _, features = unposed(seed, count=3, points=2500, depth=0.4, noise_px=1.0)
         matcher = PointMatcher(world, PlacementOptions())
         for image in features:
             found = matcher.solve(image, *matcher.match(image), GUESS, free_focal=True)
