@@ -60,7 +60,13 @@ import numpy.typing as npt
 import quadrics
 from reobj import __version__
 from reobj.appearance.crops import CropEmbedder, make_embedder
-from reobj.appearance.embedding import EmbedConfig, Embedder, LazyEmbeddings, as_embeddings
+from reobj.appearance.embedding import (
+    EmbedConfig,
+    Embedder,
+    LazyEmbeddings,
+    as_embeddings,
+    fused_rows,
+)
 from reobj.appearance.reid import (
     Gallery,
     SimilarityCalibration,
@@ -72,6 +78,8 @@ from reobj.cameras import Camera, Poses, checked_pose, viewing_rays
 from reobj.commands import SafeFormatter, make_parser, say, short_help, with_streams
 from reobj.files import Progress, atomic, load_cached, load_npz, part_path, save_npz, wrapped
 from reobj.maps.corrections import corrected
+from reobj.maps.fusion import object_state
+from reobj.maps.known import class_ids, ellipsoid_map_of, embeddings_of
 from reobj.maps.listing import MAP_EXPORTS, export_map, listing
 from reobj.maps.placement import PlacementOptions
 from reobj.maps.room_map import RoomMap, map_lock
@@ -403,7 +411,7 @@ class TrackState:
 
 # ---- Tracker -----------------------------------------------------------------------------------
 
-STATE_VERSION = 8  # of the files of Tracker.save
+STATE_VERSION = 9  # of the files of Tracker.save
 EMBEDDING_MOMENTUM = 0.8  # of a track's mean embedding (StrongSORT: .9 every frame)
 # With poses
 MAP_REFIT = 10  # frames between two fits of the ellipsoids that have new views
@@ -437,6 +445,9 @@ class MatchingOptions:
         jump_odds: log odds against a return far from the object's own coasting track.
         jump_gate: squared distance over that of the gate from which it is far: three times its
             radius.
+        map_agreement: least share of the detections, of classes that a given map has, that lie on
+            one of its objects (`Tracker.start_from`); below it the poses are not in the frame of
+            the map, and no new track gets a number of the map.
     """
 
     gate_chi2: float = 9.2103
@@ -454,6 +465,7 @@ class MatchingOptions:
     no_overlap_odds: float = 6.0
     jump_odds: float = 2.0
     jump_gate: float = 9.0
+    map_agreement: float = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -498,7 +510,10 @@ class TrackerState:
 
     Attributes:
         tracks: the live tracks.
-        last_seen: (I,) frame of each identity's last detection. identity_class: (I,) its class.
+        last_seen: (I,) frame of each identity's last detection, -1: known from a map, not yet
+            detected. identity_class: (I,) its class. numbers: (I,) its number, ascending.
+        next_number: of the next new identity.
+        map_votes: (2,) detections compared with the objects of a map, and those that lie on one.
         frame_number: of the latest frame, -1 before the first.
         detector_runs: number of frames on which the detector was run, minus one.
         component: component of the trajectory that the latest frame belongs to.
@@ -511,6 +526,9 @@ class TrackerState:
     tracks: TrackState
     last_seen: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
     identity_class: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+    numbers: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+    next_number: int = 1
+    map_votes: IntArray = field(default_factory=lambda: np.zeros(2, np.int64))
     frame_number: int = -1
     detector_runs: int = -1
     next_tracklet: int = 1
@@ -528,7 +546,8 @@ class Tracker:
     """Give every detection of a video the identity of its physical object.
 
     Call `update` once per frame: with [] if the detector found nothing, with None if it was not
-    run. Identities start at 1, are unique within this tracker and are never reused. An object that
+    run. Identities start at 1, are unique within this tracker and are never reused (`start_from`:
+    those of a map are known). An object that
     returns is re-identified by appearance anywhere in the image, unless two identities fit about
     equally well: then it gets a new identity (`run` decides later, with 3D evidence).
 
@@ -561,6 +580,38 @@ class Tracker:
         self.state = TrackerState(tracks)
         self._frame: FrameContext | None = None  # the latest
         self._latest = Tracks.empty()
+
+    def start_from(self, room: RoomMap, class_names: Sequence[str] = COCO_NAMES) -> None:
+        """Start with the objects of a map: they are known before the first frame.
+
+        A detection of their class on the projection of one gets its number at once; this needs
+        poses in the world of the map (component 0). Without poses the appearance decides, if the
+        map was made with the same embedder. New objects get numbers that the map does not have.
+        Objects that were deleted are left out; of those that were gone only the appearance is used.
+        Positions of the map are not changed.
+
+        Args:
+            class_names: of the detections' class ids; an object of another class is not recognised.
+        Raises:
+            ReobjError: frames were tracked already.
+        """
+        if self.state.frame_number >= 0:
+            raise ReobjError("start_from after frames were tracked; call it first, or after reset")
+        self.reset()
+        every = [object_state(found, room) for found in room.objects]
+        known = sorted((s for s in every if not s.deleted), key=lambda s: s.id)
+        state = self.state
+        state.numbers = np.array([s.id for s in known], np.int64)
+        state.next_number = room.next_id
+        state.last_seen = np.full(len(known), -1)
+        state.identity_class = class_ids(known, class_names)
+        state.maps[0] = ellipsoid_map_of(known)
+        model = getattr(self.embedder, "key", "")
+        identity, embeddings = embeddings_of(known, model)
+        if len(identity):
+            rows = fused_rows(embeddings, self.config.foreground_weight)
+            state.gallery.foreground_width = embeddings.foreground.shape[1]
+            state.gallery.add(identity, rows, np.full((len(identity), 3), np.nan))
 
     def update(
         self,
@@ -626,6 +677,7 @@ class Tracker:
         track_of = self._spawn(frame, track_of)
         self._update_depth_intervals(frame, track_of)
         self._embed(frame, track_of)
+        self._compare_with_map(frame)
         track_of = self._confirm(frame, track_of)
         tracks = self._report(frame, track_of)
         self._retire()
@@ -664,7 +716,8 @@ class Tracker:
         t = t[tracks.mean[t, 0, 0] > OUT_OF_VIEW / 2]
         box = xyxy_from_cxcywh(tracks.mean[t, :, 0])
         none = np.full(len(t), -1)
-        ids = (np.full(len(t), self.state.frame_number), tracks.identity[t] + 1, tracks.tracklet[t])
+        number = self.state.numbers[tracks.identity[t]]
+        ids = (np.full(len(t), self.state.frame_number), number, tracks.tracklet[t])
         return Tracks(*ids, box, np.zeros(len(t)), tracks.votes[t].argmax(1), none)
 
     def latest_embeddings(self) -> tuple[IntArray, Floats]:
@@ -784,7 +837,7 @@ class Tracker:
         if view is None:
             return
         confirmed = tracks[tracks.track_id > 0]
-        identity = confirmed.track_id - 1
+        identity = np.searchsorted(self.state.numbers, confirmed.track_id)
         self.ellipsoid_map.add(frame.number, identity, confirmed.xyxy, view)
         due = self.ellipsoid_map.due
         if self.state.detector_runs % MAP_REFIT == 0 or 2 * due[identity].sum() >= max(
@@ -1031,7 +1084,7 @@ class Tracker:
         """
         state = self.state
         tracks = self.state.tracks
-        needed = self.config.n_init if len(state.last_seen) else 1
+        needed = self.config.n_init if (state.last_seen >= 0).any() else 1
         young = (tracks.identity < 0) & (tracks.missed == 0)
         ready = np.flatnonzero(young & (tracks.evidence >= min(needed, self.config.n_init - 1)))
         seen_now = (tracks.identity >= 0) & (tracks.missed == 0)
@@ -1047,6 +1100,8 @@ class Tracker:
         ids = len(state.last_seen) + np.arange(len(fresh))
         state.last_seen = np.append(state.last_seen, np.zeros(len(fresh), np.int64))
         state.identity_class = np.append(state.identity_class, tracks.votes[fresh].argmax(1))
+        state.numbers = np.append(state.numbers, state.next_number + np.arange(len(fresh)))
+        state.next_number += len(fresh)
         returned = np.zeros(len(state.last_seen) + 1, bool)  # the last entry: no identity (-1)
         returned[returning[returning >= 0]] = True
         stale = returned[tracks.identity]  # coasting tracks of identities that returned
@@ -1094,6 +1149,8 @@ class Tracker:
         logit -= options.jump_odds * self._far_from_coasting_track(frame, ready, identity)
         possible = state.last_seen[identity] < tracks.first[ready][:, None]
         possible &= state.identity_class[identity] == tracks.votes[ready].argmax(1)[:, None]
+        if view is not None and self.ellipsoid_map.given.any() and not self._map_agrees:
+            possible &= state.last_seen[identity] >= 0  # not those known from the map only
         logit[~possible | (iou == 0)] = -np.inf
         probability = match_probability(logit)
         good = probability >= self.config.return_probability
@@ -1101,6 +1158,26 @@ class Tracker:
         taken = assign(row, column, 1 - probability[row, column])
         result[row[taken]] = identity[column[taken]]
         return result
+
+    def _compare_with_map(self, frame: FrameContext) -> None:
+        """Count detections of classes that the given map has, and those that lie on its objects."""
+        view = frame.img_from_world
+        identity = np.flatnonzero(self.ellipsoid_map.given & self.ellipsoid_map.known)
+        if view is None or not len(identity):
+            return
+        state = self.state
+        detections = frame.detections
+        same_class = detections.class_id[:, None] == state.identity_class[identity]  # (D, I)
+        rows = (detections.score >= self.config.high_score) & same_class.any(1)
+        iou, weight = self.ellipsoid_map.overlap(frame.box, identity, view, frame.image_size)
+        on_object = (same_class & (iou * weight > self.matching.low_iou)).any(1)
+        state.map_votes += [rows.sum(), (rows & on_object).sum()]
+
+    @property
+    def _map_agrees(self) -> bool:
+        """Whether the poses are in the frame of the given map, by the detections so far."""
+        compared, matched = self.state.map_votes.tolist()
+        return bool(matched >= self.matching.map_agreement * max(compared, 1))
 
     def _far_from_coasting_track(
         self, frame: FrameContext, ready: IntArray, identity: IntArray
@@ -1131,7 +1208,7 @@ class Tracker:
         t = track_of[rows]
         return Tracks(
             frame=np.full(len(rows), frame.number),
-            track_id=tracks.identity[t] + 1,
+            track_id=np.append(self.state.numbers, 0)[tracks.identity[t]],  # -1: the last
             tracklet_id=tracks.tracklet[t],
             xyxy=detections.xyxy[rows],
             score=detections.score[rows],

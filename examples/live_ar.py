@@ -38,6 +38,8 @@ def live(
     embedder = None if args.embed == "none" else rt.Embedder(args.embed)
     resume = args.state is not None and args.state.exists()
     tracker = rt.Tracker.load(args.state, embedder) if resume else rt.Tracker(embedder=embedder)
+    if args.map is not None and not resume:
+        tracker.start_from(rt.RoomMap.load(args.map), detect.class_names)
     frames: list[int] = []
     steps: list[rt.Tracks] = []
     seconds: list[tuple[float, float]] = []
@@ -80,7 +82,7 @@ def objects_of(tracker: rt.Tracker, names: tuple[str, ...]) -> list[dict[str, An
     solids, _ = quadrics.Ellipsoids.from_dual_quadrics(tracker.ellipsoid_map.dual_q[known])
     return [
         {
-            "id": int(i) + 1,
+            "id": int(tracker.state.numbers[i]),
             "category": names[tracker.state.identity_class[i]],
             "last_frame": int(tracker.state.last_seen[i]),
             "views": int((tracker.ellipsoid_map.frame[i] >= 0).sum()),
@@ -120,6 +122,7 @@ def main(argv: list[str] | None = None) -> int:
         type=Path,
         help="file of the tracker state: read if it exists, then written",
     )
+    parser.add_argument("--map", type=Path, help="map of the room, in whose frame the poses are")
     parser.add_argument("-o", "--out", type=Path, required=True)
     args = parser.parse_args(argv)
     try:

@@ -83,6 +83,7 @@ class Embedder:
     Attributes:
         layout: sampling of the map; that of the model if it was trained.
         backbone: the network, `Backbone`.
+        key: names model and head, as in a map of a room.
     """
 
     def __init__(
@@ -95,6 +96,7 @@ class Embedder:
         device: str = "cpu",
     ) -> None:
         self.model = model
+        self.key = f"{model} {head}"
         self.backbone = Backbone(model, head, layout or SamplingLayout(), threads, offline, device)
         self.layout = self.backbone.layout
         self._latest: _LatestFrame | None = None
@@ -439,6 +441,14 @@ class LazyEmbeddings:
             fore = found.foreground
             back = found.background
         self.foreground_width = fore.shape[1]
-        weight = self.weight if back.shape[1] else 1.0
-        parts = [math.sqrt(weight) * unit_rows(fore), math.sqrt(1 - weight) * unit_rows(back)]
-        return unit_rows(np.concatenate(parts, 1)).astype(np.float32)
+        return fused_rows(Embeddings(fore, back), self.weight)
+
+
+def fused_rows(embeddings: Embeddings, foreground_weight: float) -> Floats:
+    """Return the fused unit rows (n, E) of embeddings (`LazyEmbeddings`)."""
+    weight = foreground_weight if embeddings.background.shape[1] else 1.0
+    parts = [
+        math.sqrt(weight) * unit_rows(embeddings.foreground),
+        math.sqrt(1 - weight) * unit_rows(embeddings.background),
+    ]
+    return unit_rows(np.concatenate(parts, 1)).astype(np.float32)

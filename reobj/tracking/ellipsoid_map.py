@@ -109,10 +109,12 @@ class EllipsoidMap:
         step_deg: (I,) least angle between the rays of two views. fresh: (I,) views since the fit.
         size: (I, V) rough size, NaN unknown. dual_q: (I, 4, 4) dual quadrics, NaN unknown.
         ends: (I, 2, 3) centre -+ one sigma along the axis of largest uncertainty.
+        given: (I,) ellipsoids known from a map of the room; they are not fitted.
     """
 
     ARRAYS = (
-        "frame", "boxes", "img_from_world", "rays", "step_deg", "fresh", "size", "dual_q", "ends"
+        "frame", "boxes", "img_from_world", "rays", "step_deg", "fresh", "size", "dual_q", "ends",
+        "given",
     )  # fmt: skip
 
     def __init__(self, views: int = 16) -> None:
@@ -125,6 +127,25 @@ class EllipsoidMap:
         self.size = np.zeros((0, views))
         self.dual_q = np.zeros((0, 4, 4))
         self.ends = np.zeros((0, 2, 3))
+        self.given = np.zeros(0, bool)
+
+    def give(self, ellipsoids: quadrics.Ellipsoids, cov: Array) -> None:
+        """Set the ellipsoids of the first identities, which are then not fitted.
+
+        Args:
+            ellipsoids: I; NaN: unknown, fitted as others. cov: (I, 3, 3) of their centres.
+        """
+        count = len(ellipsoids)
+        self._grow(count)
+        dual_q = ellipsoids.dual_quadrics()
+        finite = np.isfinite(dual_q).all((1, 2)) & np.isfinite(cov).all((1, 2))
+        known = np.asarray(finite, bool)
+        value, vector = np.linalg.eigh(np.where(known[:, None, None], cov, 0.0))
+        sigma = np.sqrt(value[:, -1:].clip(0)) * vector[..., -1]  # (I, 3)
+        ends = ellipsoids.center_in_world[:, None] + np.stack([-sigma, sigma], 1)
+        self.dual_q[:count] = np.where(known[:, None, None], dual_q, np.nan)
+        self.ends[:count] = np.where(known[:, None, None], ends, np.nan)
+        self.given[:count] = known
 
     def add(self, frame: int, identity: IntArray, xyxy: Array, img_from_world: Array) -> None:
         """Add a view (N, 4) of each of N different identities that are seen from a new direction.
@@ -154,7 +175,7 @@ class EllipsoidMap:
         """(I,) identities with enough views for a fit, more than a quarter of them new."""
         count = (self.frame >= 0).sum(1)
         # fewer than three boxes leave an ellipsoid undetermined: 9 unknowns, 4 a box
-        return np.asarray((count >= 3) & (self.fresh > count // 4), bool)
+        return np.asarray((count >= 3) & (self.fresh > count // 4) & ~self.given, bool)
 
     def refit(self, image_size: tuple[int, int]) -> bool:
         """Fit the ellipsoids of all identities that are due.
