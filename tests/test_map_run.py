@@ -115,3 +115,13 @@ def test_frames_between_located_images_are_located_too(made):
     truth = invert_rigid(true_poses(frame[found.known]))[:, :, 3]
     assert np.median(np.linalg.norm(centre - truth, axis=1)) < 0.04  # m
     assert found.camera.params[0] == pytest.approx(492.76, rel=0.02)
+
+
+def test_a_recording_without_images_is_not_placed(made, tmp_path):
+    """Its boxes and poses are used as without a map."""
+    path, _ = made
+    before = path.read_bytes()
+    config = options(0, 80, mode=str(ROOM / "poses.txt"))
+    result = rt.run(None, tmp_path, config, detections=ROOM / "detections.npz", map=path)
+    assert result.changes.refused == "a recording without images cannot be placed in a map"
+    assert result.located and path.read_bytes() == before

@@ -97,7 +97,8 @@ class Placed:
 
     Attributes:
         poses: of the map's world, if the recording was placed (`placement.refused` is empty).
-        features: of some of its images. placement: None for the first recording of a map.
+        features: of some of its images. placement: None for the first recording of a map, and for
+            one without images.
         scale: metres per unit of the map, by supplied metric poses; None: not measured.
     """
 
@@ -123,6 +124,8 @@ def place_recording(
         camera: intrinsics that the user gave; None: unknown.
     """
     options = options or PlacementOptions()
+    if not video.has_images:
+        return Placed(poses, (), None)
     features = tuple(image_features(poses, video, options, progress("map features", 0)))
     room = opened.room
     if not room.sessions:
@@ -239,6 +242,8 @@ def finish_map(
         )
     elif poses is None or not poses.known.any():
         refused = "the recording has no camera poses"
+    elif not video.has_images and placed is not None:
+        refused = "a recording without images cannot be placed in a map"
     elif poses.map_id != room.map_id:
         refused = "its cameras were not placed in this map; run the video again with --map"
     if refused:
