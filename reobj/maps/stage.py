@@ -233,20 +233,7 @@ def finish_map(
     """
     room = opened.room
     name = session_name(video)
-    poses = result.poses
-    refused = ""
-    if placed is not None and placed.placement is not None and placed.placement.refused:
-        refused = (
-            f"this is not the room of {opened.path.name}, or nothing in view matches it: "
-            f"{placed.placement.refused}"
-        )
-    elif poses is None or not poses.known.any():
-        refused = "the recording has no camera poses"
-    elif not video.has_images and placed is not None:
-        refused = "a recording without images cannot be placed in a map"
-    elif poses.map_id != room.map_id:
-        refused = "its cameras were not placed in this map; run the video again with --map"
-    if refused:
+    if refused := _refusal(opened, result.poses, video, placed):
         text = f"map {opened.path}: {refused}; the map is unchanged, the objects lack its numbers"
         if not room.sessions:
             text = f"map {opened.path}: not made: {refused}"
@@ -270,6 +257,22 @@ def finish_map(
         text = f"map {error}; the results are complete, but the map lacks this recording"
         return dataclasses.replace(numbered, warnings=[*numbered.warnings, text])
     return numbered
+
+
+def _refusal(opened: OpenMap, poses: Poses | None, video: Video, placed: Placed | None) -> str:
+    """Say why a recording is not in the world of the map; "" if it is."""
+    if placed is not None and placed.placement is not None and placed.placement.refused:
+        return (
+            f"this is not the room of {opened.path.name}, or nothing in view matches it: "
+            f"{placed.placement.refused}"
+        )
+    if poses is None or not poses.known.any():
+        return "the recording has no camera poses"
+    if not video.has_images and placed is not None:
+        return "a recording without images cannot be placed in a map"
+    if poses.map_id != opened.room.map_id:
+        return "its cameras were not placed in this map; run the video again with --map"
+    return ""
 
 
 def session_name(video: Video) -> str:
