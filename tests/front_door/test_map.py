@@ -152,8 +152,14 @@ def test_places_are_true_in_the_world_of_the_map(made: Path) -> None:
 
 
 def test_a_recording_that_is_run_again_keeps_its_numbers(desk: Path) -> None:
-    before = RoomMap.load(desk / "flat.map")
+    """Also the chair, whose later place only the user could tell."""
     numbers = true_of(desk / "monday", ROOM)
+    chair = number_of(numbers, CHAIR)
+    later = number_of(true_of(desk / "tuesday", LATER), CHAIR)
+    if later != chair:
+        assert cli("map", desk / "flat.map", "--merge", chair, later) == 0
+    before = RoomMap.load(desk / "flat.map")
+    assert statuses(before)[chair, 2] == "moved"
     assert cli(*monday(desk)) == 0
     assert true_of(desk / "monday", ROOM) == numbers
     after = RoomMap.load(desk / "flat.map")
