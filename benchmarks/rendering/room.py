@@ -79,10 +79,7 @@ def make_room(config: RoomConfig) -> Room:
     windows = [windows[part] for part in shown]
     new_index = {truth.index: index for index, (truth, _, _) in enumerate(placed)}
     owners = [new_index.get(owners[part], -1) for part in shown]
-    placed = [
-        (replace(truth, index=index), own, outlines)
-        for index, (truth, own, outlines) in enumerate(placed)
-    ]
+    placed = [(replace(t, index=k), own, origin) for k, (t, own, origin) in enumerate(placed)]
     surfaces, light_height = build_surfaces(parts, owners, windows)
     light = bake_light(surfaces, size, light_height, config.light_rays, rng)
     return Room(
