@@ -68,10 +68,7 @@ def add_recording(room: RoomMap, result: Result, recording: Recording) -> tuple[
     own = {
         o.id: x for o in room.objects for x in o.observations if x.session == number and x.detected
     }
-    states = [
-        object_state(dataclasses.replace(o, observations=(own[o.id],)) if o.id in own else o, room)
-        for o in room.objects
-    ]
+    states = states_for(room, own)
     before = _states_before(room, number)
     objects = [o for o in result.located if o.part == 0]
     found = _with_motions(_found_objects(result, objects), states, result, room, recording)
@@ -116,6 +113,19 @@ def add_recording(room: RoomMap, result: Result, recording: Recording) -> tuple[
     names = {s.id: s.class_name for s in states if not s.deleted}
     changes = _changes(decisions, before, names, found, numbers, recording, scale_of(new_room))
     return new_room, _renumbered(result, numbers, states, decisions, changes)
+
+
+def states_for(room: RoomMap, own: Mapping[int, Observation]) -> list[ObjectState]:
+    """Return the states of the map's objects that a recording is compared with.
+
+    Args:
+        own: earlier observations of this recording, by number. Such an object is where it was then,
+            wherever other sessions saw it.
+    """
+    return [
+        object_state(dataclasses.replace(o, observations=(own[o.id],)) if o.id in own else o, room)
+        for o in room.objects
+    ]
 
 
 def _states_before(room: RoomMap, session: int) -> dict[int, ObjectState]:

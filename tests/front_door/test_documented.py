@@ -85,6 +85,16 @@ ELSEWHERE = {
     "python reobj_track.py models": "test_commands.py",
     "python reobj_track.py objects out --solver lfd": "test_commands.py, with all solvers",
     "python reobj_track.py objects out --edits edits.json": "below, of OUT",
+    "python reobj_track.py run phone.mp4 -o out --map flat.map": "test_map.py",
+    "python reobj_track.py run monday.mp4 -o monday --map flat.map": "test_map.py",
+    "python reobj_track.py run tuesday.mp4 -o tuesday --map flat.map": "test_map.py",
+    "python reobj_track.py run friday.mp4 -o friday --map flat.map --map-frozen": "test_map.py",
+    "python reobj_track.py map flat.map": "test_map_command.py",
+    "python reobj_track.py map flat.map --forget tuesday.mp4": "test_map_command.py",
+    "python reobj_track.py map flat.map --merge 3 12": "test_map_command.py",
+    "python reobj_track.py map flat.map --rename 3 armchair": "test_map_command.py",
+    "python reobj_track.py map flat.map --delete 7": "test_map_command.py",
+    "python reobj_track.py map flat.map --export csv -o flat.csv": "test_map_command.py",
 }  # fmt: skip
 
 

@@ -49,11 +49,11 @@ def words(folder: Path, out: Path, room: Path, *more: object) -> tuple[object, .
 
 
 def monday(base: Path, out: str = "monday", room: str = "flat.map") -> tuple[object, ...]:
-    return words(ROOM, base / out, base / room, "--stop", 60, "--every", 3)
+    return words(ROOM, base / out, base / room, "--stop", 60, "--every", 4)
 
 
 def tuesday(base: Path, *more: object) -> tuple[object, ...]:
-    return words(base / "later", base / "tuesday", base / "flat.map", "--every", 3, *more)
+    return words(base / "later", base / "tuesday", base / "flat.map", "--every", 4, *more)
 
 
 @pytest.fixture(scope="module")
@@ -148,12 +148,18 @@ def test_places_are_true_in_the_world_of_the_map(made: Path) -> None:
              for n, o in objects.items()}  # fmt: skip
     assert len(error) >= 8 and np.median(list(error.values())) < 0.03, error
     assert info(made / "tuesday")["world"]["units"] == "m"
-    assert changes.localised_frames == changes.tried_frames == 20 and changes.sigma_m < 0.01
+    assert changes.localised_frames == changes.tried_frames == 15 and changes.sigma_m < 0.01
 
 
 def test_a_recording_that_is_run_again_keeps_its_numbers(desk: Path) -> None:
-    before = RoomMap.load(desk / "flat.map")
+    """Also the chair, whose later place only the user could tell."""
     numbers = true_of(desk / "monday", ROOM)
+    chair = number_of(numbers, CHAIR)
+    later = number_of(true_of(desk / "tuesday", LATER), CHAIR)
+    if later != chair:
+        assert cli("map", desk / "flat.map", "--merge", chair, later) == 0
+    before = RoomMap.load(desk / "flat.map")
+    assert statuses(before)[chair, 2] == "moved"
     assert cli(*monday(desk)) == 0
     assert true_of(desk / "monday", ROOM) == numbers
     after = RoomMap.load(desk / "flat.map")
@@ -164,17 +170,18 @@ def test_a_recording_that_is_run_again_keeps_its_numbers(desk: Path) -> None:
 
 
 def test_a_frozen_map_stays_as_it_is(desk: Path) -> None:
-    """Tuesday is compared with the map of Monday."""
+    """Tuesday is compared with the map of Monday, which another run is updating."""
     shutil.move(desk / "monday.map", desk / "flat.map")
     before = (desk / "flat.map").read_bytes()
-    changes = json.loads((desk / "tuesday" / "changes.json").read_text())
+    changes = read_changes(desk / "tuesday" / "changes.json")
     numbers = true_of(desk / "tuesday", LATER)
-    with map_lock(desk / "flat.map"):  # another run updates it
-        assert cli(*tuesday(desk, "--map-frozen")) == 0
+    with map_lock(desk / "flat.map"):
+        assert refit(desk, "--set", "map.frozen=true") == 0
     assert (desk / "flat.map").read_bytes() == before
     assert true_of(desk / "tuesday", LATER) == numbers
-    again = json.loads((desk / "tuesday" / "changes.json").read_text())
-    assert again | {"map": changes["map"]} == changes
+    again = read_changes(desk / "tuesday" / "changes.json")
+    for kind in KINDS:
+        assert [c.id for c in getattr(again, kind)] == [c.id for c in getattr(changes, kind)], kind
 
 
 @pytest.fixture
@@ -257,6 +264,7 @@ def test_unusable_maps_end_the_run_before_any_work(
 def test_corrections_of_the_page_reach_the_map(desk: Path) -> None:
     """The edits are those that scene.html saves: boxes, numbers of the map and its identifier."""
     room = RoomMap.load(desk / "flat.map")
+    changes = read_changes(desk / "tuesday" / "changes.json")
     tracks = read_mot(desk / "tuesday" / "tracks.txt")
     true = true_of(desk / "tuesday", LATER)
     bowl = number_of(true, BOWL)
@@ -280,19 +288,13 @@ def test_corrections_of_the_page_reach_the_map(desk: Path) -> None:
     assert classes[bowl] == "fruit bowl" and ball not in classes
     del true[ball]
     assert true_of(desk / "tuesday", LATER) == true
-    assert len(after.sessions) == 2
-
-
-def test_a_refit_reports_the_same_changes(desk: Path) -> None:
-    """They are those since the sessions before, although the map has this one by now."""
-    before = read_changes(desk / "tuesday" / "changes.json")
-    room = RoomMap.load(desk / "flat.map")
-    assert refit(desk) == 0
+    # the changes are those since the session before, although the map has this one by now
+    assert statuses(after) == statuses(room)
     again = read_changes(desk / "tuesday" / "changes.json")
     for kind in KINDS:
-        assert [c.id for c in getattr(again, kind)] == [c.id for c in getattr(before, kind)], kind
-    assert again.moved[0].distance_m == pytest.approx(before.moved[0].distance_m, abs=1e-3)
-    assert statuses(RoomMap.load(desk / "flat.map")) == statuses(room)
+        known = [c.id for c in getattr(changes, kind) if c.id != ball]
+        assert [c.id for c in getattr(again, kind)] == known, kind
+    assert again.moved[0].distance_m == pytest.approx(changes.moved[0].distance_m, abs=1e-3)
 
 
 def statuses(room: RoomMap) -> dict[tuple[int, int], str]:
