@@ -33,6 +33,7 @@ import reobj.results.scene as scene
 import reobj.sources.detectors as detectors
 import reobj_track as rt
 from reobj.cameras import load_poses, save_poses, write_colmap
+from reobj.maps.stage import opened_map
 from reobj.options import (
     every_option,
     list_options,
@@ -1018,3 +1019,24 @@ def _(lab: Lab) -> None:
         result = lab.refit(value)
         assert (result.tracks.score == 0).sum() == count
         assert [found.views for found in result.objects] == [21, 18]
+
+
+@shows("map.path")
+def _(lab: Lab) -> None:
+    """The cameras of the folder were not placed in the map: it is named in the changes."""
+    path = lab.path / "flat.map"
+    rt.RoomMap().save(path)
+    for value in ("", str(path)):
+        changes = lab.refit(value).changes
+        assert ("" if changes is None else changes.map_path) == value
+
+
+@shows("map.frozen")
+def _(lab: Lab) -> None:
+    """A map that is only read is not locked."""
+    path = lab.path / "flat.map"
+    rt.RoomMap().save(path)
+    for value in (True, False):
+        with opened_map(lab.config(value, map__path=str(path)).map) as opened:
+            assert opened is not None and opened.frozen == value
+            assert (lab.path / ".flat.map.lock").exists() != value
