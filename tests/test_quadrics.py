@@ -434,8 +434,8 @@ def points_outside(
 def test_fits_with_points_are_minima_of_the_documented_cost() -> None:
     """As above: of 30 points around each object some lie outside, four of them far."""
     rng = np.random.default_rng(32)
-    boxes, cams, truth, priors, names = syn.scenes(80, 8, 60, 0.02, "box", rng)
-    spread = rng.uniform(-1, 1, (80, 30, 3)) * np.linspace(0.7, 1.1, 30)[:, None]
+    boxes, cams, truth, priors, names = syn.scenes(160, 8, 60, 0.02, "box", rng)
+    spread = rng.uniform(-1, 1, (160, 30, 3)) * np.linspace(0.7, 1.1, 30)[:, None]
     points = truth.center_in_world[:, None] + np.einsum(
         "oij,opj->opi", truth.world_from_obj, spread * truth.half_axes[:, None]
     )
@@ -444,7 +444,7 @@ def test_fits_with_points_are_minima_of_the_documented_cost() -> None:
     config = q.FitConfig(edge_noise_px=400, edge_noise_rel=0, correlation_deg=0, iterations=300)
     plain, fits = (q.fit_objects(*given, up=UP, points=p, config=config) for p in (None, points))
     steps, moves = [], 1e-5 * np.eye(9)
-    for k in range(0, 80, 4):
+    for k in range(0, 160, 8):
         solids = fits.ellipsoids
         solid = (solids.center_in_world[k], solids.half_axes[k], solids.world_from_obj[k])
         prior = np.asarray(priors.log_mean[k])
