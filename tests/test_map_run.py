@@ -48,25 +48,6 @@ def true_poses(frames: np.ndarray) -> np.ndarray:
     return invert_rigid(np.concatenate([rotation, rows[:, 1:4, None]], 2))
 
 
-def test_the_next_recording_has_the_same_numbers(made, tmp_path):
-    path, first = made
-    assert [c.id for c in first.changes.new] == [o.id for o in first.located]
-    before = path.read_bytes()
-    config = options(4, 84, mode=str(ROOM / "poses.txt"))
-    second = rt.run(
-        ROOM / "room.mp4", tmp_path, config, detections=ROOM / "detections.npz", map=path,
-        map_frozen=True,
-    )  # fmt: skip
-    assert path.read_bytes() == before
-    assert len(second.changes.stayed) > 0.8 * len(second.located) > 5
-    center = {o.id: o.center for o in first.located}
-    for change in second.changes.stayed:
-        assert np.linalg.norm(change.after - center[change.id]) < 0.2  # m
-    kept = rt.refit(tmp_path)  # by the options of the run: frozen, same map
-    assert path.read_bytes() == before
-    assert [c.id for c in kept.changes.stayed] == [c.id for c in second.changes.stayed]
-
-
 def test_photos_that_cannot_be_reconstructed_are_located_in_the_map(made, tmp_path):
     path, first = made
     folder = tmp_path / "photos"
