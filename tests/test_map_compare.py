@@ -341,7 +341,7 @@ def test_an_identical_chair_that_left_the_row_is_the_one_that_is_missing() -> No
 
 
 def test_swapped_identical_chairs_give_no_stolen_number() -> None:
-    """Both left their places, and nothing tells which is which: candidates, no number."""
+    """Both left their places, without evidence which is which: candidates, no number."""
     states = [*room(), *chairs((1, 2, 0.4), (3, 2, 0.4))]
     points = {11: 20, 12: 20}
     detected = all_found(states)[:6]

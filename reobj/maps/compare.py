@@ -268,8 +268,10 @@ class _Pairs:
         visibility: Visibility,
         options: CompareOptions,
     ) -> None:
-        self.states, self.found = states, found
-        self.visibility, self.options = visibility, options
+        self.states = states
+        self.found = found
+        self.visibility = visibility
+        self.options = options
         of_all = [o.classes for o in states] + [o.classes for o in found]
         self.names = sorted({name for classes in of_all for name in classes} | {""})
         self.of_map = _class_shares(states, self.names)  # (N, C)
@@ -312,7 +314,8 @@ class _Pairs:
         half_axes = [o.half_axes for o in self.states] + [o.half_axes for o in self.found]
         extents = [np.max(half) * unit for half in half_axes]
         floor = self.options.extent_share * np.array(extents)
-        n, options = len(center), self.options
+        n = len(center)
+        options = self.options
         variance = np.maximum(floor[:n, None], floor[None, n:]) ** 2 + options.position_floor_m**2
         own = center_cov[:, None] + other_cov[None] + variance[..., None, None] * np.eye(3)
         between = other[None] - center[:, None]  # (N, M, 3)
@@ -598,7 +601,8 @@ class _Verdicts:
     """
 
     def __init__(self, pairs: _Pairs) -> None:
-        self.pairs, self.options = pairs, pairs.options
+        self.pairs = pairs
+        self.options = pairs.options
         self.stayed = pairs.gain(pairs.stayed())
         self.moved = pairs.gain(pairs.moved(near=True))
         self.near = np.maximum(self.stayed, self.moved)
@@ -624,7 +628,8 @@ class _Verdicts:
 
     def _matched(self, i: int, j: int) -> Decision | None:
         """Decide about a pair of the best assignment; None: the evidence is too weak."""
-        state, found = self.pairs.states[i], self.pairs.found[j]
+        state = self.pairs.states[i]
+        found = self.pairs.found[j]
         lead = self._lead(i, j)
         there = bool(
             self.stayed[i, j] >= self.moved[i, j]
@@ -667,7 +672,8 @@ class _Verdicts:
 
     def _undetected(self, i: int) -> Decision:
         """Decide about a map object that was given no found object."""
-        state, view = self.pairs.states[i], self.pairs.visibility
+        state = self.pairs.states[i]
+        view = self.pairs.visibility
         expected, through = (int(v[i]) for v in (view.expected, view.seen_through))
         there = float(self.pairs.there_log_odds()[i])
         similar = np.flatnonzero(

@@ -309,7 +309,7 @@ def _stayed(
         return None
     camera_at = np.array([-v.pose[:, :3].T @ v.pose[:, 3] for v in views])
     distance = float(np.median(np.linalg.norm(camera_at - state.center, axis=1)))
-    # a smaller displacement is not told from none: uniform within the limit of the error
+    # a smaller displacement cannot be measured: uniform within the limit of the error
     sigma = _limit(camera, options) / camera.K[0, 0] * distance / np.sqrt(3)
     return PointMotion(
         count, len(of_view), np.eye(3, 4), np.zeros(3), float(sigma) ** 2 * np.eye(3)

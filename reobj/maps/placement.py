@@ -413,13 +413,14 @@ def _agreement(
     j = j[usable]
     if not len(i):
         return None, np.zeros(len(images), bool), 0
-    if len(i) > 3000:
-        chosen = np.linspace(0, len(i) - 1, 3000).astype(int)
-        i = i[chosen]
-        j = j[chosen]
-        length_a, length_b = (x[usable][chosen] for x in (length_a, length_b))
-    else:
-        length_a, length_b = (x[usable] for x in (length_a, length_b))
+    chosen = np.flatnonzero(usable)
+    if len(chosen) > 3000:  # hypotheses; more take longer
+        spread = np.linspace(0, len(chosen) - 1, 3000).astype(int)
+        chosen = chosen[spread]
+        i = i[spread]
+        j = j[spread]
+    length_a = length_a[chosen]
+    length_b = length_b[chosen]
     scale = length_b / length_a  # (H,)
     rotation = turn[i]
     shift = b[i] - scale[:, None] * np.einsum("hij,hj->hi", rotation, a[i])
@@ -522,12 +523,10 @@ class Placement:
     refused: str = ""
 
     @property
-    def cov(self) -> Array:
-        """(7, 7) of the alignment of the placed component with most images that agree."""
+    def best(self) -> ComponentPlacement:
+        """The placed component with most images that agree."""
         placed = [c for c in self.components if c.similarity is not None]
-        best = max(placed, key=lambda c: len(c.images))
-        assert best.similarity is not None
-        return best.similarity.cov
+        return max(placed, key=lambda c: len(c.images))
 
 
 def place(

@@ -17,7 +17,6 @@ from reobj.files import Progress
 from reobj.maps.corrections import with_edits
 from reobj.maps.fusion import scale_of
 from reobj.maps.placement import (
-    ComponentPlacement,
     ImageFeatures,
     Placement,
     PlacementOptions,
@@ -143,7 +142,7 @@ def place_recording(
     known = scale_of(room)
     scale = None
     if poses.metric and not room.metric:
-        best = best_component(placement)
+        best = placement.best
         assert best.similarity is not None
         sigma = float(np.sqrt(best.similarity.cov[6, 6]))
         scale = quadrics.Scale(1 / best.similarity.scale, sigma, "poses")
@@ -173,12 +172,6 @@ def _all_frames(
     if between:
         message += f", and {between} frames between them"
     return dataclasses.replace(placement, poses=dataclasses.replace(poses, messages=(message,)))
-
-
-def best_component(placement: Placement) -> ComponentPlacement:
-    """Return the placed component with most images that agree."""
-    placed = [c for c in placement.components if c.similarity is not None]
-    return max(placed, key=lambda c: len(c.images))
 
 
 def move_models(
@@ -320,7 +313,7 @@ def _recording(
         return Recording(
             opened.path, name, session_key(video), embedder, cov, count, count, scale, points
         )
-    best = best_component(placed.placement)
+    best = placed.placement.best
     assert best.similarity is not None
     if old is not None and placed.scale is None:
         scale = quadrics.Scale(old.metres_per_unit, old.scale_rel_sigma, old.scale_source)
