@@ -94,7 +94,7 @@ def test_one_photo_needs_many_matches():
     photo = features[5:6]
     located = locate_frames(poses, photo, world)
     assert located.refused == "" and located.poses.known.sum() == 1
-    assert np.isfinite(located.cov).all()
+    assert np.isfinite(located.best.similarity.cov).all()
     np.testing.assert_allclose(located.poses.cam_from_world[5], truth[5], atol=0.1)
     few = locate_frames(poses, [with_matches(photo[0], 30)], world)
     assert few.refused.startswith("1 of 1 images match points of the map, 2 are needed")
