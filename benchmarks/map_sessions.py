@@ -45,8 +45,8 @@ def read_mot(path: Path) -> Array:
     return np.asarray(rows)
 
 
-def true_objects(tracks: Array, truth: Array) -> dict[int, int]:
-    """Return the true object of each track."""
+def true_objects(tracks: Array, truth: Array, overlap: float = 0.5) -> dict[int, int]:
+    """Return the true object of each track: that which most of its boxes overlap (IoU)."""
     votes: dict[int, Counter[int]] = {}
     for frame in np.unique(tracks[:, 0]):
         found = tracks[tracks[:, 0] == frame]
@@ -54,7 +54,7 @@ def true_objects(tracks: Array, truth: Array) -> dict[int, int]:
         if len(true):
             iou = box_iou(found[:, 2:], true[:, 2:])
             for row, best in enumerate(iou.argmax(1)):
-                if iou[row, best] >= 0.5:
+                if iou[row, best] >= overlap:
                     vote = votes.setdefault(int(found[row, 1]), Counter())
                     vote[int(true[best, 1])] += 1
     return {track: vote.most_common(1)[0][0] for track, vote in votes.items()}
