@@ -128,8 +128,9 @@ def score(
     located = {o["id"] for o in objects if o["status"] in ("ok", "prior_dominated")}
     row: dict[str, Any] = {"objects": len(located)}
     changes = json.loads((result / "changes.json").read_text())
+    if changes["refused"]:
+        return row | {"refused": changes["refused"]}
     if owner:
-        row["refused"] = changes["refused"]
         row["shared"] = len(located & owner)
         row["false changes"] = len(changes["moved"]) + len(changes["gone"])
         row |= {kind: len(changes[kind]) for kind in ("new", "not_seen")}

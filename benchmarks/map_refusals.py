@@ -22,7 +22,7 @@ from reobj.files import Progress
 from reobj.maps.placement import (
     ImageFeatures,
     PlacementOptions,
-    image_features,
+    keyframe_features,
     place,
     points_with_descriptors,
 )
@@ -37,7 +37,7 @@ def recording(out: Path) -> tuple[Poses, list[ImageFeatures], MapPoints] | None:
     if poses is None or not poses.known.any():
         return None
     video = Workspace.open(out).video()
-    features = image_features(poses, video, PlacementOptions(), Progress("features"))
+    features = keyframe_features(poses, video, PlacementOptions(), Progress("features"))
     return poses, features, points_with_descriptors(poses, features, 1)
 
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 import reobj_track as rt
 from reobj.cameras import Camera, Poses, invert_rigid
 from reobj.files import Progress
-from reobj.maps.placement import PlacementOptions, image_features
+from reobj.maps.placement import PlacementOptions, keyframe_features
 from reobj.maps.single_frames import locate_frames, locate_rest
 
 ROOM = Path(__file__).resolve().parent.parent / "examples" / "room"
@@ -86,7 +86,7 @@ def test_frames_between_located_images_are_located_too(made):
     guess = Camera("SIMPLE_PINHOLE", *size, (700.0, size[0] / 2, size[1] / 2))
     none = np.full((len(frame), 3, 4), np.nan)
     poses = Poses(guess, frame, frame / 12, none, np.full(len(frame), "none"), "none")
-    features = image_features(poses, video, PlacementOptions(), Progress("features", 0), most=4)
+    features = keyframe_features(poses, video, PlacementOptions(), Progress("features", 0), most=4)
     assert len(features) == 4
     placement = locate_frames(poses, features, rt.RoomMap.load(path).points)
     assert placement.refused == ""

@@ -43,6 +43,7 @@ class SingleFrameOptions:
     found 4 to 47 % of the points in view again.
 
     Attributes:
+        inliers: least of an image. (More than in the placement: nothing else confirms an image.)
         alone: least inliers of an image that places a recording without a second one.
         found_again: least fraction of the points in view that are found again, median over the
             images (chosen: half of the least measured).
@@ -51,6 +52,7 @@ class SingleFrameOptions:
             one photo of a wall, seen from the front, focal length and distance are not determined.
     """
 
+    inliers: int = 15
     alone: int = 40
     found_again: float = 0.02
     for_focal: int = 15
@@ -80,8 +82,8 @@ def locate_frames(
         points are those of the map, and their observations the inliers of PnP. The similarity of
         the component is the identity, with the covariance that the images have in common.
     """
-    options = options or PlacementOptions()
     single = single or SingleFrameOptions()
+    options = dataclasses.replace(options or PlacementOptions(), inliers=single.inliers)
     matcher = PointMatcher(points, options)
     with ThreadPoolExecutor(2) as pool:
         matches = list(pool.map(matcher.match, features))

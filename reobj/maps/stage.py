@@ -21,6 +21,7 @@ from reobj.maps.placement import (
     Placement,
     PlacementOptions,
     image_features,
+    keyframe_features,
     place,
     points_with_descriptors,
 )
@@ -125,13 +126,17 @@ def place_recording(
     options = options or PlacementOptions()
     if not video.has_images:
         return Placed(poses, (), None)
-    features = tuple(image_features(poses, video, options, progress("map features", 0)))
+    features = tuple(keyframe_features(poses, video, options, progress("map features", 0)))
     room = opened.room
     if not room.sessions:
         return Placed(dataclasses.replace(poses, map_id=room.map_id), features, None)
     with progress("map", 0) as line:
         if poses.known.any():
             placement = place(poses, features, room.points, options, line.step)
+            if placement.refused:
+                features = _denser(features, poses, video, options, progress)
+                every = dataclasses.replace(options, images=len(features))
+                placement = place(poses, features, room.points, every, line.step)
         else:
             points = room.points
             placement = locate_frames(poses, features, points, camera, options, report=line.step)
@@ -155,6 +160,25 @@ def place_recording(
         map_id=room.map_id,
     )
     return Placed(moved, features, placement, scale)
+
+
+def _denser(
+    features: Sequence[ImageFeatures],
+    poses: Poses,
+    video: Video,
+    options: PlacementOptions,
+    progress: Callable[[str, int], Progress],
+    most: int = 200,
+) -> tuple[ImageFeatures, ...]:
+    """Add features of frames between: the mapped part of the room may be in view for a short time.
+
+    Args:
+        most: images, spread over the frames with a pose; more find shorter times and take longer.
+    """
+    rows = np.flatnonzero(poses.known)
+    rows = np.setdiff1d(rows[:: -(-len(rows) // most)], [image.row for image in features])
+    added = image_features(poses, video, rows, options, progress("map features", 0))
+    return tuple(sorted([*features, *added], key=lambda image: image.row))
 
 
 def _all_frames(
