@@ -381,7 +381,6 @@ def place_component(
     guess, agrees, rival = _agreement(poses, located, options)
     agreeing = [image for image, good in zip(located, agrees, strict=True) if good]
     count = f"{len(agreeing)} of {len(tried)} images agree on a position in the map"
-    needed = max(needed, -(-len(tried) // 10))
     if guess is None or len(agreeing) < needed:
         reason = f"{count}, {needed} are needed"
         return ComponentPlacement(None, tuple(agreeing), len(tried), reason)
