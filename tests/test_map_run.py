@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 import reobj_track as rt
 from reobj.cameras import Camera, Poses, invert_rigid
 from reobj.files import Progress
+from reobj.maps import stage
 from reobj.maps.placement import PlacementOptions, keyframe_features
 from reobj.maps.single_frames import locate_frames, locate_rest
 
@@ -96,6 +97,23 @@ def test_frames_between_located_images_are_located_too(made):
     truth = invert_rigid(true_poses(frame[found.known]))[:, :, 3]
     assert np.median(np.linalg.norm(centre - truth, axis=1)) < 0.04  # m
     assert found.camera.params[0] == pytest.approx(492.76, rel=0.02)
+
+
+def test_images_between_keyframes_place_a_recording(made, monkeypatch):
+    """Its keyframes show nothing of the map."""
+    path, _ = made
+    video = rt.Video(ROOM / "room.mp4", rt.InputConfig(start=12, stop=24))
+    truth = true_poses(np.arange(12, 24))
+    supplied = Poses(
+        Camera("PINHOLE", *video.size, tuple(map(float, CAMERA.split(",")))),
+        np.arange(12, 24), np.arange(12, 24) / 12, truth, np.full(12, "user"), "user",
+    )  # fmt: skip
+    monkeypatch.setattr(stage, "keyframe_features", lambda *args: [])
+    room = rt.RoomMap.load(path)
+    placed = stage.place_recording(stage.OpenMap(path, room, True), supplied, video)
+    assert placed.placement.refused == "" and len(placed.features) == 12
+    centre, expected = (invert_rigid(p)[:, :, 3] for p in (placed.poses.cam_from_world, truth))
+    assert np.linalg.norm(centre - expected, axis=1).max() < 0.03  # m
 
 
 def test_a_recording_without_images_is_not_placed(made, tmp_path):

@@ -195,6 +195,21 @@ def test_few_images_that_agree_are_not_enough():
     assert place(poses, features, points, enough).refused == ""
 
 
+def test_a_short_view_of_the_mapped_part_places_a_recording():
+    """Five of sixty images show it, with ten matches each."""
+    rng = np.random.default_rng(8)
+    points = room(rng)
+    truth = walk(60)
+    poses, features = recording(rng, points, truth, outliers=0)
+    few = [dataclasses.replace(im, xy=im.xy[:10], descriptor=im.descriptor[:10]) for im in features]
+    for image in few[5:]:
+        image.descriptor[:] = descriptors(rng, len(image.descriptor))
+    placement = place(poses, few, points, PlacementOptions(images=60))
+    assert placement.refused == ""
+    assert len(placement.components[0].images) == 5
+    np.testing.assert_allclose(placement.poses.cam_from_world[:5], truth[:5], atol=0.1)
+
+
 def test_points_are_described_by_the_mean_of_their_keypoints():
     rng = np.random.default_rng(7)
     points = room(rng, 300)
