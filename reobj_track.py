@@ -1317,8 +1317,8 @@ def run(
             config.detect.model.
         tracks: file of identities, instead of detector, tracker and linker.
         map: map of the room, in which objects keep their numbers over several recordings; it is
-            made if it does not exist. map_frozen: do not change the file. They replace its options in
-            config.map.
+            made if it does not exist. map_frozen: do not change the file. They replace the
+            options of config.map.
         in_3d: False for 2D identities only. show: show progress in rerun's viewer.
     Returns:
         Result; if the reconstruction fails, it has a warning and no cameras and ellipsoids. With a
