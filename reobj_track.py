@@ -1317,7 +1317,8 @@ def run(
             config.detect.model.
         tracks: file of identities, instead of detector, tracker and linker.
         map: map of the room, in which objects keep their numbers over several recordings; it is
-            made if it does not exist. map_frozen: do not change the file. They replace config.map.
+            made if it does not exist. map_frozen: do not change the file. They replace the
+            options of config.map.
         in_3d: False for 2D identities only. show: show progress in rerun's viewer.
     Returns:
         Result; if the reconstruction fails, it has a warning and no cameras and ellipsoids. With a
@@ -1405,8 +1406,9 @@ def _with_map(config: Config, path: str | Path | None, frozen: bool) -> Config:
     """Return the options with the map that the arguments of `run` give, if they give one."""
     if path is None and not frozen:
         return config
+    where = config.map.path if path is None else str(path)
     return dataclasses.replace(
-        config, map=MapConfig(config.map.path if path is None else str(path), frozen)
+        config, map=dataclasses.replace(config.map, path=where, frozen=frozen)
     )
 
 
@@ -1598,7 +1600,7 @@ def _finish(
     if room is not None:
         with job.timed("map"):
             embedder = f"{job.config.embed.model} {job.config.embed.head}"
-            result = finish_map(room, result, job.video, embedder, placed)
+            result = finish_map(room, result, job.video, embedder, placed, job.progress)
     warnings = [*result.warnings, *_warnings(job.config, result)]
     result = dataclasses.replace(result, warnings=warnings, out=job.workspace.out)
     with job.timed("write"):

@@ -91,6 +91,42 @@ def test_same_map_gives_the_same_bytes(room: RoomMap, saved: Path, tmp_path: Pat
     assert (tmp_path / "b.map").read_bytes() == saved.read_bytes()
 
 
+JPEG = b"\xff\xd8\xff of a chair"
+
+
+def with_picture(room: RoomMap, jpeg: bytes, row: int = 0) -> RoomMap:
+    """The map with a picture in an observation of the second object."""
+    found = room.objects[1]
+    rows = list(found.observations)
+    rows[row] = dataclasses.replace(rows[row], picture=jpeg)
+    second = dataclasses.replace(found, observations=tuple(rows))
+    return dataclasses.replace(room, objects=(room.objects[0], second, *room.objects[2:]))
+
+
+def test_pictures_are_written_and_read(room: RoomMap, saved: Path, tmp_path: Path) -> None:
+    """A map without pictures has no arrays for them."""
+    path = tmp_path / "a.map"
+    shown = with_picture(room, JPEG)
+    shown.save(path)
+    assert_same(shown, RoomMap.load(path))
+    arrays, facts = load_npz(path)
+    assert arrays["observation_picture"].tobytes() == JPEG
+    assert not [name for name in load_npz(saved)[0] if "picture" in name]
+    arrays["observation_picture"] = arrays["observation_picture"][:-1]
+    save_npz(path, arrays, **facts)
+    assert "values of picture" in refusal(path)
+
+
+@pytest.mark.parametrize(
+    ("jpeg", "row"),
+    [(b"<svg>", 0), (JPEG, 1), (JPEG + bytes(1 << 16), 0)],
+    ids=["svg", "gone", "large"],
+)
+def test_other_pictures_are_refused(room: RoomMap, jpeg: bytes, row: int) -> None:
+    with pytest.raises(ValueError, match=r"object 2: session [12]: picture"):
+        room_map.check_map(with_picture(room, jpeg, row))
+
+
 def test_map_far_from_the_origin_keeps_its_coordinates(room: RoomMap, tmp_path: Path) -> None:
     """Poses in a map projection: float32 would have a resolution of .5 m."""
     far = room.points.xyz + np.array([500_000.0, 5_400_000.0, 300.0])

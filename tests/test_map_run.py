@@ -38,8 +38,19 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, rt.Result]:
     folder = tmp_path_factory.mktemp("made")
     path = folder / "flat.map"
     config = options(0, 80, mode=str(ROOM / "poses.txt"))
+    config = dataclasses.replace(config, map=rt.MapConfig(pictures=True))
     detections = ROOM / "detections.npz"
     return path, rt.run(ROOM / "room.mp4", folder / "a", config, detections=detections, map=path)
+
+
+def test_the_map_has_pictures_on_request(made):
+    """One of each object, as the option of the configuration says."""
+    path, first = made
+    objects = rt.RoomMap.load(path).objects
+    assert [o.id for o in objects] == [o.id for o in first.located] and len(objects) > 5
+    for found in objects:
+        jpeg = np.frombuffer(found.observations[0].picture, np.uint8)
+        assert max(cv2.imdecode(jpeg, cv2.IMREAD_COLOR).shape) <= 160
 
 
 def true_poses(frames: np.ndarray) -> np.ndarray:

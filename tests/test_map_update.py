@@ -12,6 +12,7 @@ from simulated import chair_solids, fitted, tracks_of, walk
 import quadrics
 import reobj_track as rt
 from reobj.maps.corrections import delete, forget, with_edits
+from reobj.maps.earlier import earlier_sessions
 from reobj.maps.fusion import object_state
 from reobj.maps.room_map import MapPoints, RoomMap
 from reobj.maps.update import Recording, add_recording
@@ -163,6 +164,51 @@ def test_corrections_of_the_viewer_reach_the_map_once(monday):
     assert with_edits(monday, dataclasses.replace(ours, map_id="another")) is monday
     _, result = add_recording(room, seen([0, 1, 2]), recording("tuesday"))
     assert [(o.id, o.class_name) for o in result.objects] == [(1, "armchair"), (2, "chair")]
+
+
+def test_pictures_of_a_recording_are_replaced_with_it(monday):
+    """None: its video cannot be read, and the pictures that the map has are kept."""
+
+    def pictures_of(room: RoomMap, numbers: list[int], pictures: dict[int, bytes] | None):
+        again = recording("monday", pictures=pictures)
+        new, _ = add_recording(room, seen([0, 1, 2], numbers=numbers), again)
+        return new, [o.observations[0].picture for o in new.objects]
+
+    # identity 8 is chair 2
+    room, found = pictures_of(monday, [7, 8, 9], {8: b"\xff\xd8\xff8"})
+    assert found == [b"", b"\xff\xd8\xff8", b""]
+    assert pictures_of(room, [9, 7, 8], None)[1] == found
+    assert pictures_of(room, [9, 7, 8], {})[1] == [b""] * 3
+
+
+# ---- Earlier recordings for the viewer ---------------------------------------------------------
+
+
+def test_the_viewer_gets_the_objects_of_other_recordings(monday):
+    """Where they were then, and what had changed; not those that the user deleted."""
+    moved = moved_by(seen([0, 1, 2]), 1, [-0.6, 0.4, 0])
+    shown = recording("tuesday", pictures={1: b"\xff\xd8\xff1"})
+    room, tuesday = add_recording(monday, moved, shown)
+    room, _ = add_recording(room, seen([1, 2], wall=True), recording("friday"))
+    path = Path("room.map")
+    first, second = earlier_sessions(room, path, "content of friday")
+    assert [s.name for s in earlier_sessions(room, path, "content of monday")] == [
+        "tuesday", "friday"
+    ]  # fmt: skip
+    assert (first.name, first.changes, dict(first.pictures)) == ("monday", None, {})
+    assert [o.id for o in first.objects] == [o.id for o in second.objects] == [1, 2, 3]
+    np.testing.assert_array_equal(first.objects[0].center, monday.objects[0].observations[0].center)
+    np.testing.assert_array_equal(second.objects[0].center, moved.objects[0].center)
+    np.testing.assert_array_equal(second.objects[1].half_axes, moved.objects[1].half_axes)
+    np.testing.assert_allclose(second.objects[0].size_m, 2 * moved.objects[0].half_axes)
+    assert second.pictures == {1: b"\xff\xd8\xff1"}
+    assert second.changes.summary() == tuesday.changes.summary()
+    (change,), (said,) = second.changes.moved, tuesday.changes.moved
+    np.testing.assert_allclose(change.before, said.before)
+    np.testing.assert_allclose(change.before_shape.half_axes, said.before_shape.half_axes)
+    (_, _, third) = earlier_sessions(delete(room, 2), path, "")
+    assert [o.id for o in third.objects] == [3] and [c.id for c in third.changes.gone] == [1]
+    assert len(earlier_sessions(forget(room, "monday"), path, "content of friday")) == 1
 
 
 def test_known_points_are_not_added_again():

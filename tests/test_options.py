@@ -1040,3 +1040,10 @@ def _(lab: Lab) -> None:
         with opened_map(lab.config(value, map__path=str(path)).map) as opened:
             assert opened is not None and opened.frozen == value
             assert (lab.path / ".flat.map.lock").exists() != value
+
+
+@shows("map.pictures")
+def _(lab: Lab) -> None:
+    for value in (True, False):
+        with opened_map(lab.config(value, map__path=str(lab.path / "new.map")).map) as opened:
+            assert opened is not None and opened.pictures == value

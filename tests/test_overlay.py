@@ -16,6 +16,7 @@ import reobj_track as rt
 from reobj.results.changes import Change, Changes, Shape
 from reobj.results.overlay import (
     CHANGE_COLORS,
+    FormerPlaces,
     Overlay,
     _former_surface,
     change_label,
@@ -644,7 +645,7 @@ def test_labels_are_beside_their_boxes() -> None:
 
 # ---- Changes since a map ----
 
-MOVED, NEW, GONE = (CHANGE_COLORS[kind] for kind in ("moved", "new", "gone"))
+MOVED, NEW, GONE, WAS = (CHANGE_COLORS[kind] for kind in ("moved", "new", "gone", "was"))
 
 
 def changed(chairs: rt.Result, support: str = "box") -> rt.Result:
@@ -673,14 +674,14 @@ def test_labels_name_the_change(chairs: rt.Result, tmp_path: Path) -> None:
     overlay = Overlay(result, tmp_path / "o.mp4", video)
     overlay.close(False)
     assert overlay.labels == {
-        1: "1 chair", 2: "2 chair, moved 0.69 m", 3: "3 chair, new", 8: "8 cup, gone",
-        9: "9 lamp, gone",
+        1: "1 chair", 2: "2 chair, moved 0.69 m", -2: "2 chair, was here", 3: "3 chair, new",
+        -8: "8 cup, gone", -9: "9 lamp, gone",
     }  # fmt: skip
-    assert overlay.marks == {2: MOVED, 3: NEW, 8: GONE, 9: GONE}
+    assert overlay.marks == {2: MOVED, -2: WAS, 3: NEW, -8: GONE, -9: GONE}
     assert [kind for kind, _ in overlay.legend] == ["box", "solid", "thin", "moved", "new", "gone"]
     boxes = Overlay(result, tmp_path / "o.mp4", video, "boxes")
     boxes.close(False)
-    assert [kind for kind, _ in boxes.legend] == ["box", "moved", "new"] and boxes.gone == {}
+    assert [kind for kind, _ in boxes.legend] == ["box", "moved", "new"] and boxes.former == {}
     unscaled = dataclasses.replace(result.changes.moved[0], distance_m=None)
     assert change_label("moved", unscaled) == ", moved" and change_label("stayed", unscaled) == ""
 
@@ -715,21 +716,21 @@ def test_gone_objects_have_a_dashed_outline_with_a_label(
     overlay = Overlay(bare, tmp_path / "o.mp4", rt.Video(frames(tmp_path / "f", 1, SIZE)))
     overlay.close(False)
     image = grey(*SIZE)
-    bounds = overlay._draw_gone(image, 0)
-    assert list(bounds) == [9]
+    bounds = overlay._draw_former(image, 0)
+    assert list(bounds) == [-9]
     found = drawn_in(image, GONE, 25)
     np.testing.assert_allclose(found, true, atol=2.5)
-    np.testing.assert_allclose(bounds[9], true, atol=1.5)
+    np.testing.assert_allclose(bounds[-9], true, atol=1.5)
     gaps = np.abs(image[round(true[1]) : round(true[3])].astype(int) - 127).max(2) > 40
     assert 0.2 < gaps.any(1).mean()
-    # a dashed line covers about half of the outline
+    # dashes of 6 px with round ends of 1 px, and gaps of 6 px: two thirds of the outline
     hull = outline_of(poses.camera, poses.cam_from_world[0], _former_surface(lamp))
     solid_line = grey(*SIZE)
-    cv2.polylines(solid_line, [hull.round().astype(np.int32)], True, GONE, 1, cv2.LINE_AA)
+    cv2.polylines(solid_line, [hull.round().astype(np.int32)], True, GONE, 2, cv2.LINE_AA)
     share = (image != 127).any(2).sum() / (solid_line != 127).any(2).sum()
-    assert 0.35 < share < 0.75
-    draw_tracks(image, rt.Tracks.empty(), overlay.labels, 1.0, marks=overlay.marks, gone=bounds)
-    x1, y1, *_ = bounds[9]
+    assert 0.35 < share < 0.85
+    draw_tracks(image, rt.Tracks.empty(), overlay.labels, 1.0, marks=overlay.marks, former=bounds)
+    x1, y1, *_ = bounds[-9]
     assert near(image[y1 - 17 : y1, x1 : x1 + 60], GONE, 5).mean() > 0.5
 
 
@@ -776,11 +777,57 @@ def test_gone_objects_are_shifted_with_their_world(chairs: rt.Result, tmp_path: 
     for result in (near_origin, far):
         overlay = Overlay(result, tmp_path / "o.mp4", video)
         overlay.close(False)
-        solids, camera, pose = overlay.gone[0]
-        assert np.abs(solids[9]).max() < 100
-        bounds.append(outline_of(camera, pose, solids[9]))
+        places, pose = overlay.former[0]
+        assert np.abs(places.surface[9]).max() < 100
+        bounds.append(places.outlines(pose)[9])
     np.testing.assert_allclose(bounds[1].max(0), bounds[0].max(0), atol=1e-3)
     np.testing.assert_allclose(bounds[1].min(0), bounds[0].min(0), atol=1e-3)
+
+
+def test_moved_objects_have_an_outline_at_their_former_place(
+    chairs: rt.Result, tmp_path: Path
+) -> None:
+    """Dashed, with a label, where that place is; not for an object that is not in the result."""
+    result = changed(chairs)
+    (move,) = result.changes.moved
+    lamp = result.changes.gone[0].before_shape
+    move = dataclasses.replace(move, before_shape=lamp)
+    lost = dataclasses.replace(move, id=7)  # with the low-confidence objects, for example
+    changes = dataclasses.replace(result.changes, moved=(move, lost), gone=())
+    moved = dataclasses.replace(result, changes=changes)
+    overlay = Overlay(moved, tmp_path / "o.mp4", rt.Video(frames(tmp_path / "f", 1, SIZE)))
+    overlay.close(False)
+    image = grey(*SIZE)
+    assert list(overlay._draw_former(image, 0)) == [-2]
+    axes = Rotation.from_quat(lamp.quat_wxyz[[1, 2, 3, 0]]).as_matrix()
+    solid = quadrics.Ellipsoids(move.before[None], lamp.half_axes[None], axes[None])
+    poses = walk()
+    true = quadrics.solid_boxes(solid, "box", poses.camera.K @ poses.cam_from_world[:1])[0, 0]
+    np.testing.assert_allclose(drawn_in(image, WAS, 25), true, atol=2.5)
+    assert [kind for kind, _ in overlay.legend][-3:] == ["moved", "new", "was"]
+
+
+@pytest.mark.parametrize(
+    ("center", "half_axes", "shown"),
+    [
+        ((0.0, 0.0, 2.0), (0.5, 0.5, 0.5), False),  # between the camera and the place
+        ((0.0, 0.0, 6.0), (0.5, 0.5, 0.5), True),  # behind it
+        ((0.0, 0.0, 3.5), (0.7, 0.7, 0.7), True),  # around its centre
+        ((0.6, 0.0, 2.0), (0.5, 0.5, 0.5), True),  # beside the ray
+        ((0.6, 0.0, 2.0), (0.7, 0.2, 0.2), False),  # long in the direction of the ray
+        ((0.0, 0.0, -2.0), (0.5, 0.5, 0.5), True),  # behind the camera
+        ((0.0, 0.0, 0.0), (0.5, 0.5, 0.5), True),  # around the camera
+    ],
+)
+def test_a_nearer_object_hides_a_former_place(
+    center: tuple[float, ...], half_axes: tuple[float, ...], shown: bool
+) -> None:
+    place = np.array([0, 0, 4.0])
+    cube = surface_points("box") * 0.3 + place
+    turned = Rotation.from_euler("z", 10, degrees=True).as_matrix()
+    objects = quadrics.Ellipsoids(np.array([center]), np.array([half_axes]), turned[None])
+    places = FormerPlaces({5: cube}, {5: place}, objects, PINHOLE)
+    assert list(places.outlines(STILL)) == [5] * shown
 
 
 def test_outlines_of_objects_out_of_view_are_not_drawn() -> None:
@@ -792,7 +839,7 @@ def test_outlines_of_objects_out_of_view_are_not_drawn() -> None:
 
 def test_the_legend_shows_the_colours_of_changes() -> None:
     image = grey(300, 100)
-    draw_legend(image, [("moved", "a"), ("new", "b"), ("gone", "c")])
-    rows = [image[30 + 20 * k : 50 + 20 * k, 8:40] for k in range(3)]
-    for row, color in zip(rows, (MOVED, NEW, GONE), strict=True):
+    draw_legend(image, [("moved", "a"), ("new", "b"), ("gone", "c"), ("was", "d")])
+    rows = [image[10 + 20 * k : 30 + 20 * k, 8:40] for k in range(4)]
+    for row, color in zip(rows, (MOVED, NEW, GONE, WAS), strict=True):
         assert [near(r, color, 30).any() for r in rows] == [r is row for r in rows]

@@ -29,10 +29,17 @@ import quadrics
 import reobj.results.scene as scene
 import reobj_track as rt
 from reobj.cameras import invert_rigid
-from reobj.files import decimals
-from reobj.results.changes import Change, Changes, Shape
+from reobj.files import Progress, decimals
+from reobj.results.changes import Change, Changes, EarlierSession, Shape
 from reobj.results.result import VideoInfo
-from reobj.results.scene import Pictures, diverse_rows, page_text, write_pictures, write_scene
+from reobj.results.scene import (
+    Pictures,
+    best_pictures,
+    diverse_rows,
+    page_text,
+    write_pictures,
+    write_scene,
+)
 from reobj.types import object_color
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -1012,11 +1019,138 @@ def test_ghosts_are_shifted_with_their_world(tmp_path: Path, browser: Browser) -
     assert gap == pytest.approx(1, abs=1e-3)
 
 
+def jpeg_of(color: tuple[int, int, int]) -> bytes:
+    """A small picture of one colour (BGR)."""
+    return cv2.imencode(".jpg", np.full((40, 60, 3), color, np.uint8))[1].tobytes()
+
+
+@pytest.fixture(scope="module")
+def page_with_sessions(page: Path) -> Path:
+    """The page of the small scene on Friday: the map has Monday and Tuesday.
+
+    The lamp, 9, was there on both days; the chair, 1, moved on Tuesday and again on Friday.
+    """
+    result = rt.Result.load(page.parent)
+    chair, second = result.objects[:2]
+    changes = changes_of_walk(result.objects)
+    (lamp,) = changes.gone
+    gone = dataclasses.replace(
+        chair, id=9, class_name=EVIL, center=lamp.before, support="cylinder", size=np.full(3, 0.4)
+    )
+    start = dataclasses.replace(chair, center=chair.center + np.array([0, 2.0, 0]))
+    middle = dataclasses.replace(chair, center=changes.moved[0].before)
+    shape = Shape("box", chair.half_axes, chair.quat_wxyz)
+    move = Change(1, "chair", start.center, middle.center, 1.0, before_shape=shape)
+    tuesday = Changes("flat.map", "tuesday", stayed=(Change(2, EVIL),), moved=(move,))
+    shots = ({1: jpeg_of((0, 0, 255)), 9: jpeg_of((0, 0, 255))}, {1: jpeg_of((0, 255, 0))})
+    earlier = (
+        EarlierSession(
+            "monday", "2026-03-02T10:15:20+00:00", (start, second, gone), None, shots[0]
+        ),
+        EarlierSession(
+            "tuesday", "2026-03-03T11:30:00+00:00", (middle, second, gone), tuesday, shots[1]
+        ),
+    )
+    out = page.parent.parent / "sessions"
+    out.mkdir()
+    video = rt.Video(page.parent.parent / "frames")
+    shown = dataclasses.replace(result, changes=changes, earlier=earlier)
+    write_pictures(shown, out, video, overlay="none")
+    return out / "scene.html"
+
+
+SWITCH = "(value => {{ $('session').value = value; $('session').onchange(); }})({})"
+
+
+def test_the_objects_of_other_recordings_are_shown(
+    browser: Browser, page_with_sessions: Path
+) -> None:
+    browser.open(page_with_sessions)
+    options = browser.eval("[...$('session').options].map(o => o.text)")
+    assert options == ["this recording: tuesday", "monday, 2026-03-02 10:15",
+                       "tuesday, 2026-03-03 11:30"]  # fmt: skip
+    assert browser.eval("$('session').hidden") is False
+    here = """(draw(), [solid.map(o => [o.id, o.group.visible]), ghosts.map(g => [g.id, g.kind]),
+        [...document.querySelectorAll('.row')].filter(r => !r.hidden).length])"""
+    now = browser.eval(here)
+    assert now[0] == [[1, True], [2, True], [3, True]]
+    gap = "(([a, b]) => Math.hypot(...add(a, b, -1)))([solid[0].at, {}])"
+    browser.eval("window.chair = solid[0].at")
+    browser.eval(SWITCH.format(0))  # Monday: no changes, the lamp, no suitcase
+    assert browser.eval(here) == [[[1, True], [2, True], [9, True]], [], 3]
+    assert browser.eval(gap.format("chair")) == pytest.approx(2, abs=1e-5)
+    text = browser.eval("$('since').innerText")
+    assert "monday (2026-03-02 10:15 UTC)" in text and "First recording of the map: 3" in text
+    browser.eval("select(solid[0])")
+    text = browser.eval("$('panel').innerText")
+    assert "2.00 m from here" in text and "Correct it" not in text and "Visits" not in text
+    browser.press("Delete")  # corrections are those of this recording
+    assert browser.eval("[pending.length, solid.length]") == [0, 3]
+    browser.eval("select(solid[2])")
+    assert "now\ngone" in browser.eval("$('panel').innerText")
+    browser.picture(SCREENSHOTS / "earlier.png")
+    browser.eval(SWITCH.format(1))  # Tuesday: the chair moved, with an arrow from Monday's place
+    assert browser.eval(here)[1] == [[1, "moved"]]
+    assert browser.eval(gap.format("ghosts[0].at")) == pytest.approx(1, abs=1e-5)
+    assert "chair 1 moved 1.00 m" in browser.eval("$('labels').innerText")
+    browser.press("Escape")
+    browser.eval(SWITCH.format(-1))
+    assert browser.eval(here) == now and browser.eval(gap.format("chair")) == 0
+    assert "1 moved (chair 1" in browser.eval("$('since').innerText")
+    assert browser.eval("window.hacked") is None and complaints(browser) == []
+
+
+def test_pictures_before_and_after_a_change(browser: Browser, page_with_sessions: Path) -> None:
+    """The last picture of the map, and the best one of this recording; on request of the map."""
+    browser.open(page_with_sessions)
+    sessions = data_of(page_with_sessions)["earlier"]
+    shown = """[...document.querySelectorAll('.pair img')].map(i => i.src.split(',')[1])"""
+    browser.eval("select(here[0])")
+    before, after = browser.eval(shown)
+    assert before == sessions[1]["pictures"]["1"]  # Tuesday's
+    chair = data_of(page_with_sessions)["objects"][0]
+    assert [chair["best"], after] in chair["crops"]
+    assert browser.eval("$('panel').querySelector('h3').innerText") == "Before and after"
+    browser.eval("select(here[1])")  # it stayed
+    assert browser.eval(shown) == []
+    browser.eval("selectGhost(ghosts.find(g => g.kind === 'gone'))")
+    assert browser.eval(shown) == [sessions[0]["pictures"]["9"]]
+    browser.eval(SWITCH.format(0) + "; select(solid[0])")
+    assert browser.eval(shown) == [sessions[0]["pictures"]["1"]]
+    assert complaints(browser) == []
+
+
+def test_a_page_has_the_latest_pictures_of_the_map() -> None:
+    shots = [{i: bytes([k]) for i in (1, 2, 3)} for k in range(3)]
+    sessions = [EarlierSession(str(k), "", (), None, shots[k]) for k in range(3)]
+    entries = scene._earlier_sessions(sessions, max_pictures=4)
+    assert [e["name"] for e in entries] == ["0", "1", "2"]
+    assert [list(e["pictures"]) for e in entries] == [[], ["1"], ["1", "2", "3"]]
+
+
+def test_the_best_pictures_show_the_objects(tmp_path: Path) -> None:
+    """Of the largest box in the video, with a margin; only of objects with a shape."""
+    poses = poses_of_walk()
+    tracks = tracks_of_walk(poses)
+    row = np.flatnonzero(tracks.track_id == 3)[7]
+    tracks.xyxy[row] = [20, 20, 300, 220]
+    for i in range(FRAMES):
+        image = np.full((HEIGHT, WIDTH, 3), (255, 0, 0), np.uint8)
+        image[20:220, 20:300] = (0, 255, 0) if i == tracks.frame[row] else (0, 0, 255)
+        cv2.imwrite(str(tmp_path / f"{i:02d}.png"), image)
+    result = fitted(tracks, poses, names=NAMES)
+    found = best_pictures(result, rt.Video(tmp_path), Progress("pictures"))
+    assert sorted(found) == [o.id for o in result.located]
+    crop = cv2.imdecode(np.frombuffer(found[3], np.uint8), cv2.IMREAD_COLOR)
+    assert max(crop.shape) == 160
+    assert crop[40:-40, 40:-40].mean((0, 1)) == pytest.approx([0, 255, 0], abs=9)
+
+
 def test_without_a_map_the_page_has_no_changes(browser: Browser, page: Path) -> None:
     assert "changes" not in data_of(page)
     browser.open(page)
-    shown = "['since', 'kinds', 'changes-label'].map(id => $(id).offsetParent === null)"
-    assert browser.eval(shown) == [True] * 3
+    shown = "['since', 'kinds', 'changes-label', 'session'].map(id => $(id).offsetParent === null)"
+    assert browser.eval(shown) == [True] * 4
     assert browser.eval("[former.children.length, $('sort').value, $('labels').innerHTML]")[:2] == [
         0, "id"
     ]  # fmt: skip

@@ -1,8 +1,8 @@
 """The map file: sessions, objects with one observation per session, points with descriptors.
 
 A map is an npz file with JSON in it, written atomically, with a digest and a version. It holds no
-pictures. What is known of an object now is computed from its observations (`reobj.maps.fusion`),
-so that a session can be forgotten or replaced.
+pictures unless they were asked for. What is known of an object now is computed from its
+observations (`reobj.maps.fusion`), so that a session can be forgotten or replaced.
 """
 
 from __future__ import annotations
@@ -43,6 +43,8 @@ OBSERVATIONS: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {
 }
 LOWER = np.tril_indices(9)  # entries of a covariance in the file
 UNIT = 1.001  # largest component of a unit vector, rounded to float16
+JPEG_START = b"\xff\xd8\xff"
+PICTURE_MAX = 1 << 16  # bytes; a JPEG of 160 px has 13 kB even if it is noise
 STATUSES = ("new", "stayed", "moved", "gone", "not_seen")
 
 
@@ -62,6 +64,7 @@ class Observation:
         views: detections. expected: independent views in which it should have been detected.
         missed: of those, views without a detection.
         log_odds: that the object existed, from this session.
+        picture: JPEG; empty unless pictures were asked for.
     """
 
     session: int
@@ -79,6 +82,7 @@ class Observation:
     expected: int = 0
     missed: int = 0
     log_odds: float = 0.0
+    picture: bytes = b""
 
     ARRAYS = ("center", "half_axes", "quat_wxyz", "cov")
     EMBEDDINGS = ("foreground", "background")
@@ -350,6 +354,8 @@ def _check_observation(o: Observation, where: str) -> None:
         _expect(_whole(getattr(o, name)), f"{where}{name}")
     _expect(o.missed <= o.expected, f"{where}missed {o.missed} of {o.expected}")
     _expect(_number(o.log_odds), f"{where}log_odds")
+    jpeg = o.picture.startswith(JPEG_START) and len(o.picture) <= PICTURE_MAX
+    _expect(not o.picture or (o.detected and jpeg), f"{where}picture")
     for name in Observation.EMBEDDINGS:
         mean = getattr(o, name)
         _expect(mean.ndim == 1 and _bounded(mean, UNIT), f"{where}{name}")
@@ -392,6 +398,10 @@ def save_map(path: Path, room: RoomMap) -> None:
         means = [np.asarray(getattr(o, name), np.float16) for o in rows]
         arrays[f"observation_{name}"] = np.concatenate([np.empty(0, np.float16), *means])
         arrays[f"observation_{name}_length"] = np.array([len(m) for m in means], np.int32)
+    if any(o.picture for o in rows):
+        pictures = np.frombuffer(b"".join(o.picture for o in rows), np.uint8)
+        arrays["observation_picture"] = pictures
+        arrays["observation_picture_length"] = np.array([len(o.picture) for o in rows], np.int32)
     sessions = sorted(room.sessions, key=lambda session: session.number)
     for session in sessions:
         for name in Session.ARRAYS:
@@ -416,7 +426,8 @@ def save_map(path: Path, room: RoomMap) -> None:
             for found in objects
         ],
         "observations": [
-            _without_arrays(o, (*Observation.ARRAYS, *Observation.EMBEDDINGS)) for o in rows
+            _without_arrays(o, (*Observation.ARRAYS, *Observation.EMBEDDINGS, "picture"))
+            for o in rows
         ],
     }  # fmt: skip
     save_npz(path, arrays, **facts)
@@ -513,6 +524,15 @@ def _column(
     return np.asarray(values)
 
 
+def _split_column(arrays: dict[str, Any], name: str, kind: np.dtype[Any]) -> list[npt.NDArray[Any]]:
+    """Return a value (n,) of each observation; in the file they are concatenated."""
+    column = _column(arrays, f"observation_{name}", kind, ())
+    length = _column(arrays, f"observation_{name}_length", np.dtype(np.int32), ())
+    if (length < 0).any() or length.sum() != len(column):
+        raise ValueError(f"{len(column)} values of {name}, {length.sum()} expected")
+    return np.split(column, np.cumsum(length))[:-1]
+
+
 def _decoded_observations(arrays: dict[str, Any], facts: dict[str, Any]) -> list[Observation]:
     """Build the observations of all objects, in the order of the file."""
     values: dict[str, Any] = {}
@@ -524,11 +544,11 @@ def _decoded_observations(arrays: dict[str, Any], facts: dict[str, Any]) -> list
     cov[:, LOWER[1], LOWER[0]] = values["cov"]
     values["cov"] = cov
     for name in Observation.EMBEDDINGS:
-        means = _column(arrays, f"observation_{name}", np.dtype(np.float16), ())
-        length = _column(arrays, f"observation_{name}_length", np.dtype(np.int32), ())
-        if (length < 0).any() or length.sum() != len(means):
-            raise ValueError(f"{len(means)} values of {name}, {length.sum()} expected")
-        values[name] = np.split(means.astype(np.float32), np.cumsum(length))[:-1]
+        means = _split_column(arrays, name, np.dtype(np.float16))
+        values[name] = [mean.astype(np.float32) for mean in means]
+    if "observation_picture" in arrays:
+        pictures = _split_column(arrays, "picture", np.dtype(np.uint8))
+        values["picture"] = [picture.tobytes() for picture in pictures]
     if any(len(column) != len(facts["observations"]) for column in values.values()):
         raise ValueError(f"arrays of other lengths than {len(facts['observations'])} observations")
     rows = (dict(zip(values, row, strict=True)) for row in zip(*values.values(), strict=True))

@@ -15,6 +15,7 @@ import quadrics
 from reobj.cameras import Camera, Poses, import_pycolmap
 from reobj.files import Progress
 from reobj.maps.corrections import with_edits
+from reobj.maps.earlier import earlier_sessions
 from reobj.maps.fusion import scale_of
 from reobj.maps.placement import (
     ImageFeatures,
@@ -30,6 +31,7 @@ from reobj.maps.single_frames import locate_frames, locate_rest
 from reobj.maps.update import Recording, add_recording
 from reobj.results.changes import Changes
 from reobj.results.result import Result
+from reobj.results.scene import best_pictures
 from reobj.sources.video import Video
 from reobj.types import ReobjError, option
 
@@ -45,6 +47,11 @@ class MapConfig:
         "--map",
     )
     frozen: bool = option(False, "compare with --map only: the file is not changed", "--map-frozen")
+    pictures: bool = option(
+        False,
+        "keep a small picture of each object and recording in the map, for before and after in "
+        "scene.html",
+    )
 
     def absolute(self) -> MapConfig:
         """Return the options with the absolute path, to be found from any folder."""
@@ -57,11 +64,13 @@ class OpenMap:
 
     Attributes:
         path: of the file. room: its content, or an empty map. frozen: the file is not changed.
+        pictures: keep a picture of each object.
     """
 
     path: Path
     room: RoomMap
     frozen: bool
+    pictures: bool = False
 
 
 @contextlib.contextmanager
@@ -85,10 +94,11 @@ def opened_map(config: MapConfig, must_exist: bool = False) -> Iterator[OpenMap 
             "--set map.path=FILE (empty: none)"
         )
     if config.frozen:
-        yield OpenMap(path, RoomMap.load(path), True)
+        yield OpenMap(path, RoomMap.load(path), True, config.pictures)
         return
     with map_lock(path):
-        yield OpenMap(path, RoomMap.load(path) if path.exists() else RoomMap(), False)
+        room = RoomMap.load(path) if path.exists() else RoomMap()
+        yield OpenMap(path, room, False, config.pictures)
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,7 +249,12 @@ def move_models(
 
 
 def finish_map(
-    opened: OpenMap, result: Result, video: Video, embedder: str, placed: Placed | None
+    opened: OpenMap,
+    result: Result,
+    video: Video,
+    embedder: str,
+    placed: Placed | None,
+    progress: Callable[[str, int], Progress] = Progress,
 ) -> Result:
     """Number the objects of a recording, write the map, and return the result with `changes`.
 
@@ -265,7 +280,14 @@ def finish_map(
     if result.edits is not None:
         room = with_edits(room, result.edits)
     recording = _recording(opened, result, video, name, embedder, placed)
+    if opened.pictures and not opened.frozen:
+        pictures = None
+        if video.has_images and not video.is_live:
+            pictures = best_pictures(result, video, progress("map pictures", video.expected))
+        recording = dataclasses.replace(recording, pictures=pictures)
     new_room, numbered = add_recording(room, result, recording)
+    earlier = earlier_sessions(new_room, opened.path, recording.fingerprint)
+    numbered = dataclasses.replace(numbered, earlier=earlier)
     if opened.frozen:
         return numbered
     try:

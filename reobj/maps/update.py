@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import datetime
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,7 @@ class Recording:
         scale: metres per unit of the map as this recording measured it; source "none": it did not.
         points: with descriptors, in the world of the map; None: those of the map are kept.
         features: of some of its images, in which the points of map objects are recognised.
+        pictures: JPEG of its objects, by identity; None: those that the map has are kept.
     """
 
     map_path: Path
@@ -49,6 +50,7 @@ class Recording:
     scale: quadrics.Scale
     points: MapPoints | None
     features: tuple[ImageFeatures, ...] = ()
+    pictures: Mapping[int, bytes] | None = field(default_factory=dict)
 
 
 def add_recording(room: RoomMap, result: Result, recording: Recording) -> tuple[RoomMap, Result]:
@@ -91,6 +93,12 @@ def add_recording(room: RoomMap, result: Result, recording: Recording) -> tuple[
     numbers = _numbers(result, decisions, room, is_first)
     session = _session(number, recording, result.poses)
     observations = _observations(number, decisions, found, states, visibility)
+    pictures = recording.pictures
+    if pictures is None:
+        pictures = {i: own[n].picture for i, n in numbers.items() if n in own}
+    observations = [
+        (n, i, dataclasses.replace(o, picture=pictures.get(i, b""))) for n, i, o in observations
+    ]
     sessions = (*(s for s in room.sessions if s.number != number), session)
     points = room.points
     if recording.points is not None:

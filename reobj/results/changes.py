@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from reobj.files import atomic, load_json, numbers, rounded
-from reobj.results.entries import decode
+from reobj.results.entries import Object, decode
 from reobj.types import Array, ReobjError
 
 HEADER = {"format": "reobj-changes", "version": 1}
@@ -195,6 +195,24 @@ class Changes:
         if self.ambiguous:
             counts.append(f"{len(self.ambiguous)} ambiguous among identical objects")
         return f"map {self.map_path}: " + ", ".join(counts)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EarlierSession:
+    """Another recording in the map, for the viewer.
+
+    Attributes:
+        name: of the recording. date: when it was added to the map, ISO 8601, UTC.
+        objects: that were detected in it: places and sizes then, in the world of the map.
+        changes: since the recordings before it, as far as the map tells; None: it is the first.
+        pictures: JPEG of objects, by number; {}: the map has none.
+    """
+
+    name: str
+    date: str
+    objects: Sequence[Object]
+    changes: Changes | None = None
+    pictures: Mapping[int, bytes] = field(default_factory=dict)
 
 
 def _moved_text(change: Change) -> str:

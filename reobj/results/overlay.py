@@ -64,7 +64,7 @@ def draw_tracks(
     positions: dict[int, int] | None = None,
     thin: frozenset[int] = frozenset(),
     marks: Mapping[int, Color] | None = None,
-    gone: Mapping[int, IntArray] | None = None,
+    former: Mapping[int, IntArray] | None = None,
 ) -> None:
     """Draw the boxes and identities of one frame's rows, in place; interpolated boxes are dashed.
 
@@ -76,10 +76,11 @@ def draw_tracks(
             here, so that labels jump less.
         thin: identities whose solid is drawn too.
         marks: colours of the labels of changed objects, and of a second outline of their boxes.
-        gone: bounds (4,) of the outlines of gone objects, pixels of the image: they get a label.
+        former: bounds (4,) of the outlines of former places, pixels of the image, by the number of
+            the object, negative: they get the label and the colour of this number.
     """
     marks = marks or {}
-    gone = gone or {}
+    former = former or {}
     boxes = (tracks.xyxy * scale).round().astype(int)  # (N, 4)
     ids = tracks.track_id.tolist()
     scores = tracks.score.tolist()
@@ -87,8 +88,8 @@ def draw_tracks(
         _draw_box(image, box, object_color(obj), 1 if obj in thin else 2, dashed=score == 0)
         if obj in marks:  # 1 px between both outlines
             _draw_box(image, box + np.array([-4, -4, 4, 4]), marks[obj], 2, dashed=False)
-    ids = [*ids, *gone]
-    boxes = np.array([*boxes, *gone.values()], int).reshape(-1, 4)
+    ids = [*ids, *former]
+    boxes = np.array([*boxes, *former.values()], int).reshape(-1, 4)
     positions = {} if positions is None else positions
     texts = [labels.get(obj, str(obj)) for obj in ids]
     sizes = np.array([_text_size(text) for text in texts], int).reshape(-1, 2)
@@ -405,9 +406,10 @@ def _fits(pixels: Array, image: Image) -> bool:
 # ---- Changes since a map -----------------------------------------------------------------------
 
 # BGR. Colours of identities have a saturation of at most .78 (`object_color`): these are purer or
-# grey, and no two of them have the same lightness. Black text is readable on each.
+# grey, and no two of them have the same lightness. Black text is readable on each. "was": former
+# places of moved objects: light, as video codecs keep less of colour than of brightness.
 CHANGE_COLORS: dict[str, Color] = {
-    "moved": (255, 0, 255), "new": (40, 255, 90), "gone": (225, 225, 225),
+    "moved": (255, 0, 255), "new": (40, 255, 90), "gone": (225, 225, 225), "was": (255, 150, 255),
 }  # fmt: skip
 
 
@@ -470,26 +472,77 @@ def _former_surface(change: Change) -> Array:
     return np.asarray(points, np.float64)
 
 
-def _gone_places(result: Result) -> dict[int, tuple[dict[int, Array], Camera, Array]]:
-    """Map frames to the gone objects in the world of their component, the camera and the pose.
+@dataclass(frozen=True, slots=True, eq=False)
+class FormerPlaces:
+    """Former places of moved and gone objects, and what occludes them, in one component.
 
-    Objects are surface points (P, 3) by number. Only components placed in the map are included.
+    Attributes:
+        surface: points (P, 3) of each by the number of the object. center: (3,) of each.
+        present: ellipsoids of the objects that are there now. camera: of the component.
     """
-    places: dict[int, tuple[dict[int, Array], Camera, Array]] = {}
+
+    surface: dict[int, Array]
+    center: dict[int, Array]
+    present: quadrics.Ellipsoids
+    camera: Camera
+
+    def outlines(self, cam_from_world: Array) -> dict[int, Array]:
+        """Return the outlines (n, 2), native pixels, of the places in view by their numbers.
+
+        A place is out of view if a present ellipsoid lies between its centre and the camera. One
+        that contains the centre does not.
+        """
+        eye = -cam_from_world[:, :3].T @ cam_from_world[:, 3]
+        outlines = {}
+        for number, points in self.surface.items():
+            outline = outline_of(self.camera, cam_from_world, points)
+            if outline is not None and not _passes_through(eye, self.center[number], self.present):
+                outlines[number] = outline
+        return outlines
+
+
+def _passes_through(start: Array, end: Array, ellipsoids: quadrics.Ellipsoids) -> bool:
+    """Test whether a segment between points (3,) enters an ellipsoid and leaves it again."""
+    axes = ellipsoids.world_from_obj
+    scaled = axes / ellipsoids.half_axes[:, None]  # (O, 3, 3): each ellipsoid is the unit sphere
+    from_center = np.einsum("ojk,oj->ok", scaled, start - ellipsoids.center_in_world)
+    way = np.einsum("ojk,j->ok", scaled, end - start)  # (O, 3)
+    a = (way**2).sum(1)  # |from_center + t way|^2 = 1 is a t^2 + 2 b t + c = 0
+    b = (from_center * way).sum(1)
+    c = (from_center**2).sum(1) - 1
+    root = np.sqrt((b**2 - a * c).clip(0))  # 0: the line passes the ellipsoid or touches it
+    entered = -b - root > 0
+    left = -b + root < a
+    return bool((entered & left & (root > 0)).any())
+
+
+def _former_places(result: Result) -> dict[int, tuple[FormerPlaces, Array]]:
+    """Map frames to the former places of moved and gone objects of the component, and the pose.
+
+    Only components placed in the map are included. Moved objects are those of the component.
+    """
+    places: dict[int, tuple[FormerPlaces, Array]] = {}
     changes = result.changes
-    gone = () if changes is None else changes.gone
-    if changes is None or not any(c.before_shape for c in gone):
+    if changes is None or not any(c.before_shape for c in (*changes.moved, *changes.gone)):
         return places
     for k, component in enumerate(result.parts()):
         shifted, origin = centred(component)
         poses = shifted.poses
         if poses is None or k not in changes.components:
             continue
-        solids = {c.id: _former_surface(c) - origin for c in gone if c.before_shape}
+        here = {o.id for o in component.objects}
+        shown = [c for c in changes.moved if c.before_shape and c.id in here]
+        shown += [c for c in changes.gone if c.before_shape]
+        former = FormerPlaces(
+            {c.id: _former_surface(c) - origin for c in shown},
+            {c.id: np.asarray(c.before) - origin for c in shown},
+            shifted.ellipsoids(),
+            poses.camera,
+        )
         known = poses.known
         for frame, pose in zip(poses.frame[known].tolist(), poses.cam_from_world[known],
                                strict=True):  # fmt: skip
-            places[frame] = (solids, poses.camera, pose)
+            places[frame] = (former, pose)
     return places
 
 
@@ -521,13 +574,18 @@ class Overlay:
         for i, (kind, change) in _changes_of(result).items():
             if kind in CHANGE_COLORS:
                 name = self.labels.get(i, f"{i} {cut(change.class_name, 24)}")
-                self.labels[i] = name + change_label(kind, change)
-                self.marks[i] = CHANGE_COLORS[kind]
-        self.gone = _gone_places(result) if self.layers & {"solids", "ellipses"} else {}
+                key = -i if kind == "gone" else i  # negative: the label of its former place
+                self.labels[key] = name + change_label(kind, change)
+                self.marks[key] = CHANGE_COLORS[kind]
+                if kind == "moved":
+                    self.labels[-i] = f"{name}, was here"
+                    self.marks[-i] = CHANGE_COLORS["was"]
+        self.former = _former_places(result) if self.layers & {"solids", "ellipses"} else {}
         self.outlines = _project_all(result, self.scale, self.layers)
         self.label_positions: dict[int, int] = {}
         self.cameras = _cameras(result) if "solids" in self.layers else {}
-        self.legend = _legend(result, self.layers, bool(self.gone))
+        outlined = {i for places, _ in self.former.values() for i in places.surface}
+        self.legend = _legend(result, self.layers, outlined)
         self.trails: dict[int, list[tuple[int, Array]]] = {}  # by identity: frame, position
 
     def take(self, frame: Frame) -> None:
@@ -540,9 +598,9 @@ class Overlay:
         if "trails" in self.layers:
             self._draw_trails(image, rows)
         thin = self._draw_solids(image, frame.index, seen)
-        gone = self._draw_gone(image, frame.index)
+        former = self._draw_former(image, frame.index)
         draw_tracks(
-            image, rows, self.labels, self.scale, self.label_positions, thin, self.marks, gone
+            image, rows, self.labels, self.scale, self.label_positions, thin, self.marks, former
         )
         if self.legend and self.writer.count < 2 * self.fps:  # 2 s are enough to read it
             draw_legend(image, self.legend)
@@ -567,22 +625,21 @@ class Overlay:
             shown |= set(ids)
         return frozenset(shown & seen)
 
-    def _draw_gone(self, image: Image, frame: int) -> dict[int, IntArray]:
-        """Draw the outlines of gone objects whose former place is in view.
+    def _draw_former(self, image: Image, frame: int) -> dict[int, IntArray]:
+        """Draw the outlines of moved and gone objects at their former places in view.
 
         Returns:
-            bounds (4,) of each outline by the number of the object, pixels of the image.
+            bounds (4,) of each outline, pixels of the image, by the number of the object, negative.
         """
         bounds: dict[int, IntArray] = {}
-        if frame not in self.gone:
+        if frame not in self.former:
             return bounds
-        solids, camera, cam_from_world = self.gone[frame]
-        for number, points in solids.items():
-            outline = outline_of(camera, cam_from_world, points)
-            if outline is not None and _fits(self.scale * outline, image):
+        places, cam_from_world = self.former[frame]
+        for number, outline in places.outlines(cam_from_world).items():
+            if _fits(self.scale * outline, image):
                 line = self.scale * outline - 0.5  # OpenCV draws with the pixel's centre at 0
-                _draw_dashes(image, line, CHANGE_COLORS["gone"], 1)
-                bounds[number] = np.array([line.min(0), line.max(0)]).round().astype(int).ravel()
+                _draw_dashes(image, line, self.marks[-number], 2)
+                bounds[-number] = np.array([line.min(0), line.max(0)]).round().astype(int).ravel()
         return bounds
 
     def _draw_trails(self, image: Image, rows: Tracks) -> None:
@@ -659,11 +716,11 @@ def _project_all(
 # ---- Legend ------------------------------------------------------------------------------------
 
 
-def _legend(result: Result, layers: frozenset[str], gone: bool) -> list[tuple[str, str]]:
+def _legend(result: Result, layers: frozenset[str], former: set[int]) -> list[tuple[str, str]]:
     """List the kinds of lines in this video and their meaning.
 
     Args:
-        gone: outlines of gone objects are drawn.
+        former: numbers of the objects whose former places are outlined.
     """
     lines = [("box", "detected; number = identity")]
     if (result.tracks.score == 0).any():
@@ -677,8 +734,9 @@ def _legend(result: Result, layers: frozenset[str], gone: bool) -> list[tuple[st
     kinds = {kind for kind, _ in _changes_of(result).values()}
     meanings = {"moved": "moved since the map", "new": "not in the map"}
     lines += [(kind, text) for kind, text in meanings.items() if kind in kinds]
-    if gone:
-        lines.append(("gone", "was here, gone now"))
+    outlined = {kind for i, (kind, _) in _changes_of(result).items() if i in former}
+    lines += [("was", "was here, moved")] if "moved" in outlined else []
+    lines += [("gone", "was here, gone now")] if "gone" in outlined else []
     return lines
 
 
@@ -701,8 +759,8 @@ def draw_legend(image: Image, lines: Sequence[tuple[str, str]]) -> None:
         elif kind in ("moved", "new"):
             _draw_box(image, box + np.array([3, 3, -3, -3]), color, 1, dashed=False)
             _draw_box(image, box, CHANGE_COLORS[kind], 2, dashed=False)
-        elif kind == "gone":
-            _draw_box(image, box, CHANGE_COLORS[kind], 1, dashed=True)
+        elif kind in ("was", "gone"):
+            _draw_box(image, box, CHANGE_COLORS[kind], 2, dashed=True)
         else:
             middle = y + line_px // 2
             thickness = 1 if kind == "thin" else 2

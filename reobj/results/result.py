@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 import quadrics
 from reobj.cameras import Poses
 from reobj.results import report, saving
-from reobj.results.changes import Changes
+from reobj.results.changes import Changes, EarlierSession
 from reobj.results.edits import Edits
 from reobj.results.entries import Object, Part, VideoInfo, World
 from reobj.types import Embeddings, IntArray, Tracks
@@ -45,6 +45,7 @@ class Result:
             taken from the cache.
         warnings: for the user. edits: manual corrections.
         changes: since the map that the recording was placed in; None: run without a map.
+        earlier: the other recordings in that map, in their order; for the viewer, not in the files.
         out: the folder that it was saved to or loaded from.
     """
 
@@ -65,6 +66,7 @@ class Result:
     warnings: list[str] = field(default_factory=list)
     edits: Edits | None = None
     changes: Changes | None = None
+    earlier: Sequence[EarlierSession] = ()
     out: Path | None = None
 
     @property
@@ -150,7 +152,7 @@ class Result:
 
     @classmethod
     def load(cls, out: str | Path) -> Result:
-        """Read what `save` wrote; without the fits and the embeddings.
+        """Read what `save` wrote; without the fits, the embeddings and the earlier recordings.
 
         Boxes have the precision of tracks.txt, .01 px, and the class of their object (-1 if the
         object does not exist, as in a file that was edited by hand).

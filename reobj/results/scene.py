@@ -14,7 +14,7 @@ import json
 import math
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ import quadrics
 from reobj.cameras import Camera, Poses, invert_rigid, place_of, undistort_boxes
 from reobj.files import Progress, atomic, base64_text, rounded, significant
 from reobj.poses.floor import NOISE
+from reobj.results.changes import EarlierSession
 from reobj.results.origin import centred
 from reobj.results.overlay import Overlay, film_layers
 from reobj.results.report import sides
@@ -55,6 +56,7 @@ class Pictures:
         wanted: rows of the tracks to crop, ascending. whole: numbers of the frames to keep.
         crops: [frame number, base64] of each object's crops, by identity, in temporal order.
         frames: [frame number, base64] of whole frames, undistorted.
+        best: frame number of the best box of each object, by identity.
     """
 
     def __init__(self, result: Result, video: Video, max_crops: int = 480) -> None:
@@ -64,6 +66,7 @@ class Pictures:
         self.crops: dict[int, list[tuple[int, str]]] = {o.id: [] for o in result.objects}
         self.frames: list[tuple[int, str]] = []
         poses = [part.poses for part in result.parts()]
+        self.best: dict[int, int] = {}
         chosen = [np.empty(0, np.int64)]
         left = max_crops
         ranked = sorted(result.objects, key=lambda o: -o.frames_seen)
@@ -71,6 +74,9 @@ class Pictures:
             group = [o for o in ranked if (o.status == "doubtful") == doubtful]
             count = min(max(left // max(len(group), 1), 1), 8)
             rows = [diverse_rows(result.tracks, o, poses[o.part], count) for o in group[:left]]
+            for views in filter(len, rows):
+                best = int(views[0])
+                self.best[int(result.tracks.track_id[best])] = int(result.tracks.frame[best])
             chosen = chosen + rows
             left = left - sum(map(len, rows))
         self.wanted = np.sort(np.concatenate(chosen))
@@ -85,17 +91,13 @@ class Pictures:
     def take(self, frame: Frame) -> None:
         """Crop the wanted boxes of this frame, and keep the frame if it is one of `whole`."""
         rows = self.wanted[self.tracks.frame[self.wanted] == frame.index]
-        height, width = frame.image.shape[:2]
         for obj, box in zip(self.tracks.track_id[rows], self.tracks.xyxy[rows], strict=True):
-            margin = 0.1 * (box[2:] - box[:2])  # shows what the object stands on
-            x1, y1 = ((box[:2] - margin) * self.scale).clip(0).astype(int)
-            x2, y2 = np.minimum((box[2:] + margin) * self.scale + 1, (width, height)).astype(int)
-            if x1 < x2 and y1 < y2:
-                crop = _jpeg(shrunk(frame.image[y1:y2, x1:x2], 112))
-                self.crops[int(obj)].append((frame.index, crop))
+            crop = _crop(frame.image, box * self.scale, 112)
+            if crop:
+                self.crops[int(obj)].append((frame.index, _base64(crop)))
         if frame.index in self.whole:
             image = self._undistorted(shrunk(frame.image, 640))
-            self.frames.append((frame.index, _jpeg(image)))
+            self.frames.append((frame.index, _base64(_jpeg(image))))
 
     def _undistorted(self, image: Image) -> Image:
         """Undistort a small picture, so that projected solids coincide with their objects."""
@@ -120,10 +122,56 @@ def _distorted_grid(camera: Camera, width: int, height: int) -> npt.NDArray[np.f
     return np.nan_to_num(distorted, nan=-1.0).reshape(height, width, 2).astype(np.float32)
 
 
-def _jpeg(image: Image) -> str:
-    """Encode a small picture as base64 of a JPEG; WebP: half the bytes, eight times the time."""
-    data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 60])[1]
-    return base64.b64encode(data.tobytes()).decode()
+def _crop(image: Image, box: Array, size_px: int) -> bytes:
+    """Cut a box (4,), pixels of the image, out of it: a JPEG; b"" if the box is outside.
+
+    Args:
+        size_px: longest side.
+    """
+    height, width = image.shape[:2]
+    margin = 0.1 * (box[2:] - box[:2])  # shows what the object stands on
+    x1, y1 = (box[:2] - margin).clip(0).astype(int)
+    x2, y2 = np.minimum(box[2:] + margin + 1, (width, height)).astype(int)
+    if x1 >= x2 or y1 >= y2:
+        return b""
+    return _jpeg(shrunk(image[y1:y2, x1:x2], size_px))
+
+
+def _jpeg(image: Image) -> bytes:
+    """Encode a small picture as JPEG; WebP: half the bytes, eight times the time."""
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 60])[1].tobytes()
+
+
+def _base64(data: bytes) -> str:
+    """Encode bytes for the page."""
+    return base64.b64encode(data).decode()
+
+
+def best_pictures(
+    result: Result, video: Video, line: Progress, size_px: int = 160
+) -> dict[int, bytes]:
+    """Return a JPEG of the best box of each object with a shape in the first component.
+
+    Args:
+        line: of the progress; its steps are frames. size_px: longest side: 1.7 kB a picture in
+            rendered rooms.
+    Returns:
+        pictures by identity.
+    """
+    poses = result.of_part(0).poses
+    objects = [o for o in result.located if o.part == 0]
+    rows = [diverse_rows(result.tracks, o, poses, 1) for o in objects]
+    row = np.concatenate([np.empty(0, np.int64), *rows])  # (n,)
+    frames = result.tracks.frame[row]
+    pictures = {}
+    for frame in video if len(row) else ():
+        for k in row[frames == frame.index].tolist():
+            crop = _crop(frame.image, result.tracks.xyxy[k] * video.scale, size_px)
+            if crop:
+                pictures[int(result.tracks.track_id[k])] = crop
+        line.step()
+    line.close()
+    return pictures
 
 
 def diverse_rows(tracks: Tracks, obj: Object, poses: Poses | None, count: int) -> IntArray:
@@ -222,6 +270,10 @@ def write_scene(
     }
     if result.changes is not None:
         data["changes"] = result.changes.to_json() | {"summary": result.changes.summary()}
+    if result.earlier:
+        data["earlier"] = _earlier_sessions(result.earlier)
+        for entry in data["objects"]:
+            entry["best"] = pictures.best.get(entry["id"])
     text = json.dumps(data, separators=(",", ":"), allow_nan=False)
     head, tail = page_text().split("@DATA@")
     with atomic(path) as part:  # "<" is escaped: no name can end the script element
@@ -317,6 +369,42 @@ def _scene_object(
         "visits": sorted(visits),
         "crops": pictures.crops[obj.id],
     }
+
+
+def _earlier_sessions(
+    sessions: Sequence[EarlierSession], max_pictures: int = 240
+) -> list[dict[str, Any]]:
+    """Collect the earlier recordings for the viewer: objects, changes, pictures.
+
+    Args:
+        max_pictures: of all, the latest ones; 240 are .5 MB of the page.
+    """
+    entries: list[dict[str, Any]] = []
+    left = max_pictures
+    for session in reversed(sessions):
+        changes = session.changes
+        count = len(session.objects)
+        first = f"First recording of the map: {count} object{'s' * (count != 1)}"
+        chosen = sorted(session.pictures)[:left]
+        left -= len(chosen)
+        entries.append({
+            "name": session.name,
+            "date": session.date,
+            "summary": first if changes is None else changes.summary(),
+            "changes": None if changes is None else changes.to_json(),
+            "objects": [_earlier_object(o) for o in session.objects],
+            "pictures": {str(i): _base64(session.pictures[i]) for i in chosen},
+        })  # fmt: skip
+    return entries[::-1]
+
+
+def _earlier_object(obj: Object) -> dict[str, Any]:
+    """Collect what the viewer shows of an object in an earlier recording."""
+    keys = ("id", "class", "support", "center", "half_axes", "quat_wxyz", "size", "size_m",
+            "size_rel_sigma")  # fmt: skip
+    entry = obj.to_json()
+    cov = "" if obj.cov is None else base64_text(obj.cov, "<f4")
+    return {key: entry[key] for key in keys} | {"cov": cov, "sides": sides(obj)}
 
 
 def _why_flat(result: Result) -> str:

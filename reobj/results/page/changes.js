@@ -1,7 +1,9 @@
 // Changes since a map: kinds of objects, ghosts at former places, arrows from there.
 const RANK = ["moved", "gone", "new", "stayed", "not_seen"];
-const CHANGES = new Map(RANK.flatMap((kind) => (S.changes?.[kind] || [])
+const kindsOf = (changes) => new Map(RANK.flatMap((kind) => (changes?.[kind] || [])
   .map((c) => [c.id, { ...c, kind }])));
+const SINCE = kindsOf(S.changes);                // of this recording
+let CHANGES = SINCE;                             // of the recording whose objects are shown
 let ghosts = [];                                 // former places in the part: of moved, gone, not seen
 
 // An object has the change of the first of its numbers; a ghost that of its own.
@@ -20,7 +22,7 @@ function changeFacts(c) {                        // rows of the panel
   if (!c) return [];
   const text = c.kind === "moved" && c.distance_m !== null && c.sigma_m
     ? `moved ${withSigma(c.distance_m, c.sigma_m, "m")}` : kindText(c);
-  return [["since the map", text], ...(c.evidence ? [["evidence", c.evidence]] : []),
+  return [[state.session ? "change" : "since the map", text], ...(c.evidence ? [["evidence", c.evidence]] : []),
     ...(c.candidates.length ? [["may also be", c.candidates.join(", ")]] : [])];
 }
 
@@ -31,8 +33,7 @@ const allowedGhost = (g) => $("changes").checked && !state.hidden.has(g.class)
 const absentHere = () => ghosts.filter((g) => absent(g) && g.at && allowedGhost(g));
 
 function gatherGhosts() {
-  const inMap = S.changes?.components.includes(state.part);
-  ghosts = [...CHANGES.values()].filter((c) => inMap && ["moved", "gone", "not_seen"].includes(c.kind))
+  ghosts = [...CHANGES.values()].filter((c) => inMap(state.part) && ["moved", "gone", "not_seen"].includes(c.kind))
     .map((c) => ({ ...c, ...c.from_shape, size: null, frames_seen: 0, visits: [], center: c.from && add(c.from, S.parts[state.part].origin, -1),
       object: here.find((o) => o.ids.includes(c.id) && changeOf(o)?.id === c.id) || null }))
     .filter((g) => g.kind !== "moved" || g.object?.center);
@@ -97,7 +98,7 @@ function selectGhost(g) {                        // a second time: no more
   $("panel").style.setProperty("--own", "transparent");
   $("panel").replaceChildren(
     el("button", { id: "close", title: "close (Esc)", onclick: () => selectGhost(g) }, "×"),
-    el("h2", { className: `ghost ${g.kind}` }, el("i"), nameOf(g)),
+    el("h2", { className: `ghost ${g.kind}` }, el("i"), nameOf(g)), ...beforeAfter(g.id, null),
     el("dl", {}, ...changeFacts(g).flatMap(([k, v]) => [el("dt", {}, k), el("dd", {}, v)])));
   markGhostRow();
   redraw();
@@ -139,7 +140,7 @@ function startChanges() {                        // a page without a map has non
   if (!S.changes) return;
   $("since").textContent = S.changes.summary;
   $("since").hidden = false;
-  if (!CHANGES.size) return;
+  if (!SINCE.size) return;
   $("changes-label").hidden = false;
   $("changes").onchange = () => { if (state.ghost) select(null); fillList(); redraw(); };
   $("sort").prepend(el("option", { value: "change" }, "by change"));

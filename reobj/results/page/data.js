@@ -5,6 +5,8 @@ const S = JSON.parse($("data").textContent);
 const bytes = (b64) => Uint8Array.from(atob(b64), (c) => c.charCodeAt(0));
 const floats = (b64) => new Float32Array(bytes(b64).buffer);
 const picture = (b64) => `data:image/jpeg;base64,${b64}`;
+const figure = (data, alt, text, more = {}) => el("figure", more, el("img", { src: picture(data), alt }),
+  text);
 const percent = (x) => `${Math.round(100 * x)} %`;
 const rgb = (o) => `rgb(${o.color})`;
 
@@ -49,7 +51,7 @@ const sizeText = (o) => o.sides.length
   ? `${o.sides.map(([side]) => side).join(" × ")} ${o.size_m ? "m" : "units"}` : "";
 
 // ---- The selected component in its level frame: z up, 0 on the floor, metres if known ----
-const state = { part: -1, step: -1, selected: null, ghost: null, hidden: new Set(),
+const state = { part: -1, step: -1, session: null, selected: null, ghost: null, hidden: new Set(),
   hiddenKinds: new Set(["not_seen"]), measured: [] };
 let objects = S.objects;                         // as the edits have them
 let here, solid, steps, cams, posed, level;      // of the part: objects, with a solid, steps, cameras

@@ -14,7 +14,7 @@ function row(o) {
   const made = el("button", { className: `row ${o.status}`, onclick: () => select(o),
     title: o.reason || o.status.replace("_", " ") }, el("i"), el("b", {}, nameOf(o)),
   el("small", {}, [(o.status === "prior_dominated" ? "≈ " : "") + sizeText(o), S.why_flat ? "" : NOTE[o.status], o.edited ? "edited" : ""]
-    .filter(Boolean).map((text) => ` · ${text}`).join("")), ...kindTag(o), bar(o));
+    .filter(Boolean).map((text) => ` · ${text}`).join("")), ...kindTag(o), ...(o.then ? [] : [bar(o)]));
   made.style.setProperty("--own", rgb(o));
   return made;
 }
@@ -55,6 +55,7 @@ function fillList() {
     const count = here.filter((o) => o.class === name && o.status !== "doubtful").length;
     return el("label", {}, box, `${name} ${count}`);
   }));
+  $("legend").hidden = Boolean(state.session);
   const ends = steps.length ? [steps[0], steps.at(-1)].map(frameOf) : [0, 0];
   $("legend").replaceChildren(el("span", {}, `bars: seen in frames ${ends[0]}`),
     el("span", {}, el("b", {}, "| "), "now"), el("span", {}, `${ends[1]}`));
@@ -87,7 +88,8 @@ function evidence(link) {
 
 function facts(o) {
   const { scale } = S.parts[o.part], unitName = o.size_m ? "m" : "units";
-  const rows = [["status", o.status.replace("_", " ") + (o.reason ? `: ${o.reason}` : "")]];
+  const rows = o.then ? [["recording", `${o.then.name}, ${dateOf(o.then)} UTC`], ["now", nowOf(o)]]
+    : [["status", o.status.replace("_", " ") + (o.reason ? `: ${o.reason}` : "")]];
   ["width", "depth", "height"].forEach((name, i) => { if (o.sides.length) rows.push(
     [name, `${o.sides[i].join(" ± ")} ${unitName}`
       + (o.size_rel_sigma ? ` (${percent(o.size_rel_sigma[i])})` : "")]); });
@@ -95,6 +97,7 @@ function facts(o) {
     ["scale", scale && scale.source !== "none" ? `from ${scale.source.replace("_", " ")}, ± `
       + percent(scale.rel_sigma || 0) : "unknown"], ["shape", o.support]);
   rows.push(...changeFacts(changeOf(o)));
+  if (o.then) return rows;
   if (o.confidence !== null) rows.push(["confidence", percent(o.confidence)]);
   const [, second] = Object.entries(o.classes);
   if (second && second[1] >= 0.05) rows.push(["class", Object.entries(o.classes)
@@ -121,16 +124,15 @@ function select(o) {
   if (!state.selected) return;
   o.row.scrollIntoView({ block: "nearest" });
   const links = S.links.filter((l) => l.tracklets.some((t) => o.tracks.includes(t)));
-  const crop = ([frame, data]) => el("figure",
-    { onclick: () => goTo(S.steps.frame.findLastIndex((f) => f <= frame)) },
-    el("img", { src: picture(data), alt: `${o.class} in frame ${frame}` }), `${frame}`);
+  const crop = ([frame, data]) => figure(data, `${o.class} in frame ${frame}`, `${frame}`,
+    { onclick: () => goTo(S.steps.frame.findLastIndex((f) => f <= frame)) });
   $("panel").style.setProperty("--own", rgb(o));
   $("panel").append(
     el("button", { id: "close", title: "close (Esc)", onclick: () => select(o) }, "×"),
-    el("h2", {}, el("i"), nameOf(o)), bar(o),
+    el("h2", {}, el("i"), nameOf(o)), ...(o.then ? [] : [bar(o)]), ...beforeAfter(o.id, o),
     el("div", { className: "crops" }, ...o.crops.map(crop)),
     el("dl", {}, ...facts(o).flatMap(([k, v]) => [el("dt", {}, k), el("dd", {}, v)])),
-    ...editButtons(o), ...visitRows(o),
+    ...(o.then ? [] : [...editButtons(o), ...visitRows(o)]),
     ...(links.length ? [el("h3", {}, "Merges and splits"),
       el("ul", {}, ...links.map((l) => el("li", {}, evidence(l))))] : []));
 }

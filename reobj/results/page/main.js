@@ -6,7 +6,7 @@ function hint(text) {
 }
 
 function gather() {                              // the objects of the part
-  here = objects.filter((o) => o.part === state.part);
+  here = state.session ? objectsThen(state.session) : objects.filter((o) => o.part === state.part);
   solid = here.filter((o) => o.center);
   gatherGhosts();
 }
@@ -17,6 +17,8 @@ function enter(part) {                           // show one part of the cameras
   Object.assign(state, { part, step: -1, measured: [] });
   setFollow(false);
   level = levelFrame(part);
+  $("session").hidden = !EARLIER.length || !inMap(part);
+  if (state.session && !inMap(part)) enterSession(null);
   gather();
   steps = [...S.steps.part.keys()].filter((i) => S.steps.part[i] === part);
   cams = S.steps.frame.map((_, i) => S.steps.part[i] === part ? camera(i) : null);
@@ -43,7 +45,7 @@ const KEYS = [
   ["f", "Follow the moving camera", () => setFollow(!state.follow)],
   ["a", "ride along: look through the camera", () => setRide(!state.ride)],
   ["m", "measure", () => setMeasure(!state.measuring)],
-  ["Delete", "delete the selected object", () => state.selected && edit(edits.delete(state.selected))],
+  ["Delete", "delete the selected object", () => state.selected && !state.session && edit(edits.delete(state.selected))],
   ["u", "undo a correction", undo],
   ["Escape", "end merging, measuring, riding; deselect", leave],
   ["?", "this help", () => $("help").open ? $("help").close() : $("help").showModal()],
@@ -133,6 +135,7 @@ document.title = $("title").textContent = `${S.title}: ${S.objects.filter(
 $("part").append(...S.parts.map(({ name }, value) => el("option", { value }, name)));
 $("part").hidden = S.parts.length < 2;
 startChanges();
+startSessions();
 $("doubtful").checked = S.doubtful;
 $("doubtful-label").hidden = !S.objects.some((o) => o.status === "doubtful");
 objects = S.objects.map((o) => ({ ...o, ids: [o.id] }));

@@ -275,7 +275,7 @@ function draw() {
   const cam = viewpoint(), inside = cam === seat, visible = new Set(shown());
   for (const o of solid) {
     const { wire, halo, faces, ellipsoid } = o.group.parts, chosen = o === state.selected;
-    const lit = chosen || state.step < 0 || seenAt(o, state.step);
+    const lit = chosen || state.step < 0 || o.then || seenAt(o, state.step);
     o.group.visible = visible.has(o);
     wire.visible = faces.visible = $("solids").checked;
     ellipsoid.visible = $("ellipsoids").checked || !$("solids").checked;
@@ -312,7 +312,7 @@ function drawLabels(cam) {                       // nearer labels win where two 
     .filter(([, at]) => at).sort(([a, p], [b, q]) => first(b) - first(a) || p[2] - q[2]);
   $("labels").replaceChildren();
   for (const [o, [x, y]] of $("names").checked ? placed : []) {
-    if (cam === seat && !o.kind && o !== state.selected && !seenAt(o, state.step)) continue;
+    if (cam === seat && !o.kind && !o.then && o !== state.selected && !seenAt(o, state.step)) continue;
     const mark = o.kind ? kindText(o) : markOf(o), text = [nameOf(o), mark].filter(Boolean).join(" ");
     const w = 7 * text.length + 8, free = (at) => !taken.some((t) =>
       Math.abs(t[0] - x) < (t[2] + w) / 2 && Math.abs(t[1] - at) < 17);
