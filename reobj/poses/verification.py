@@ -5,7 +5,8 @@ two scenes by a few wrong matches, register a frame metres from its true positio
 of another focal length towards the scene. Three checks find this:
 
 1. consistency: a model is split where few points connect two groups of images, or where it does
-   not explain the matches of consecutive images;
+   not explain the matches of consecutive images, or, of photos without an order, of those with
+   the most matches;
 2. soundness: parallax, triangulation angles, the covariance of the camera centres, and a second
    mapper where that is large;
 3. zoom: the focal length of each image, by points triangulated from its neighbours on one side.
