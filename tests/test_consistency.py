@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -59,6 +62,20 @@ def test_nearly_half_of_the_pairs_may_be_outliers():
     wrong = wrong / np.array([320, 320, 1])[:, None]
     F = np.concatenate([fundamental(0.8, 22), wrong])
     assert focal_from_pairs(pairs_of(F), SIZE) == pytest.approx(0.8, rel=0.02)
+
+
+def test_pairs_of_few_matches_do_not_outvote_those_of_many():
+    """As between photos without an order, which are matched with many that see little of it."""
+    right = pairs_of(fundamental(0.8, 22), matches=200)
+    wrong = pairs_of(fundamental(0.6, 60), matches=40)
+    pairs = MatchedPairs(
+        np.concatenate([right.image_ids, wrong.image_ids]),
+        right.inliers + wrong.inliers,
+        {},
+        np.concatenate([right.fundamental, wrong.fundamental]),
+        is_path=False,
+    )
+    assert focal_from_pairs(pairs, SIZE) == pytest.approx(0.8, rel=0.02)
 
 
 def test_few_pairs_or_few_matches_give_no_focal_length():
@@ -205,6 +222,43 @@ def test_an_image_connected_to_no_neighbour_splits_nothing():
             pairs.inliers[k] = np.column_stack([pairs.inliers[k][:, 0], pairs.inliers[k][::-1, 1]])
     found = consistent_groups(read_arrays(model), pairs)
     assert [ids.tolist() for ids in found] == [[1, 2, 3, 4, 6, 7, 8, 9, 10, 11, 12]]
+
+
+def shuffled(scene, seed=1):
+    """Put the images of a scene into another order; pairs that also match neighbours in it.
+
+    The latter are wrong, as on repeated texture: no point of the model is matched.
+    """
+    order = np.random.default_rng(seed).permutation(len(scene.seen))
+    scene.poses, scene.xy, scene.seen = scene.poses[order], scene.xy[order], scene.seen[order]
+    ids, inliers = [], []
+    for a, b in itertools.combinations(range(len(order)), 2):
+        both = np.flatnonzero(scene.seen[a] & scene.seen[b])
+        near = abs(order[a] - order[b]) <= 2
+        if near or b - a == 1:
+            ids.append((a + 1, b + 1))
+            inliers.append(np.column_stack([both, both if near else np.roll(both, 1)]))
+    keypoints = {i + 1: xy for i, xy in enumerate(scene.xy)}
+    unknown = np.full((len(ids), 3, 3), np.nan)
+    return MatchedPairs(np.array(ids), inliers, keypoints, unknown, is_path=False)
+
+
+def test_wrong_matches_with_the_next_photo_of_a_list_separate_nothing():
+    scene = Scene()
+    pairs = shuffled(scene)
+    arrays = read_arrays(scene.model())
+    assert [ids.tolist() for ids in consistent_groups(arrays, pairs)] == numbers((1, 13))
+    assert len(consistent_groups(arrays, replace(pairs, is_path=True))) > 1
+
+
+def test_a_photo_whose_matches_are_not_in_the_model_is_left_out():
+    scene = Scene()
+    pairs = shuffled(scene)
+    for k, pair in enumerate(pairs.image_ids.tolist()):
+        if 5 in pair:
+            pairs.inliers[k] = np.column_stack([pairs.inliers[k][:, 0], pairs.inliers[k][::-1, 1]])
+    (found,) = consistent_groups(read_arrays(scene.model()), pairs)
+    assert found.tolist() == [1, 2, 3, 4, 6, 7, 8, 9, 10, 11, 12]
 
 
 def keyframes_dropped(scene, model, dropped):

@@ -244,7 +244,8 @@ def test_photos_without_an_order_have_no_zoom(search, monkeypatch):
     )
     ids = np.column_stack([np.arange(1, 21), np.arange(10, 30)])  # photos 9 apart match
     matches = [np.zeros((50, 2), np.int64)] * 20
-    search.pairs = MatchedPairs(ids, matches, dict.fromkeys(range(1, 31)), fundamental(0.9, 20))
+    keypoints = dict.fromkeys(range(1, 31))
+    search.pairs = MatchedPairs(ids, matches, keypoints, fundamental(0.9, 20), False)
     search.focal = MATCHES
     search.made = [component(1, 30)]
     models, messages, _ = search.run()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -99,7 +100,7 @@ def test_shuffled_photos_of_a_line_are_put_back_in_a_line():
     ids = numbers(5, 84)
     place = dict(zip(ids, np.random.default_rng(0).permutation(80).tolist(), strict=True))
     pairs = matched(ids, lambda a, b: abs(place[a] - place[b]) <= 3)
-    found = _path(ids, pairs)
+    found = _path(ids, replace(pairs, is_path=pairs.in_order(ids)))
     assert sorted(found) == ids
     assert np.abs(np.diff([place[i] for i in found])).max() <= 6
     for window in split(found, WindowOptions(size=20, overlap=5)):

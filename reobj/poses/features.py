@@ -7,6 +7,7 @@ pycolmap. Results in the database are kept, so that keyframes can be added.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
@@ -296,17 +297,25 @@ class MatchedPairs:
         image_ids: (P, 2) of each pair, the lower first. inliers: of each pair the matching
             keypoints (n, 2). keypoints: (N, 2) pixels by image id.
         fundamental: (P, 3, 3), NaN where the pair has none (planar, or a pure rotation).
+        is_path: consecutive images show the same scene (`in_order`); of photos without an order
+            neighbours in the list say nothing.
     """
 
     image_ids: IntArray
     inliers: list[IntArray]
     keypoints: dict[int, Array]
     fundamental: Array
+    is_path: bool = True
+
+    @property
+    def matches(self) -> IntArray:
+        """Count the verified matches of each pair (P,)."""
+        return np.array([len(found) for found in self.inliers], np.int64)
 
     @property
     def enough(self) -> BoolArray:
         """Mark the pairs (P,) with as many verified matches as register an image."""
-        return np.array([len(found) >= MIN_MATCHES for found in self.inliers], bool)
+        return np.asarray(self.matches >= MIN_MATCHES, bool)
 
     def in_order(self, ids: Sequence[int]) -> bool:
         """True if at least half of consecutive images match: they follow a path."""
@@ -317,9 +326,13 @@ class MatchedPairs:
     def only(self, ids: Sequence[int]) -> MatchedPairs:
         """Return the pairs of some images."""
         rows = np.flatnonzero(np.isin(self.image_ids, ids).all(1))
-        inliers = [self.inliers[row] for row in rows]
-        keypoints = {i: self.keypoints[i] for i in ids}
-        return MatchedPairs(self.image_ids[rows], inliers, keypoints, self.fundamental[rows])
+        return dataclasses.replace(
+            self,
+            image_ids=self.image_ids[rows],
+            inliers=[self.inliers[row] for row in rows],
+            keypoints={i: self.keypoints[i] for i in ids},
+            fundamental=self.fundamental[rows],
+        )
 
 
 def read_pairs(database: Path) -> MatchedPairs:
@@ -352,7 +365,8 @@ def focal_from_pairs(
 
     E = K' F K has two equal singular values for the true K. The cost of each focal length on a grid
     is the median over pairs of 1 - s2 / s1: half of the pairs may be wrong, and there is no start
-    value and no local minimum.
+    value and no local minimum. Photos without an order have many pairs of few matches, which
+    determine a fundamental matrix badly: there a pair counts once for each MIN_MATCHES of them.
 
     Args:
         min_pairs: whose median is trusted (chosen; lower: a few wrong pairs decide).
@@ -360,7 +374,8 @@ def focal_from_pairs(
         focal length over the longer side; None with too few pairs.
     Ref: Mendonca and Cipolla, CVPR 1999.
     """
-    F = pairs.fundamental[pairs.enough & np.isfinite(pairs.fundamental[:, 0, 0])]  # (P, 3, 3)
+    used = pairs.enough & np.isfinite(pairs.fundamental[:, 0, 0])
+    F = pairs.fundamental[used]  # (P, 3, 3)
     if len(F) < min_pairs:
         return None
     tried = np.geomspace(*FOCAL_RANGE, 161)  # (S,) 1 % apart
@@ -371,7 +386,8 @@ def focal_from_pairs(
     K[:, 2, 2] = 1
     E = np.swapaxes(K, 1, 2)[:, None] @ F[None] @ K[:, None]  # (S, P, 3, 3)
     s = np.linalg.svd(E, compute_uv=False)
-    cost = np.median(1 - s[..., 1] / s[..., 0], 1)  # (S,)
+    counts = 1 if pairs.is_path else pairs.matches[used] // MIN_MATCHES
+    cost = np.median(np.repeat(1 - s[..., 1] / s[..., 0], counts, axis=1), 1)  # (S,)
     best = int(cost.argmin())
     is_inside = 0 < best < len(cost) - 1
     return float(tried[best]) if is_inside else None

@@ -136,11 +136,9 @@ class MapperSearch:
             focal length; messages about keyframes without poses.
         """
         zooms = list[tuple[int, int, float]]()
-        # in photos without an order the one before does not show the same points
-        is_path = self.pairs.in_order(self.ids)
         for _ in range(3):  # each without the images of other focal lengths found before
             best, messages = self._best()
-            others, changes = self._other_focal(best) if is_path else (np.empty(0), [])
+            others, changes = self._other_focal(best)
             if not len(others):
                 break
             zooms += changes
@@ -177,20 +175,24 @@ class MapperSearch:
         for component in best:
             ids = component.arrays.ids.tolist()
             if component.problem and len(ids) >= self.options.soundness.images:
-                lost.append(
-                    f"frames {self.frames[ids[0]]}-{self.frames[ids[-1]]} have no poses: "
-                    f"{component.problem}"
-                )
+                lost.append(f"frames {self._range(ids)} have no poses: {component.problem}")
         return models_of_one_camera(sound), messages, lost
 
     def _other_focal(
         self, components: list[Component]
     ) -> tuple[npt.NDArray[Any], list[tuple[int, int, float]]]:
         """Find images of another focal length than most, and the changes (`constant_focal`)."""
+        if not self.pairs.is_path:  # the photo before does not show the same points
+            return np.empty(0), []
         known = [c for c in components if c.focal_source is not FocalSource.GUESS]
         # with little parallax a zoom cannot be observed
         known = [c for c in known if not c.problem] or known
         return constant_focal([component.arrays for component in known], self.options.zoom)
+
+    def _range(self, ids: list[int]) -> str:
+        """Return the first and last frame of some keyframes; all, of photos without an order."""
+        frames = [self.frames[i] for i in ids]
+        return f"{frames[0]}-{frames[-1]}" if self.pairs.is_path else spans(frames)
 
     def _match_counts(self) -> str:
         """Describe the matches of the keyframes for a message."""
@@ -238,7 +240,7 @@ class MapperSearch:
             return best, []
         ids = best[0].arrays.ids.tolist()
         return best, [
-            f"frames {self.frames[ids[0]]}-{self.frames[ids[-1]]} do not determine the focal "
+            f"frames {self._range(ids)} do not determine the focal "
             "length (the camera should turn as well as move): it is assumed to be "
             f"{start:.3g} x the longer side, depths are rough; give --camera fx,fy,cx,cy, or walk "
             "around the objects"

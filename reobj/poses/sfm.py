@@ -321,10 +321,11 @@ def _map_job(folder: Path, job: dict[str, Any], images: ImageFile) -> None:
     path = [view_of[number] for number in ids if view_of[number]]
     match_pairs(database, choose_pairs(path, mapped, vlad), seed)
     every_pair = read_pairs(database)
-    if not every_pair.only(mapped).in_order(mapped):
-        match_pairs(database, choose_pairs(path, mapped, vlad, UNORDERED), seed)
+    is_path = every_pair.only(mapped).in_order(mapped)
+    if not is_path:
+        match_pairs(database, choose_pairs(path, mapped, vlad, UNORDERED), seed, "match-2")
         every_pair = read_pairs(database)
-    pairs = every_pair.only(mapped)
+    pairs = dataclasses.replace(every_pair.only(mapped), is_path=is_path)
     frames = {number: job["frames"][row_of[number]] for number in mapped}
     focal = Focal(guess, FocalSource.GIVEN) if is_given else estimate_focal(pairs, size, guess)
     search = MapperSearch(database, frames, pairs, focal, guess, seed)

@@ -5,7 +5,8 @@ two scenes by a few wrong matches, register a frame metres from its true positio
 of another focal length towards the scene. Three checks find this:
 
 1. consistency: a model is split where few points connect two groups of images, or where it does
-   not explain the matches of consecutive images;
+   not explain the matches of consecutive images, or, of photos without an order, of those with
+   the most matches;
 2. soundness: parallax, triangulation angles, the covariance of the camera centres, and a second
    mapper where that is large;
 3. zoom: the focal length of each image, by points triangulated from its neighbours on one side.
@@ -75,7 +76,10 @@ def consistent_groups(
     """
     explained = count_explained(arrays, pairs)
     groups = list[IntArray]()
-    todo = _runs_of_tied_neighbours(arrays, pairs, explained, options.tied)
+    if pairs.is_path:
+        todo = _runs_of_tied_neighbours(arrays, pairs, explained, options.tied)
+    else:
+        todo = [_tied_photos(arrays, pairs, explained, options.tied)]
     while todo:
         rows = todo.pop()
         side = _weak_cut(arrays, rows, pairs, explained, options)
@@ -128,7 +132,7 @@ def _runs_of_tied_neighbours(
     """Split rows of images where matches of neighbours in time are not triangulated in the model.
 
     Consecutive images show the same scene (others may only look alike), so their verified matches
-    must be points of the model (`_ties`). They are not where an image was registered at a
+    must be points of the model (`_tied`). They are not where an image was registered at a
     look-alike position, at another scale, or not at all. An image that is tied to neither neighbour
     is left out; it splits the rest unless the images before and after it are tied to each other.
 
@@ -138,7 +142,10 @@ def _runs_of_tied_neighbours(
         rows (n,) of each run, ascending.
     """
     every = sorted(pairs.keypoints)  # keyframes in the order of time, registered or not
-    tied = _ties(arrays, pairs, explained, every, least)
+    order = np.searchsorted(every, pairs.image_ids)
+    near = np.flatnonzero(pairs.enough & (order[:, 1] - order[:, 0] <= 4))
+    are_tied = _tied(arrays, pairs, explained, near, least).tolist()
+    tied = dict(zip(map(tuple, pairs.image_ids[near].tolist()), are_tied, strict=True))
     links = [tied.get(pair) for pair in itertools.pairwise(every)]
     around = zip([None, *links], [*links, None], strict=True)
     inside = set(arrays.ids.tolist())
@@ -152,36 +159,59 @@ def _runs_of_tied_neighbours(
     return [run for run in np.split(rows, starts) if len(run)]
 
 
-def _ties(
-    arrays: ModelArrays, pairs: MatchedPairs, explained: IntArray, every: list[int], least: float
-) -> dict[tuple[int, int], bool]:
-    """Check for each pair of images with enough matches that they are triangulated in the model.
+def _tied_photos(
+    arrays: ModelArrays, pairs: MatchedPairs, explained: IntArray, least: float
+) -> IntArray:
+    """Leave out photos whose matches with the most similar photos are not points of the model.
+
+    Of photos without an order the two with which one has the most matches take the place of the
+    image before and after it. A photo that is tied to neither is left out. The others stay
+    together: of the pairs in a right model up to a tenth are wrong (measured), some with many
+    matches.
+
+    Args:
+        least: `ConsistencyOptions.tied`.
+    Returns:
+        rows (n,) of the photos, ascending.
+    """
+    enough = np.flatnonzero(pairs.enough & np.isin(pairs.image_ids, arrays.ids).all(1))
+    pair = np.repeat(enough, 2)  # (2 E,) each pair belongs to two images
+    image = np.searchsorted(arrays.ids, pairs.image_ids[enough]).ravel()
+    order = np.lexsort((-pairs.matches[pair], image))
+    rank = np.arange(len(order)) - np.searchsorted(image[order], image[order])
+    nearest = order[rank < 2]
+    rows = np.unique(pair[nearest])
+    tied = np.isin(pair[nearest], rows[_tied(arrays, pairs, explained, rows, least)])
+    untied = np.setdiff1d(image[nearest], image[nearest[tied]])
+    return np.setdiff1d(np.arange(len(arrays.ids)), untied)
+
+
+def _tied(
+    arrays: ModelArrays, pairs: MatchedPairs, explained: IntArray, rows: IntArray, least: float
+) -> BoolArray:
+    """Mark the pairs of images whose matches are triangulated in the model.
 
     A fraction `least` of the matches must be one point of the model; and an essential matrix of
     the pair alone must not explain many more of them than the model does.
 
     Args:
-        every: ids in the order of time; pairs up to 4 images apart are checked.
+        rows: (n,) of the pairs. explained: (P,) matches of every pair that the model explains.
     """
-    order = {number: k for k, number in enumerate(every)}
     point_of = {}
-    ties = {}
     for row, image_id in enumerate(arrays.ids.tolist()):
         point_of[image_id] = np.full(len(pairs.keypoints[image_id]), -1)
         mine = arrays.image == row
         point_of[image_id][arrays.keypoint[mine]] = arrays.point[mine]
-    for row, (a, b) in enumerate(pairs.image_ids.tolist()):
-        matches = pairs.inliers[row]
-        if len(matches) < MIN_MATCHES or order[b] - order[a] > 4:
-            continue
-        ties[a, b] = False
+    tied = np.zeros(len(rows), bool)
+    for k, row in enumerate(rows.tolist()):
+        a, b = pairs.image_ids[row].tolist()
         if a in point_of and b in point_of:
+            matches = pairs.inliers[row]
             one = point_of[a][matches[:, 0]]
             other = point_of[b][matches[:, 1]]
-            tied = np.mean((one == other) & (one >= 0))
-            contradicted = _contradicted(arrays, pairs, row, int(explained[row]))
-            ties[a, b] = bool(tied >= least and not contradicted)
-    return ties
+            enough = np.mean((one == other) & (one >= 0)) >= least
+            tied[k] = enough and not _contradicted(arrays, pairs, row, int(explained[row]))
+    return tied
 
 
 def _contradicted(arrays: ModelArrays, pairs: MatchedPairs, row: int, explained: int) -> bool:

@@ -62,7 +62,7 @@ def _path(ids: list[int], pairs: MatchedPairs) -> list[int]:
 
     Ref: Cuthill and McKee, ACM 1969: an order in which the connections of a graph are short.
     """
-    if pairs.in_order(ids):
+    if pairs.is_path:
         return ids
     ends = np.searchsorted(ids, pairs.image_ids[pairs.enough])
     graph = csr_matrix((np.ones(len(ends)), ends.T), (len(ids), len(ids)))
