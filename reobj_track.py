@@ -1598,7 +1598,7 @@ def _finish(
     if room is not None:
         with job.timed("map"):
             embedder = f"{job.config.embed.model} {job.config.embed.head}"
-            result = finish_map(room, result, job.video, embedder, placed)
+            result = finish_map(room, result, job.video, embedder, placed, job.progress)
     warnings = [*result.warnings, *_warnings(job.config, result)]
     result = dataclasses.replace(result, warnings=warnings, out=job.workspace.out)
     with job.timed("write"):

@@ -16,6 +16,7 @@ from reobj.cameras import Camera, Poses, import_pycolmap
 from reobj.files import Progress
 from reobj.maps.corrections import with_edits
 from reobj.maps.fusion import scale_of
+from reobj.maps.object_points import object_views, triangulated
 from reobj.maps.placement import (
     ImageFeatures,
     Placement,
@@ -215,7 +216,12 @@ def move_models(
 
 
 def finish_map(
-    opened: OpenMap, result: Result, video: Video, embedder: str, placed: Placed | None
+    opened: OpenMap,
+    result: Result,
+    video: Video,
+    embedder: str,
+    placed: Placed | None,
+    progress: Callable[[str, int], Progress] = Progress,
 ) -> Result:
     """Number the objects of a recording, write the map, and return the result with `changes`.
 
@@ -241,6 +247,8 @@ def finish_map(
     if result.edits is not None:
         room = with_edits(room, result.edits)
     recording = _recording(opened, result, video, name, embedder, placed)
+    if placed is not None and video.has_images:
+        recording = _with_object_points(recording, result, video, progress)
     new_room, numbered = add_recording(room, result, recording)
     if opened.frozen:
         return numbered
@@ -250,6 +258,21 @@ def finish_map(
         text = f"map {error}; the results are complete, but the map lacks this recording"
         return dataclasses.replace(numbered, warnings=[*numbered.warnings, text])
     return numbered
+
+
+def _with_object_points(
+    recording: Recording,
+    result: Result,
+    video: Video,
+    progress: Callable[[str, int], Progress],
+) -> Recording:
+    """Add features in the boxes of objects, and the points that they give."""
+    assert result.poses is not None
+    objects = [o for o in result.located if o.part == 0]
+    with progress("object features", 0) as line:
+        views = object_views(objects, result.poses, result.tracks, video, line)
+    points = triangulated(objects, views, result.poses)
+    return dataclasses.replace(recording, views=tuple(views), object_points=points)
 
 
 def _refusal(opened: OpenMap, poses: Poses | None, video: Video, placed: Placed | None) -> str:
@@ -321,7 +344,7 @@ def _recording(
         scale = placed.scale or none
     return Recording(
         opened.path, name, session_key(video), embedder, best.similarity.cov,
-        len(best.images), best.tried, scale, points, placed.features,
+        len(best.images), best.tried, scale, points,
     )  # fmt: skip
 
 
