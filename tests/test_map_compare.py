@@ -419,6 +419,30 @@ def test_chairs_between_two_places_are_ambiguous_and_the_shorter_way_wins() -> N
     assert (decisions[6].candidates, decisions[7].candidates) == ((12,), (11,))
 
 
+def test_another_bottle_beside_the_place_of_one_that_is_gone_does_not_get_its_number() -> None:
+    """It stands 9 cm from there. Other objects show how exact positions are: millimetres here."""
+    rng = np.random.default_rng(4)
+    states = [*room(), *(state(k, "plant", (k - 7, 5, 0.4)) for k in range(7, 17))]
+    views = Visibility(np.full(16, 6.0), np.eye(16)[5] * 4)
+    for error_m, expected in ((0.002, ("new", 0, 106)), (0.04, ("stayed", 6, 106))):
+        detected = [found(s, 100 + s.id, s.center + rng.normal(0, error_m, 3)) for s in states]
+        place = states[5].center + np.array([0.065, -0.065, 0.02])
+        strange = unit(states[5].foreground + 0.12 * np.random.default_rng(2).normal(size=64))
+        detected[5] = found(states[5], 106, place, foreground=strange)
+        assert expected in summary(decide(states, detected, views))
+
+
+def test_points_of_one_that_looks_alike_do_not_overrule_the_size() -> None:
+    """The points of a bottle are recognised; a second one of the class is half as large again."""
+    states = [*room(), state(7, "bottle", (3.5, 2.5, 0.8), foreground=looks(6))]
+    states[6] = dataclasses.replace(states[6], half_axes=1.7 * states[6].half_axes)
+    detected = all_found(states)[:5]
+    place = (2.9, 1.9, 0.8)
+    points = motions(states, place, {6: 9})
+    detected.append(found(states[5], 106, place, motion_of=points))
+    assert ("moved", 6, 106) in summary(decide(states, detected))
+
+
 def test_a_class_that_changed_in_place_is_one_object_only_if_all_else_agrees() -> None:
     states = room()
     detected = all_found(states)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from map_worlds import some_points
 from simulated import chair_solids, fitted, tracks_of, walk
 
 import quadrics
@@ -163,6 +164,18 @@ def test_corrections_of_the_viewer_reach_the_map_once(monday):
     assert with_edits(monday, dataclasses.replace(ours, map_id="another")) is monday
     _, result = add_recording(room, seen([0, 1, 2]), recording("tuesday"))
     assert [(o.id, o.class_name) for o in result.objects] == [(1, "armchair"), (2, "chair")]
+
+
+def test_points_of_objects_get_the_numbers_of_the_map(monday):
+    """The identity in the recording is 11; the map knows the object as another number."""
+    result = seen([2], [11])
+    cloud = some_points(5, 1, [], seed=2)
+    of_object = dataclasses.replace(cloud, object_id=np.full(5, 11))
+    new = recording("tuesday", points=MapPoints.empty(), object_points=of_object)
+    room, numbered = add_recording(monday, result, new)
+    (number,) = {o.id for o in numbered.objects}
+    added = room.points[room.points.session == 2]
+    assert number != 11 and len(added) == 5 and (added.object_id == number).all()
 
 
 def test_known_points_are_not_added_again():

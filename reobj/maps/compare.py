@@ -129,6 +129,7 @@ class CompareOptions:
         usual_stayed: number of objects with the expected displacement to which those that stayed
             are added when the variance of displacements is measured. (In three rendered pairs it
             was .04 of the expected one, in simulated rooms with known covariances 1.)
+        variance_margin: factor of the measured variance: its error, and tails heavier than normal.
         least_move_m: a shorter displacement counts as stayed, whatever its covariance.
         size_floor: standard deviation of a log half axis besides its covariance.
         class_size: standard deviation of a log half axis among objects of one class, with
@@ -177,7 +178,8 @@ class CompareOptions:
     position_floor_m: float = 0.02
     extent_share: float = 0.05
     near_move_m: float = 0.5
-    usual_stayed: float = 3.0
+    usual_stayed: float = 1.0
+    variance_margin: float = 2.0
     least_move_m: float = 0.1
     size_floor: float = 0.1
     class_size: float = 0.25
@@ -339,8 +341,10 @@ class _Pairs:
             self.position, square = _log_normal(difference, total)
             self.distance = np.linalg.norm(difference, axis=2)
             rows, columns = self.known_stayed()
-            shrunk = self._variance_ratio(square[rows, columns])
-            self.position, square = _log_normal(difference, shrunk * total)
+            by_center = self.inliers < options.enough_inliers
+            ratio = self._variance_ratio(square[rows, columns][by_center[rows, columns]])
+            total = np.where(by_center[..., None, None], ratio, 1.0) * total
+            self.position, square = _log_normal(difference, total)
             self.sigmas = np.sqrt(square)
             if not len(rows):
                 break
@@ -353,14 +357,17 @@ class _Pairs:
         """Return the variance of displacements of objects that stayed over the expected one.
 
         Shapes that one detector measures twice from similar places have errors in common, so that
-        they differ less than their covariances say. At most 1: outliers among what stayed may have
-        moved.
+        they differ less than their covariances say. The median, as some of them may have moved; at
+        most 1.
 
         Args:
-            square: (K,) squared Mahalanobis distances of objects that stayed, 3 each expected.
+            square: (K,) squared Mahalanobis distances of objects that stayed, 3 coordinates each,
+                by their centres.
         """
         prior = self.options.usual_stayed
-        return float(min((square.sum() + 3 * prior) / (3 * (len(square) + prior)), 1.0))
+        median = float(np.median(square)) / 2.366 if len(square) else 1.0  # of chi-squared with 3
+        measured = (len(square) * median + prior) / (len(square) + prior)
+        return min(self.options.variance_margin * measured, 1.0)
 
     def known_stayed(self) -> tuple[IntArray, IntArray]:
         """Find pairs that stayed by geometry, size and class, without a rival on either side."""

@@ -89,13 +89,14 @@ def object_views(
         objects: with a shape, in the world of the poses; `tracks` has their boxes, native pixels.
     """
     options = options or ObjectPointOptions()
-    row_of = {int(poses.frame[k]): k for k in np.flatnonzero(poses.measured & (poses.part == 0))}
+    usable = np.flatnonzero(poses.measured & (poses.part == 0)).tolist()
+    row_of = {int(poses.frame[k]): k for k in usable}
     centre = invert_rigid(poses.cam_from_world)[:, :, 3]
     of_frame: dict[int, list[tuple[int, Array]]] = {}
     for o in objects:
         rows = np.flatnonzero((tracks.track_id == o.id) & (tracks.detection_index >= 0))
         rows = rows[[int(f) in row_of for f in tracks.frame[rows]]] if len(rows) else rows
-        if not len(rows):
+        if o.center is None or not len(rows):
             continue
         boxes = tracks.xyxy[rows]
         ray = centre[[row_of[int(f)] for f in tracks.frame[rows]]] - o.center
@@ -104,7 +105,7 @@ def object_views(
 
     def describe(item: tuple[int, Image]) -> list[ObjectView]:
         frame, image = item
-        gray = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_BGR2GRAY)
+        gray = np.asarray(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_BGR2GRAY), np.uint8)
         return [
             ObjectView(row_of[frame], identity, box, *_features(gray, box, options))
             for identity, box in of_frame[frame]
@@ -312,9 +313,7 @@ def _track(
     return point, rows
 
 
-def _described(
-    identity: int, rays: _Rays, tracks: Sequence[tuple[Array, IntArray]]
-) -> MapPoints:
+def _described(identity: int, rays: _Rays, tracks: Sequence[tuple[Array, IntArray]]) -> MapPoints:
     """Return points with mean descriptors."""
     if not tracks:
         return MapPoints.empty()
