@@ -432,15 +432,19 @@ def test_another_bottle_beside_the_place_of_one_that_is_gone_does_not_get_its_nu
         assert expected in summary(decide(states, detected, views))
 
 
-def test_points_of_one_that_looks_alike_do_not_overrule_the_size() -> None:
-    """The points of a bottle are recognised; a second one of the class is half as large again."""
-    states = [*room(), state(7, "bottle", (3.5, 2.5, 0.8), foreground=looks(6))]
-    states[6] = dataclasses.replace(states[6], half_axes=1.7 * states[6].half_axes)
-    detected = all_found(states)[:5]
-    place = (2.9, 1.9, 0.8)
-    points = motions(states, place, {6: 9})
-    detected.append(found(states[5], 106, place, motion_of=points))
-    assert ("moved", 6, 106) in summary(decide(states, detected))
+def test_points_of_one_that_looks_alike_do_not_overrule_the_looks() -> None:
+    bottle = state(6, "bottle", (1, 1, 0.8))
+    twin = dataclasses.replace(bottle, id=7, center=np.array([2.0, 1, 0.8]))
+    place = (3, 2, 0.8)
+    strange = found(
+        bottle, 106, place, foreground=-bottle.foreground,
+        motion_of=motions([bottle], place, {6: 9}),
+    )  # fmt: skip
+    pairs = _Pairs([bottle, twin], [strange], seen(2), CompareOptions())
+    pairs.place(EXACT, 1.0)
+    pairs.compare_appearance(same_embedder=True)
+    assert pairs.recognised().all()
+    assert np.isfinite(pairs.moved(near=True)[:, 0]).tolist() == [True, False]
 
 
 def test_a_class_that_changed_in_place_is_one_object_only_if_all_else_agrees() -> None:

@@ -145,8 +145,8 @@ class CompareOptions:
             were not recognised, in nats.
         few_inliers, many_inliers: log likelihood ratio per inlier of the object's own points, below
             and from `enough_inliers` on, which also give the displacement; `inliers_limit`: the
-            largest, in nats. (Of 8,500 pairs of different objects, in five pairs of recordings and
-            across them, none had a wrong motion of 5 or more points.)
+            largest, in nats. (Of pairs of objects of different classes, in three
+            pairs of recordings and across them, none had a wrong motion.)
         margin: in nats, below which two explanations are equally probable (3: design).
         looks_margin, size_margin: in nats, by which "moved" must exceed every other explanation if
             its own points were not recognised: with appearance, and with size and class alone. (A
@@ -666,8 +666,6 @@ class _Verdicts:
         if there:
             # rivals among map objects only: the displacement decided
             accepted = self.loss[-1, j] - self.loss[i, j] >= self.options.margin
-            if self.moved[i, j] > self.stayed[i, j]:  # its place excludes that it stayed
-                accepted = accepted and lead >= self._moved_margin(i, j)
         else:
             margin = self._moved_margin(i, j)
             accepted = lead >= margin and self._distinguished(i, j)

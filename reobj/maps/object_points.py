@@ -246,7 +246,7 @@ def _points_of(
         if not free[seed] or len(rows) < options.least_views:
             continue
         track = _track(rays, rows, options)
-        if track is not None and inside(track[0]):
+        if track is not None:
             free[track[1]] = False
             tracks.append(track)
     return _described(found.id, rays, tracks)
