@@ -419,6 +419,34 @@ def test_chairs_between_two_places_are_ambiguous_and_the_shorter_way_wins() -> N
     assert (decisions[6].candidates, decisions[7].candidates) == ((12,), (11,))
 
 
+def test_another_bottle_beside_the_place_of_one_that_is_gone_does_not_get_its_number() -> None:
+    """It stands 9 cm from there. Other objects show how exact positions are: millimetres here."""
+    rng = np.random.default_rng(4)
+    states = [*room(), *(state(k, "plant", (k - 7, 5, 0.4)) for k in range(7, 17))]
+    views = Visibility(np.full(16, 6.0), np.eye(16)[5] * 4)
+    for error_m, expected in ((0.002, ("new", 0, 106)), (0.04, ("stayed", 6, 106))):
+        detected = [found(s, 100 + s.id, s.center + rng.normal(0, error_m, 3)) for s in states]
+        place = states[5].center + np.array([0.065, -0.065, 0.02])
+        strange = unit(states[5].foreground + 0.12 * np.random.default_rng(2).normal(size=64))
+        detected[5] = found(states[5], 106, place, foreground=strange)
+        assert expected in summary(decide(states, detected, views))
+
+
+def test_points_of_one_that_looks_alike_do_not_overrule_the_looks() -> None:
+    bottle = state(6, "bottle", (1, 1, 0.8))
+    twin = dataclasses.replace(bottle, id=7, center=np.array([2.0, 1, 0.8]))
+    place = (3, 2, 0.8)
+    strange = found(
+        bottle, 106, place, foreground=-bottle.foreground,
+        motion_of=motions([bottle], place, {6: 9}),
+    )  # fmt: skip
+    pairs = _Pairs([bottle, twin], [strange], seen(2), CompareOptions())
+    pairs.place(EXACT, 1.0)
+    pairs.compare_appearance(same_embedder=True)
+    assert pairs.recognised().all()
+    assert np.isfinite(pairs.moved(near=True)[:, 0]).tolist() == [True, False]
+
+
 def test_a_class_that_changed_in_place_is_one_object_only_if_all_else_agrees() -> None:
     states = room()
     detected = all_found(states)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from map_worlds import some_points
 from simulated import chair_solids, fitted, tracks_of, walk
 
 import quadrics
@@ -209,6 +210,18 @@ def test_the_viewer_gets_the_objects_of_other_recordings(monday):
     (_, _, third) = earlier_sessions(delete(room, 2), path, "")
     assert [o.id for o in third.objects] == [3] and [c.id for c in third.changes.gone] == [1]
     assert len(earlier_sessions(forget(room, "monday"), path, "content of friday")) == 1
+
+
+def test_points_of_objects_get_the_numbers_of_the_map(monday):
+    """The identity in the recording is 11; the map knows the object as another number."""
+    result = seen([2], [11])
+    cloud = some_points(5, 1, [], seed=2)
+    of_object = dataclasses.replace(cloud, object_id=np.full(5, 11))
+    new = recording("tuesday", points=MapPoints.empty(), object_points=of_object)
+    room, numbered = add_recording(monday, result, new)
+    (number,) = {o.id for o in numbered.objects}
+    added = room.points[room.points.session == 2]
+    assert number != 11 and len(added) == 5 and (added.object_id == number).all()
 
 
 def test_known_points_are_not_added_again():

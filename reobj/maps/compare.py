@@ -126,6 +126,10 @@ class CompareOptions:
             that is seen from one side shifts with its depth.
         near_move_m: standard deviation of the shorter half of the moves, on each axis; the other
             half ends anywhere in the room.
+        usual_stayed: number of objects with the expected displacement to which those that stayed
+            are added when the variance of displacements is measured. (In three rendered pairs it
+            was .04 of the expected one, in simulated rooms with known covariances 1.)
+        variance_margin: factor of the measured variance: its error, and tails heavier than normal.
         least_move_m: a shorter displacement counts as stayed, whatever its covariance.
         size_floor: standard deviation of a log half axis besides its covariance.
         class_size: standard deviation of a log half axis among objects of one class, with
@@ -141,8 +145,8 @@ class CompareOptions:
             were not recognised, in nats.
         few_inliers, many_inliers: log likelihood ratio per inlier of the object's own points, below
             and from `enough_inliers` on, which also give the displacement; `inliers_limit`: the
-            largest, in nats. (Of 8,500 pairs of different objects, in five pairs of recordings and
-            across them, none had a wrong motion of 5 or more points.)
+            largest, in nats. (Of pairs of objects of different classes, in three
+            pairs of recordings and across them, none had a wrong motion.)
         margin: in nats, below which two explanations are equally probable (3: design).
         looks_margin, size_margin: in nats, by which "moved" must exceed every other explanation if
             its own points were not recognised: with appearance, and with size and class alone. (A
@@ -174,6 +178,8 @@ class CompareOptions:
     position_floor_m: float = 0.02
     extent_share: float = 0.05
     near_move_m: float = 0.5
+    usual_stayed: float = 1.0
+    variance_margin: float = 2.0
     least_move_m: float = 0.1
     size_floor: float = 0.1
     class_size: float = 0.25
@@ -252,6 +258,7 @@ class _Pairs:
         appearance, appearance_there: (N, M) log likelihood ratios of the embeddings, without and
             with those of the background.
         inliers: (N, M) of the motion of the map object's own points on the found object.
+        own_recognised: (N, M) they are enough to overrule class, size and looks.
         size_square: (N, M) squared Mahalanobis distance of the sizes.
         distance, sigmas: (N, M) displacement in metres and in standard deviations, of the points if
             enough were recognised, otherwise of the centres.
@@ -301,6 +308,7 @@ class _Pairs:
         enough = self.inliers >= options.enough_inliers
         per_inlier = np.where(enough, options.many_inliers, options.few_inliers)
         self.points = np.minimum(per_inlier * self.inliers, options.inliers_limit)
+        self.own_recognised = self.points >= options.margin
         self.appearance = np.zeros(self.overlap.shape)
         self.appearance_there = np.zeros(self.overlap.shape)
 
@@ -332,14 +340,34 @@ class _Pairs:
             total = own + jacobian @ cov @ jacobian.swapaxes(1, 2)
             self.position, square = _log_normal(difference, total)
             self.distance = np.linalg.norm(difference, axis=2)
-            self.sigmas = np.sqrt(square)
             rows, columns = self.known_stayed()
+            by_center = self.inliers < options.enough_inliers
+            ratio = self._variance_ratio(square[rows, columns][by_center[rows, columns]])
+            total = np.where(by_center[..., None, None], ratio, 1.0) * total
+            self.position, square = _log_normal(difference, total)
+            self.sigmas = np.sqrt(square)
             if not len(rows):
                 break
             update, cov = _refined_alignment(
                 jacobian[columns], between[rows, columns], own[rows, columns],
                 alignment_cov * np.outer(to_metres, to_metres),
             )  # fmt: skip
+
+    def _variance_ratio(self, square: Array) -> float:
+        """Return the variance of displacements of objects that stayed over the expected one.
+
+        Shapes that one detector measures twice from similar places have errors in common, so that
+        they differ less than their covariances say. The median, as some of them may have moved; at
+        most 1.
+
+        Args:
+            square: (K,) squared Mahalanobis distances of objects that stayed, 3 coordinates each,
+                by their centres.
+        """
+        prior = self.options.usual_stayed
+        median = float(np.median(square)) / 2.366 if len(square) else 1.0  # of chi-squared with 3
+        measured = (len(square) * median + prior) / (len(square) + prior)
+        return min(self.options.variance_margin * measured, 1.0)
 
     def known_stayed(self) -> tuple[IntArray, IntArray]:
         """Find pairs that stayed by geometry, size and class, without a rival on either side."""
@@ -423,7 +451,7 @@ class _Pairs:
         agrees = self.overlap >= options.least_class_overlap
         agrees &= self.size_square <= options.worst_size
         agrees &= self.appearance >= options.least_appearance
-        return np.where(agrees | self.recognised(), score + np.log(confidence), -np.inf)
+        return np.where(agrees | self.own_recognised, score + np.log(confidence), -np.inf)
 
     def recognised(self) -> BoolArray:
         """Mark the pairs (N, M) with own points, or points of an object that looks alike.

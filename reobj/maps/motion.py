@@ -17,10 +17,11 @@ import quadrics
 from reobj.cameras import Camera, Poses, import_pycolmap
 from reobj.maps.compare import FoundObject, PointMotion
 from reobj.maps.fusion import ObjectState
-from reobj.maps.placement import ImageFeatures, unit_descriptors
+from reobj.maps.object_points import ObjectView
+from reobj.maps.placement import unit_descriptors
 from reobj.maps.room_map import MapPoints
 from reobj.maps.visibility import shapes_of
-from reobj.types import Array, BoolArray, Floats, IntArray, Tracks
+from reobj.types import Array, BoolArray, Floats, IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,26 +34,30 @@ class MotionOptions:
             another place of it. (Objects of the same class do not compete: the points of identical
             instances have the same descriptors.)
         angle: largest angle between descriptors, radians.
+        same_point: cells of this share of the largest half axis hold one point.
         own_spread: of the largest half axis: points of an object nearer to each other do not
             compete.
-        error_px: largest error of an inlier, px of an image 640 px wide, as in the placement.
-        images: of a found object that are compared, those with its largest boxes.
+        error_px: largest error of an inlier, px of an image 640 px wide. (With 6 px, as in the
+            placement, any few points fit on a small object.)
         points: least different points of a map object. inliers: least in an image that agrees.
         agreeing: least images that agree.
         trials: of RANSAC; enough for 15 % of inliers (1 - .15^3)^2000 = .1 %.
+        tilt_deg: an object that is turned over more than this needs `tilted` points.
         bottom: share of the height over the lower end of the object, below which its points may
             belong to what it stands on.
     """
 
     ratio: float = 0.85
-    angle: float = 0.9
+    angle: float = 0.6
+    same_point: float = 0.05
     own_spread: float = 0.25
-    error_px: float = 6.0
-    images: int = 16
+    error_px: float = 3.0
     points: int = 5
-    inliers: int = 3
+    inliers: int = 2
     agreeing: int = 2
     trials: int = 2000
+    tilt_deg: float = 25.0
+    tilted: int = 12
     bottom: float = 0.15
 
 
@@ -60,9 +65,8 @@ def point_motions(
     points: MapPoints,
     states: Sequence[ObjectState],
     found: Sequence[FoundObject],
-    features: Sequence[ImageFeatures],
+    views: Sequence[ObjectView],
     poses: Poses,
-    tracks: Tracks,
     up: Array | None,
     options: MotionOptions | None = None,
 ) -> list[dict[int, PointMotion]]:
@@ -70,8 +74,7 @@ def point_motions(
 
     Args:
         points: of the map. states, found: objects of the map and of the recording.
-        features: of images of the recording, native pixels. poses: in the world of the map.
-        tracks: boxes of the found objects, native pixels.
+        views: features in boxes of the found objects. poses: in the world of the map.
         up: (3,) unit vector against gravity in the map; None: unknown.
     Returns:
         for each found object, the motions of map objects onto it, by their number.
@@ -79,18 +82,43 @@ def point_motions(
     options = options or MotionOptions()
     search = _Search(points, states, up, options)
     motions: list[dict[int, PointMotion]] = [{} for _ in found]
+    in_place = _in_place(states, found)
+    search.usable = [k for k in search.usable if not in_place[k].any()]
     if not search.usable:
         return motions
-    views = _views(found, features, poses, tracks, options)
+    row_of = {o.id: j for j, o in enumerate(found) if not in_place[:, j].any()}
     matches: dict[tuple[int, int], list[_View]] = {}
-    for image, boxes in views:
-        for k, j, view in search.match(image, boxes, poses):
-            matches.setdefault((k, j), []).append(view)
+    for view in views:
+        for k, match in search.match(view, poses) if view.identity in row_of else ():
+            matches.setdefault((k, row_of[view.identity]), []).append(match)
     for (k, j), of_pair in sorted(matches.items()):
-        motion = _motion(states[k], found[j], of_pair, poses.camera, options)
+        motion = _motion(states[k], found[j], of_pair, poses.camera, up, options)
         if motion is not None:
             motions[j][states[k].id] = motion
     return motions
+
+
+def _in_place(
+    states: Sequence[ObjectState], found: Sequence[FoundObject], share: float = 0.25
+) -> BoolArray:
+    """Mark pairs (N, M) of objects that have obviously stayed; their points are not needed.
+
+    They have a class in common, their centres are nearer than a share of the largest half axis of
+    both, and neither is as near to another object.
+    """
+    offset = np.array([[f.center - s.center for f in found] for s in states])
+    distance = np.linalg.norm(offset.reshape(len(states), len(found), 3), axis=2)
+    reach = np.array(
+        [[min(s.half_axes.max(), f.half_axes.max()) for f in found] for s in states]
+    ).reshape(distance.shape)
+    common = np.array(
+        [[bool(set(s.classes) & set(f.classes)) for f in found] for s in states], bool
+    ).reshape(distance.shape)
+    distance = np.where(common & (distance < share * reach), distance, np.inf)
+    nearest = (distance == distance.min(1, keepdims=True, initial=np.inf)) & (
+        distance == distance.min(0, keepdims=True, initial=np.inf)
+    )
+    return np.asarray(nearest & np.isfinite(distance))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,32 +142,12 @@ class _View:
 # ---- Matches -----------------------------------------------------------------------------------
 
 
-def _views(
-    found: Sequence[FoundObject],
-    features: Sequence[ImageFeatures],
-    poses: Poses,
-    tracks: Tracks,
-    options: MotionOptions,
-) -> list[tuple[ImageFeatures, list[tuple[int, Array]]]]:
-    """Choose the images of each found object; return images with the (row, box) of objects."""
-    usable = [f for f in features if poses.measured[f.row] and poses.part[f.row] == 0]
-    image_of = {int(poses.frame[f.row]): k for k, f in enumerate(usable)}
-    chosen: dict[int, list[tuple[int, Array]]] = {}
-    for j, o in enumerate(found):
-        rows = np.flatnonzero(tracks.track_id == o.id)
-        rows = rows[[int(frame) in image_of for frame in tracks.frame[rows]]] if len(rows) else rows
-        area = np.prod(tracks.xyxy[rows, 2:] - tracks.xyxy[rows, :2], axis=1)
-        for row in rows[np.argsort(-area, kind="stable")[: options.images]].tolist():
-            image = image_of[int(tracks.frame[row])]
-            chosen.setdefault(image, []).append((j, tracks.xyxy[row]))
-    return [(usable[k], chosen[k]) for k in sorted(chosen)]
-
-
 class _Search:
     """Matches keypoints to the points of each map object.
 
     Attributes:
-        usable: rows of map objects with enough points.
+        usable: rows of map objects with enough points. tagged: first row of points that lie on
+            objects; those before it lie on none.
     """
 
     def __init__(
@@ -155,6 +163,7 @@ class _Search:
         order = np.argsort(owner, kind="stable")
         self.points = points[order]
         self.owner = owner[order]
+        self.tagged = int((owner < 0).sum())
         self.descriptor = unit_descriptors(self.points.descriptor)
         shapes = shapes_of(states)
         # an object that moved has points at its earlier places too: they are of no use
@@ -169,63 +178,48 @@ class _Search:
         ).reshape(len(states), len(self.group))  # fmt: skip
         self.apart = options.own_spread * np.array([s.half_axes.max() for s in states])
 
-    def match(
-        self, image: ImageFeatures, boxes: Sequence[tuple[int, Array]], poses: Poses
-    ) -> list[tuple[int, int, _View]]:
-        """Match the keypoints in the boxes of an image.
-
-        Args:
-            boxes: row of a found object and its box (4,).
-        Returns:
-            row of the map object, row of the found object, matches.
-        """
-        options = self.options
-        corners = np.array([box for _, box in boxes])  # (B, 4)
-        xy = image.xy[None]
-        above = xy >= corners[:, None, :2]  # (B, n, 2)
-        in_box = np.asarray((above & (xy <= corners[:, None, 2:])).all(2), bool)  # (B, n)
-        chosen = np.flatnonzero(in_box.any(0))
-        in_box = in_box[:, chosen]
-        xy = np.asarray(image.xy[chosen], np.float64)
-        if not len(chosen):
+    def match(self, view: ObjectView, poses: Poses) -> list[tuple[int, _View]]:
+        """Match the features in a box; return rows of map objects and their matches."""
+        unit = unit_descriptors(view.descriptor)
+        least = float(np.cos(self.options.angle))
+        on_objects = unit @ self.descriptor[self.tagged :].T  # (n, tagged)
+        similar = np.flatnonzero(on_objects.max(1, initial=-1.0) > least)
+        if len(similar) < self.options.inliers:
             return []
-        cosine = unit_descriptors(image.descriptor[chosen]) @ self.descriptor.T  # (n, N)
+        unit = unit[similar]
+        cosine = np.hstack([unit @ self.descriptor[: self.tagged].T, on_objects[similar]])  # (n, N)
         best_of_group = np.maximum.reduceat(cosine, self.first, axis=1)  # (n, G)
-        pose = poses.cam_from_world[image.row]
-        views = []
+        pose = poses.cam_from_world[view.row]
+        matches = []
         for k in self.usable:
-            rival = np.where(self.rivals[k], best_of_group, -1.0).max(1)
-            feature, point = self._of_object(k, cosine, rival)
-            if len(feature) < options.inliers:
+            of_object = cosine[:, self.own[k]]
+            rows = np.flatnonzero(of_object.max(1) > least)
+            if len(rows) < self.options.inliers:
+                continue
+            rival = best_of_group[np.ix_(rows, np.flatnonzero(self.rivals[k]))].max(1, initial=-1.0)
+            feature, point = self._of_object(k, of_object[rows], rival)
+            if len(feature) < self.options.inliers:
                 continue
             xyz = self.points.xyz[point]
-            error = _errors(xyz, xy[feature], pose, poses.camera)
-            still = error < _limit(poses.camera, options)
-            for b, (j, _) in enumerate(boxes):
-                here = in_box[b, feature]
-                if here.sum() >= options.inliers:
-                    views.append((k, j, _View(
-                        pose, xy[feature[here]], point[here], xyz[here], still[here],
-                        self.above[point[here]],
-                    )))  # fmt: skip
-        return views
+            xy = view.xy[similar[rows[feature]]]
+            still = _errors(xyz, xy, pose, poses.camera) < _limit(poses.camera, self.options)
+            matches.append((k, _View(pose, xy, point, xyz, still, self.above[point])))
+        return matches
 
-    def _of_object(self, k: int, cosine: Floats, rival: Floats) -> tuple[IntArray, IntArray]:
+    def _of_object(self, k: int, own: Floats, rival: Floats) -> tuple[IntArray, IntArray]:
         """Match features to the points of a map object; each point keeps its best feature.
 
         Args:
-            rival: (n,) best cosine of the points of others.
+            own: (n, P) cosines of its points. rival: (n,) best cosine of the points of others.
         """
         rows = self.own[k]
-        own = cosine[:, rows]
         best = own.argmax(1)
         value = own[np.arange(len(own)), best]
         xyz = self.points.xyz[rows]
-        apart = np.linalg.norm(xyz[:, None] - xyz[None], axis=2) > self.apart[k]
-        rival = np.maximum(rival, np.where(apart[best], own, -1.0).max(1))
+        apart = np.linalg.norm(xyz[best, None] - xyz[None], axis=2) > self.apart[k]  # (n, P)
+        rival = np.maximum(rival, np.where(apart, own, -1.0).max(1))
         angle = np.arccos(value.clip(-1, 1))
-        other = np.arccos(rival.clip(-1, 1))
-        good = np.flatnonzero((angle < self.options.ratio * other) & (angle < self.options.angle))
+        good = np.flatnonzero(angle < self.options.ratio * np.arccos(rival.clip(-1, 1)))
         nearest = good[np.argsort(angle[good], kind="stable")]
         _, first = np.unique(best[nearest], return_index=True)
         feature = np.sort(nearest[first])
@@ -282,11 +276,15 @@ def _motion(
     found: FoundObject,
     views: Sequence[_View],
     camera: Camera,
+    up: Array | None,
     options: MotionOptions,
 ) -> PointMotion | None:
     """Return the motion of a map object that most points follow; None: no images agree."""
     still = _stayed(state, found, views, camera, options)
     moved = _moved(state, found, views, camera, options)
+    if moved is not None and up is not None and moved.inliers < options.tilted:
+        upright = float(up @ moved.new_from_old[:, :3] @ up)
+        moved = moved if upright > np.cos(np.radians(options.tilt_deg)) else None
     if still is None or moved is None:
         return still or moved
     return max(still, moved, key=lambda m: m.inliers)
@@ -300,11 +298,11 @@ def _stayed(
     options: MotionOptions,
 ) -> PointMotion | None:
     """Count the points of an object that are where they were."""
-    of_view = [v.point[v.still & v.above] for v in views]
-    of_view = [rows for rows in of_view if len(rows) >= options.inliers]
-    if len(of_view) < options.agreeing or not _coincide(state.center, state, found):
+    of_view = [v.xyz[v.still & v.above] for v in views]
+    of_view = [xyz for xyz in of_view if len(xyz) >= options.inliers]
+    if len(of_view) < options.agreeing or not _coincide(state.center, state, found, 1.0):
         return None
-    count = len(np.unique(np.concatenate(of_view)))
+    count = _distinct(np.concatenate(of_view), state, options)
     if count < options.points:
         return None
     camera_at = np.array([-v.pose[:, :3].T @ v.pose[:, 3] for v in views])
@@ -351,11 +349,11 @@ def _moved(
     motion = np.array(estimate["rig_from_world"].matrix(), np.float64)  # about the object's centre
     moved = motion[:, 3].copy()
     motion[:, 3] -= motion[:, :3] @ state.center
-    if not np.isfinite(motion).all() or not _coincide(moved, state, found):
+    if not np.isfinite(motion).all() or not _coincide(moved, state, found, 0.5):
         return None
     inlier = np.asarray(estimate["inlier_mask"], bool)
     agrees = np.bincount(image[inlier], minlength=len(kept)) >= options.inliers  # (L,)
-    count = len(np.unique(point[inlier & agrees[image]]))
+    count = _distinct(xyz[inlier & agrees[image]], state, options)
     if agrees.sum() < options.agreeing or count < options.points:
         return None
     error = np.concatenate([
@@ -369,21 +367,29 @@ def _moved(
     return PointMotion(count, int(agrees.sum()), motion, moved - state.center, cov)
 
 
+def _distinct(xyz: Array, state: ObjectState, options: MotionOptions) -> int:
+    """Count different places of points (n, 3): the map may have a point several times."""
+    cell = options.same_point * float(state.half_axes.max())
+    return len(np.unique(np.round((xyz - state.center) / cell), axis=0))
+
+
 def _composed(cam_from_map: Array, motion: Array) -> Array:
     """Return the pose (3, 4) of a camera relative to the map before a motion (3, 4)."""
     turn = cam_from_map[:, :3] @ motion[:, :3]
     return np.column_stack([turn, cam_from_map[:, :3] @ motion[:, 3] + cam_from_map[:, 3]])
 
 
-def _coincide(center: Array, state: ObjectState, found: FoundObject) -> bool:
+def _coincide(center: Array, state: ObjectState, found: FoundObject, share: float) -> bool:
     """Return whether a map object with its centre there is the found object, not one beside it.
 
-    The centres are nearer than the largest half axis of the smaller object; uncertainty at most
-    doubles it. (The points of a cup on a table are in the box of the table.)
+    The centres are nearer than a share of the largest half axis of the smaller object; uncertainty
+    at most doubles it. (The points of a cup on a table are in the box of the table, and keys of a
+    keyboard look alike.)
     """
     offset = center - found.center
     distance = float(np.linalg.norm(offset))
     reach = min(float(state.half_axes.max()), float(found.half_axes.max()))
+    reach *= share
     along = offset / max(distance, 1e-9)
     variance = float(along @ (found.cov[:3, :3] + state.cov[:3, :3]) @ along)
     sigma = np.sqrt(max(variance, 0.0)) if np.isfinite(variance) else 0.0

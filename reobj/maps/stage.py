@@ -17,6 +17,7 @@ from reobj.files import Progress
 from reobj.maps.corrections import with_edits
 from reobj.maps.earlier import earlier_sessions
 from reobj.maps.fusion import scale_of
+from reobj.maps.object_points import object_views, triangulated
 from reobj.maps.placement import (
     ImageFeatures,
     Placement,
@@ -280,6 +281,8 @@ def finish_map(
     if result.edits is not None:
         room = with_edits(room, result.edits)
     recording = _recording(opened, result, video, name, embedder, placed)
+    if placed is not None and video.has_images:
+        recording = _with_object_points(recording, result, video, progress)
     if opened.pictures and not opened.frozen:
         pictures = None
         if video.has_images and not video.is_live:
@@ -296,6 +299,21 @@ def finish_map(
         text = f"map {error}; the results are complete, but the map lacks this recording"
         return dataclasses.replace(numbered, warnings=[*numbered.warnings, text])
     return numbered
+
+
+def _with_object_points(
+    recording: Recording,
+    result: Result,
+    video: Video,
+    progress: Callable[[str, int], Progress],
+) -> Recording:
+    """Add features in the boxes of objects, and the points that they give."""
+    assert result.poses is not None
+    objects = [o for o in result.located if o.part == 0]
+    with progress("object features", 0) as line:
+        views = object_views(objects, result.poses, result.tracks, video, line)
+    points = triangulated(objects, views, result.poses)
+    return dataclasses.replace(recording, views=tuple(views), object_points=points)
 
 
 def _refusal(opened: OpenMap, poses: Poses | None, video: Video, placed: Placed | None) -> str:
@@ -367,7 +385,7 @@ def _recording(
         scale = placed.scale or none
     return Recording(
         opened.path, name, session_key(video), embedder, best.similarity.cov,
-        len(best.images), best.tried, scale, points, placed.features,
+        len(best.images), best.tried, scale, points,
     )  # fmt: skip
 
 

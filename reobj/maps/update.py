@@ -17,7 +17,7 @@ from reobj.cameras import Poses
 from reobj.maps.compare import CompareOptions, Decision, FoundObject, Visibility, compare
 from reobj.maps.fusion import ObjectState, object_state, scale_of
 from reobj.maps.motion import point_motions
-from reobj.maps.placement import ImageFeatures
+from reobj.maps.object_points import ObjectView
 from reobj.maps.room_map import MapObject, MapPoints, Observation, RoomMap, Session
 from reobj.maps.visibility import shapes_of, visibility_of, without_unlocated
 from reobj.results.changes import Change, Changes, Shape
@@ -36,7 +36,8 @@ class Recording:
         localised_frames, tried_frames: images that agreed, that were compared.
         scale: metres per unit of the map as this recording measured it; source "none": it did not.
         points: with descriptors, in the world of the map; None: those of the map are kept.
-        features: of some of its images, in which the points of map objects are recognised.
+        views: features in boxes of its objects, in which the points of map objects are recognised.
+        object_points: triangulated from the views, with the identities of the recording.
         pictures: JPEG of its objects, by identity; None: those that the map has are kept.
     """
 
@@ -49,7 +50,8 @@ class Recording:
     tried_frames: int
     scale: quadrics.Scale
     points: MapPoints | None
-    features: tuple[ImageFeatures, ...] = ()
+    views: tuple[ObjectView, ...] = ()
+    object_points: MapPoints = field(default_factory=MapPoints.empty)
     pictures: Mapping[int, bytes] | None = field(default_factory=dict)
 
 
@@ -103,6 +105,10 @@ def add_recording(room: RoomMap, result: Result, recording: Recording) -> tuple[
     points = room.points
     if recording.points is not None:
         marked = _on_objects(recording.points, result, objects, numbers)
+        of_objects = recording.object_points
+        known_as = np.array([numbers[i] for i in of_objects.object_id.tolist()], np.int64)
+        of_objects = dataclasses.replace(of_objects, object_id=known_as)
+        marked = MapPoints.joined([marked, of_objects])
         marked = dataclasses.replace(marked, session=np.full(len(marked), number))
         points = _with_new_points(points[points.session != number], marked)
     map_objects = _with_observations(room, number, observations, numbers, own)
@@ -208,9 +214,7 @@ def _with_motions(
     assert result.poses is not None
     old = room.session_of(recording.fingerprint)
     points = room.points if old is None else room.points[room.points.session != old.number]
-    motions = point_motions(
-        points, states, found, recording.features, result.poses, result.tracks, room.up
-    )
+    motions = point_motions(points, states, found, recording.views, result.poses, room.up)
     return [
         dataclasses.replace(o, motion_of=of_map) for o, of_map in zip(found, motions, strict=True)
     ]
