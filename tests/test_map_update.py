@@ -145,6 +145,18 @@ def test_the_same_recording_again_replaces_its_session(monday):
     assert [o.observations[0].status for o in again.objects] == ["new"] * 3
 
 
+def test_a_refit_keeps_date_and_change_and_names_its_comparison(monday):
+    tuesday = moved_by(seen([0, 1, 2]), 1, [-0.6, 0.4, 0])
+    room, _ = add_recording(monday, tuesday, recording("tuesday"))
+    dated = dataclasses.replace(room.sessions[1], date="2026-01-06T08:00:00+00:00")
+    room = dataclasses.replace(room, sessions=(room.sessions[0], dated))
+    again, result = add_recording(room, tuesday, recording("tuesday"))
+    assert again.sessions[1].date == dated.date
+    (change,) = result.changes.moved
+    assert change.distance_m == pytest.approx(np.hypot(0.6, 0.4), abs=0.03)
+    assert change.evidence.startswith("compared with the last run of this recording: 0.00 m")
+
+
 def test_a_deleted_object_stays_out_of_later_results(monday):
     room = delete(monday, 2)
     room, result = add_recording(room, seen([0, 1, 2], numbers=[3, 1, 2]), recording("tuesday"))

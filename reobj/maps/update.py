@@ -93,7 +93,8 @@ def add_recording(room: RoomMap, result: Result, recording: Recording) -> tuple[
     if old is not None:
         decisions = _as_before(decisions, before, own)
     numbers = _numbers(result, decisions, room, is_first)
-    session = _session(number, recording, result.poses)
+    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    session = _session(number, recording, result.poses, now if old is None else old.date)
     observations = _observations(number, decisions, found, states, visibility)
     pictures = recording.pictures
     if pictures is None:
@@ -165,12 +166,13 @@ def _as_before(
     """
     kept = []
     for d in decisions:
-        kind = d.kind
         if d.found_id and d.map_id in own:
-            kind = own[d.map_id].status
+            evidence = f"compared with the last run of this recording: {d.evidence}"
+            kept.append(dataclasses.replace(d, kind=own[d.map_id].status, evidence=evidence))
         elif d.found_id and d.map_id not in before:
-            kind = "new"
-        kept.append(dataclasses.replace(d, kind=kind))
+            kept.append(dataclasses.replace(d, kind="new"))
+        else:
+            kept.append(d)
     return kept
 
 
@@ -362,7 +364,7 @@ def _chosen(fits: quadrics.ObjectFits, order: IntArray) -> quadrics.ObjectFits:
 # ---- The new session ---------------------------------------------------------------------------
 
 
-def _session(number: int, recording: Recording, poses: Poses) -> Session:
+def _session(number: int, recording: Recording, poses: Poses, date: str) -> Session:
     """Describe the recording; at most 100 cameras spread over its first component."""
     rows = np.flatnonzero(poses.measured & (poses.part == 0))
     chosen = np.unique(np.linspace(0, max(len(rows) - 1, 0), min(100, len(rows))).round())
@@ -370,7 +372,7 @@ def _session(number: int, recording: Recording, poses: Poses) -> Session:
     return Session(
         number,
         recording.name,
-        datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        date,
         recording.fingerprint,
         recording.embedder,
         poses.camera,

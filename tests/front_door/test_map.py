@@ -294,7 +294,8 @@ def test_corrections_of_the_page_reach_the_map(desk: Path) -> None:
     for kind in KINDS:
         known = [c.id for c in getattr(changes, kind) if c.id != ball]
         assert [c.id for c in getattr(again, kind)] == known, kind
-    assert again.moved[0].distance_m == pytest.approx(changes.moved[0].distance_m, abs=1e-3)
+    difference = again.moved[0].distance_m - changes.moved[0].distance_m
+    assert abs(difference) < 2 * again.moved[0].sigma_m  # without pictures: that of the centres
 
 
 def statuses(room: RoomMap) -> dict[tuple[int, int], str]:
