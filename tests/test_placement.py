@@ -191,23 +191,48 @@ def test_few_images_that_agree_are_not_enough():
     for image in features[4:]:
         image.descriptor[:] = descriptors(rng, len(image.descriptor))
     assert place(poses, features, points).refused.startswith("4 of 20 images")
-    enough = PlacementOptions(frames=4)
+    enough = PlacementOptions(frames=4, confirmed=0.2)
     assert place(poses, features, points, enough).refused == ""
 
 
+def seen_from(points, cam_from_map):
+    """Mark points that project into an image."""
+    in_cam = points.xyz @ cam_from_map[:, :3].T + cam_from_map[:, 3]
+    xy = in_cam[:, :2] / in_cam[:, 2:] @ CAMERA.K[:2, :2].T + CAMERA.K[:2, 2]
+    return (in_cam[:, 2] > 0.1) & ((xy > 0) & (xy < (640, 480))).all(1)
+
+
+def with_few_matches(rng, features, matching):
+    """Features of which only those of the first images, 14 each, are in the map."""
+    few = [dataclasses.replace(im, xy=im.xy[:14], descriptor=im.descriptor[:14]) for im in features]
+    for image in few[matching:]:
+        image.descriptor[:] = descriptors(rng, len(image.descriptor))
+    return few
+
+
 def test_a_short_view_of_the_mapped_part_places_a_recording():
-    """Five of sixty images show it, with ten matches each."""
+    """Eight of sixty images show the part that the map has."""
     rng = np.random.default_rng(8)
     points = room(rng)
     truth = walk(60)
     poses, features = recording(rng, points, truth, outliers=0)
-    few = [dataclasses.replace(im, xy=im.xy[:10], descriptor=im.descriptor[:10]) for im in features]
-    for image in few[5:]:
-        image.descriptor[:] = descriptors(rng, len(image.descriptor))
-    placement = place(poses, few, points, PlacementOptions(images=60))
+    part = points[np.flatnonzero(seen_from(points, truth[4]))]
+    few = with_few_matches(rng, features, 8)
+    placement = place(poses, few, part, PlacementOptions(images=60))
     assert placement.refused == ""
-    assert len(placement.components[0].images) == 5
-    np.testing.assert_allclose(placement.poses.cam_from_world[:5], truth[:5], atol=0.1)
+    (component,) = placement.components
+    assert len(component.images) >= 7 and max(len(im.point) for im in component.images) < 15
+    np.testing.assert_allclose(placement.poses.cam_from_world[:8], truth[:8], atol=0.1)
+
+
+def test_images_that_show_nothing_of_what_they_should_contradict_a_placement():
+    """Of a mirrored room, a few images agree by chance."""
+    rng = np.random.default_rng(8)
+    points = room(rng)
+    poses, features = recording(rng, points, walk(60), outliers=0)
+    few = with_few_matches(rng, features, 8)
+    reason = "8 of 60 images agree on a position in the map, where 57 should show points of it"
+    assert place(poses, few, points, PlacementOptions(images=60)).refused.startswith(reason)
 
 
 def test_points_are_described_by_the_mean_of_their_keypoints():

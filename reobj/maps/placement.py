@@ -46,6 +46,9 @@ class PlacementOptions:
         frames: least images that agree on one similarity; of few images, half.
         turn_deg, shift: largest difference of the camera's orientation and position (over the
             median depth of its points) between PnP and the similarity.
+        shown: points of the map that an image should show again, to count as a view of it.
+        confirmed: least fraction of these images that agree. (Of recordings of the room .6 to 1
+            did, of one with mirrored images .03.)
         rival: fraction of the images that agree, in another placement, that makes both ambiguous.
     """
 
@@ -58,6 +61,8 @@ class PlacementOptions:
     frames: int = 5
     turn_deg: float = 5.0
     shift: float = 0.1
+    shown: int = 50
+    confirmed: float = 0.25
     rival: float = 0.5
 
 
@@ -381,6 +386,12 @@ def place_component(
     guess, agrees, rival = _agreement(poses, located, options)
     agreeing = [image for image, good in zip(located, agrees, strict=True) if good]
     count = f"{len(agreeing)} of {len(tried)} images agree on a position in the map"
+    if guess is not None and len(agreeing) >= needed:
+        cam_from_map = guess.poses(poses.cam_from_world[[image.row for image in tried]])
+        in_view = [int(matcher.in_view(pose, poses.camera).sum()) for pose in cam_from_map]
+        shows = sum(number >= options.shown for number in in_view)
+        count += f", where {shows} should show points of it"
+        needed = max(needed, int(np.ceil(options.confirmed * shows)))
     if guess is None or len(agreeing) < needed:
         reason = f"{count}, {needed} are needed"
         return ComponentPlacement(None, tuple(agreeing), len(tried), reason)
