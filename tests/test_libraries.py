@@ -104,7 +104,8 @@ def test_transformers_with_words(video: rt.Video, tmp_path: Path) -> None:
              "num_attention_heads": 2}  # fmt: skip
     config = tf.Owlv2Config(
         text_config=small | {"vocab_size": last + 1, "bos_token_id": last - 1,
-                             "eos_token_id": last, "pad_token_id": last},
+                             "eos_token_id": last, "pad_token_id": last,
+                             "max_position_embeddings": 32},
         vision_config=small | {"image_size": 64, "patch_size": 16}, projection_dim=32,
     )  # fmt: skip
     folder = str(tmp_path / "model")

@@ -147,7 +147,7 @@ def _transformers(options: LibraryOptions) -> LibraryDetector:
 
     def detect(image: Image) -> Any:
         rgb = image[..., ::-1].copy()
-        text = {"text": [words], "padding": True} if words else {}
+        text = {"text": [words], "padding": True, "truncation": True} if words else {}
         inputs = processor(images=rgb, return_tensors="pt", **text).to(options.device)
         with torch.inference_mode():
             outputs = model(**inputs)
