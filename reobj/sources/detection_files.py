@@ -51,8 +51,16 @@ class DetectConfig:
 
     model: str = option(
         "deimv2-n",
-        "detector: a name of `models`, fast (deimv2-femto), or a .onnx file",
+        "detector: a name of `models`, fast (deimv2-femto), a .onnx file, a model of an installed "
+        "library (FILE.pt or ultralytics:MODEL, rfdetr:MODEL, torchvision:MODEL, hf:MODEL), or "
+        "module:function of a BGR image",
         "--detector",
+    )
+    words: str = option(
+        "",
+        "comma-separated objects to look for, in free text, by a detector that takes text "
+        "(ultralytics' YOLO-World and YOLOE, hf: Grounding DINO and OWLv2)",
+        "--words",
     )
     tiles: str = option(
         "",

@@ -27,6 +27,12 @@ from reobj.sources.detection_files import (
     read_detections,
     unnamed_class,
 )
+from reobj.sources.libraries import (
+    fixed_classes,
+    library_detector,
+    library_of,
+    user_function,
+)
 from reobj.sources.onnx_layouts import (
     LAYOUTS,
     Geometry,
@@ -363,7 +369,18 @@ def open_detections(
         threads: of onnxruntime (0: all cores). offline: never download weights. device: of the
             ONNX model, cpu, cuda, coreml, ...
     """
+    names = load_class_names(config.class_names) if config.class_names else ()
     if detections is None or detections == "":
+        words = tuple(word.strip() for word in config.words.split(",") if word.strip())
+        if library_of(config.model):
+            opened, version = library_detector(config.model, words, config.min_score, device)
+            key = _cache_key(config, version, _file_key(config.model), device)
+            source = _filtered(as_source(opened), config)
+            return dataclasses.replace(source, key=key, slow=True, always_looks=True)
+        if words:
+            raise fixed_classes(config.model)
+        if function := user_function(config.model):
+            return _filtered(as_source(function, names), config)
         path = model_path(config.model, offline)
         detector = OnnxDetector("", config, threads, offline, device)
         key = _cache_key(config, path.name, path.stat().st_size, device)
@@ -372,8 +389,35 @@ def open_detections(
         recorded = read_detections(detections, video, config)
         key = _cache_key(config, recorded.fingerprint())
         return dataclasses.replace(as_source(recorded), key=key)
-    names = load_class_names(config.class_names) if config.class_names else ()
     return as_source(detections, names)
+
+
+def _filtered(source: DetectionSource, config: DetectConfig) -> DetectionSource:
+    """Clip the detections of a source to the image; select them by score, area, class and number.
+
+    Best first.
+    """
+    allowed = class_filter(config.classes, source.class_names) if config.classes else None
+
+    def detect(frame: Frame) -> Detections | None:
+        found = source.detect(frame)
+        if found is None:
+            return None
+        boxes = np.clip(found.xyxy, 0, np.tile(frame.image.shape[1::-1], 2))
+        use = (found.score >= config.min_score) & (boxes[:, 2:] > boxes[:, :2]).all(1)
+        if allowed is not None:
+            use &= np.isin(found.class_id, allowed)
+        rows = np.flatnonzero(use)
+        rows = rows[best_rows(found.score[rows])][: config.max_detections or None]
+        return dataclasses.replace(found, xyxy=boxes)[rows]
+
+    return dataclasses.replace(source, detect=detect)
+
+
+def _file_key(model: str) -> str:
+    """Identify the file of a library's model; "": it is no file."""
+    path = Path(model.partition(":")[2] or model).expanduser()
+    return source_fingerprint(str(path)) if path.is_file() else ""
 
 
 def _cache_key(config: DetectConfig, *source: str | int) -> str:

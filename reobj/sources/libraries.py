@@ -1,0 +1,273 @@
+"""Detectors of other libraries, by their public API: one adapter each.
+
+Start at `library_detector`. The libraries are no requirement of this package: each adapter imports
+its own.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from reobj.types import Image, ReobjError
+
+Detect = Callable[[Image], Any]
+
+
+@dataclass(frozen=True, slots=True)
+class LibraryOptions:
+    """What an adapter gets.
+
+    Attributes:
+        model: name or file, as the library expects it. words: that a detector of free text looks
+            for; (): the model's own classes. min_score: least score. device: of PyTorch.
+    """
+
+    model: str
+    words: tuple[str, ...] = ()
+    min_score: float = 0.1
+    device: str = "cpu"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LibraryDetector:
+    """Detector of another library.
+
+    Attributes:
+        detect: BGR image (H, W, 3) uint8 -> detections as `reobj.types.as_detections` accepts them.
+        class_names: by class id.
+    """
+
+    detect: Detect
+    class_names: tuple[str, ...]
+
+    def __call__(self, image: Image) -> Any:
+        """Detect the objects in an image."""
+        return self.detect(image)
+
+
+@dataclass(frozen=True, slots=True)
+class Library:
+    """A library whose detectors can be used.
+
+    Attributes:
+        open: makes a detector. install: what pip installs. models: examples of names.
+        takes_words: the example that finds free text; "": none.
+    """
+
+    open: Callable[[LibraryOptions], LibraryDetector]
+    install: str
+    models: str
+    takes_words: str = ""
+
+
+def _ultralytics(options: LibraryOptions) -> LibraryDetector:
+    from ultralytics import YOLO
+
+    model = YOLO(options.model)
+    if options.words:
+        if not hasattr(model.model, "set_classes"):
+            raise fixed_classes(f"ultralytics:{options.model}")
+        model.set_classes(list(options.words))
+
+    def detect(image: Image) -> Any:
+        return model.predict(
+            image, conf=options.min_score, device=options.device, retina_masks=True, verbose=False
+        )[0]
+
+    return LibraryDetector(detect, _by_id(model.names))
+
+
+def _rfdetr(options: LibraryOptions) -> LibraryDetector:
+    import rfdetr
+
+    name, _, weights = options.model.partition("=")
+    classes = {key[6:].lower(): key for key in dir(rfdetr) if key[:6] == "RFDETR" and key[6:]}
+    wanted = name.lower().replace("-", "")
+    if wanted not in classes:
+        raise _unknown(f"rfdetr:{name}", classes)
+    given = {"pretrain_weights": weights or None} if "=" in options.model else {}
+    model = getattr(rfdetr, classes[wanted])(device=options.device, **given)
+
+    def detect(image: Image) -> Any:
+        found = model.predict(image[..., ::-1].copy(), threshold=options.min_score)
+        return found[np.array([bool(name) for name in found.data["class_name"]], bool)]
+
+    return LibraryDetector(detect, tuple(map(str, model.class_names)))
+
+
+def _torchvision(options: LibraryOptions) -> LibraryDetector:
+    import torch
+    from torchvision.models import detection, get_model, get_model_weights, list_models
+
+    name, _, weights = options.model.partition("=")
+    known = list_models(detection)
+    if name not in known:
+        raise _unknown(f"torchvision:{name}", known)
+    trained = get_model_weights(name).DEFAULT
+    if "=" in options.model:
+        model = get_model(name, weights=None, weights_backbone=None)
+        if weights:
+            model.load_state_dict(torch.load(weights, map_location="cpu", weights_only=True))
+    else:
+        model = get_model(name, weights=trained)
+    model = model.to(options.device).eval()
+
+    def detect(image: Image) -> dict[str, Any]:
+        tensor = torch.from_numpy(image[..., ::-1].copy()).permute(2, 0, 1).float() / 255
+        with torch.inference_mode():
+            found = model([tensor.to(options.device)])[0]
+        keep = (found["scores"] >= options.min_score) & (found["labels"] > 0)  # 0: background
+        return {key: value[keep].cpu() for key, value in found.items()}
+
+    return LibraryDetector(detect, tuple(trained.meta["categories"]))
+
+
+def _transformers(options: LibraryOptions) -> LibraryDetector:
+    import torch
+    import transformers
+
+    words = list(options.words)
+    kind = "ZeroShotObjectDetection" if words else "ObjectDetection"
+    try:
+        model = getattr(transformers, f"AutoModelFor{kind}").from_pretrained(options.model)
+        loader = transformers.AutoProcessor if words else transformers.AutoImageProcessor
+        processor = loader.from_pretrained(options.model)
+    except (OSError, ValueError) as error:
+        advice = "" if words else "; a detector of free text needs --words"
+        raise ReobjError(f"hf:{options.model}: {str(error).splitlines()[0]}{advice}") from error
+    model = model.to(options.device).eval()
+
+    def detect(image: Image) -> Any:
+        rgb = image[..., ::-1].copy()
+        text = {"text": [words], "padding": True, "truncation": True} if words else {}
+        inputs = processor(images=rgb, return_tensors="pt", **text).to(options.device)
+        with torch.inference_mode():
+            outputs = model(**inputs)
+        asked: dict[str, Any] = {"threshold": options.min_score, "target_sizes": [rgb.shape[:2]]}
+        if not words:
+            return processor.post_process_object_detection(outputs, **asked)[0]
+        if "input_ids" in inputs and type(processor).__name__.startswith("GroundingDino"):
+            asked |= {"input_ids": inputs["input_ids"], "text_threshold": options.min_score}
+        else:
+            asked["text_labels"] = [words]
+        return _with_words(
+            processor.post_process_grounded_object_detection(outputs, **asked), words
+        )
+
+    return LibraryDetector(detect, options.words or _by_id(model.config.id2label))
+
+
+def _with_words(found: Any, words: list[str]) -> dict[str, Any]:
+    """Number detections of one image by the word that shares most tokens with their phrase.
+
+    Grounding DINO returns phrases, which may lack tokens of a word or join several words.
+    """
+    (image,) = found
+    phrases = [set(str(text).lower().split()) for text in image["text_labels"]]
+    tokens = [set(word.lower().split()) for word in words]
+    shared = np.array([[len(p & t) / len(t) for t in tokens] for p in phrases])
+    shared = shared.reshape(len(phrases), len(words))
+    rows = np.flatnonzero(shared.max(1, initial=0) > 0)
+    return {
+        "boxes": image["boxes"][rows],
+        "scores": image["scores"][rows],
+        "labels": shared[rows].argmax(1),
+    }
+
+
+LIBRARIES = {
+    "ultralytics": Library(_ultralytics, "ultralytics", "yolo11n.pt", "yolov8s-worldv2.pt"),
+    "rfdetr": Library(_rfdetr, "rfdetr", "nano, seg-nano, nano=WEIGHTS.pth"),
+    "torchvision": Library(_torchvision, "torchvision", "fasterrcnn_resnet50_fpn_v2"),
+    "hf": Library(
+        _transformers, "transformers torchvision", "PekingU/rtdetr_v2_r18vd or a folder",
+        "IDEA-Research/grounding-dino-tiny",
+    ),
+}  # fmt: skip
+
+
+def library_of(detector: str) -> tuple[str, str] | None:
+    """Split `library:model` or `FILE.pt`; None: another kind of detector."""
+    name, _, model = detector.partition(":")
+    if name in LIBRARIES and model:
+        return name, model
+    return ("ultralytics", detector) if Path(detector).suffix == ".pt" else None
+
+
+def library_detector(
+    detector: str, words: tuple[str, ...], min_score: float, device: str
+) -> tuple[LibraryDetector, str]:
+    """Open a detector of another library.
+
+    Args:
+        detector: `library:model`, or a .pt file of ultralytics. words: to look for; (): the
+            model's classes. device: cpu, cuda, cuda:1 or mps.
+    Returns:
+        the detector, and name and version of its library for cache keys.
+    Raises:
+        ReobjError: the library is not installed, has no such model, or does not take words.
+    """
+    named = library_of(detector)
+    assert named is not None
+    name, model = named
+    library = LIBRARIES[name]
+    if words and not library.takes_words:
+        raise fixed_classes(detector)
+    if device.partition(":")[0] not in ("cpu", "cuda", "mps"):
+        raise ReobjError(f"--device {device}: detectors of {name} run on cpu, cuda or mps")
+    try:
+        found = library.open(LibraryOptions(model, words, min_score, device))
+    except ImportError as error:
+        raise ReobjError(
+            f"--detector {detector}: {error}; it needs: pip install {library.install}"
+        ) from error
+    except (OSError, RuntimeError) as error:  # no such file, no download, no such device
+        raise ReobjError(f"--detector {detector}: {str(error).splitlines()[0]}") from error
+    package = "transformers" if name == "hf" else name
+    return found, f"{package} {importlib.metadata.version(package)}"
+
+
+def user_function(detector: str) -> Any:
+    """Import `module:function`, also from the current folder; None: another kind of detector."""
+    module, _, function = detector.partition(":")
+    if not function or not all(part.isidentifier() for part in [*module.split("."), function]):
+        return None
+    sys.path.insert(0, str(Path.cwd()))
+    try:
+        found = getattr(importlib.import_module(module), function)
+    except (ImportError, AttributeError) as error:
+        known = ", ".join(LIBRARIES)
+        text = f"expected a function of a module in this folder or installed, or one of {known}"
+        raise ReobjError(f"--detector {detector}: {error}; {text}") from error
+    finally:
+        sys.path.pop(0)
+    if not callable(found):
+        raise ReobjError(f"--detector {detector}: it is no function image -> detections")
+    return found
+
+
+def _by_id(names: Mapping[Any, Any]) -> tuple[str, ...]:
+    """Return the names of ids 0, 1, ...; ids without a name get a number."""
+    of_id = {int(i): str(name) for i, name in names.items()}
+    return tuple(of_id.get(i, f"class {i}") for i in range(max(of_id, default=-1) + 1))
+
+
+def fixed_classes(detector: str) -> ReobjError:
+    """Make the error for words given to a detector with fixed classes."""
+    others = [f"{name}:{lib.takes_words}" for name, lib in LIBRARIES.items() if lib.takes_words]
+    return ReobjError(
+        f"--words: {detector} has fixed classes; detectors that take words: {', '.join(others)}"
+    )
+
+
+def _unknown(detector: str, known: Any) -> ReobjError:
+    """Make the error for a name that a library does not have."""
+    return ReobjError(f"--detector {detector}: no such model; there are {', '.join(sorted(known))}")

@@ -1,0 +1,194 @@
+"""Detectors of other libraries and of the user's module, from `--detector` to detections.
+
+The models have random weights and are made from configurations: shapes, classes and coordinates are
+what is tested. `pip install ultralytics rfdetr torchvision transformers` to run all tests.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+import reobj_track as rt
+from reobj.sources import libraries
+from reobj.sources.detectors import DetectionSource, open_detections
+from reobj.types import Detections
+
+WORDS = ("espresso machine", "red toolbox")
+
+
+@pytest.fixture
+def video(tmp_path: Path) -> rt.Video:
+    """One photo of noise, 320 x 240."""
+    image = np.random.default_rng(0).integers(0, 255, (240, 320, 3), dtype=np.uint8)
+    cv2.imwrite(str(tmp_path / "0.png"), image)
+    return rt.Video(tmp_path)
+
+
+def detect(video: rt.Video, model: str, **config: Any) -> tuple[Detections, DetectionSource]:
+    """Detections of the photo, checked as those of any detector."""
+    source = open_detections(video, rt.DetectConfig(model=model, **config))
+    (frame,) = list(video)
+    found = source(frame)
+    assert np.isfinite(found.xyxy).all() and (found.xyxy >= 0).all()
+    assert (found.xyxy <= (320, 240, 320, 240)).all()
+    assert (found.xyxy[:, 2:] > found.xyxy[:, :2]).all()
+    assert (np.diff(found.score) <= 0).all()
+    assert (found.class_id < len(source.class_names)).all()
+    return found, source
+
+
+# ---- Each library ------------------------------------------------------------------------------
+
+
+def test_ultralytics(video: rt.Video) -> None:
+    pytest.importorskip("ultralytics")
+    found, source = detect(video, "ultralytics:yolo11n-seg.yaml", min_score=1e-6)
+    assert len(found) > 0 and found.masks is not None
+    assert found.masks.shape == (len(found), 240, 320)
+    assert len(source.class_names) == 80 and source.key
+    with pytest.raises(rt.ReobjError, match=r"--words: ultralytics:yolo11n.yaml has fixed classes"):
+        detect(video, "ultralytics:yolo11n.yaml", words="toolbox")
+
+
+def test_rfdetr(video: rt.Video) -> None:
+    pytest.importorskip("rfdetr")
+    found, source = detect(video, "rfdetr:nano=", min_score=0.01)
+    assert len(found) > 10 and source.class_names[0] == "person" and source.key
+    with pytest.raises(rt.ReobjError, match=r"rfdetr:huge: no such model; there are base, .*nano"):
+        detect(video, "rfdetr:huge")
+
+
+def test_torchvision(video: rt.Video) -> None:
+    pytest.importorskip("torchvision")
+    found, source = detect(video, "torchvision:maskrcnn_resnet50_fpn=", min_score=0.001)
+    assert len(found) > 10 and found.masks is not None
+    assert found.masks.shape == (len(found), 240, 320)
+    assert source.class_names[1] == "person" and found.class_id.min() > 0  # 0: background
+
+
+def test_transformers(video: rt.Video, tmp_path: Path) -> None:
+    tf = pytest.importorskip("transformers")
+    pytest.importorskip("torch")
+    backbone = tf.RTDetrResNetConfig(
+        embedding_size=16, hidden_sizes=[16, 32, 64, 64], depths=[1, 1, 1, 1],
+        out_features=["stage2", "stage3", "stage4"],
+    )  # fmt: skip
+    config = tf.RTDetrV2Config(
+        backbone_config=backbone, encoder_in_channels=[32, 64, 64], encoder_hidden_dim=64,
+        decoder_in_channels=[64, 64, 64], encoder_layers=1, encoder_ffn_dim=64, d_model=64,
+        decoder_layers=2, num_queries=20, id2label={0: "lamp", 1: "plant"},
+    )  # fmt: skip
+    folder = str(tmp_path / "model")
+    tf.RTDetrV2ForObjectDetection(config).save_pretrained(folder)
+    tf.RTDetrImageProcessor().save_pretrained(folder)
+    found, source = detect(video, f"hf:{folder}", min_score=0.001)
+    assert len(found) > 5 and tuple(source.class_names) == ("lamp", "plant")
+    assert np.ptp(found.xyxy[:, ::2]) > 50  # px of the photo, not of the network or 0..1
+    plants, _ = detect(video, f"hf:{folder}", min_score=0.001, classes="plant")
+    assert set(plants.class_id) <= {1}
+
+
+def test_transformers_with_words(video: rt.Video, tmp_path: Path) -> None:
+    tf = pytest.importorskip("transformers")
+    pytest.importorskip("torch")
+    letters = [chr(c) for c in range(ord("a"), ord("z") + 1)]
+    tokens = [*letters, *(c + "</w>" for c in letters), "<|startoftext|>", "<|endoftext|>"]
+    vocabulary = {token: i for i, token in enumerate(tokens)}
+    last = len(tokens) - 1
+    small = {"hidden_size": 32, "intermediate_size": 32, "num_hidden_layers": 1,
+             "num_attention_heads": 2}  # fmt: skip
+    config = tf.Owlv2Config(
+        text_config=small | {"vocab_size": last + 1, "bos_token_id": last - 1,
+                             "eos_token_id": last, "pad_token_id": last,
+                             "max_position_embeddings": 32},
+        vision_config=small | {"image_size": 64, "patch_size": 16}, projection_dim=32,
+    )  # fmt: skip
+    folder = str(tmp_path / "model")
+    tf.Owlv2ForObjectDetection(config).save_pretrained(folder)
+    images = tf.Owlv2ImageProcessor(size={"height": 64, "width": 64})
+    tokenizer = tf.CLIPTokenizer(vocab=vocabulary, merges=[])
+    tf.Owlv2Processor(images, tokenizer).save_pretrained(folder)
+    _, source = detect(video, f"hf:{folder}", min_score=0.001, words=", ".join(WORDS))
+    assert tuple(source.class_names) == WORDS
+
+
+# ---- What needs no library ---------------------------------------------------------------------
+
+
+def test_phrases_get_the_word_that_shares_most_tokens() -> None:
+    phrases = ["machine", "red espresso machine", "toolbox red", "", "lamp"]
+    image = {"boxes": np.arange(20.0).reshape(5, 4), "scores": np.arange(5.0),
+             "text_labels": phrases}  # fmt: skip
+    found = libraries._with_words([image], list(WORDS))
+    assert found["labels"].tolist() == [0, 0, 1]
+    np.testing.assert_array_equal(found["scores"], [0, 1, 2])
+    none = libraries._with_words([image | {"boxes": np.empty((0, 4)), "scores": np.empty(0),
+                                           "text_labels": []}], list(WORDS))  # fmt: skip
+    assert len(none["labels"]) == 0
+
+
+def test_a_missing_library_is_one_line_with_the_command(
+    video: rt.Video, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "ultralytics", None)
+    with pytest.raises(rt.ReobjError, match=r"--detector mine\.pt: .* pip install ultralytics$"):
+        detect(video, "mine.pt")
+
+
+@pytest.mark.parametrize("device", ["openvino", "coreml"])
+def test_a_device_of_onnxruntime_is_refused(video: rt.Video, device: str) -> None:
+    with pytest.raises(rt.ReobjError, match=f"--device {device}: detectors of hf run on cpu, cuda"):
+        open_detections(video, rt.DetectConfig(model="hf:some/model"), device=device)
+
+
+def test_words_need_a_detector_of_free_text(video: rt.Video) -> None:
+    with pytest.raises(rt.ReobjError, match=r"--words: deimv2-n has fixed classes; .*grounding"):
+        detect(video, "deimv2-n", words="toolbox")
+    with pytest.raises(rt.ReobjError, match="--words: rfdetr:nano has fixed classes"):
+        detect(video, "rfdetr:nano", words="toolbox")
+
+
+def test_a_function_of_the_users_module(
+    video: rt.Video, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "my_boxes.py").write_text(
+        "def find(image):\n"
+        "    return [[-5, 10, 400, 200, .9, 2], [10, 10, 60, 60, .95, 1], [0, 0, 9, 9, .05, 1]]\n"
+        "find.names = {1: 'lamp', 2: 'plant'}\n"
+        "number = 3\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    found, source = detect(video, "my_boxes:find")
+    assert [source.class_names[k] for k in found.class_id] == ["lamp", "plant"]
+    np.testing.assert_array_equal(found.xyxy[1], [0, 10, 320, 200])  # clipped; low scores left out
+    assert not source.key  # what the function depends on is unknown: nothing is cached
+    plants, _ = detect(video, "my_boxes:find", classes="plant")
+    assert len(plants) == 1
+    for wrong, text in (("my_boxes:no", "no attribute"), ("my_boxes:number", "no function"),
+                        ("no_module:find", "No module named")):  # fmt: skip
+        with pytest.raises(rt.ReobjError, match=f"--detector {wrong}: .*{text}"):
+            detect(video, wrong)
+
+
+def test_names_of_libraries() -> None:
+    assert libraries.library_of("yolo11n.pt") == ("ultralytics", "yolo11n.pt")
+    assert libraries.library_of("hf:IDEA/dino") == ("hf", "IDEA/dino")
+    assert libraries.library_of("fast") is None and libraries.library_of("my:find") is None
+
+
+def test_a_library_without_a_file_is_one_line(
+    video: rt.Video, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def missing(options: libraries.LibraryOptions) -> libraries.LibraryDetector:
+        raise FileNotFoundError(f"no such file: {options.model}")
+
+    stub = libraries.Library(missing, "ultralytics", "")
+    monkeypatch.setitem(libraries.LIBRARIES, "ultralytics", stub)
+    monkeypatch.setattr(libraries.importlib.metadata, "version", lambda name: "1")
+    with pytest.raises(rt.ReobjError, match=r"^--detector no\.pt: no such file: no\.pt$"):
+        detect(video, "no.pt")
