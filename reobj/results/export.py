@@ -284,24 +284,34 @@ def export_ply(result: Result, path: Path) -> None:
 
 
 def export_csv(result: Result, path: Path) -> None:
-    """Write a table of the objects, one a line, for spreadsheets and pandas.
+    """Write the table of the objects, one a line, for spreadsheets.
 
-    Lengths are in world units, `_m` in metres; empty where unknown. Text that a spreadsheet would
-    read as a formula gets an apostrophe.
+    Text that a spreadsheet would read as a formula gets an apostrophe.
+    """
+    head, rows = object_table(result)
+    with atomic(path) as part, part.open("w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(head)
+        table.writerows([formula_safe(value) for value in row] for row in rows)
+
+
+def object_table(result: Result) -> tuple[list[str], list[list[Any]]]:
+    """Return the names of the columns, and a row for each object.
+
+    Lengths are in world units, `_m` in metres; None where unknown.
     """
     head = ["id", "class", "status", "reason", "score", "confidence", "support"]
     vectors = ("center", "size", "size_m", "size_rel_sigma")
     head += [f"{name}_{axis}" for name in vectors for axis in "xyz"]
     head += ["qw", "qx", "qy", "qz", "views", "frames_seen", "visits", "part"]
-    with atomic(path) as part, part.open("w", newline="", encoding="utf-8") as file:
-        table = csv.writer(file, lineterminator="\n")
-        table.writerow(head)
-        for o in result.objects:
-            row = [o.id, o.class_name, o.status, o.reason, o.score, o.confidence, o.support]
-            for name in vectors:
-                row += _numbers(getattr(o, name), 3)
-            row += [*_numbers(o.quat_wxyz, 4), o.views, o.frames_seen, len(o.visits), o.part]
-            table.writerow([formula_safe(value) for value in row])
+    rows = list[list[Any]]()
+    for o in result.objects:
+        row = [o.id, o.class_name, o.status, o.reason, o.score, o.confidence, o.support]
+        for name in vectors:
+            row += _numbers(getattr(o, name), 3)
+        row += [*_numbers(o.quat_wxyz, 4), o.views, o.frames_seen, len(o.visits), o.part]
+        rows.append(row)
+    return head, rows
 
 
 def _numbers(values: Array | None, count: int) -> list[float | None]:

@@ -359,10 +359,12 @@ def open_detections(
 
     Args:
         detections: a file for `read_detections`; a function or another argument of `as_source`, for
-            which `config` gives only the class names; or None: the ONNX model of `config`.
+            which `config` gives only the class names; a detector of `with_detector`; or None: the
+            ONNX model of `config`.
         threads: of onnxruntime (0: all cores). offline: never download weights. device: of the
             ONNX model, cpu, cuda, coreml, ...
     """
+    config, detections = with_detector(config, detections)
     if detections is None or detections == "":
         path = model_path(config.model, offline)
         detector = OnnxDetector("", config, threads, offline, device)
@@ -374,6 +376,24 @@ def open_detections(
         return dataclasses.replace(as_source(recorded), key=key)
     names = load_class_names(config.class_names) if config.class_names else ()
     return as_source(detections, names)
+
+
+def with_detector(config: DetectConfig, detections: Any) -> tuple[DetectConfig, Any]:
+    """Move the name of a detector from the argument `detections` to the option `model`.
+
+    Args:
+        detections: the name of a known detector where no file has this name, or the path of a
+            .onnx file; any other argument of `open_detections` is returned unchanged.
+    Returns:
+        config, detections; None for a detector.
+    """
+    if not isinstance(detections, str | Path):
+        return config, detections
+    known = known_weights(detections)
+    named = known is not None and known.role == "detector" and not Path(detections).exists()
+    if not named and Path(detections).suffix.lower() != ".onnx":
+        return config, detections
+    return dataclasses.replace(config, model=str(detections)), None
 
 
 def _cache_key(config: DetectConfig, *source: str | int) -> str:
