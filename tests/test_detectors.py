@@ -798,6 +798,8 @@ def test_a_detector_is_named_where_detections_are_given(
     (tmp_path / "fast").mkdir()
     for other in ("fast", "reobj", "det.txt", Path("det.npz"), "", None, len):
         assert with_detector(config, other) == (config, other)
+    with pytest.raises(rt.ReobjError, match=r"fsat: no such file .*; did you mean fast"):
+        rt.run("a.mp4", detector="fsat")
 
 
 def test_run_and_track_accept_a_model_a_video_and_a_dict(

@@ -35,6 +35,7 @@ from reobj.files import Progress, atomic, spans, staged
 from reobj.results.origin import centred, far_origin, shifted
 from reobj.results.ply import write_ply, write_point_ply
 from reobj.results.result import Result, VideoInfo
+from reobj.results.table import object_table
 from reobj.results.workspace import Workspace
 from reobj.sources.image_files import IMAGE_FPS
 from reobj.sources.video import Video
@@ -293,29 +294,6 @@ def export_csv(result: Result, path: Path) -> None:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(head)
         table.writerows([formula_safe(value) for value in row] for row in rows)
-
-
-def object_table(result: Result) -> tuple[list[str], list[list[Any]]]:
-    """Return the names of the columns, and a row for each object.
-
-    Lengths are in world units, `_m` in metres; None where unknown.
-    """
-    head = ["id", "class", "status", "reason", "score", "confidence", "support"]
-    vectors = ("center", "size", "size_m", "size_rel_sigma")
-    head += [f"{name}_{axis}" for name in vectors for axis in "xyz"]
-    head += ["qw", "qx", "qy", "qz", "views", "frames_seen", "visits", "part"]
-    rows = list[list[Any]]()
-    for o in result.objects:
-        row = [o.id, o.class_name, o.status, o.reason, o.score, o.confidence, o.support]
-        for name in vectors:
-            row += _numbers(getattr(o, name), 3)
-        row += [*_numbers(o.quat_wxyz, 4), o.views, o.frames_seen, len(o.visits), o.part]
-        rows.append(row)
-    return head, rows
-
-
-def _numbers(values: Array | None, count: int) -> list[float | None]:
-    return [None] * count if values is None else values.tolist()
 
 
 def formula_safe(value: Any) -> Any:

@@ -1,21 +1,22 @@
-"""A result in a notebook: its table of objects and its viewer as HTML, its objects for pandas."""
+"""A result in a notebook: the table of its objects and its viewer as HTML."""
 
 from __future__ import annotations
 
 import html
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from reobj.files import cut
-from reobj.results.export import object_table
+from reobj.results.entries import Object
 from reobj.results.report import sides
-from reobj.results.result import Object, Result
 from reobj.results.scene import Pictures, write_scene
 from reobj.sources.imageless import ImagelessVideo
-from reobj.types import ReobjError
+
+if TYPE_CHECKING:
+    from reobj.results.result import Result
 
 VIEWER_PX = 600  # height of the viewer: a notebook on a laptop shows it whole
 
@@ -84,13 +85,3 @@ def _cells(found: Object) -> tuple[str, ...]:
         f"{size} {unit}" if size else "-",
         "-" if sigma is None else f"{100 * np.max(sigma):.0f} %",
     )
-
-
-def to_pandas(result: Result) -> Any:
-    """Return the objects as a pandas DataFrame, with the columns of `export --to csv`."""
-    try:
-        import pandas
-    except ImportError as error:
-        raise ReobjError("to_pandas needs pandas: pip install pandas") from error
-    head, rows = object_table(result)
-    return pandas.DataFrame(rows, columns=head).set_index("id")

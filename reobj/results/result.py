@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 import quadrics
 from reobj.cameras import Poses
-from reobj.results import report, saving
+from reobj.results import notebook, report, saving, table
 from reobj.results.changes import Changes, EarlierSession
 from reobj.results.edits import Edits
 from reobj.results.entries import Object, Part, VideoInfo, World
@@ -82,8 +82,6 @@ class Result:
 
     def _repr_html_(self) -> str:
         """Show the objects and the viewer in a notebook."""
-        from reobj.results import notebook  # which imports this module
-
         return notebook.to_html(self)
 
     def object(self, number: int) -> Object:
@@ -104,9 +102,7 @@ class Result:
 
         The columns are those of `export --to csv`: lengths in world units, `_m` in metres.
         """
-        from reobj.results import notebook  # which imports this module
-
-        return notebook.to_pandas(self)
+        return table.to_pandas(self)
 
     @property
     def located(self) -> list[Object]:

@@ -19,7 +19,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from reobj.files import save_npz
+from reobj.files import did_you_mean, save_npz
 from reobj.sources.class_names import Vocabulary, check_length, load_class_names
 from reobj.sources.detection_files import (
     DetectConfig,
@@ -38,7 +38,7 @@ from reobj.sources.onnx_layouts import (
 from reobj.sources.recorded import NORMALISED_MAX, RecordedDetections, pack_detections, read_npz
 from reobj.sources.tiles import detect_in_tiles, parse_tiles
 from reobj.sources.video import Video, source_fingerprint
-from reobj.sources.weights import known_weights, model_path, onnx_session
+from reobj.sources.weights import WEIGHTS, known_weights, model_path, onnx_session
 from reobj.types import (
     COCO_NAMES,
     Array,
@@ -386,14 +386,18 @@ def with_detector(config: DetectConfig, detections: Any) -> tuple[DetectConfig, 
             .onnx file; any other argument of `open_detections` is returned unchanged.
     Returns:
         config, detections; None for a detector.
+    Raises:
+        ReobjError: no such file, and a name similar to that of a detector.
     """
     if not isinstance(detections, str | Path):
         return config, detections
-    known = known_weights(detections)
-    named = known is not None and known.role == "detector" and not Path(detections).exists()
-    if not named and Path(detections).suffix.lower() != ".onnx":
-        return config, detections
-    return dataclasses.replace(config, model=str(detections)), None
+    path = Path(detections)
+    names = [name for w in WEIGHTS if w.role == "detector" for name in (w.name, w.alias) if name]
+    if path.suffix.lower() == ".onnx" or (str(path) in names and not path.exists()):
+        return dataclasses.replace(config, model=str(path)), None
+    if not path.exists() and (close := did_you_mean(str(detections), names)):
+        raise ReobjError(f"{path}: no such file of detections, and no known detector{close}")
+    return config, detections
 
 
 def _cache_key(config: DetectConfig, *source: str | int) -> str:
