@@ -44,10 +44,11 @@ import dataclasses
 import json
 import logging
 import math
+import re
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -98,6 +99,8 @@ from reobj.objects.fit import fill, link_and_fit
 from reobj.objects.phases import PhasesOfFit
 from reobj.objects.published import solve_again
 from reobj.options import (
+    as_config,
+    changed_options,
     check_known_size,
     check_shape,
     config_from_args,
@@ -139,7 +142,12 @@ from reobj.results.scene import write_pictures
 from reobj.results.stages import collect_tracks, detect_all, detections_key, keep_detections
 from reobj.results.workspace import Workspace
 from reobj.sources.detection_files import DetectConfig, read_detections, read_tracks
-from reobj.sources.detectors import DetectionSource, OnnxDetector, open_detections
+from reobj.sources.detectors import (
+    DetectionSource,
+    OnnxDetector,
+    open_detections,
+    with_detector,
+)
 from reobj.sources.looked import Intervals
 from reobj.sources.recorded import write_detections_npz
 from reobj.sources.video import InputConfig, Video
@@ -192,6 +200,12 @@ __all__ = [
     "open_detections", "read_detections", "read_poses", "read_tracks", "refit", "run", "track",
     "write_detections_npz",
 ]  # fmt: skip
+
+
+def __dir__() -> list[str]:
+    """List the public names, for completion."""
+    return list(__all__)
+
 
 # ---- Configuration -----------------------------------------------------------------------------
 
@@ -272,6 +286,10 @@ class Config:
         "cpu", "device of the networks: cpu, cuda, coreml, ... (onnxruntime)", "--device"
     )
     offline: bool = option(False, "never download weights", "--offline")
+
+    def __repr__(self) -> str:
+        """List the options that differ from the defaults, in one line."""
+        return f"Config({', '.join(f'{k}={v!r}' for k, v in changed_options(self).items())})"
 
 
 # ---- Kalman filter -----------------------------------------------------------------------------
@@ -552,7 +570,8 @@ class Tracker:
     equally well: then it gets a new identity (`run` decides later, with 3D evidence).
 
     Args:
-        config: thresholds; the defaults suit video of static scenes at 5 to 60 frames per second.
+        config: thresholds, or a dict of them; the defaults suit video of static scenes at 5 to 60
+            frames per second.
         embedder: computes embeddings of ambiguous matches; without one, pass `embeddings=` or
             track by motion alone.
         matching: gates, costs and odds.
@@ -564,11 +583,11 @@ class Tracker:
 
     def __init__(
         self,
-        config: TrackerConfig | None = None,
+        config: TrackerConfig | Mapping[str, Any] | None = None,
         embedder: Embedder | None = None,
         matching: MatchingOptions | None = None,
     ) -> None:
-        self.config = config or TrackerConfig()
+        self.config = as_config(TrackerConfig(), config)
         self.embedder = embedder
         self.matching = matching or MatchingOptions()
         self.reset()
@@ -1266,9 +1285,9 @@ def track(
 
     Args:
         video: a `Video`, or its source: file, folder of images, glob, camera index, stream URL.
-        detector: function image -> detections (`OnnxDetector`, your own), a file of recorded
-            detections, or a `DetectionSource`; default: the default detector. A function returns
-            None for frames that it skips.
+        detector: function image -> detections (`OnnxDetector`, your own), a name of `list_models`
+            such as "fast", a .onnx file, a file of recorded detections, or a `DetectionSource`;
+            default: the default detector. A function returns None for frames that it skips.
         tracker: default: a `Tracker` with the bundled embedder.
         poses: cameras of the video, if known; objects are then also re-identified by 3D position.
     Yields:
@@ -1295,10 +1314,11 @@ def track(
 
 
 def run(
-    source: str | Path | int | None,
-    out: str | Path,
-    config: Config | None = None,
+    source: Video | str | Path | int | None,
+    out: str | Path | None = None,
+    config: Config | Mapping[str, Any] | None = None,
     *,
+    detector: Any = None,
     detections: str | Path | Callable[[Image], Any] | None = None,
     tracks: str | Path | None = None,
     map: str | Path | None = None,
@@ -1311,10 +1331,13 @@ def run(
 
     Args:
         source: video file, folder of images, glob, camera index or stream URL (Ctrl-C ends a live
-            source and writes its files); None: no images, only detections and poses.
-        out: output folder; cached results of earlier stages in it are used again.
-        detections: file of recorded detections, or a callable image -> detections; default:
-            config.detect.model.
+            source and writes its files), or a `Video`, whose options replace config.input; None: no
+            images, only detections and poses.
+        out: output folder; cached results of earlier stages in it are used again. Default: in the
+            working folder, with the name of the source: room_out for room.mp4.
+        config: options, or a dict of them: {"detect": {"classes": "chair"}}.
+        detector: as in `track`; default: config.detect.model. detections: the same argument, by
+            the name of the flag --detections.
         tracks: file of identities, instead of detector, tracker and linker.
         map: map of the room, in which objects keep their numbers over several recordings; it is
             made if it does not exist. map_frozen: do not change the file. They replace the
@@ -1326,11 +1349,14 @@ def run(
     Raises:
         ReobjError: invalid input; the message says what to do.
     """
-    config = _with_map(config or Config(), map, map_frozen)
+    config = _with_map(as_config(Config(), config), map, map_frozen)
+    config, detections = _with_detector(config, detector, detections)
     if config.threads:
         cv2.setNumThreads(config.threads)
     _check_objects(config.objects)
     video = open_video(source, config.input, config.poses, tracks or detections, config.detect)
+    config = _with_input(config, video.config)
+    out = _default_out(source) if out is None else out
     with Workspace(out, overwrite) as workspace, opened_map(config.map) as room:
         workspace.bind(video, overwrite)
         job = _Job(video, workspace, dataclasses.replace(config, map=config.map.absolute()))
@@ -1369,7 +1395,7 @@ def run(
 
 def refit(
     out: str | Path,
-    config: Config | None = None,
+    config: Config | Mapping[str, Any] | None = None,
     tracks: str | Path | None = None,
     edits: str | Path | None = None,
 ) -> Result:
@@ -1378,6 +1404,7 @@ def refit(
     The map of the room is one of these options.
 
     Args:
+        config: options; or a dict of those that differ from the last ones.
         tracks: file of identities that replace the tracks.
         edits: file of corrections that replace those of the folder.
     """
@@ -1387,7 +1414,7 @@ def refit(
         last = workspace.load_last()
         video, warnings = (workspace.video(), []) if tracks else workspace.video_or_frames(last)
         corrections = read_edits(edits) if edits else None
-        config = dataclasses.replace(config or _last_config(out), input=video.config)
+        config = dataclasses.replace(as_config(_last_config(out), config), input=video.config)
         _check_objects(config.objects)
         sizes = config.objects
         check_known_size(sizes.known_size, sizes.priors, last.class_names)
@@ -1400,6 +1427,36 @@ def refit(
         )
         with opened_map(config.map, must_exist=True) as room:
             return _finish(_Job(video, workspace, config), result, room)
+
+
+def _with_detector(config: Config, detector: Any, detections: Any) -> tuple[Config, Any]:
+    """Return the options with the detector that the arguments of `run` name, and the detections."""
+    if detector is not None and detections is not None:
+        raise ReobjError("detector and detections are the same argument: give one of them")
+    given = detections if detector is None else detector
+    detect, given = with_detector(config.detect, given)
+    return dataclasses.replace(config, detect=detect), given
+
+
+def _with_input(config: Config, of_video: InputConfig) -> Config:
+    """Return the options with those that the video was opened with."""
+    if config.input not in (InputConfig(), of_video):
+        raise ReobjError(f"config.input is {config.input}, but the Video was opened with {of_video}"
+                         ": give these options to the Video only")  # fmt: skip
+    return dataclasses.replace(config, input=of_video)
+
+
+def _default_out(source: Video | str | Path | int | None) -> Path:
+    """Name the output folder of a source, in the working folder.
+
+    >>> _default_out("recordings/room.mp4").name
+    'room_out'
+    """
+    if source is None:
+        return Path("out")
+    text = str(source.source if isinstance(source, Video) else source)
+    name = re.sub(r"[^\w.-]+", "_", Path(without_secrets(text)).stem).strip("_.")
+    return Path(f"{name}_out" if name else "out")
 
 
 def _with_map(config: Config, path: str | Path | None, frozen: bool) -> Config:

@@ -23,7 +23,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from reobj.files import atomic, load_npz, save_npz
-from reobj.types import Array, BoolArray, IntArray, ReobjError, as_numbers
+from reobj.types import Array, BoolArray, IntArray, ReobjError, as_numbers, counted
 
 
 @contextlib.contextmanager
@@ -265,6 +265,14 @@ class Poses:
     def __post_init__(self) -> None:
         if len(self.part) != len(self.frame):
             object.__setattr__(self, "part", np.zeros(len(self.frame), np.int64))
+
+    def __repr__(self) -> str:
+        """Describe the poses in one line."""
+        facts = [self.cameras_text, counted(len(self.points), "point", "points")]
+        facts += ["in metres"] * self.metric
+        if self.part_count > 1:
+            facts.append(f"{self.part_count} components")
+        return f"Poses({', '.join(facts)})"
 
     @property
     def measured(self) -> BoolArray:

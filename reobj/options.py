@@ -10,7 +10,7 @@ import math
 import re
 import textwrap
 import tomllib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -44,6 +44,8 @@ def value_of(config: Any, name: str) -> Any:
 def with_option(config: C, name: str, value: Any, where: str = "--set ") -> C:
     """Return the config with one option changed; a string is converted to the option's type.
 
+    A list of strings for an option of type str is joined by commas.
+
     Args:
         where: source of the option; begins the message of an error.
     Raises:
@@ -61,7 +63,7 @@ def with_option(config: C, name: str, value: Any, where: str = "--set ") -> C:
                      "no": False, "off": False}[value.lower()]  # fmt: skip
         elif isinstance(value, (bool, float)) and kind is int:
             raise TypeError
-        value = kind(value)
+        value = _text(value) if kind is str else kind(value)
         if kind in (int, float) and not 0 <= value < (2**31 if kind is int else math.inf):
             in_range = ", finite, 0 or more"
             raise ValueError
@@ -78,6 +80,15 @@ def with_option(config: C, name: str, value: Any, where: str = "--set ") -> C:
     return changed  # type: ignore[no-any-return]
 
 
+def _text(value: Any) -> str:
+    """Convert the value of an option of type str: a string, path, number or a list of strings."""
+    if isinstance(value, list | tuple):
+        return ",".join(map(_text, value))
+    if not isinstance(value, str | Path | float | int):
+        raise TypeError
+    return str(value)
+
+
 def _most_similar(name: str, options: Iterable[str]) -> str:
     """Find the option most similar to a wrong name: as a whole, by its field or a word of it."""
     name = name[:100]  # longer than our names; the comparison takes quadratic time
@@ -90,7 +101,38 @@ def _most_similar(name: str, options: Iterable[str]) -> str:
     return max(options, key=similarity)
 
 
-# ---- Files of options ----
+# ---- Dicts and files of options ----
+
+
+def as_config(config: C, options: C | Mapping[str, Any] | None) -> C:
+    """Return a config, or the default one with the options of a dict.
+
+    Args:
+        config: the default, for None and for options that the dict does not have.
+        options: a config of the same type; or a dict of options by section,
+            {"detect": {"classes": "chair"}}, or by name, {"detect.classes": "chair"}.
+    Raises:
+        ReobjError: another type, no such option, or a value of another type.
+    """
+    if options is None:
+        return config
+    if isinstance(options, Mapping):
+        for name, value in _settings(options).items():
+            config = with_option(config, name, value, "config: ")
+        return config
+    if not isinstance(options, type(config)):
+        expected = f"expected {type(config).__name__} or a dict of options"
+        raise ReobjError(f"config is of type {type(options).__name__}, {expected}")
+    return options
+
+
+def _settings(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of a table of sections by the names of the options for --set."""
+    settings: dict[str, Any] = {}
+    for key, value in table.items():
+        inner = isinstance(value, Mapping)
+        settings |= {f"{key}.{k}": v for k, v in value.items()} if inner else {str(key): value}
+    return settings
 
 
 def read_config(config: C, path: str | Path) -> C:
@@ -105,12 +147,17 @@ def read_config(config: C, path: str | Path) -> C:
         table = tomllib.loads(read_text(path, 1 << 20, "surrogateescape"))
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise ReobjError(f"{path}: not valid TOML ({error})") from None
-    for key, value in table.items():
-        inner = {f"{key}.{k}": v for k, v in value.items()} if isinstance(value, dict) else None
-        for name, setting in (inner if inner is not None else {key: value}).items():
-            setting = _with_bytes(setting) if isinstance(setting, str) else setting
-            config = with_option(config, name, setting, f"{path}: ")
+    for name, value in _settings(table).items():
+        value = _with_bytes(value) if isinstance(value, str) else value
+        config = with_option(config, name, value, f"{path}: ")
     return config
+
+
+def changed_options(config: Any) -> dict[str, Any]:
+    """Return the options that differ from the defaults, by their name for --set."""
+    default = type(config)()
+    values = {name: value_of(config, name) for name in every_option(config)}
+    return {name: value for name, value in values.items() if value != value_of(default, name)}
 
 
 def write_config(config: Any, path: str | Path) -> None:
@@ -118,14 +165,9 @@ def write_config(config: Any, path: str | Path) -> None:
 
     Written by hand: Python has no TOML writer, and flat sections of plain values need no package.
     """
-    default = type(config)()
     lines = []
     sections = ""
-    changed = {
-        name: value
-        for name in every_option(config)
-        if (value := value_of(config, name)) != value_of(default, name)
-    }
+    changed = changed_options(config)
     for name in sorted(changed, key=lambda name: "." in name):  # options without a section first
         section, _, field_name = name.rpartition(".")
         lines += [f"\n[{section}]"] if section != sections else []

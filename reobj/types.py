@@ -81,6 +81,15 @@ def _public_part(url: re.Match[str]) -> str:
     return scheme + re.split(parameters, rest)[0]
 
 
+def counted(count: int, one: str, more: str) -> str:
+    """Format a number with its noun.
+
+    >>> counted(1, "box", "boxes")
+    '1 box'
+    """
+    return f"{count:,} {one if count == 1 else more}"
+
+
 def visible_name(name: str) -> str:
     """Replace control characters of a name by U+FFFD; XML cannot hold them either.
 
@@ -124,6 +133,11 @@ class Frame:
     time_s: float
     image: Image
 
+    def __repr__(self) -> str:
+        """Describe the frame in one line."""
+        size = "no image" if self.image is None else "{1}x{0}".format(*self.image.shape)
+        return f"Frame({self.index}, {self.time_s:.3f} s, {size})"
+
 
 @dataclass(frozen=True, slots=True)
 class Detections:
@@ -144,6 +158,16 @@ class Detections:
 
     def __len__(self) -> int:
         return len(self.xyxy)
+
+    def __repr__(self) -> str:
+        """Describe the detections in one line."""
+        facts = [counted(len(self), "box", "boxes")]
+        if len(self):
+            facts.append(counted(len(np.unique(self.class_id)), "class", "classes"))
+            facts.append(f"scores {np.min(self.score):.2f} to {np.max(self.score):.2f}")
+        if self.masks is not None:
+            facts.append("with masks")
+        return f"Detections({', '.join(facts)})"
 
     def __getitem__(self, keep: Any) -> Detections:
         """Select by index array, boolean mask or slice."""
@@ -221,6 +245,15 @@ class Tracks:
 
     def __len__(self) -> int:
         return len(self.track_id)
+
+    def __repr__(self) -> str:
+        """Describe the tracks in one line."""
+        facts = [counted(len(self), "box", "boxes")]
+        if len(self):
+            identities = np.setdiff1d(self.track_id, [0])
+            facts.append(counted(len(identities), "identity", "identities"))
+            facts.append(f"frames {np.min(self.frame)} to {np.max(self.frame)}")
+        return f"Tracks({', '.join(facts)})"
 
     def __getitem__(self, keep: Any) -> Tracks:
         return Tracks(*(getattr(self, name)[keep] for name in self.__slots__))

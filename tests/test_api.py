@@ -34,6 +34,10 @@ def test_public_names_are_few_sorted_and_documented() -> None:
         assert not name.startswith("_"), name
 
 
+def test_dir_lists_the_public_names() -> None:
+    assert dir(rt) == rt.__all__ and "run" in dir(rt)
+
+
 def test_every_public_method_has_a_docstring() -> None:
     missing = [
         f"{name}.{method}"

@@ -14,8 +14,15 @@ import numpy as np
 import pytest
 
 import reobj_track as rt
+from reobj.options import read_config
 from reobj.sources import detectors, weights
-from reobj.sources.detectors import DetectionCache, DetectionSource, as_source, open_detections
+from reobj.sources.detectors import (
+    DetectionCache,
+    DetectionSource,
+    as_source,
+    open_detections,
+    with_detector,
+)
 from reobj.sources.recorded import RecordedDetections
 from reobj.types import Image
 
@@ -777,6 +784,47 @@ def test_a_model_is_a_source_of_detections(
     for change in ({"min_score": 0.2}, {"tiles": "2x2"}, {"classes": "tv"}):
         keys.add(open_detections(clip, rt.DetectConfig(model=str(path), **change)).key)
     assert len(keys) == 4
+
+
+def test_a_detector_is_named_where_detections_are_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By a known name, unless a file or folder has it, or as a .onnx file."""
+    monkeypatch.chdir(tmp_path)
+    config = rt.DetectConfig(min_score=0.2)
+    for name in ("fast", "yolox-nano", "a/b.ONNX", Path("c.onnx")):
+        expected = rt.DetectConfig(model=str(name), min_score=0.2)
+        assert with_detector(config, name) == (expected, None)
+    (tmp_path / "fast").mkdir()
+    for other in ("fast", "reobj", "det.txt", Path("det.npz"), "", None, len):
+        assert with_detector(config, other) == (config, other)
+    with pytest.raises(rt.ReobjError, match=r"fsat: no such file .*; did you mean fast"):
+        rt.run("a.mp4", detector="fsat")
+
+
+def test_run_and_track_accept_a_model_a_video_and_a_dict(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The output folder is named by the source; the folder keeps the options of all three."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my room").mkdir()
+    for index in range(5):
+        cv2.imwrite(str(tmp_path / f"my room/{index}.png"), IMAGE)
+    path = model(tmp_path, yolov8(), names="{0: 'cup', 1: 'bowl', 2: 'tv'}")
+    options = {"embed": {"model": "none"}, "output": {"overlay": "none", "scene": False}}
+    video = rt.Video("my room", rt.InputConfig(start=1))
+    result = rt.run(video, config=options, detector=path, in_3d=False)
+    assert result.out == Path("my_room_out") and result.class_names == ("cup", "bowl", "tv")
+    assert [int(f) for f in result.tracks.frame] == [1, 2, 3, 4]
+    kept = read_config(rt.Config(), "my_room_out/config.toml")
+    assert (kept.detect.model, kept.input.start) == (str(path), 1)
+    tracker = rt.Tracker()
+    online = [tracks for _, tracks in rt.track(video, str(path), tracker)]
+    np.testing.assert_array_equal(rt.Tracks.joined(online).xyxy, result.tracks.xyxy)
+    with pytest.raises(rt.ReobjError, match="the same argument"):
+        rt.run(video, detector="fast", detections="det.txt")
+    with pytest.raises(rt.ReobjError, match="give these options to the Video only"):
+        rt.run(video, config={"input": {"every": 2}})
 
 
 def test_masks_of_a_model_reach_the_tracker_and_the_cache(

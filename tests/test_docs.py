@@ -8,6 +8,7 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -210,6 +211,41 @@ def test_tutorial(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         said = done.stdout[-2000:] + done.stderr[-3000:]
         assert done.returncode == 0, f"{page}:\n{text}\n{said}"
     check(tmp_path)
+
+
+# ---- Packaging: neither file is built by the tests ----
+
+
+def test_the_conda_recipe_has_version_and_dependencies_of_the_project() -> None:
+    yaml = pytest.importorskip("yaml", reason="pip install pyyaml (extra `dev`)")
+    recipe = yaml.safe_load((ROOT / "docs/packaging/recipe.yaml").read_text())
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    facts = project["project"]
+    pypi, conda = "opencv-python-headless>=4.10.0.84", "py-opencv>=4.10.0"
+    wanted = ["python>=${{python_min}}", *facts["dependencies"]]
+    wanted = [line.replace(pypi, conda) for line in wanted]
+    assert [line.replace(" ", "") for line in recipe["requirements"]["run"]] == wanted
+    (backend,) = project["build-system"]["requires"]
+    assert recipe["requirements"]["host"][-1].replace(" ", "") == backend
+    assert recipe["context"] == {
+        "version": facts["version"],
+        "python_min": facts["requires-python"].removeprefix(">="),
+    }
+    assert recipe["about"]["summary"] == facts["description"]
+    assert recipe["about"]["license_file"] == facts["license-files"]
+    (program,) = (f"{name} = {where}" for name, where in facts["scripts"].items())
+    assert recipe["build"]["python"]["entry_points"] == [program]
+
+
+def test_the_dockerfile_copies_what_the_wheel_needs() -> None:
+    text = (ROOT / "docs/packaging/Dockerfile").read_text()
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    copied = {path for line in re.findall(r"^COPY (.*) \S+$", text, re.M) for path in line.split()}
+    wheel = project["tool"]["hatch"]["build"]["targets"]["wheel"]["only-include"]
+    assert copied == {*wheel, project["project"]["readme"], "LICENSE", "pyproject.toml"}
+    assert re.search(r"^FROM python:3\.1[123]-slim$", text, re.M)
+    (extra,) = re.findall(r'"\.\[(\w+)\]"', text)
+    assert extra in project["project"]["optional-dependencies"]
 
 
 PAGES_OF_TEXT = [

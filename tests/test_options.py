@@ -35,6 +35,7 @@ import reobj_track as rt
 from reobj.cameras import load_poses, save_poses, write_colmap
 from reobj.maps.stage import opened_map
 from reobj.options import (
+    as_config,
     every_option,
     list_options,
     read_config,
@@ -227,6 +228,36 @@ def test_flags_override_the_file(tmp_path: Path, seen: list[rt.Config]) -> None:
     assert (config.threads, config.input.every, config.input.start) == (2, 3, 8)
     assert config.tracker.high_score == 1.0 and type(config.tracker.high_score) is float
     assert read_config(rt.Config(), kept) == config
+
+
+# ---- Options as a dict ----
+
+
+def test_a_dict_gives_options_by_section_or_name() -> None:
+    chosen = {"detect": {"classes": ["chair", "cup"]}, "tracker.n_init": 2, "offline": True}
+    config = as_config(rt.Config(threads=3), chosen)
+    expected = rt.Config(rt.InputConfig(), rt.DetectConfig(classes="chair,cup"), threads=3,
+                         tracker=rt.TrackerConfig(n_init=2), offline=True)  # fmt: skip
+    assert config == expected
+    assert as_config(config, None) is config and as_config(rt.Config(), config) is config
+    assert rt.Tracker({"n_init": 2}).config == rt.TrackerConfig(n_init=2)
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"detect": {"clases": "cup"}}, r"config: detect\.clases: no such option; did you mean"),
+        ({7: 1}, "config: 7: no such option"),
+        ({"detect": {"classes": None}}, r"detect\.classes: expected =STR, found None"),
+        ({"detect": {"classes": ["cup", None]}}, "expected =STR"),
+        ({"tracker": {"n_init": [1]}}, "expected =INT"),
+        ("a.toml", "config is of type str, expected Config or a dict of options"),
+        (rt.TrackerConfig(), "config is of type TrackerConfig, expected Config"),
+    ],
+)
+def test_an_invalid_dict_names_the_option(options: Any, expected: str) -> None:
+    with pytest.raises(rt.ReobjError, match=expected):
+        rt.run("a.mp4", config=options)
 
 
 # ---- Effect of every option ----

@@ -7,6 +7,7 @@ import json
 import re
 import sys
 from collections.abc import Callable
+from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -541,6 +542,115 @@ def test_a_damaged_file_is_not_reported_as_another_version(saved: Path) -> None:
     (saved / "cache/last-poses.npz").write_bytes(b"PK")
     with pytest.raises(rt.ReobjError, match=r"last-poses\.npz: is damaged: run"):
         rt.Result.load(saved)
+
+
+# ---- In Python and in a notebook ----
+
+
+def test_reprs_are_one_line_without_arrays(chairs: rt.Result, saved: Path) -> None:
+    video = rt.Video(Path(__file__).parents[1] / "examples/room/room.mp4")
+    masks = np.zeros((1, 4, 6), bool)
+    config = rt.Config(detect=rt.DetectConfig(classes="cup"), threads=2)
+    named = dataclasses.replace(chairs.objects[1], class_name="a\nb", size_m=None, frames_seen=1)
+    size = " x ".join(f"{side:.3g}" for side in chairs.objects[1].size)
+    box = rt.Detections.from_array([[0, 0, 10, 20, 0.9, 56]])
+    expected = {
+        "Result('walk.mp4', 3 objects (3 located), 120 boxes, cameras: 40 of 40 frames (user))":
+            chairs,
+        "Result('walk.mp4', 0 objects, 0 boxes, out='o')":
+            rt.Result(rt.Tracks.empty(), (), chairs.video, out=Path("o")),
+        f"Object(2 chair, ok, {size} m, 40 frames)": chairs.objects[1],
+        f"Object(2 a\\nb, ok, {size} units, 1 frame)": named,
+        "Object(1 cup, tracked, 0 frames)": rt.Object(1, "cup", 0.5, "tracked", ""),
+        "Tracks(120 boxes, 3 identities, frames 0 to 39)": chairs.tracks,
+        "Tracks(0 boxes)": rt.Tracks.empty(),
+        "Poses(cameras: 40 of 40 frames (user), 0 points, in metres)": chairs.poses,
+        "Detections(1 box, 1 class, scores 0.90 to 0.90)": box,
+        "Detections(0 boxes)": rt.Detections.empty(),
+        "Detections(1 box, 1 class, scores 0.90 to 0.90, with masks)":
+            dataclasses.replace(box, masks=masks),
+        "Frame(3, 0.100 s, 6x4)": rt.Frame(3, 0.1, np.zeros((4, 6, 3), np.uint8)),
+        "Config()": rt.Config(),
+        "Config(detect.classes='cup', threads=2)": config,
+        f"Video({video.source!r}, 640x480, 240 frames to read)": video,
+    }  # fmt: skip
+    assert {text: repr(value) for text, value in expected.items()} == {t: t for t in expected}
+    assert video._clock is None  # the file was not decoded
+
+
+def test_an_object_by_its_number(chairs: rt.Result) -> None:
+    assert chairs.object(2) is chairs.objects[1]
+    objects = [dataclasses.replace(chairs.objects[0], id=i) for i in (1, 9, 10, 14, 15, 30)]
+    with pytest.raises(
+        rt.ReobjError, match=r"no object 12; the nearest numbers are 9, 10, 14, 15$"
+    ):
+        copy_of(chairs, objects=objects).object(12)
+    with pytest.raises(rt.ReobjError, match="no object 1; the result has no objects"):
+        copy_of(chairs, objects=[]).object(1)
+
+
+def test_the_table_for_pandas_is_that_of_the_csv(saved: Path) -> None:
+    pandas = pytest.importorskip("pandas", reason="pip install pandas (extra `dev`)")
+    result = rt.Result.load(saved)
+    objects = [*result.objects, rt.Object(7, "=cup", 0.5, "rejected", "few views")]
+    table = copy_of(result, objects=objects).to_pandas()
+    written = pandas.read_csv(rt.export(saved, "csv"), index_col="id")
+    assert list(table.columns) == list(written.columns) and table.index.tolist() == [1, 2, 3, 7]
+    numbers = ["center_x", "size_m_z", "qw", "views", "part"]
+    np.testing.assert_array_equal(table.loc[:3, numbers], written[numbers])
+    assert table.center_x.dtype == np.float64 and np.isnan(table.center_x[7])
+    assert table["class"][7] == "=cup" and table.reason[7] == "few views"
+
+
+def test_pandas_is_needed_for_its_table_alone(
+    chairs: rt.Result, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(rt.ReobjError, match="to_pandas needs pandas: pip install pandas"):
+        chairs.to_pandas()
+
+
+class Shown(HTMLParser):
+    """The elements of a page, the texts of its cells, and the attributes of its iframe."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.tags: set[str] = set()
+        self.cells: list[str] = []
+        self.frame: dict[str, str | None] = {}
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.add(tag)
+        self.cells += [""] * (tag == "td")
+        self.frame |= dict(attrs) if tag == "iframe" else {}
+
+    def handle_data(self, data: str) -> None:
+        if self.cells:
+            self.cells[-1] += data
+
+
+def test_a_notebook_shows_the_objects_and_the_viewer(chairs: rt.Result, saved: Path) -> None:
+    """The viewer is made if the folder has none; scripts of its page cannot reach the notebook."""
+    first, *rest = chairs.objects
+    bad = dataclasses.replace(first, class_name='<script>&amp;"', status="doubtful")
+    result = copy_of(chairs, objects=[bad, *rest], fits=None)
+    shown = Shown(result._repr_html_())
+    assert shown.tags == {"p", "code", "div", "table", "tr", "th", "td", "iframe"}
+    assert shown.cells[:3] == ["2", "chair", "ok"] and shown.cells[3] == "40"
+    assert shown.cells[12:15] == ["1", '<script>&amp;"', "doubtful"]
+    assert shown.frame["sandbox"] == "allow-scripts allow-downloads"
+    page = str(shown.frame["srcdoc"])
+    assert page.startswith("<!doctype html>") and page.rstrip().endswith("</html>")
+    assert '"title":"walk.mp4"' in page and "\\u003cscript>&amp;" in page
+    assert not list(saved.glob("scene.html"))
+    (saved / "scene.html").write_text('<b title="&lt;">')
+    assert Shown(rt.Result.load(saved)._repr_html_()).frame["srcdoc"] == '<b title="&lt;">'
+
+
+def test_a_notebook_shows_no_viewer_without_cameras(chairs: rt.Result) -> None:
+    shown = Shown(copy_of(chairs, poses=None)._repr_html_())
+    assert "iframe" not in shown.tags and len(shown.cells) == 3 * 6
 
 
 @pytest.mark.parametrize("missing", ["objects.json", "tracks.txt"])

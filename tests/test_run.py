@@ -25,6 +25,7 @@ from scipy.spatial.transform import Rotation
 import quadrics
 import reobj
 import reobj_track as rt
+from reobj.options import read_config
 from reobj.poses import stage
 from reobj.results import stages as stages_module
 from reobj.results.saving import validate_objects
@@ -199,6 +200,10 @@ def test_python_callable_as_detector(clip: Path, tmp_path: Path) -> None:
     again = rt.Result.load(tmp_path / "out")
     assert [o.to_json() for o in again.objects] == [o.to_json() for o in result.objects]
     np.testing.assert_allclose(again.tracks.xyxy, result.tracks.xyxy, atol=0.011)
+    rt.refit(tmp_path / "out", {"objects": {"min_views": 5}})
+    rt.refit(tmp_path / "out", {"threads": 3})  # a dict changes the options of the last run
+    kept = read_config(rt.Config(), tmp_path / "out/config.toml")
+    assert (kept.objects.min_views, kept.threads) == (5, 3)
 
 
 def test_run_from_another_folder(clip: Path, detections: Path, tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ import quadrics
 from reobj.files import rounded, shortened
 from reobj.poses.floor import Floor
 from reobj.sources.video import Video
-from reobj.types import Array, LinkEvent, ReobjError, visible_name
+from reobj.types import Array, LinkEvent, ReobjError, counted, printable, visible_name
 
 # keys of objects.json and changes.json that differ from the names of our fields
 _JSON_KEYS = {
@@ -72,6 +72,16 @@ class Object:
     part: int = 0
     confidence: float | None = None
     classes: dict[str, float] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        """Describe the object in one line."""
+        facts = [f"{self.id} {printable(self.class_name)}", self.status]
+        size = self.size if self.size_m is None else self.size_m
+        if size is not None:
+            sides = " x ".join(f"{side:.3g}" for side in size)
+            facts.append(f"{sides} {'units' if self.size_m is None else 'm'}")
+        facts.append(counted(self.frames_seen, "frame", "frames"))
+        return f"Object({', '.join(facts)})"
 
     @property
     def located(self) -> bool:

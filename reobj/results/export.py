@@ -35,6 +35,7 @@ from reobj.files import Progress, atomic, spans, staged
 from reobj.results.origin import centred, far_origin, shifted
 from reobj.results.ply import write_ply, write_point_ply
 from reobj.results.result import Result, VideoInfo
+from reobj.results.table import object_table
 from reobj.results.workspace import Workspace
 from reobj.sources.image_files import IMAGE_FPS
 from reobj.sources.video import Video
@@ -284,28 +285,15 @@ def export_ply(result: Result, path: Path) -> None:
 
 
 def export_csv(result: Result, path: Path) -> None:
-    """Write a table of the objects, one a line, for spreadsheets and pandas.
+    """Write the table of the objects, one a line, for spreadsheets.
 
-    Lengths are in world units, `_m` in metres; empty where unknown. Text that a spreadsheet would
-    read as a formula gets an apostrophe.
+    Text that a spreadsheet would read as a formula gets an apostrophe.
     """
-    head = ["id", "class", "status", "reason", "score", "confidence", "support"]
-    vectors = ("center", "size", "size_m", "size_rel_sigma")
-    head += [f"{name}_{axis}" for name in vectors for axis in "xyz"]
-    head += ["qw", "qx", "qy", "qz", "views", "frames_seen", "visits", "part"]
+    head, rows = object_table(result)
     with atomic(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(head)
-        for o in result.objects:
-            row = [o.id, o.class_name, o.status, o.reason, o.score, o.confidence, o.support]
-            for name in vectors:
-                row += _numbers(getattr(o, name), 3)
-            row += [*_numbers(o.quat_wxyz, 4), o.views, o.frames_seen, len(o.visits), o.part]
-            table.writerow([formula_safe(value) for value in row])
-
-
-def _numbers(values: Array | None, count: int) -> list[float | None]:
-    return [None] * count if values is None else values.tolist()
+        table.writerows([formula_safe(value) for value in row] for row in rows)
 
 
 def formula_safe(value: Any) -> Any:

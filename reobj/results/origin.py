@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from reobj.cameras import Poses, invert_rigid
-from reobj.results.result import Result
 from reobj.types import Array
+
+if TYPE_CHECKING:
+    from reobj.results.result import Result
 
 
 def far_origin(poses: Poses | None, points: Array | None = None) -> Array:

@@ -9,17 +9,18 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 import quadrics
 from reobj.cameras import Poses
-from reobj.results import report, saving
+from reobj.results import notebook, report, saving, table
 from reobj.results.changes import Changes, EarlierSession
 from reobj.results.edits import Edits
 from reobj.results.entries import Object, Part, VideoInfo, World
-from reobj.types import Embeddings, IntArray, Tracks
+from reobj.types import Embeddings, IntArray, ReobjError, Tracks, counted
 
 __all__ = ["Object", "Part", "Result", "VideoInfo", "World"]
 
@@ -68,6 +69,40 @@ class Result:
     changes: Changes | None = None
     earlier: Sequence[EarlierSession] = ()
     out: Path | None = None
+
+    def __repr__(self) -> str:
+        """Describe the result in one line."""
+        facts = [repr(Path(self.video.path).name)]
+        located = f" ({len(self.located)} located)" if self.poses is not None else ""
+        facts.append(counted(len(self.objects), "object", "objects") + located)
+        facts.append(counted(len(self.tracks), "box", "boxes"))
+        facts += [] if self.poses is None else [self.poses.cameras_text]
+        facts += [] if self.out is None else [f"out={str(self.out)!r}"]
+        return f"Result({', '.join(facts)})"
+
+    def _repr_html_(self) -> str:
+        """Show the objects and the viewer in a notebook."""
+        return notebook.to_html(self)
+
+    def object(self, number: int) -> Object:
+        """Return the object of a number.
+
+        Raises:
+            ReobjError: there is none; the message names the nearest numbers.
+        """
+        for found in self.objects:
+            if found.id == number:
+                return found
+        near = sorted((o.id for o in self.objects), key=lambda i: abs(i - number))[:4]
+        numbers = f"the nearest numbers are {', '.join(map(str, sorted(near)))}"
+        raise ReobjError(f"no object {number}; {numbers if near else 'the result has no objects'}")
+
+    def to_pandas(self) -> Any:
+        """Return the objects as a pandas DataFrame, one row each, indexed by `id` (needs pandas).
+
+        The columns are those of `export --to csv`: lengths in world units, `_m` in metres.
+        """
+        return table.to_pandas(self)
 
     @property
     def located(self) -> list[Object]:

@@ -16,7 +16,7 @@ import os
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -27,10 +27,10 @@ from reobj.cameras import Camera, Poses, invert_rigid, place_of, undistort_boxes
 from reobj.files import Progress, atomic, base64_text, rounded, significant
 from reobj.poses.floor import NOISE
 from reobj.results.changes import EarlierSession
+from reobj.results.entries import Object, World
 from reobj.results.origin import centred
 from reobj.results.overlay import Overlay, film_layers
 from reobj.results.report import sides
-from reobj.results.result import Object, Result, World
 from reobj.sources.image_files import IMAGE_FPS
 from reobj.sources.video import Video, shrunk
 from reobj.types import (
@@ -45,6 +45,9 @@ from reobj.types import (
     one_line,
     rows_by,
 )
+
+if TYPE_CHECKING:
+    from reobj.results.result import Result
 
 
 class Pictures:

@@ -19,7 +19,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from reobj.files import save_npz
+from reobj.files import did_you_mean, save_npz
 from reobj.sources.class_names import Vocabulary, check_length, load_class_names
 from reobj.sources.detection_files import (
     DetectConfig,
@@ -29,6 +29,7 @@ from reobj.sources.detection_files import (
 )
 from reobj.sources.libraries import (
     fixed_classes,
+    is_function,
     library_detector,
     library_of,
     user_function,
@@ -44,7 +45,7 @@ from reobj.sources.onnx_layouts import (
 from reobj.sources.recorded import NORMALISED_MAX, RecordedDetections, pack_detections, read_npz
 from reobj.sources.tiles import detect_in_tiles, parse_tiles
 from reobj.sources.video import Video, source_fingerprint
-from reobj.sources.weights import known_weights, model_path, onnx_session
+from reobj.sources.weights import WEIGHTS, known_weights, model_path, onnx_session
 from reobj.types import (
     COCO_NAMES,
     Array,
@@ -365,10 +366,12 @@ def open_detections(
 
     Args:
         detections: a file for `read_detections`; a function or another argument of `as_source`, for
-            which `config` gives only the class names; or None: the ONNX model of `config`.
+            which `config` gives only the class names; a detector of `with_detector`; or None: the
+            ONNX model of `config`.
         threads: of onnxruntime (0: all cores). offline: never download weights. device: of the
             ONNX model, cpu, cuda, coreml, ...
     """
+    config, detections = with_detector(config, detections)
     names = load_class_names(config.class_names) if config.class_names else ()
     if detections is None or detections == "":
         words = tuple(word.strip() for word in config.words.split(",") if word.strip())
@@ -379,7 +382,8 @@ def open_detections(
             return dataclasses.replace(source, key=key, slow=True, always_looks=True)
         if words:
             raise fixed_classes(config.model)
-        if function := user_function(config.model):
+        if is_function(config.model):
+            function = user_function(config.model)
             return _filtered(as_source(function, names), config)
         path = model_path(config.model, offline)
         detector = OnnxDetector("", config, threads, offline, device)
@@ -418,6 +422,30 @@ def _file_key(model: str) -> str:
     """Identify the file of a library's model; "": it is no file."""
     path = Path(model.partition(":")[2] or model).expanduser()
     return source_fingerprint(str(path)) if path.is_file() else ""
+
+
+def with_detector(config: DetectConfig, detections: Any) -> tuple[DetectConfig, Any]:
+    """Move the name of a detector from the argument `detections` to the option `model`.
+
+    Args:
+        detections: a name that `--detector` takes where no file has this name, or the path of a
+            .onnx or .pt file; any other argument of `open_detections` is returned unchanged.
+    Returns:
+        config, detections; None for a detector.
+    Raises:
+        ReobjError: no such file, and a name similar to that of a detector.
+    """
+    if not isinstance(detections, str | Path):
+        return config, detections
+    path = Path(detections)
+    named = str(detections)
+    names = [name for w in WEIGHTS if w.role == "detector" for name in (w.name, w.alias) if name]
+    known = named in names or library_of(named) is not None or is_function(named)
+    if path.suffix.lower() in (".onnx", ".pt") or (known and not path.exists()):
+        return dataclasses.replace(config, model=named), None
+    if not path.exists() and (close := did_you_mean(named, names)):
+        raise ReobjError(f"{path}: no such file of detections, and no known detector{close}")
+    return config, detections
 
 
 def _cache_key(config: DetectConfig, *source: str | int) -> str:

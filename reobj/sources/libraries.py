@@ -235,11 +235,15 @@ def library_detector(
     return found, f"{package} {importlib.metadata.version(package)}"
 
 
-def user_function(detector: str) -> Any:
-    """Import `module:function`, also from the current folder; None: another kind of detector."""
+def is_function(detector: str) -> bool:
+    """Return whether a detector is named as `module:function`."""
     module, _, function = detector.partition(":")
-    if not function or not all(part.isidentifier() for part in [*module.split("."), function]):
-        return None
+    return all(part.isidentifier() for part in [*module.split("."), function])
+
+
+def user_function(detector: str) -> Any:
+    """Import `module:function`, also from the current folder."""
+    module, _, function = detector.partition(":")
     sys.path.insert(0, str(Path.cwd()))
     try:
         found = getattr(importlib.import_module(module), function)

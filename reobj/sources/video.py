@@ -38,7 +38,16 @@ from reobj.sources.image_files import (
     read_image,
     times_of_names,
 )
-from reobj.types import Array, Frame, Image, ReobjError, log, option, without_secrets
+from reobj.types import (
+    Array,
+    Frame,
+    Image,
+    ReobjError,
+    counted,
+    log,
+    option,
+    without_secrets,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,6 +175,12 @@ class Video:
         width, height = (max(round(side * ratio), 1) for side in self.size)
         self.working_size = (width, height)
         self.scale = width / self.size[0]
+
+    def __repr__(self) -> str:
+        """Describe the video in one line; a file is not decoded for it."""
+        width, height = self.size
+        frames = "live" if self.is_live else f"{counted(self.expected, 'frame', 'frames')} to read"
+        return f"{type(self).__name__}({self.source!r}, {width}x{height}, {frames})"
 
     def after(self, index: int) -> Video:
         """Return this video without the frames up to `index`, to continue with the next one.

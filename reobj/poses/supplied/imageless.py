@@ -37,7 +37,7 @@ from reobj.types import ReobjError
 
 
 def open_video(
-    source: str | Path | int | None,
+    source: Video | str | Path | int | None,
     config: InputConfig,
     poses: PosesConfig,
     boxes: Any = None,
@@ -46,7 +46,7 @@ def open_video(
     """Open a video, or without one the frames of the files of detections and poses.
 
     Args:
-        source: as `Video` takes it; None: there is none.
+        source: a `Video`, or its source; None: there is none.
         poses, boxes: file of poses, and of detections or identities; used without a video.
         detect: how the detections are read.
     Raises:
@@ -55,6 +55,8 @@ def open_video(
     """
     if poses.mode == "none" and (poses.depth or poses.metric):
         raise ReobjError("--depth and --metric need camera poses, but --poses is none")
+    if isinstance(source, Video):
+        return source
     if source is not None:
         return Video(source, config)
     if poses.depth:
