@@ -15,7 +15,7 @@ import pytest
 
 import reobj_track as rt
 from reobj.sources import libraries
-from reobj.sources.detectors import DetectionSource, open_detections
+from reobj.sources.detectors import DetectionSource, open_detections, with_detector
 from reobj.types import Detections
 
 WORDS = ("espresso machine", "red toolbox")
@@ -179,6 +179,10 @@ def test_names_of_libraries() -> None:
     assert libraries.library_of("yolo11n.pt") == ("ultralytics", "yolo11n.pt")
     assert libraries.library_of("hf:IDEA/dino") == ("hf", "IDEA/dino")
     assert libraries.library_of("fast") is None and libraries.library_of("my:find") is None
+    for name in ("yolo11n.pt", "hf:IDEA/dino", "my.module:find"):
+        config, given = with_detector(rt.DetectConfig(), name)
+        assert config.model == name and given is None
+    assert with_detector(rt.DetectConfig(), "boxes.csv") == (rt.DetectConfig(), "boxes.csv")
 
 
 def test_a_library_without_a_file_is_one_line(

@@ -460,6 +460,13 @@ def _(lab: Lab) -> None:
         rt.open_detections(video, lab.config("no-such-model").detect)
 
 
+@shows("detect.words")
+def _(lab: Lab) -> None:
+    video = rt.Video(images(lab.path / "images", 1))
+    with pytest.raises(rt.ReobjError, match="--words: deimv2-n has fixed classes"):
+        rt.open_detections(video, lab.config("red toolbox").detect)
+
+
 @shows("detect.min_score")
 def _(lab: Lab) -> None:
     for find in (by_network, by_file):
