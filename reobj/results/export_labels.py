@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,13 @@ from scipy.spatial.transform import Rotation
 from reobj.cameras import place_of
 from reobj.files import atomic, staged
 from reobj.results.entries import Object
-from reobj.results.export_source import image_files, upright_world, video_of, warn_of_components
+from reobj.results.export_source import (
+    image_files,
+    label_names,
+    upright_world,
+    video_of,
+    warn_of_components,
+)
 from reobj.results.result import Result
 from reobj.results.upright import component_of
 from reobj.sources.image_files import IMAGE_FPS
@@ -24,19 +31,14 @@ def export_yolo(result: Result, path: Path) -> None:
     """Write data.yaml with the class names, and labels/NAME.txt beside it for frames with boxes.
 
     Rows are `class cx cy w h score id` as of ultralytics' tracker, relative to the image size;
-    boxes are cut at the borders of the image. A frame of a video is VIDEO_N, N from 1. Filled gaps
-    have score 0.
+    boxes are cut at the borders of the image. Filled gaps have score 0.
     """
     warn_of_components(result, path)
-    video = video_of(result)
-    stem = Path(result.video.path).stem
+    labels = label_names(result, video_of(result), result.tracks.frame.tolist())
     size = np.array([result.video.width, result.video.height], np.float64)
     names = [visible_name(name) for name in result.class_names]
     with staged(path.parent, ".part-yolo") as folder:
         for frame, rows in _by_frame(result.tracks):
-            name = f"{stem}_{frame + 1}.jpg"
-            if video is not None and video.names:
-                name = video.names[frame]
             low = (rows.xyxy[:, :2] / size).clip(0, 1)
             high = (rows.xyxy[:, 2:] / size).clip(0, 1)
             box = np.hstack([(low + high) / 2, high - low])
@@ -48,7 +50,7 @@ def export_yolo(result: Result, path: Path) -> None:
                 )
                 if values[2] > 0 and values[3] > 0
             ]  # fmt: skip
-            label = (folder / "labels" / name).with_suffix(".txt")
+            label = folder / "labels" / f"{labels[frame]}.txt"
             label.parent.mkdir(parents=True, exist_ok=True)
             label.write_text("".join(lines))
         entries = "".join(f"  {i}: {json.dumps(name)}\n" for i, name in enumerate(names))
@@ -57,11 +59,11 @@ def export_yolo(result: Result, path: Path) -> None:
 
 
 def export_labelme(result: Result, path: Path) -> None:
-    """Write labelme's label files: the list of classes, and NAME.json beside it for each frame.
+    """Write labelme's label files: the list of classes, and NAME.json for each frame with boxes.
 
     A rectangle has its class as `label` and its identity as `group_id`. Images of a folder are
-    referenced; frames of a video with boxes are written to images/. Without filled gaps, as they
-    are no detections.
+    referenced; frames of a video are written to images/, their labels beside them. Without filled
+    gaps, as they are no detections.
 
     Ref: github.com/wkentaro/labelme, labelme/_label_file.py.
     """
@@ -75,22 +77,24 @@ def export_labelme(result: Result, path: Path) -> None:
     tracks = result.tracks[result.tracks.score > 0]
     with staged(path.parent, ".part-labelme") as folder:
         files = image_files(video, tracks.frame.tolist(), path.parent, folder)
+        labels = {frame: Path(file).with_suffix("").as_posix() for frame, file in files.items()}
+        if video.files:
+            labels = label_names(result, video, files)
         for frame, rows in _by_frame(tracks):
             if frame not in files:
                 continue
             shapes = [
                 {"label": names[kind], "points": [box[:2], box[2:]], "group_id": identity,
-                 "description": "", "shape_type": "rectangle", "flags": {}, "mask": None}
+                 "shape_type": "rectangle", "flags": {}}
                 for kind, box, identity in zip(
                     rows.class_id.tolist(), rows.xyxy.tolist(), rows.track_id.tolist(), strict=True
                 )
             ]  # fmt: skip
-            name = video.names[frame] if video.names else Path(files[frame]).name
-            label = (folder / name).with_suffix(".json")
-            image = Path(*[".."] * (len(Path(name).parts) - 1), files[frame]).as_posix()
-            data = {
-                "version": "5.5.0", "flags": {}, "shapes": shapes, "imagePath": image,
-                "imageData": None, "imageHeight": result.video.height,
+            label = folder / f"{labels[frame]}.json"
+            image = os.path.relpath(files[frame], label.parent.relative_to(folder))
+            data: dict[str, Any] = {
+                "version": "5.5.0", "flags": {}, "shapes": shapes, "imageData": None,
+                "imagePath": Path(image).as_posix(), "imageHeight": result.video.height,
                 "imageWidth": result.video.width,
             }  # fmt: skip
             label.parent.mkdir(parents=True, exist_ok=True)

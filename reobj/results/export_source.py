@@ -19,6 +19,7 @@ from reobj.results.origin import centred
 from reobj.results.result import Object, Result
 from reobj.results.upright import rotation_to_up
 from reobj.results.workspace import Workspace
+from reobj.sources.image_files import IMAGE_SUFFIXES
 from reobj.sources.video import Video
 from reobj.types import Array, ReobjError, log
 
@@ -152,19 +153,36 @@ def upright_world(result: Result, path: Path, float32: bool = False) -> UprightW
     return UprightWorld(part.located, turned, poses, scale, metric, rotation, origin)
 
 
+def label_names(result: Result, video: Video | None, frames: Iterable[int]) -> dict[int, str]:
+    """Return the name of the labels of each frame, without suffix: that of its image.
+
+    With the folders below the one that all images have in common. A frame of a video is VIDEO_N, N
+    from 1, as ultralytics calls it. Names that were read from a file cannot leave the folder.
+    """
+    names: Sequence[str] = [] if video is None else video.names
+    if video is not None and video.files:
+        common = os.path.commonpath([file.parent for file in video.files])
+        names = [os.path.relpath(file, common) for file in video.files]
+    stem = Path(result.video.path).stem
+    found = {}
+    for frame in sorted(set(frames)):
+        path = Path(names[frame] if frame < len(names) else "")
+        path = Path(*(part for part in path.parts if part not in ("..", path.anchor)))
+        path = path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path
+        found[frame] = path.as_posix() if path.parts else f"{stem}_{frame + 1}"
+    return found
+
+
 def image_files(video: Video, frames: Iterable[int], target: Path, folder: Path) -> dict[int, str]:
     """Return the image files of frames, relative to `target`; write those of a video.
 
     Args:
         folder: a new one, whose files are moved to `target`.
     """
-    source = Path(str(video.source))
-    names = video.names
     wanted = set(frames)
-    if names:
-        images = source if source.is_dir() else source.parent
+    if video.files:
         return {
-            frame: Path(os.path.relpath(images / names[frame], target)).as_posix()
+            frame: Path(os.path.relpath(video.files[frame], target)).as_posix()
             for frame in sorted(wanted)
         }
     files = {}
