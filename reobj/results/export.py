@@ -38,6 +38,7 @@ from reobj.results.export_labels import (
 )
 from reobj.results.export_ros import export_mcap, export_ros
 from reobj.results.export_source import (
+    formula_safe,
     frames_read,
     image_files,
     largest_part,
@@ -257,11 +258,6 @@ def export_csv(result: Result, path: Path) -> None:
 
 def _numbers(values: Array | None, count: int) -> list[float | None]:
     return [None] * count if values is None else values.tolist()
-
-
-def formula_safe(value: Any) -> Any:
-    """Protect text from evaluation as a formula (CWE-1236: = + - @, tab, carriage return)."""
-    return f"'{value}" if isinstance(value, str) and value[:1] in tuple("=+-@\t\r") else value
 
 
 def export_nerfstudio(result: Result, path: Path) -> None:

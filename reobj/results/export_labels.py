@@ -15,6 +15,7 @@ from reobj.cameras import place_of
 from reobj.files import atomic, staged
 from reobj.results.entries import Object
 from reobj.results.export_source import (
+    formula_safe,
     image_files,
     label_names,
     upright_world,
@@ -207,7 +208,7 @@ def export_boxer(result: Result, path: Path) -> None:
 
 def _boxer_tail(found: Object, numbers: dict[str, int]) -> str:
     """Return the columns name (lower case, without commas), instance, sem_id and prob."""
-    name = visible_name(found.class_name).replace(",", " ").lower()
+    name = formula_safe(visible_name(found.class_name).replace(",", " ").lower())
     prob = found.score if found.confidence is None else found.confidence
     return f"{name},{found.id},{numbers.get(found.class_name, -1)},{prob:.6g}"
 

@@ -8,6 +8,7 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -171,6 +172,11 @@ def label_names(result: Result, video: Video | None, frames: Iterable[int]) -> d
         path = path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path
         found[frame] = path.as_posix() if path.parts else f"{stem}_{frame + 1}"
     return found
+
+
+def formula_safe(value: Any) -> Any:
+    """Protect text from evaluation as a formula (CWE-1236: = + - @, tab, carriage return)."""
+    return f"'{value}" if isinstance(value, str) and value[:1] in tuple("=+-@\t\r") else value
 
 
 def image_files(video: Video, frames: Iterable[int], target: Path, folder: Path) -> dict[int, str]:
