@@ -490,7 +490,8 @@ def test_labels_of_images_in_folders(chairs: rt.Result, tmp_path: Path) -> None:
 
 def test_names_in_a_file_cannot_leave_the_folder(chairs: rt.Result, tmp_path: Path) -> None:
     """A run without images takes the names of its frames from a file."""
-    names = ["../../evil.jpg", "/etc/evil.png", "", "..", "a/b.c", *(f"{i}.jpg" for i in range(35))]
+    absolute = tmp_path / "abs.png"
+    names = ["../../evil.jpg", str(absolute), "", "..", "a/b.c", *(f"{i}.jpg" for i in range(35))]
     (tmp_path / "poses.txt").write_text("")
     video = ImagelessVideo(tmp_path / "poses.txt", SIZE, names=names)
     out = tmp_path / "deep" / "er" / "out"
@@ -499,5 +500,5 @@ def test_names_in_a_file_cannot_leave_the_folder(chairs: rt.Result, tmp_path: Pa
     rt.export(out, "yolo")
     labels = sorted(str(p.relative_to(out / "yolo/labels")) for p in tmp_path.rglob("*.txt")
                     if p.parent not in (tmp_path, out))  # fmt: skip
-    expected = ["evil.txt", "etc/evil.txt", "walk_3.txt", "walk_4.txt", "a/b.c.txt"]
+    expected = ["evil.txt", f"{str(absolute)[1:-4]}.txt", "walk_3.txt", "walk_4.txt", "a/b.c.txt"]
     assert labels == sorted([*expected, *(f"{i}.txt" for i in range(35))])
