@@ -13,14 +13,12 @@ import numpy as np
 import pytest
 from front_door.room import ROOM
 from scipy.spatial.transform import Rotation
-from simulated import SIZE, chair_solids, fitted, looking_at, tracks_of, walk
+from simulated import SIZE, chair_solids, looking_at, walk
 
 import quadrics
 import reobj_track as rt
 from reobj.cameras import invert_rigid
 from reobj.results.export import EXPORTS
-from reobj.results.result import VideoInfo
-from reobj.results.upright import rotation_to_up
 from reobj.results.workspace import Workspace
 from reobj.sources.imageless import ImagelessVideo
 from reobj.types import object_color
@@ -110,13 +108,18 @@ def test_objects_json_leaves_out_what_is_unknown(chairs: rt.Result, tmp_path: Pa
         assert [bool(r["yaw_deg"]) for r in rows] == [yaw_known] * 3
 
 
-def test_each_component_has_its_own_upright_frame(parted: rt.Result, tmp_path: Path) -> None:
-    entries = upright_entries(parted, tmp_path / "a.json")
-    assert {o["part"] for o in entries} == {0, 1}
-    for entry in entries:
-        part = parted.world.parts[entry["part"]]
-        expected = part.scale.value * rotation_to_up(part.up_in_world) @ entry["center"]
-        np.testing.assert_allclose(entry["center_m"], expected, rtol=1e-5, atol=1e-5)
+def test_each_component_has_its_own_upright_frame(chairs: rt.Result, tmp_path: Path) -> None:
+    turned = tilted(chairs)
+    parts = (chairs.world.parts[0], turned.world.parts[0])
+    other = dataclasses.replace(turned.objects[0], id=4, part=1)
+    world = dataclasses.replace(chairs.world, parts=parts)
+    both = dataclasses.replace(chairs, objects=[*chairs.objects, other], world=world, fits=None)
+    entries = upright_entries(both, tmp_path / "both.json")
+    alone = upright_entries(turned, tmp_path / "turned.json")
+    assert [entry["part"] for entry in entries] == [0, 0, 0, 1]
+    for name in ("center_m", "yaw_deg"):
+        assert entries[3][name] == alone[0][name]
+    np.testing.assert_allclose(entries[0]["center_m"], entries[0]["center"], atol=1e-5)
 
 
 # ---- USD ----
@@ -420,12 +423,11 @@ def test_yolo_boxes_lie_in_the_image(chairs: rt.Result, tmp_path: Path) -> None:
     boxes = chairs.tracks.xyxy.copy()
     boxes[0] = [-50, -20, 100, 90]
     boxes[1] = [700, 10, 800, 90]  # outside
-    tracks = dataclasses.replace(chairs.tracks, xyxy=boxes)
-    tracks.score[2] = 0  # a filled gap
+    score = chairs.tracks.score.copy()
+    score[2] = 0  # a filled gap
+    columns = {"xyxy": boxes, "score": score, "class_id": np.zeros(120, np.int64)}
+    tracks = dataclasses.replace(chairs.tracks, **columns)
     result = dataclasses.replace(chairs, tracks=tracks, class_names=('a "b": 桌', "chair"))
-    result = dataclasses.replace(
-        result, tracks=dataclasses.replace(tracks, class_id=np.zeros(120, np.int64))
-    )
     path = written(result, "yolo", tmp_path / "y/data.yaml")
     yaml = pytest.importorskip("yaml", reason="pip install pyyaml (with the dev extra)")
     assert yaml.safe_load(path.read_text())["names"] == {0: 'a "b": 桌', 1: "chair"}
@@ -462,17 +464,15 @@ def test_labelme_files_have_what_its_loader_checks(room: Path, tmp_path: Path) -
 
 def test_labels_of_images_in_folders(chairs: rt.Result, tmp_path: Path) -> None:
     """Image names that are equal in two folders; images are referenced."""
+    image = cv2.imencode(".png", np.zeros((SIZE[1], SIZE[0], 3), np.uint8))[1]
     for i in range(40):
         (tmp_path / f"f/{i % 2}").mkdir(parents=True, exist_ok=True)
-        image = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
-        cv2.imwrite(str(tmp_path / f"f/{i % 2}/{i // 2}.png"), image)
+        (tmp_path / f"f/{i % 2}/{i // 2}.png").write_bytes(image.tobytes())
     video = rt.Video(str(tmp_path / "f/*/*.png"))
     assert len(video.names) == 40
     out = tmp_path / "out"
     Workspace(out).bind(video)
-    poses = walk()
-    info = VideoInfo(str(video.source), *SIZE, 30.0)
-    dataclasses.replace(fitted(tracks_of(poses), poses), video=info).save(out)
+    chairs.save(out)
     rt.export(out, "labelme")
     rt.export(out, "yolo")
     assert not (out / "labelme/images").exists()
