@@ -16,7 +16,7 @@ PATHS = [
 ]
 LAZY = {  # optional, or slow to load
     "pycolmap", "onnxruntime", "filterpy", "jsonschema", "trimesh", "rerun", "supervision", "av",
-    "shtab",
+    "shtab", "mcap_ros2",
 }  # fmt: skip
 
 

@@ -215,7 +215,7 @@ def test_every_result_is_written_drawn_and_exported(
             refused = str(error)
         assert (out / default).exists() == (not refused), refused
         if refused:
-            assert str(out / default) in refused and "\n" not in refused
+            assert "\n" not in refused
             assert Path(default).parent == Path() or not (out / default).parent.exists()
     assert not list(out.rglob(".part*"))
 
