@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import reobj_track as rt
+from reobj.results.export_labels import BOXER_HEADER
 from reobj.sources import coco, cvat, recorded, tables
 from reobj.sources.recorded import RecordedDetections
 
@@ -300,6 +301,7 @@ LINE = "1,-1,10,20,30,40,.9\n"
         ("d.csv", CSV + "3,1,2,4,5,.9,80\n", "line 4: class 80, but there are only 80 class names"),
         ("d.csv", "frame,x1,y1,score\n0,1,2,.9\n", "line 1: no column x2, y2 in the header"),
         ("d.csv", "x1,y1,x2,y2\n1,2,3,4\n", "no column frame"),
+        ("d.csv", f"{BOXER_HEADER}\n", "these are 3D boxes in the world"),
         ("d.csv", "frame,x1,y1,x2,y2\n0,100,90,30,40\n", "have x2 < x1 .*all fit it as x, y, w, h"),
         ("d.json", "{", "line 1: not valid JSON"),
         ("d.json", '{"images": []}', "expected COCO results"),

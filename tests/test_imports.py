@@ -16,7 +16,7 @@ PATHS = [
 ]
 LAZY = {  # optional, or slow to load
     "pycolmap", "onnxruntime", "filterpy", "jsonschema", "trimesh", "rerun", "supervision", "av",
-    "shtab", "pandas",
+    "shtab", "pandas", "mcap_ros2", "torch", "torchvision", "transformers", "ultralytics", "rfdetr",
 }  # fmt: skip
 
 

@@ -16,7 +16,7 @@ from reobj import __version__
 from reobj.files import atomic, cut, numbers, rounded, spans, texts_with_sigma
 from reobj.maps.fusion import ObjectState, object_state, scale_of
 from reobj.maps.room_map import MapObject, RoomMap
-from reobj.results.export import formula_safe
+from reobj.results.export_source import formula_safe
 from reobj.results.ply import write_ply
 from reobj.types import Array, ReobjError, visible_name
 

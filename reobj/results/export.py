@@ -1,11 +1,10 @@
-"""Export of results to COCO-VID, CSV, CVAT, GLB, nerfstudio, PLY and rerun.
+"""Export of results to the formats of other tools.
 
 Start at `export`. EXPORTS lists the writers.
 """
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import dataclasses
 import itertools
@@ -20,7 +19,6 @@ from xml.etree import ElementTree as ET
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from reobj import __version__
 from reobj.cameras import (
@@ -31,12 +29,29 @@ from reobj.cameras import (
     invert_rigid,
     quat_wxyz_from_matrix,
 )
-from reobj.files import Progress, atomic, spans, staged
+from reobj.files import atomic, staged
+from reobj.results.export_labels import (
+    export_boxer,
+    export_kitti,
+    export_labelme,
+    export_yolo,
+)
+from reobj.results.export_ros import export_mcap, export_ros
+from reobj.results.export_source import (
+    formula_safe,
+    frames_read,
+    image_files,
+    largest_part,
+    upright,
+    video_of,
+    warn_of_components,
+    warn_of_origin,
+)
+from reobj.results.export_usd import export_usd
 from reobj.results.origin import centred, far_origin, shifted
 from reobj.results.ply import write_ply, write_point_ply
 from reobj.results.result import Result, VideoInfo
 from reobj.results.table import object_table
-from reobj.results.workspace import Workspace
 from reobj.sources.image_files import IMAGE_FPS
 from reobj.sources.video import Video
 from reobj.types import (
@@ -76,49 +91,6 @@ def export(out: str | Path, to: str, path: str | Path | None = None) -> Path:
     return path
 
 
-def _largest_part(result: Result, path: Path) -> Result:
-    """Return the objects and cameras of component 0; warn if there are others."""
-    if len(parts := result.world.parts) > 1:
-        exported = f"component 0 of {len(parts)} ({parts[0].span_text})"
-        log.warning("%s contains %s: the others have other frames and scales", path, exported)
-    return result.of_part(0)
-
-
-def _warn_of_components(result: Result, path: Path) -> None:
-    """Warn that objects are not joined across components, and list those of each."""
-    if len(result.world.parts) > 1:
-        ids = [spans(o.id for o in part.objects) or "none" for part in result.parts()]
-        lists = [f"{part.span_text}: {i}" for part, i in zip(result.world.parts, ids, strict=True)]
-        text = "; ".join(lists)
-        log.warning("%s: objects are not joined across components; objects of %s", path, text)
-
-
-def _video_of(result: Result) -> Video | None:
-    """Open the video of a result; None if it was moved or deleted: most exports do not need it."""
-    if result.out is not None and (result.out / "cache" / "source.json").is_file():
-        with contextlib.suppress(ReobjError):
-            return Workspace.open(result.out).video()
-    return None
-
-
-def _frames_read(result: Result) -> tuple[list[int], list[str]]:
-    """List the frames that were read or have a track (interpolated gaps), ascending.
-
-    Returns:
-        source frame numbers, and the image names by frame number ([]: a video, or it is missing).
-    """
-    video = _video_of(result)
-    names = video.names if video is not None else []
-    read = np.empty(0, np.int64)
-    if result.poses is not None:
-        read = result.poses.frame
-    elif video is not None and video.frame_count:
-        config = video.config
-        count = video.frame_count
-        read = np.arange(config.start, min(config.stop or count, count), config.every)
-    return np.union1d(read, result.tracks.frame).tolist(), names
-
-
 def export_coco_vid(result: Result, path: Path) -> None:
     """Write COCO-VID for MMTracking: images with frame_id, annotations with instance_id.
 
@@ -126,7 +98,7 @@ def export_coco_vid(result: Result, path: Path) -> None:
     """
     video = result.video
     tracks = result.tracks
-    frames, names = _frames_read(result)
+    frames, names = frames_read(result)
     size = {"width": video.width, "height": video.height}
     image_id = {frame: i for i, frame in enumerate(frames, 1)}
     images = [
@@ -134,7 +106,7 @@ def export_coco_vid(result: Result, path: Path) -> None:
          "video_id": 1, "frame_id": f}
         for f in frames
     ]  # fmt: skip
-    _warn_of_components(result, path)
+    warn_of_components(result, path)
     part_of: dict[int, dict[str, int]] = {}
     if len(result.world.parts) > 1:
         part_of = {o.id: {"part": o.part} for o in result.objects}
@@ -169,8 +141,8 @@ def export_cvat(result: Result, path: Path) -> None:
     """
     tracks = result.tracks
     video = result.video
-    frames, _ = _frames_read(result)
-    _warn_of_components(result, path)
+    frames, _ = frames_read(result)
+    warn_of_components(result, path)
     root = ET.Element("annotations")
     ET.SubElement(root, "version").text = "1.1"
     task = ET.SubElement(ET.SubElement(root, "meta"), "task")
@@ -204,31 +176,6 @@ def _cvat_boxes(track: ET.Element, rows: Tracks, following: dict[int, int]) -> N
             ET.SubElement(track, "box", facts | corners | {"z_order": "0"})
 
 
-def _upright(result: Result, path: Path, up_axis: Sequence[float]) -> tuple[float, Array]:
-    """Compute scale and rotation of the world for a viewer; warn if scale or up is unknown.
-
-    Returns:
-        metres per unit (1 if unknown), and the rotation (3, 3) from up to `up_axis`.
-    """
-    scale = result.world.scale
-    up = result.world.up_in_world
-    metres = scale.value if scale is not None and scale.source != "none" else None
-    if result.located:
-        if not metres:
-            log.warning("the scale is unknown: %s is not in metres; give --known-size", path)
-        if up is None:
-            log.warning("up is unknown: %s keeps the world's axes", path)
-    turn = Rotation.align_vectors([up_axis], [up_axis if up is None else up])[0].as_matrix()
-    return metres or 1.0, np.asarray(turn)
-
-
-def _warn_of_origin(origin: Array, path: Path) -> None:
-    """Warn if the world was shifted, for formats with float32."""
-    if origin.any():
-        point = ", ".join(f"{value:.12g}" for value in origin)
-        log.warning("%s: its origin is %s of the world: the format has float32", path, point)
-
-
 def export_glb(result: Result, path: Path) -> None:
     """Write binary glTF 2.0 with trimesh: a mesh per object, the sparse points, the camera path.
 
@@ -239,9 +186,9 @@ def export_glb(result: Result, path: Path) -> None:
         import trimesh
     except ImportError as error:
         raise ReobjError("trimesh is not installed: pip install 'reobj-track[viewer]'") from error
-    result, origin = centred(_largest_part(result, path))
-    scale, turn = _upright(result, path, [0.0, 1, 0])
-    _warn_of_origin(origin, path)
+    result, origin = centred(largest_part(result, path))
+    scale, turn = upright(result, path, [0.0, 1, 0])
+    warn_of_origin(origin, path)
     world = np.eye(4)
     poses = result.poses
     world[:3, :3] = scale * turn
@@ -277,7 +224,7 @@ def export_ply(result: Result, path: Path) -> None:
 
     In the world and units of poses.txt: the fitted boxes, cylinders and ellipsoids.
     """
-    result = _largest_part(result, path)
+    result = largest_part(result, path)
     if not result.located:
         raise ReobjError(f"{path}: nothing to export: the result has no solids, see `run`")
     located = result.located
@@ -296,11 +243,6 @@ def export_csv(result: Result, path: Path) -> None:
         table.writerows([formula_safe(value) for value in row] for row in rows)
 
 
-def formula_safe(value: Any) -> Any:
-    """Protect text from evaluation as a formula (CWE-1236: = + - @, tab, carriage return)."""
-    return f"'{value}" if isinstance(value, str) and value[:1] in tuple("=+-@\t\r") else value
-
-
 def export_nerfstudio(result: Result, path: Path) -> None:
     """Write transforms.json for nerfstudio, with initial points and the images of a video.
 
@@ -309,9 +251,9 @@ def export_nerfstudio(result: Result, path: Path) -> None:
 
     Ref: docs.nerf.studio, "Data conventions": camera axes of OpenGL, world_from_cam.
     """
-    result, origin = centred(_largest_part(result, path))
+    result, origin = centred(largest_part(result, path))
     poses = result.poses
-    video = _video_of(result)
+    video = video_of(result)
     if poses is None or not poses.known.any():
         raise ReobjError(f"{path}: the result has no cameras, see `run`")
     if video is None:
@@ -331,7 +273,7 @@ def _write_nerfstudio(poses: Poses, origin: Array, video: Video, path: Path, fol
     world_from_cam = np.tile(np.eye(4), (len(poses.frame), 1, 1))
     world_from_cam[:, :3] = invert_rigid(poses.cam_from_world)
     world_from_cam[:, :3, :3] = world_from_cam[:, :3, :3] @ CV_FROM_GL
-    files = _image_files(video, poses, path.parent, folder)
+    files = image_files(video, poses.frame[poses.known].tolist(), path.parent, folder)
     frames = [
         {"file_path": files[frame], "transform_matrix": pose.tolist()}
         for frame, pose in zip(poses.frame.tolist(), world_from_cam, strict=True)
@@ -362,35 +304,6 @@ def _nerf_camera(camera: Camera, path: Path) -> dict[str, Any]:
     facts = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
     size = {"w": camera.width, "h": camera.height}
     return {"camera_model": model, **{k: float(v) for k, v in facts.items()}, **size, **known}
-
-
-def _image_files(video: Video, poses: Poses, target: Path, folder: Path) -> dict[int, str]:
-    """Return the image file of each frame, relative to `target`; write those of a video.
-
-    Args:
-        folder: a new one, whose files are moved to `target`.
-    """
-    source = Path(str(video.source))
-    names = video.names
-    if names:
-        images = source if source.is_dir() else source.parent
-        return {
-            frame: Path(os.path.relpath(images / names[frame], target)).as_posix()
-            for frame in poses.frame.tolist()
-        }
-    files = {}
-    wanted = set(poses.frame[poses.known].tolist())
-    with Progress("images", len(wanted)) as progress:
-        for frame in video:
-            if frame.index in wanted:
-                name = f"images/frame_{frame.index:06d}.jpg"
-                image = cv2.resize(frame.image, video.size) if video.scale != 1 else frame.image
-                data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1]
-                (folder / name).parent.mkdir(exist_ok=True)
-                (folder / name).write_bytes(data.tobytes())
-                files[frame.index] = name
-                progress.step()
-    return files
 
 
 # ---- rerun -------------------------------------------------------------------------------------
@@ -458,9 +371,9 @@ class Viewer:
         """
         rr = self.rr
         rec = self.rec
-        largest, origin = centred(_largest_part(result, path))
-        scale, turn = _upright(largest, path, [0.0, 0, 1])
-        _warn_of_origin(origin, path)
+        largest, origin = centred(largest_part(result, path))
+        scale, turn = upright(largest, path, [0.0, 0, 1])
+        warn_of_origin(origin, path)
         names = {o.id: f"{o.id} {o.class_name}" for o in result.objects}
         rec.log("world", rr.Transform3D(mat3x3=turn), static=True)  # a scale: no pinholes
         ellipsoids = largest.ellipsoids()
@@ -478,8 +391,8 @@ class Viewer:
             rec.log("world/points", cloud, static=True)
         pose_of = _pose_by_frame(poses)
         tracks = result.tracks
-        frames, _ = _frames_read(result)
-        video = _video_of(result) if images else None
+        frames, _ = frames_read(result)
+        video = video_of(result) if images else None
         shown = iter(video if video is not None and video.has_images else ())
         ahead = next(shown, None)
         for frame in frames:
@@ -550,11 +463,18 @@ def export_rrd(result: Result, path: Path) -> None:
 
 
 EXPORTS: dict[str, tuple[str, Callable[[Result, Path], None]]] = {  # name: file in OUT, writer
+    "boxer": ("boxer_3dbbs.csv", export_boxer),
     "coco-vid": ("coco_vid.json", export_coco_vid),
     "csv": ("objects.csv", export_csv),
     "cvat": ("cvat.xml", export_cvat),
     "glb": ("objects.glb", export_glb),
+    "kitti": ("kitti_tracking.txt", export_kitti),
+    "labelme": ("labelme/labels.txt", export_labelme),
+    "mcap": ("objects.mcap", export_mcap),
     "nerfstudio": ("nerfstudio/transforms.json", export_nerfstudio),
     "ply": ("solids.ply", export_ply),
+    "ros": ("detection3d_array.json", export_ros),
     "rrd": ("scene.rrd", export_rrd),
+    "usd": ("scene.usda", export_usd),
+    "yolo": ("yolo/data.yaml", export_yolo),
 }

@@ -37,6 +37,7 @@ from reobj.results.edits import write_edits
 from reobj.results.entries import Object, VideoInfo, World, decode
 from reobj.results.names import OutputFile
 from reobj.results.ply import write_ply
+from reobj.results.upright import component_of, upright_pose
 from reobj.sources.tables import read_mot_rows
 from reobj.types import Embeddings, ReobjError, Tracks, printable, without_secrets
 
@@ -241,10 +242,14 @@ def write_objects(result: Result, path: Path) -> None:
             "size": "full extents of the solid along its own axes",
             "ellipsoid": "inscribed in a box or cylinder",
             "cov": "9x9: center, log half axes, rotation vector in object axes",
+            "center_m": "metres, z up, from the origin of the world",
+            "yaw_deg": "of the x axis of the object about z",
         },
         "video": dataclasses.asdict(result.video) | tracked,
         "world": result.world.to_json(),
-        "objects": [o.to_json() for o in result.objects],
+        "objects": [
+            o.to_json() | upright_pose(o, component_of(o, result.world)) for o in result.objects
+        ],
         "warnings": result.warnings,
     }
     with atomic(path) as part:

@@ -243,6 +243,9 @@ def _by_role(by_name: Mapping[str, list[str]], path: Path) -> dict[str, list[str
         if used:
             cells[role] = by_name[used[0]]
     has_frame = any(role in cells for role in ("frame", "image", "time"))
+    if "tx_world_object" in by_name:
+        fault = "these are 3D boxes in the world (Boxer, WildDet3D), expected 2D boxes in images"
+        raise ReobjError(f"{path}, line 1: {fault}; Boxer writes them to owl_2dbbs.csv")
     if not has_frame or not _box_roles(cells):
         missing = [role for role in ("x1", "y1", "x2", "y2") if role not in cells]
         missing = ["frame"] * (not has_frame) + missing

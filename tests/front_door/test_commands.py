@@ -271,8 +271,9 @@ def near_true(names: list[str], centres: np.ndarray, limit_m: float = 0.15) -> N
 def check_csv(path: Path) -> None:
     with path.open() as file:
         rows = [r for r in csv.DictReader(file) if r["status"] in ("ok", "prior_dominated")]
-    column = [k for k in rows[0] if re.search("center|centre", k)]
-    near_true([r["class"] for r in rows], np.array([[float(r[k]) for k in column] for r in rows]))
+    for name in ("center", "center_m"):  # the clip is in metres, z up
+        centres = np.array([[float(r[f"{name}_{axis}"]) for axis in "xyz"] for r in rows])
+        near_true([r["class"] for r in rows], centres)
 
 
 def check_glb(path: Path) -> None:
@@ -287,6 +288,69 @@ def check_glb(path: Path) -> None:
             names.append(found[1])
             centres.append([x, -z, y])  # y up -> z up
     near_true(names, np.array(centres))
+
+
+def check_boxer(path: Path) -> None:
+    with path.open() as file:
+        rows = {r["instance"]: r for r in csv.DictReader(file)}.values()
+    column = [f"{axis}_world_object" for axis in ("tx", "ty", "tz")]
+    near_true([r["name"] for r in rows], np.array([[float(r[k]) for k in column] for r in rows]))
+
+
+def boxes_of_kitti(path: Path) -> tuple[list[list[float]], dict[int, str]]:
+    cells = [line.split() for line in path.read_text().splitlines()]
+    rows = [[float(v) for v in (*row[:2], *row[6:10])] for row in cells]
+    return rows, {int(row[1]): row[2].replace("_", " ") for row in cells}
+
+
+def boxes_of_labelme(path: Path) -> tuple[list[list[float]], dict[int, str]]:
+    rows, names = [], {}
+    for file in path.parent.glob("images/*.json"):
+        for shape in json.loads(file.read_text())["shapes"]:
+            corners = [v for point in shape["points"] for v in point]
+            rows.append([float(file.stem.removeprefix("frame_")), shape["group_id"], *corners])
+            names[shape["group_id"]] = shape["label"]
+    return rows, names
+
+
+def boxes_of_yolo(path: Path) -> tuple[list[list[float]], dict[int, str]]:
+    kinds = [json.loads(k) for k in re.findall(r"^  \d+: (.+)$", path.read_text(), re.M)]
+    rows, names = [], {}
+    for file in (path.parent / "labels").glob("room_*.txt"):
+        frame = int(file.stem.removeprefix("room_")) - 1
+        for kind, *box, _, identity in np.loadtxt(file, ndmin=2).tolist():
+            x, y, w, h = np.array(box) * [640, 480, 640, 480]
+            rows.append([frame, identity, x - w / 2, y - h / 2, x + w / 2, y + h / 2])
+            names[int(identity)] = kinds[int(kind)]
+    return rows, names
+
+
+def ros_objects(detections: list[Any]) -> tuple[list[str], np.ndarray]:
+    names = [d["results"][0]["hypothesis"]["class_id"] for d in detections]
+    places = [d["bbox"]["center"]["position"] for d in detections]
+    return names, np.array([[place[axis] for axis in "xyz"] for place in places])
+
+
+def check_ros(path: Path) -> None:
+    near_true(*ros_objects(json.loads(path.read_text())["detections"]))
+
+
+def check_mcap(path: Path) -> None:
+    reader = pytest.importorskip("mcap.reader", reason="pip install '.[mcap]'")
+    with path.open("rb") as file:
+        summary = reader.make_reader(file).get_summary()
+    counts = {c.topic: summary.statistics.channel_message_counts[i]
+              for i, c in summary.channels.items()}  # fmt: skip
+    every = {"/tf": 40, "/camera_info": 40, "/detections": 40}
+    assert counts == every | {"/objects": 1, "/markers": 1}
+
+
+def check_usd(path: Path) -> None:
+    usd = pytest.importorskip("pxr.Usd", reason="pip install usd-core (dev extra)")
+    stage = usd.Stage.Open(str(path))
+    prims = stage.GetPrimAtPath("/World/objects").GetChildren()
+    names = [prim.GetAttribute("userProperties:class").Get() for prim in prims]
+    near_true(names, np.array([prim.GetAttribute("xformOp:translate").Get() for prim in prims]))
 
 
 def check_nerfstudio(path: Path) -> None:
@@ -319,21 +383,28 @@ def check_rrd(path: Path) -> None:
 
 
 EXPORTED: dict[str, Callable[[Path], None]] = {
+    "boxer": check_boxer,
     "coco-vid": check_tracks(boxes_of_coco),
     "csv": check_csv,
     "cvat": check_tracks(boxes_of_cvat),
     "glb": check_glb,
+    "kitti": check_tracks(boxes_of_kitti),
+    "labelme": check_tracks(boxes_of_labelme),
+    "mcap": check_mcap,
     "nerfstudio": check_nerfstudio,
     "ply": check_ply,
+    "ros": check_ros,
     "rrd": check_rrd,
+    "usd": check_usd,
+    "yolo": check_tracks(boxes_of_yolo),
 }
 
 
 @pytest.mark.parametrize("to", rt.EXPORTS)
 def test_every_export(out: Path, to: str, capsys: pytest.CaptureFixture[str]) -> None:
     """A new format needs an entry in EXPORTED."""
-    if to in ("glb", "rrd"):
-        pytest.importorskip({"glb": "trimesh", "rrd": "rerun"}[to])
+    if to in ("glb", "mcap", "rrd"):
+        pytest.importorskip({"glb": "trimesh", "mcap": "mcap_ros2", "rrd": "rerun"}[to])
     assert cli("export", out, "--to", to) == 0
     path = Path(re.findall(rf"{re.escape(str(out))}\S+", capsys.readouterr().out)[-1])
     EXPORTED[to](path)

@@ -156,6 +156,9 @@ TABLES = {
         "Frame number, X1 [px], Y1 [px], X2 [px], Y2 [px], Score, Class", CSV_ROW),
     "csv of a spreadsheet": csv("frame;x1;y1;x2;y2;score;class",
                                 "{f};{x1},0;{y1},0;{x2},0;{y2},0;0,9;chair"),
+    "Boxer's 2D boxes": csv(
+        "time_ns,frame_id,sensor,device,img_width,img_height,x1,y1,x2,y2,name,instance,sem_id,prob",
+        "-1,{f},rgb,iPad,640,480,{x1},{y1},{x2},{y2},chair,-1,56,0.9"),
     "pandas' index": csv(",frame,x1,y1,x2,y2,score,class", "{n}," + CSV_ROW),
     "pandas' floats": csv("frame,x1,y1,x2,y2,score,class", "{f}.0,{x1}.0,{y1},{x2},{y2},.9,56.0"),
     "supervision's sink": csv(
