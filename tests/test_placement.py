@@ -13,6 +13,7 @@ from reobj.maps.placement import (
     ImageFeatures,
     PlacementOptions,
     Similarity,
+    largest,
     place,
     points_with_descriptors,
 )
@@ -233,6 +234,29 @@ def test_images_that_show_nothing_of_what_they_should_contradict_a_placement():
     few = with_few_matches(rng, features, 8)
     reason = "8 of 60 images agree on a position in the map, where 57 should show points of it"
     assert place(poses, few, points, PlacementOptions(images=60)).refused.startswith(reason)
+
+
+def test_the_largest_columns_are_those_of_a_full_sort():
+    rng = np.random.default_rng(9)
+    for count in (7, 64, 300, 1000):
+        values = rng.normal(size=(20, count)).astype(np.float32)
+        expected = np.sort(np.argsort(-values, axis=1)[:, :6], axis=1)
+        np.testing.assert_array_equal(np.sort(largest(values, 6), axis=1), expected)
+
+
+def test_of_a_large_map_points_on_no_object_are_matched_first():
+    rng = np.random.default_rng(10)
+    points = room(rng)
+    truth = walk()
+    poses, features = recording(rng, points, truth)
+    on_object = dataclasses.replace(points, object_id=(np.arange(len(points)) < 400).astype(int))
+    options = PlacementOptions(points=500)  # all of the others
+    (component,) = place(poses, features, on_object, options).components
+    assert component.similarity.scale == pytest.approx(1 / SCALE, rel=0.003)
+    changed = dataclasses.replace(on_object, descriptor=points.descriptor.copy())
+    changed.descriptor[:400] = 0
+    (same,) = place(poses, features, changed, options).components
+    np.testing.assert_array_equal(same.similarity.cov, component.similarity.cov)
 
 
 def test_points_are_described_by_the_mean_of_their_keypoints():

@@ -36,6 +36,7 @@ class PlacementOptions:
     Attributes:
         size_px: longer side of the images for features, as in the reconstruction.
         images: of a component that are matched to the map; more take longer.
+        points: of the map that are matched, first those on no object; more take longer.
         ratio: largest ratio of angles to the best and to the second best point of the map that
             lies elsewhere (Lowe, IJCV 2004).
         elsewhere: distance of such a point, over that of the best one from the camera.
@@ -54,6 +55,7 @@ class PlacementOptions:
 
     size_px: int = 640
     images: int = 40
+    points: int = 15_000
     ratio: float = 0.8
     elsewhere: float = 0.03
     error_px: float = 6.0
@@ -183,6 +185,25 @@ def points_with_descriptors(
     )
 
 
+def largest(values: Floats, count: int, width: int = 64) -> IntArray:
+    """Return the columns (n, count) of the largest of (n, N) values in each row, unordered.
+
+    They lie in the `count` blocks with the largest maxima: the rows are partitioned by block.
+
+    Args:
+        width: columns of a block; has no effect on the result.
+    """
+    missing = -values.shape[1] % width
+    blocks = np.pad(values, ((0, 0), (0, missing)), constant_values=-np.inf)
+    blocks = blocks.reshape(len(values), -1, width)
+    if blocks.shape[1] <= count:
+        return np.argpartition(-values, count, axis=1)[:, :count]
+    chosen = np.argpartition(-blocks.max(2), count, axis=1)[:, :count]  # (n, count)
+    inside = np.take_along_axis(blocks, chosen[:, :, None], 1).reshape(len(values), -1)
+    best = np.argpartition(-inside, count, axis=1)[:, :count]
+    return np.take_along_axis(chosen, best // width, 1) * width + best % width
+
+
 def unit_descriptors(rows: npt.NDArray[np.generic]) -> Floats:
     """Scale descriptors to unit length."""
     values = rows.astype(np.float32)
@@ -236,7 +257,7 @@ class PointMatcher:
         if len(image.xy) < 2 or len(self.points) <= few:
             return np.empty(0, np.int64), np.empty(0, np.int64)
         cosine = unit_descriptors(image.descriptor) @ self.descriptor.T  # (n, N)
-        best = np.argpartition(-cosine, few, axis=1)[:, :few]  # (n, few)
+        best = largest(cosine, few)  # (n, few)
         value = np.take_along_axis(cosine, best, 1)
         order = np.argsort(-value, axis=1)
         best = np.take_along_axis(best, order, 1)
@@ -560,7 +581,7 @@ def place(
         report: gets the number of images that were compared.
     """
     options = options or PlacementOptions()
-    matcher = PointMatcher(points, options)
+    matcher = PointMatcher(_matched(points, options.points), options)
     components = list[ComponentPlacement]()
     for part in range(poses.part_count):
         of_part = [im for im in features if poses.part[im.row] == part and poses.known[im.row]]
@@ -573,6 +594,16 @@ def place(
     if not placed:
         return Placement(poses, tuple(components), components[0].reason)
     return Placement(_joined(poses, components, placed), tuple(components))
+
+
+def _matched(points: MapPoints, most: int) -> MapPoints:
+    """Choose at most `most` points, spread over the map: those on no object, then the others."""
+    on_object = points.object_id > 0
+    chosen = list[IntArray]()
+    for rows in (np.flatnonzero(~on_object), np.flatnonzero(on_object)):
+        left = most - sum(map(len, chosen))
+        chosen.append(rows[np.linspace(0, len(rows) - 1, min(left, len(rows))).astype(int)])
+    return points[np.sort(np.concatenate(chosen))]
 
 
 def _joined(poses: Poses, components: Sequence[ComponentPlacement], placed: Sequence[int]) -> Poses:
