@@ -167,7 +167,7 @@ def main() -> None:
             work = folder / f"part{k}"
             work.mkdir(exist_ok=True)
             words = [sys.executable, str(ROOT / "reobj_track.py"), *command(part, data, work)]
-            words += ["-o", str(work / "out"), "--map", str(folder / "room.map"),
+            words += ["-o", str(work / "out"), "--overwrite", "--map", str(folder / "room.map"),
                       "--set", "output.overlay=none"]  # fmt: skip
             with open(work / "log.txt", "w") as log:
                 subprocess.run(words, stdout=log, stderr=subprocess.STDOUT, check=True)
