@@ -1401,7 +1401,7 @@ def refit(
 ) -> Result:
     """Link and fit the tracks of an output folder again, by default with its last options.
 
-    The map of the room is one of these options.
+    `config.map` names the map of the room.
 
     Args:
         config: options; or a dict of those that differ from the last ones.

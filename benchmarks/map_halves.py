@@ -56,8 +56,10 @@ class Part:
     flipped: bool = False
 
 
-RED, HOLO = "redkitchen_7scenes/images", "hololens_kitchen/images"
-OFFICE, BONSAI = "office_loop/images", "bonsai_mip360/images"
+RED = "redkitchen_7scenes/images"
+HOLO = "hololens_kitchen/images"
+OFFICE = "office_loop/images"
+BONSAI = "bonsai_mip360/images"
 SUN = "sun3d_studyroom_fragments"
 CASES = {  # truth (MOTChallenge, in DATA), overlap of a true box, parts
     "redkitchen": ("redkitchen_7scenes/gt_mot.txt", 0.5, [
@@ -78,7 +80,8 @@ def write_poses(folder: Path, out: Path, moved: bool) -> None:
     poses = np.loadtxt(folder / "poses_c2w.txt").reshape(-1, 4, 4)
     if moved:
         rng = np.random.default_rng(1)
-        turn, scale = Rotation.random(random_state=1).as_matrix(), float(rng.uniform(0.5, 2))
+        turn = Rotation.random(random_state=1).as_matrix()
+        scale = float(rng.uniform(0.5, 2))
         poses[:, :3, 3] = scale * poses[:, :3, 3] @ turn.T + rng.normal(0, 5, 3)
         poses[:, :3, :3] = turn @ poses[:, :3, :3]
     out.mkdir(exist_ok=True)

@@ -230,8 +230,11 @@ def shuffled(scene, seed=1):
     The latter are wrong, as on repeated texture: no point of the model is matched.
     """
     order = np.random.default_rng(seed).permutation(len(scene.seen))
-    scene.poses, scene.xy, scene.seen = scene.poses[order], scene.xy[order], scene.seen[order]
-    ids, inliers = [], []
+    scene.poses = scene.poses[order]
+    scene.xy = scene.xy[order]
+    scene.seen = scene.seen[order]
+    ids = []
+    inliers = []
     for a, b in itertools.combinations(range(len(order)), 2):
         both = np.flatnonzero(scene.seen[a] & scene.seen[b])
         near = abs(order[a] - order[b]) <= 2

@@ -221,7 +221,8 @@ def test_the_conda_recipe_has_version_and_dependencies_of_the_project() -> None:
     recipe = yaml.safe_load((ROOT / "docs/packaging/recipe.yaml").read_text())
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     facts = project["project"]
-    pypi, conda = "opencv-python-headless>=4.10.0.84", "py-opencv>=4.10.0"
+    pypi = "opencv-python-headless>=4.10.0.84"
+    conda = "py-opencv>=4.10.0"
     wanted = ["python>=${{python_min}}", *facts["dependencies"]]
     wanted = [line.replace(pypi, conda) for line in wanted]
     assert [line.replace(" ", "") for line in recipe["requirements"]["run"]] == wanted

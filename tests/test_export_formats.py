@@ -260,7 +260,8 @@ def test_mcap_in_its_library(chairs: rt.Result, tmp_path: Path) -> None:
     expected = [round(1e9 * t) for i, t in enumerate(chairs.poses.time_s.tolist()) if i != 7]
     for topic in ("/tf", "/camera_info", "/detections"):
         assert [time for time, _ in found[topic]] == expected
-    (_, objects), (_, markers) = found["/objects"][0], found["/markers"][0]
+    _, objects = found["/objects"][0]
+    _, markers = found["/markers"][0]
     centers = np.array([vector(d.bbox.center.position) for d in objects.detections])
     links = [data.transforms[0] for _, data in found["/tf"]]
     assert {(x.header.frame_id, x.child_frame_id) for x in links} == {
@@ -382,7 +383,8 @@ def test_kitti_boxes_project_as_the_shapes(chairs: rt.Result, tmp_path: Path) ->
     ]
     assert {len(row) for row in rows} == {18} and len(rows) == 120
     for row in rows:
-        frame, identity = int(row[0]), int(row[1])
+        frame = int(row[0])
+        identity = int(row[1])
         alpha, *box = map(float, (row[5], *row[10:17]))
         if frame == 5:
             assert [alpha, *box] == [-10, -1, -1, -1, -1000, -1000, -1000, -10]

@@ -72,7 +72,8 @@ class World:
         self.rng = np.random.default_rng(seed)
         self.poses = poses()
         wall = self.rng.uniform([-3, 5, 0], [3, 6, 2.5], (300, 3))
-        self.xyz, self.code = [wall], [descriptors(self.rng, 300)]
+        self.xyz = [wall]
+        self.code = [descriptors(self.rng, 300)]
         self.owner = [np.zeros(300, np.int64)]
         self.seen = [(wall, self.code[0])]
         self.states: list[ObjectState] = []
@@ -112,7 +113,8 @@ class World:
 
     @property
     def points(self) -> MapPoints:
-        xyz, owner = np.concatenate(self.xyz), np.concatenate(self.owner)
+        xyz = np.concatenate(self.xyz)
+        owner = np.concatenate(self.owner)
         ray = xyz - [0, 0, 1.3]
         distance = np.linalg.norm(ray, axis=1)
         return MapPoints(
@@ -211,9 +213,8 @@ def test_one_image_is_too_few() -> None:
 
 def test_an_object_with_few_points_has_no_motion() -> None:
     world = moved_world()
-    world.xyz[1], world.code[1], world.owner[1] = (
-        table[1][:4] for table in (world.xyz, world.code, world.owner)
-    )
+    for table in (world.xyz, world.code, world.owner):
+        table[1] = table[1][:4]
     assert world.motions()[0] == {}
 
 
@@ -295,7 +296,8 @@ def test_a_recording_is_compared_with_the_points_of_the_other_sessions() -> None
 
 def test_the_displacement_is_that_of_the_points() -> None:
     world = moved_world()
-    state, found = world.states[0], world.found[0]
+    state = world.states[0]
+    found = world.found[0]
     known = PointMotion(9, 4, np.eye(3, 4), np.array([0, 0.3, 0.4]), np.diag([1, 4e-4, 4e-4]))
     measured = dataclasses.replace(found, motion_of={1: known})
     assert _displacement(state, measured, np.zeros((7, 7)), 2.0) == pytest.approx((1.0, 0.04))

@@ -36,7 +36,8 @@ def views_of(xyz: Array, code: np.ndarray, rng: np.random.Generator) -> list[Obj
     for row, cam in enumerate(poses().cam_from_world):
         in_cam = xyz @ cam[:, :3].T + cam[:, 3]
         xy = (in_cam @ CAMERA.K.T)[:, :2] / in_cam[:, 2:] + rng.normal(0, 0.3, (len(xyz), 2))
-        low, high = xy.min(0), xy.max(0)
+        low = xy.min(0)
+        high = xy.max(0)
         xy = np.concatenate([xy, rng.uniform(low, high, (10, 2))])
         noisy = (code + rng.normal(0, 5, code.shape)).clip(0, 255).astype(np.uint8)
         of_all = np.concatenate([noisy, descriptors(rng, 10)])

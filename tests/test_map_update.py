@@ -216,7 +216,8 @@ def test_the_viewer_gets_the_objects_of_other_recordings(monday):
     np.testing.assert_allclose(second.objects[0].size_m, 2 * moved.objects[0].half_axes)
     assert second.pictures == {1: b"\xff\xd8\xff1"}
     assert second.changes.summary() == tuesday.changes.summary()
-    (change,), (said,) = second.changes.moved, tuesday.changes.moved
+    (change,) = second.changes.moved
+    (said,) = tuesday.changes.moved
     np.testing.assert_allclose(change.before, said.before)
     np.testing.assert_allclose(change.before_shape.half_axes, said.before_shape.half_axes)
     (_, _, third) = earlier_sessions(delete(room, 2), path, "")

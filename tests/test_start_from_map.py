@@ -105,7 +105,8 @@ def numbers_of_frames(tracker, scene, poses, given=None, embed=False, seed=1):
 
 
 def test_known_numbers_from_the_first_frame_on():
-    scene, poses = world(), walk(20, 60.0)
+    scene = world()
+    poses = walk(20, 60.0)
     tracker = rt.Tracker(CONFIG)
     tracker.start_from(scene.room(COUNT - 2), NAMES)
     frames = numbers_of_frames(tracker, scene, poses, poses.cam_from_world)
@@ -122,7 +123,8 @@ def test_known_numbers_from_the_first_frame_on():
 
 
 def test_numbers_survive_a_saved_tracker(tmp_path):
-    scene, poses = world(), walk(20, 60.0)
+    scene = world()
+    poses = walk(20, 60.0)
     tracker = rt.Tracker(CONFIG)
     tracker.start_from(scene.room(COUNT - 2), NAMES)
     tracker.save(tmp_path / "before.npz")
@@ -137,7 +139,8 @@ def test_numbers_survive_a_saved_tracker(tmp_path):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_poses_of_another_world_give_no_numbers(seed):
-    scene, poses = world(seed), walk(20, 60.0)
+    scene = world(seed)
+    poses = walk(20, 60.0)
     turned = poses.cam_from_world.copy()
     a = 0.5 + 0.3 * seed  # the session's world: turned and shifted against that of the map
     other = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1.0]])
@@ -151,7 +154,8 @@ def test_poses_of_another_world_give_no_numbers(seed):
 
 
 def test_without_poses_the_appearance_decides():
-    scene, poses = world(), walk(12, 40.0)
+    scene = world()
+    poses = walk(12, 40.0)
     kept = {}
     for key in ("net", "another"):  # the map's sessions used "net"
         tracker = rt.Tracker(CONFIG, Looks(scene.looks, key))
@@ -162,7 +166,8 @@ def test_without_poses_the_appearance_decides():
 
 
 def test_deleted_objects_are_left_out_and_gone_ones_have_no_position():
-    scene, poses = world(), walk(3, 20.0)
+    scene = world()
+    poses = walk(3, 20.0)
     gone = scene.room(status="gone", support="")
     gone_state = rt.Tracker(CONFIG)
     gone_state.start_from(gone, NAMES)

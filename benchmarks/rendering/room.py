@@ -106,7 +106,9 @@ def later_plan(plan: list[Placement]) -> tuple[list[Placement], tuple[int, ...]]
 
     Returns: the placements, in their order, new ones last; indices of those that are gone.
     """
-    chair, bowl, bottle = 4, 5, 8
+    chair = 4
+    bowl = 5
+    bottle = 8
     later = list(plan)
     later[chair] = replace(plan[chair], position=(-2.75, -0.05, 0.0), yaw_rad=0.9)
     x, y, z = plan[bowl].position

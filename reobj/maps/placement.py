@@ -220,7 +220,7 @@ class LocatedImage:
     Attributes:
         row: of the frame in the poses. cam_from_map: (3, 4).
         xy: (n, 2) native pixels of its inliers. point: (n,) rows of the map's points.
-        depth: median depth of these. focal: focal length with which it was located, px.
+        depth: median depth of the inliers. focal: focal length with which it was located, px.
         matches: before PnP. in_view: points of the map that the image should show again: in it,
             seen from a similar direction and distance before.
     """

@@ -2,7 +2,7 @@
 
 Frames spread over the recording are matched to the points of the map and located by PnP. Without
 intrinsics their common focal length is estimated first. The frames between them are located by PnP
-on the points of the map, tracked from these frames (`reobj.poses.localize`).
+on the points of the map, tracked from the located frames (`reobj.poses.localize`).
 """
 
 from __future__ import annotations

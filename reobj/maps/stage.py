@@ -282,7 +282,7 @@ def finish_map(
         room = with_edits(room, result.edits)
     recording = _recording(opened, result, video, name, embedder, placed)
     if placed is not None and video.has_images:
-        recording = _with_object_points(recording, result, video, progress)
+        recording = _with_object_points(recording, result, video, progress, opened.frozen)
     if opened.pictures and not opened.frozen:
         pictures = None
         if video.has_images and not video.is_live:
@@ -306,14 +306,18 @@ def _with_object_points(
     result: Result,
     video: Video,
     progress: Callable[[str, int], Progress],
+    frozen: bool,
 ) -> Recording:
-    """Add features in the boxes of objects, and the points that they give."""
+    """Add features in the boxes of objects, and the points that they give to a map that learns."""
     assert result.poses is not None
     objects = [o for o in result.located if o.part == 0]
     with progress("object features", 0) as line:
         views = object_views(objects, result.poses, result.tracks, video, line)
+    recording = dataclasses.replace(recording, views=tuple(views))
+    if frozen:
+        return recording
     points = triangulated(objects, views, result.poses)
-    return dataclasses.replace(recording, views=tuple(views), object_points=points)
+    return dataclasses.replace(recording, object_points=points)
 
 
 def _refusal(opened: OpenMap, poses: Poses | None, video: Video, placed: Placed | None) -> str:

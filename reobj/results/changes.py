@@ -204,7 +204,7 @@ class EarlierSession:
     Attributes:
         name: of the recording. date: when it was added to the map, ISO 8601, UTC.
         objects: that were detected in it: places and sizes then, in the world of the map.
-        changes: since the recordings before it, as far as the map tells; None: it is the first.
+        changes: since the recordings before it, as far as the map has them; None: it is the first.
         pictures: JPEG of objects, by number; {}: the map has none.
     """
 

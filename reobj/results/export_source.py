@@ -97,7 +97,7 @@ class UprightWorld:
     """The largest component of a result with z up, in metres if the scale is known.
 
     Attributes:
-        objects: the located ones, by id. ellipsoids: of these, inscribed in their shapes.
+        objects: the located ones, by id. ellipsoids: (O,) inscribed in their shapes.
         poses: cameras and points; None without cameras.
         scale: metres per unit of the world of poses.txt, 1 if unknown; metric: it is known.
         rotation: (3, 3) of this world from that of poses.txt.

@@ -227,7 +227,8 @@ def test_eval_of_some_classes(out: Path) -> None:
 
 
 def boxes_of_cvat(path: Path) -> tuple[list[list[float]], dict[int, str]]:
-    rows, names = [], {}
+    rows = []
+    names = {}
     for track in ET.parse(path).getroot().iter("track"):
         number = int(track.attrib["id"])
         names[number] = track.attrib["label"]
@@ -304,7 +305,8 @@ def boxes_of_kitti(path: Path) -> tuple[list[list[float]], dict[int, str]]:
 
 
 def boxes_of_labelme(path: Path) -> tuple[list[list[float]], dict[int, str]]:
-    rows, names = [], {}
+    rows = []
+    names = {}
     for file in path.parent.glob("images/*.json"):
         for shape in json.loads(file.read_text())["shapes"]:
             corners = [v for point in shape["points"] for v in point]
@@ -315,7 +317,8 @@ def boxes_of_labelme(path: Path) -> tuple[list[list[float]], dict[int, str]]:
 
 def boxes_of_yolo(path: Path) -> tuple[list[list[float]], dict[int, str]]:
     kinds = [json.loads(k) for k in re.findall(r"^  \d+: (.+)$", path.read_text(), re.M)]
-    rows, names = [], {}
+    rows = []
+    names = {}
     for file in (path.parent / "labels").glob("room_*.txt"):
         frame = int(file.stem.removeprefix("room_")) - 1
         for kind, *box, _, identity in np.loadtxt(file, ndmin=2).tolist():
