@@ -2355,10 +2355,11 @@ def _status(
     for b, rejection in enumerate(rejections):
         doubt = []
         if weak[b].any():
-            axes = ", ".join("xyz"[k] for k in np.flatnonzero(weak[b]))
-            doubt.append(f"size along {axes} rests on the prior")
+            names = [("width", "depth", "height")[k] for k in np.flatnonzero(weak[b])]
+            guessed = "size" if len(names) == 3 else " and ".join(names)
+            doubt.append(f"{guessed} guessed from the category")
         if parallax[b] < limits.min_parallax_deg:
-            doubt.append(f"parallax {parallax[b]:.1f} deg: depth rests on the prior")
+            doubt.append(f"distance guessed from the category, parallax {parallax[b]:.1f} deg")
         status.append("rejected" if rejection else "prior_dominated" if doubt else "ok")
         if deviation[b] > limits.odd_size:
             why = "another object?" if growth[b] > 0.7 * deviation[b] else "partly occluded?"

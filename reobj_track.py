@@ -166,6 +166,7 @@ from reobj.tracking.ellipsoid_map import (
 )  # fmt: skip
 from reobj.types import (
     COCO_NAMES,
+    NOTE,
     Array,
     BoolArray,
     Detections,
@@ -1360,6 +1361,8 @@ def run(
     with Workspace(out, overwrite) as workspace, opened_map(config.map) as room:
         workspace.bind(video, overwrite)
         job = _Job(video, workspace, dataclasses.replace(config, map=config.map.absolute()))
+        log.info("input: %r", video)
+        log.debug("options that differ from the defaults: %s", changed_options(config))
         viewer = Viewer(VideoInfo.of(video)) if show else None
         in_3d = in_3d and config.poses.mode != "none"
         readings = supplied_poses(video, config.poses) if in_3d else []
@@ -1370,6 +1373,7 @@ def run(
         else:
             detected, boxes = _detect(job, detections, in_3d)
             class_names = tuple(detected.class_names)
+            log.info("detections: %d, of %d classes", len(boxes), len(np.unique(boxes.class_id)))
         sizes = config.objects
         check_known_size(sizes.known_size, sizes.priors, class_names)
         poses: Poses | None = None
@@ -1378,12 +1382,15 @@ def run(
             poses = _supplied_cameras(job, readings, boxes if tracks else _tracklets(boxes))
         elif in_3d and not video.is_live:
             poses, models = _reconstructed_cameras(job, boxes, class_names)
+        if poses is not None:
+            log.info("%s", poses.cameras_text)
         placed = None
         if room is not None and poses is not None and (poses.known.any() or room.room.sessions):
             placed, models = _place(job, room, poses, models)
             poses = placed.poses
         if not tracks:
             result = _track_video(job, detected, poses, viewer)
+        log.info("identities: %d", len(np.unique(result.tracks.track_id)))
         warnings = [*result.warnings, *workspace.save_last(result, poses, models)]
         result = dataclasses.replace(result, poses=poses, warnings=warnings)
         result = _finish(job, result, room, placed)
@@ -1534,6 +1541,10 @@ class _Job:
             steps[line.stage] = steps.get(line.stage, 0.0) + line.seconds
         if steps or may_be_cached:
             self.step_seconds[stage] = steps
+        details = ", ".join(f"{step} {seconds:.1f} s" for step, seconds in steps.items())
+        if may_be_cached and not steps:
+            details = "from the cache"
+        log.info("%s: %.1f s%s", stage, self.seconds[stage], f" ({details})" * bool(details))
 
 
 def _check_objects(config: ObjectsConfig) -> None:
@@ -1839,6 +1850,11 @@ def _cmd_models(args: argparse.Namespace) -> int:
     return 0
 
 
+LEVEL_NAMES = {
+    logging.DEBUG: "debug", logging.INFO: "info", NOTE: "note", logging.WARNING: "warning",
+}  # fmt: skip
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns 0, 2 for bad input, 130 after Ctrl-C, 1 for a fault of ours.
 
@@ -1856,11 +1872,12 @@ def _main(words: Sequence[str]) -> int:
             say(text)
             return 2
         args = parser.parse_args(words)
-        level = logging.DEBUG if args.debug else logging.INFO if args.verbose else logging.WARNING
-        logging.addLevelName(logging.WARNING, "warning")
+        log.setLevel(logging.DEBUG if args.debug else logging.INFO if args.verbose else NOTE)
+        for level, name in LEVEL_NAMES.items():
+            logging.addLevelName(level, name)
         handler = logging.StreamHandler(sys.stderr)
         handler.setFormatter(SafeFormatter("%(levelname)s: %(message)s"))
-        logging.basicConfig(level=level, handlers=[handler], force=True)
+        logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
         return int(args.func(args))
     except KeyboardInterrupt as interruption:
         where = "".join(f" {note}" for note in getattr(interruption, "__notes__", [])[-1:])

@@ -259,7 +259,7 @@ def connect(address: str, workers: int, cpus: int) -> Any:
     try:
         import ray
     except ImportError:
-        raise rt.ReobjError('Ray is not installed: pip install "reobj-track[batch]"') from None
+        raise rt.ReobjError("Ray is not installed: pip install ray") from None
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # no usage statistics are sent
     quiet = {"include_dashboard": False, "logging_level": "ERROR", "log_to_driver": False}
     if address == "local":

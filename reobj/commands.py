@@ -23,6 +23,14 @@ from reobj.types import ReobjError, one_line, printable, without_secrets
 Command = Callable[[argparse.Namespace], int]
 
 
+def program() -> str:
+    """Return the command that this program was started with, for messages."""
+    path = Path(sys.argv[0])
+    if path.stem == "reobj-track":
+        return path.stem
+    return f"python {path}" if path.name == "reobj_track.py" else "python -m reobj_track"
+
+
 class Parser(argparse.ArgumentParser):
     """Argument parser whose errors are one line with a suggestion."""
 
@@ -152,13 +160,13 @@ def make_parser(
         return add_command(sub, name, text, func, example, config, *sections).add_argument
 
     parser = Parser(
-        prog="reobj_track.py",
+        prog=program(),
         description="Re-identify object instances in a hand-held video of a static scene and "
         "localise them in 3D.",
-        epilog="Example: reobj_track.py run room.mp4 -o out; then open out/scene.html.",
+        epilog=f"Example: {program()} run room.mp4 -o out; then open out/scene.html.",
     )
     parser.add_argument("--version", action="version", version=f"reobj_track {__version__}")
-    text = "list all options of --set section.field=value"
+    text = "list all options of --set section.field=value, and stop"
     parser.add_argument("--options", action=_ListOptions, nargs=0, const=config, help=text)
     text = "print a shell completion script for `reobj-track` (needs shtab)"
     shells = ("bash", "zsh")  # shtab's script for tcsh does not complete the flags of commands
@@ -269,7 +277,7 @@ def add_command(
         name,
         help=text,
         description=text[0].upper() + text[1:] + ".",
-        epilog=f"Example: reobj_track.py {name} {example}",
+        epilog=f"Example: {program()} {name} {example}",
     )
     add_flags(parser, config, sections)
     add = parser.add_argument
@@ -278,6 +286,8 @@ def add_command(
         add("--save-config", metavar="FILE", help="write the options of this run, for --config")
     text = "set any option, e.g. tracker.coast_frames=60; --options lists them"
     add("--set", action="append", metavar="SECTION.FIELD=VALUE", help=text)
+    text = "list all options of --set, and stop"
+    add("--options", action=_ListOptions, nargs=0, const=config, help=text)
     add("-v", "--verbose", action="store_true", help="log each step")
     add("--debug", action="store_true", help="log details, and tracebacks of errors")
     parser.set_defaults(func=func, config=None, save_config=None)
@@ -310,6 +320,6 @@ def completion(parser: argparse.ArgumentParser, shell: str) -> str:
     try:
         import shtab
     except ImportError as error:
-        raise ReobjError("shtab is not installed: pip install 'reobj-track[completion]'") from error
+        raise ReobjError("shtab is not installed: pip install shtab") from error
     parser.prog = "reobj-track"  # the program that pip installs
     return str(shtab.complete(parser, shell))

@@ -43,6 +43,7 @@ def atomic(path: Path) -> Iterator[Path]:
             yield part
             _sync(part)
             part.replace(path)
+            log.debug("wrote %s", path)
         finally:
             part.unlink(missing_ok=True)
 
@@ -330,7 +331,9 @@ def load_cached(path: Path, read: Callable[[Path], T]) -> T | None:
     if not path.exists():
         return None
     try:
-        return read(path)
+        content = read(path)
+        log.debug("read %s from the cache", path)
+        return content
     except (ReobjError, OSError) as error:
         log.warning("%s; it is removed and computed again", error)
         if path.is_dir():
@@ -343,8 +346,9 @@ class Progress:
     """Show the progress of a stage on stderr: how much is done, the time left, the rate.
 
     On a terminal it is one line that is drawn again. Elsewhere (a log file) a long stage leaves a
-    plain line each minute and one at its end. Used in a `with` block: the stage is complete if the
-    block ends without an exception, whatever the expected total was.
+    plain line every 10 s, and each stage of at least a second one at its end. Used in a `with`
+    block: the stage is complete if the block ends without an exception, whatever the expected total
+    was.
 
     Args:
         counted: the steps have a meaning for the user, such as frames; False: they are fractions
@@ -451,9 +455,9 @@ class Progress:
 
 
 # Where stderr is no terminal: s between lines of a stage, and its least duration for a line at its
-# end (chosen: the run of the example leaves only its reconstruction)
-LOG_EVERY_S = 60.0
-LOG_LEAST_S = 10.0
+# end
+LOG_EVERY_S = 10.0
+LOG_LEAST_S = 1.0
 
 
 def duration(seconds: float) -> str:
@@ -499,9 +503,9 @@ def cut(text: str, most: int) -> str:
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
-def wrapped(text: str) -> list[str]:
+def wrapped(text: str, columns: int = 100) -> list[str]:
     """Wrap a line for the terminal; continuation lines are indented."""
-    return textwrap.wrap(text, 100, subsequent_indent="  ", break_long_words=False)
+    return textwrap.wrap(text, columns, subsequent_indent="  ", break_long_words=False)
 
 
 def spans(numbers: Iterable[int], step: int = 1) -> str:

@@ -19,6 +19,7 @@ BoolArray = npt.NDArray[np.bool_]
 Image = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.float32]
 log = logging.getLogger("reobj_track")
+NOTE = 25  # level of a log line that is no warning, but is shown without --verbose
 
 
 class ReobjError(ValueError):

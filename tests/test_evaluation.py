@@ -251,17 +251,18 @@ def truth_of(path: Path, result: rt.Result) -> Path:
 
 
 def test_the_report_omits_classes_without_detections() -> None:
-    """Undetected classes are listed in one line; a class with any score keeps its own."""
+    """Undetected objects are listed by class; a class with any score keeps its own line."""
     zero = dict.fromkeys("HOTA DetA AssA IDF1 IDP IDR MOTA IDSW Frag ids_per_object".split(), 0.0)
     some = zero | {"HOTA": 0.4, "IDF1": 0.5, "IDP": 0.5, "IDR": 0.5, "IDSW": 3}
     names = {f"object {i}": zero for i in range(20)}
     tracks = {"all": some, "chair": some, "clock": zero, **names}
-    lines = score_report({"tracks": tracks, "ranks": {}}).splitlines()
+    missed = {"clock": [4, 7], **{name: [10 + i] for i, name in enumerate(names)}}
+    lines = score_report({"tracks": tracks, "ranks": {}, "missed": missed}).splitlines()
     assert [line.split()[0] for line in lines[1:3]] == ["all", "chair"]
-    assert lines[1].split()[1:] == [f"{v}.00" for v in (40, 0, 0, 50, 50, 50, 0, 3, 0, 0)]
-    assert lines[3].startswith("nothing found of: clock, object 0,")
+    assert lines[1].split()[1:] == "40.0 0.0 0.0 50.0 50.0 50.0 0.0 3 0 0".split()
+    assert lines[3].startswith("not found: 22 true objects (clock 4, 7; object 0 10; ")
     assert not any(line.startswith("clock") for line in lines) and max(map(len, lines)) <= 100
-    nothing = score_report({"tracks": {"all": zero}, "ranks": {}}).splitlines()
+    nothing = score_report({"tracks": {"all": zero}, "ranks": {}, "missed": {}}).splitlines()
     assert nothing[1].startswith("all ")
 
 

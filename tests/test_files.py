@@ -465,23 +465,23 @@ def test_a_short_stage_is_silent_without_a_terminal(
     clock: list[float], capsys: pytest.CaptureFixture[str]
 ) -> None:
     with files.Progress("track", 200) as progress:
-        clock[0] += 4
+        clock[0] += 0.5
         progress.step(20)
-    assert progress.close() == 4 and capsys.readouterr().err == ""
+    assert progress.close() == 0.5 and capsys.readouterr().err == ""
 
 
 def test_a_long_stage_leaves_plain_lines_in_a_log(
     clock: list[float], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """One each minute and one at the end, without control characters."""
-    with files.Progress("track", 600) as progress:
-        for _ in range(150):
+    """One every 10 s and one at the end, without control characters."""
+    with files.Progress("track", 100) as progress:
+        for _ in range(25):
             clock[0] += 1
             progress.step(4)
     assert capsys.readouterr().err.splitlines() == [
-        "track     244/600  41 %, 1 min 30 s left, 4.0/s",
-        "track     488/600  81 %, 28 s left, 4.0/s",
-        "track     600/600 100 %, 150.0 s, 4.0/s",
+        "track     44/100  44 %, 14 s left, 4.0/s",
+        "track     88/100  88 %, 3 s left, 4.0/s",
+        "track     100/100 100 %, 25.0 s, 4.0/s",
     ]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import dataclasses
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -516,18 +517,22 @@ def test_the_summary_has_a_line_for_each_component(parted: rt.Result) -> None:
     lines = parted.summary().splitlines()
     cameras = "cameras: 61 of 64 frames (pycolmap) in 2 components"
     assert f"{cameras}, each with its own frame and scale" in lines
-    first, second = (line for line in lines if line.startswith("component "))
+    first, second = (line for line in lines if re.match(r"component \d: ", line))
     assert first.startswith("component 0: frames 0-39; 38 of 40 frames; 3 objects; scale ")
     assert second.startswith("component 1: frames 40-63; 23 of 24 frames; 3 objects; scale ")
-    assert sum("ok, component 1" in line for line in lines) == 3
+    groups = [k for k, line in enumerate(lines) if line in ("component 0", "component 1")]
+    assert ["measured" in line for line in lines[groups[1] + 1 : groups[1] + 4]] == [True] * 3
+    assert groups[1] - groups[0] == 4
     assert not [line for line in lines if line.startswith("scale")]
 
 
 def test_a_component_without_scale_is_not_reported_in_metres(parted: rt.Result) -> None:
     unscaled = [dataclasses.replace(o, size_m=None) if o.part else o for o in parted.objects]
     lines = dataclasses.replace(parted, objects=unscaled).summary().splitlines()
-    assert "m  " in lines[0]
-    assert ["units" in line for line in lines[1:7]] == [False] * 3 + [True] * 3
+    start = next(k for k, line in enumerate(lines) if line.startswith("object "))
+    assert "height, m  " in lines[start]
+    rows = [line for line in lines[start + 1 : start + 9] if "component" not in line]
+    assert ["units" in line for line in rows] == [False] * 3 + [True] * 3
 
 
 # ---- Overlay and viewer ----

@@ -738,7 +738,7 @@ def test_status_reflects_the_evidence() -> None:
     thin = fitted(30, 2, 0.5, 0.02, "box")[0]
     assert (wide.status == "ok").mean() > 0.95 and all(r == "" for r in wide.reason[:5])
     assert (thin.status == "prior_dominated").all()
-    assert all("prior" in reason for reason in thin.reason)
+    assert all("guessed from the category" in reason for reason in thin.reason)
     assert (thin.prior_share.max(1) > 0.8).all() and (wide.prior_share.max(1) < 0.7).mean() > 0.9
 
 

@@ -813,7 +813,7 @@ def test_ctrl_c_leaves_complete_files(stream: tuple[Stream, str], tmp_path: Path
         data = json.loads((out / "objects.json").read_text())
         assert {entry["id"] for entry in data["objects"]} == {1, 2}
         assert any(w.startswith("live: ") and "dropped" in w for w in data["warnings"])
-        assert "identities only" in errors and "distinct objects: 2" in text
+        assert "identities only" in errors and "2 objects: " in text
         files = [p for p in out.rglob("*") if p.suffix in (".json", ".html", ".txt")]
         written = "".join(p.read_text() for p in files) + text + errors
         assert "secret" not in written and str(server.server_port) in written

@@ -297,7 +297,8 @@ def test_redirects_are_followed_but_never_off_https(
 
 
 FETCHES = """
-import dataclasses, sys, reobj_track as rt
+import dataclasses, logging, sys, reobj_track as rt
+logging.basicConfig(level=20)
 from reobj.sources import weights
 weights.WEIGHTS = (weights.Weights(*eval(sys.argv[1])),)
 print(rt.model_path("toy"))
@@ -411,7 +412,7 @@ def test_states_and_unknown_names(server: Any) -> None:
     rt.model_path("toy")
     (row,) = rt.list_models()
     assert (row.state, row.path) == ("verified", server.target)
-    expected = r"model yolo99: no such file, nor one of the known names \(toy\)"
+    expected = r"detector yolo99: no such file, nor one of the known names \(toy\)"
     with pytest.raises(rt.ReobjError, match=expected):
         rt.model_path("yolo99")
 

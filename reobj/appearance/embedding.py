@@ -268,7 +268,7 @@ class Backbone:
         offline: bool,
         device: str = "cpu",
     ) -> None:
-        path = model_path(model, offline=offline)
+        path = model_path(model, offline, "backbone")
         self.session = onnx_session(path, threads, device)
         spatial = [o.name for o in self.session.get_outputs() if len(o.shape) == 4]
         if not spatial or len(self.session.get_inputs()[0].shape) != 4:
@@ -340,7 +340,7 @@ def trained_head(model: str, head: str = "") -> Path | None:
         ReobjError: `head` is neither a file nor "none".
     """
     if head:
-        return None if head == "none" else model_path(head, offline=True)
+        return None if head == "none" else model_path(head, True, "head")
     kind, _, backbone = model.rpartition(":")
     path = Path(backbone)
     folder = path.parent if path.suffix == ".onnx" else own_models()

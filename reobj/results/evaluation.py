@@ -298,14 +298,28 @@ def identity_map(truth: LabelledBoxes, predicted: LabelledBoxes) -> dict[int, in
     return pairs | dict(zip(gt_ids[a].tolist(), ids[b].tolist(), strict=True))
 
 
+COLUMNS = {
+    "HOTA": "higher-order tracking accuracy, %",
+    "DetA": "its part for detection, %",
+    "AssA": "its part for association, %",
+    "IDF1": "boxes with the right identity, %: harmonic mean of IDP and IDR",
+    "IDP": "of the boxes of the result, %",
+    "IDR": "of the true boxes, %",
+    "MOTA": "1 - (missed + false boxes + IDSW) / true boxes, %",
+    "IDSW": "identity switches",
+    "Frag": "interruptions of a tracked object",
+    "IDs": "identities of the result per true object",
+}
+COUNTS = ("IDSW", "Frag", "IDs")
+
+
 def score_table(scores: dict[str, dict[str, float]]) -> str:
     """Format one line for each name, rates in per cent."""
-    counts = ("IDSW", "Frag", "ids_per_object")
-    columns = ("HOTA", "DetA", "AssA", "IDF1", "IDP", "IDR", "MOTA", *counts)
-    lines = [f"{'':<14}" + "".join(f"{c[:7]:>8}" for c in columns)]
+    lines = [f"{'':<14}" + "".join(f"{c:>6}" for c in COLUMNS)]
     for name, score in scores.items():
-        cells = [score[c] * (1 if c in counts else 100) for c in columns]
-        lines.append(f"{name[:14]:<14}" + "".join(f"{cell:8.2f}" for cell in cells))
+        values = score | {"IDs": score["ids_per_object"]}
+        cells = [f"{values[c]:6.4g}" if c in COUNTS else f"{100 * values[c]:6.1f}" for c in COLUMNS]
+        lines.append(f"{name[:14]:<14}" + "".join(cells))
     return "\n".join(lines)
 
 
@@ -313,10 +327,8 @@ def score_report(scores: dict[str, Any]) -> str:
     """Format the result of `evaluate` for the terminal."""
     tracks: dict[str, dict[str, float]] = scores["tracks"]
     matched = {n: s for n, s in tracks.items() if n == "all" or s["IDF1"] or s["HOTA"] or s["IDP"]}
-    lines = [score_table(matched)]
+    lines = [score_table(matched), *_missed_text(scores["missed"])]
     ranks = scores["ranks"]
-    if missed := [name for name in tracks if name not in matched]:
-        lines += wrapped(f"nothing found of: {', '.join(missed)}")
     rates = [f"{k.replace('rank', 'Rank-')} {v:.3f}" for k, v in ranks.items() if k != "queries"]
     if ranks:
         lines.append(f"returns by appearance alone, {ranks['queries']:.0f} queries: "
@@ -325,10 +337,31 @@ def score_report(scores: dict[str, Any]) -> str:
         lines.append("Rank-k: no embeddings (an output folder of `run` or `track` has them)")
     if "objects" in scores:
         numbers = {k: v for k, v in scores["objects"].items() if isinstance(v, int | float)}
-        lines.append("3D: " + ", ".join(f"{k} {v:.3g}" for k, v in numbers.items()))
+        lines += wrapped("3D: " + ", ".join(f"{k} {v:.3g}" for k, v in numbers.items()))
     for text in scores.get("messages", ()):
         lines += wrapped(f"note: {text}")
+    lines += [f"{column:<5}{meaning}" for column, meaning in COLUMNS.items()]
     return "\n".join(lines)
+
+
+def _missed_text(missed: dict[str, list[int]]) -> list[str]:
+    """Format the true objects that no identity of the result matches, by class."""
+    if not missed:
+        return []
+    count = sum(map(len, missed.values()))
+    names = [f"{name} {', '.join(map(str, ids))}".strip() for name, ids in missed.items()]
+    return wrapped(f"not found: {count} true objects ({'; '.join(names)})")
+
+
+def _missed(truth: LabelledBoxes, predicted: LabelledBoxes) -> dict[str, list[int]]:
+    """List the true identities that no identity of the result matches, by class."""
+    scored = truth[truth.role == Role.SCORED]
+    name_of = dict(zip(scored.identity.tolist(), scored.name.tolist(), strict=True))
+    missed: dict[str, list[int]] = {}
+    for identity, match in identity_map(truth, predicted).items():
+        if match is None and identity in name_of:
+            missed.setdefault(name_of[identity], []).append(identity)
+    return dict(sorted(missed.items()))
 
 
 def evaluate(
@@ -351,7 +384,8 @@ def evaluate(
             evaluate, (): all. min_visibility: true boxes of lower visibility are ignored.
     Returns:
         {"tracks": scores by class, "ranks": Rank-k of the returns, "objects": scores in 3D,
-        "messages": assumptions about the files}.
+        "missed": true identities without a match by class, "messages": assumptions about the
+        files}.
     Raises:
         ReobjError: a file is missing or of another format, no true box counts, an identity has two
             boxes in a frame, or a class does not occur.
@@ -393,6 +427,7 @@ def evaluate(
             scores[name] = score_tracks(*_of_classes(truth, predicted, [name], named))
     result: dict[str, Any] = {"version": __version__, "gt": str(gt), "tracks": scores}
     result["ranks"] = score_appearance(tracked, truth) if tracked is not None else {}
+    result["missed"] = _missed(truth, predicted)
     result["messages"] = notes
     if solids is not None:
         pairs = identity_map(truth, predicted)

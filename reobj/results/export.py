@@ -185,7 +185,7 @@ def export_glb(result: Result, path: Path) -> None:
     try:
         import trimesh
     except ImportError as error:
-        raise ReobjError("trimesh is not installed: pip install 'reobj-track[viewer]'") from error
+        raise ReobjError("trimesh is not installed: pip install trimesh") from error
     result, origin = centred(largest_part(result, path))
     scale, turn = upright(result, path, [0.0, 1, 0])
     warn_of_origin(origin, path)
@@ -324,7 +324,7 @@ class Viewer:
         try:
             import rerun as rr
         except ImportError as error:
-            raise ReobjError("rerun is not installed: pip install 'reobj-track[viewer]'") from error
+            raise ReobjError("rerun is not installed: pip install rerun-sdk") from error
         self.rr = rr
         self.video = video
         self.followed = False

@@ -48,7 +48,7 @@ def export_mcap(result: Result, path: Path) -> None:
     try:
         from mcap_ros2.writer import Writer
     except ImportError as error:
-        advice = "mcap-ros2-support is not installed: pip install 'reobj-track[mcap]'"
+        advice = "mcap-ros2-support is not installed: pip install mcap-ros2-support"
         raise ReobjError(advice) from error
     world = upright_world(result, path)
     with atomic(path) as part, part.open("wb") as file, Writer(file) as writer:

@@ -6,6 +6,8 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 import quadrics
 from reobj.files import cut, texts_with_sigma, wrapped
 from reobj.results.entries import Object
@@ -13,24 +15,28 @@ from reobj.results.entries import Object
 if TYPE_CHECKING:
     from reobj.results.result import Result
 
+COLUMNS = 80  # of the terminal
+LEAST_NAME = 14  # characters of a class
+MOST_NAME = 20
+SIZE_WORDS = {"ok": "measured", "prior_dominated": "guessed", "rejected": "none"}
+
 
 def summary(result: Result) -> str:
-    """Write the report that `run` prints."""
+    """Write the report that `run` prints: what was found, where to look, and the table."""
     counted = [o for o in result.objects if o.status != "doubtful"]
-    lines = _table(result, counted)
-    lines += _reasons(counted)
-    lines += _class_counts(result, counted)
+    lines = _counts(result, counted)
     if result.changes is not None:
-        lines += wrapped(result.changes.summary())
-    doubtful = len(result.objects) - len(counted)
-    if doubtful > 0:
-        lines.append(f"low confidence: {doubtful} more, probably false positives (objects.json)")
-    lines += _cameras(result)
-    lines.append("seconds: " + ", ".join(_stage_time(result, s) for s in result.seconds))
+        lines += _wrapped(result.changes.summary())
     if result.out is not None:
         names = ("scene.html", "overlay.mp4", "overlay.webm", "objects.json")
         files = [result.out / name for name in names]
         lines.append("look at: " + ", ".join(str(file) for file in files if file.exists()))
+    if counted:
+        lines += ["", *_table(result, counted), *_reasons(counted)]
+    if any(o.size_rel_sigma is not None for o in counted):
+        lines.append("sigma: standard deviation of the least certain side")
+    lines += ["", *_cameras(result)]
+    lines += _wrapped("seconds: " + ", ".join(_stage_time(result, s) for s in result.seconds))
     return "\n".join(lines)
 
 
@@ -58,23 +64,27 @@ def sides(found: Object) -> list[tuple[str, ...]]:
 
 
 def _table(result: Result, counted: Sequence[Object]) -> list[str]:
-    """Format a header and a line for each object; sizes only if there are any."""
+    """Format a header and a line for each object; sizes only if there are any.
+
+    Objects of several components are grouped by component, each below a line with its name.
+    """
     in_metres = any(o.size_m is not None for o in result.objects)
     has_sizes = any(o.size is not None for o in counted)
     several = len(result.world.parts) > 1
     unit = "m" if in_metres else "units"
-    columns = f"{'object':>6}  {'class':<14} {'frames':>6} {'visits':>6}  "
+    width = max([LEAST_NAME, *(min(len(o.class_name), MOST_NAME) for o in counted)])
+    columns = f"{'object':>6}  {'class':<{width}} {'frames':>6}"
     if has_sizes:
-        columns += f"{f'width x depth x height, {unit}':<26} {'sigma':>6}  "
-    lines = [columns + "status"]
-    for o in counted:
-        name = cut(o.class_name, 40)  # for a line of 120 characters
-        line = f"{o.id:>6}  {name:<14} {o.frames_seen:>6} {len(o.visits):>6}  "
+        columns += f"  {f'width x depth x height, {unit}':<26} {'sigma':>6}  size"
+    lines = [columns]
+    component = None
+    for o in sorted(counted, key=lambda o: o.part):
+        if several and o.part != component:
+            component = o.part
+            lines.append(f"component {component}")
+        line = f"{o.id:>6}  {cut(o.class_name, MOST_NAME):<{width}} {o.frames_seen:>6}"
         if has_sizes:
-            line += _size_columns(o, in_metres)
-        line += o.status
-        if several:
-            line += f", component {o.part}"
+            line += _size_columns(o, in_metres) + SIZE_WORDS.get(o.status, o.status)
         lines.append(line)
     return lines
 
@@ -91,27 +101,32 @@ def _size_columns(found: Object, in_metres: bool) -> str:
     sigma = "-"
     if found.size_rel_sigma is not None:
         sigma = f"{100 * found.size_rel_sigma.max():.0f} %"
-    return f"{size:<26} {sigma:>6}  "
+    return f"  {size:<26} {sigma:>6}  "
 
 
 def _reasons(counted: Sequence[Object]) -> list[str]:
     """Format each reason once, with the objects that have it."""
     objects_of: dict[str, list[int]] = {}
     for o in counted:
-        if o.reason:
-            objects_of.setdefault(f"{o.status}: {o.reason}", []).append(o.id)
+        for reason in filter(None, o.reason.split("; ")):
+            objects_of.setdefault(reason, []).append(o.id)
     lines = list[str]()
     for reason, ids in objects_of.items():
-        lines += wrapped(f"{reason}: {', '.join(map(str, ids))}")
+        lines += _wrapped(f"{reason}: {', '.join(map(str, ids))}")
     return lines
 
 
-def _class_counts(result: Result, counted: Sequence[Object]) -> list[str]:
-    """Format the number of objects of each class."""
-    counts = sorted(Counter(o.class_name for o in counted).items())
+def _counts(result: Result, counted: Sequence[Object]) -> list[str]:
+    """Format the number of objects, in all and of each class, most frequent first."""
+    counts = sorted(Counter(o.class_name for o in counted).items(), key=lambda c: (-c[1], c[0]))
     names = ", ".join(f"{count} {name}" for name, count in counts) or "none"
-    note = " (each component counted separately)" if len(result.world.parts) > 1 else ""
-    return wrapped(f"distinct objects: {names}{note}")
+    noun = "object" if len(counted) == 1 else "objects"
+    text = f"{len(counted)} {noun}: {names}" if counted else "objects: none"
+    if len(result.world.parts) > 1:
+        text += " (each component counted separately)"
+    if doubtful := len(result.objects) - len(counted):
+        text += f"; {doubtful} more of low confidence, probably false positives (objects.json)"
+    return _wrapped(text)
 
 
 def _cameras(result: Result) -> list[str]:
@@ -133,10 +148,15 @@ def _cameras(result: Result) -> list[str]:
         ]
         if component.scale:
             facts.append(f"scale {_scale_text(component.scale)}")
-        lines += wrapped(f"component {k}: " + "; ".join(facts))
+        lines += _wrapped(f"component {k}: " + "; ".join(facts))
     return lines
 
 
 def _scale_text(scale: quadrics.Scale) -> str:
-    sigma = f"{100 * (scale.rel_sigma or 0):.0f} %"
-    return f"{scale.value} m per unit, sigma {sigma} (from {scale.source})"
+    sigma = scale.rel_sigma or 0.0
+    ((value, *_),) = texts_with_sigma(np.array([scale.value]), np.array([sigma * scale.value]))
+    return f"{value} m per unit, sigma {100 * sigma:.0f} % (from {scale.source})"
+
+
+def _wrapped(text: str) -> list[str]:
+    return wrapped(text, COLUMNS)

@@ -305,7 +305,7 @@ def validate_objects(path: Path) -> list[str]:
     try:
         from jsonschema import Draft202012Validator, validators
     except ImportError as error:
-        advice = "jsonschema is not installed: pip install 'reobj-track[validate]'"
+        advice = "jsonschema is not installed: pip install jsonschema"
         raise ReobjError(advice) from error
     path = path / OutputFile.OBJECTS if path.is_dir() else path
     types = Draft202012Validator.TYPE_CHECKER.redefine("number", _is_finite)

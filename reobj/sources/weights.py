@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from reobj.files import LockedError, Progress, atomic, locked
-from reobj.types import ReobjError, log
+from reobj.types import NOTE, ReobjError, log
 
 # Mean and standard deviation of the pixels of ImageNet, RGB, 0..255 (torchvision: .485, .456, .406
 # and .229, .224, .225, times 255), as used to train most published networks
@@ -156,13 +156,13 @@ def list_models() -> list[ModelRow]:
     return rows
 
 
-def model_path(name_or_path: str | Path, offline: bool = False) -> Path:
+def model_path(name_or_path: str | Path, offline: bool = False, role: str = "detector") -> Path:
     """Find a file of weights, or download it.
 
     Args:
         name_or_path: an existing file, which is not verified; a name of the table, whose file is
             verified or downloaded; or another file in a folder of weights, with or without ".onnx".
-        offline: never download.
+        offline: never download. role: detector or backbone, whose names an error lists.
     Raises:
         ReobjError: an unknown name, a changed file, or a failed download.
     """
@@ -175,8 +175,8 @@ def model_path(name_or_path: str | Path, offline: bool = False) -> Path:
     if file is None:
         if weights is not None:
             return _fetch(weights, offline)
-        known = ", ".join(w.name for w in WEIGHTS)
-        raise ReobjError(f"model {name}: no such file, nor one of the known names ({known})")
+        known = ", ".join(w.name for w in WEIGHTS if w.role == role)
+        raise ReobjError(f"{role} {name}: no such file, nor one of the known names ({known})")
     if weights is not None and (digest := weights.digest_of(file)) != weights.digest:
         raise ReobjError(
             f"{file}: {weights.digest_kind} is {digest}, expected {weights.digest}: delete the "
@@ -197,7 +197,7 @@ def _fetch(weights: Weights, offline: bool) -> Path:
     lock = target.with_name(".lock")
     with contextlib.suppress(LockedError), locked(lock):
         return _fetch_alone(weights, target, missing, by_hand)
-    log.warning("another process is fetching weights into %s: waiting for it", target.parent)
+    log.log(NOTE, "another process is fetching weights into %s: waiting for it", target.parent)
     with locked(lock, wait_s=600.0):  # 100 MB at 1.3 Mbit/s
         return _fetch_alone(weights, target, missing, by_hand)
 
@@ -208,8 +208,8 @@ def _fetch_alone(weights: Weights, target: Path, missing: str, by_hand: str) -> 
         return target
     expected = f"{weights.digest_kind} {weights.digest}"
     size = f"{weights.size / 1e6:.1f} MB" if weights.size else "size unknown"
-    log.warning(
-        "fetching %s: %s, licence %s, from %s, %s",
+    log.log(
+        NOTE, "fetching %s: %s, licence %s, from %s, %s",
         weights.name, size, weights.licence, weights.url, expected,
     )  # fmt: skip
     try:

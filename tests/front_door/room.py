@@ -41,7 +41,7 @@ def cli(*args: object) -> int:
 def readme_command() -> list[str]:
     """Return the words of README's first command, from `run` on."""
     line = re.search(
-        r"^    pip install -r requirements.txt && python reobj_track.py (.*)$",
+        r"^    pip install -r requirements.txt -e \. && python reobj_track.py (.*)$",
         (ROOT / "README.md").read_text(),
         re.M,
     )

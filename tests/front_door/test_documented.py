@@ -71,15 +71,15 @@ DOCUMENTED = {c: page_name(p) for p in reversed(PAGES) for c in reversed(command
 # ---- Not run here, and why ----
 
 ELSEWHERE = {
-    "pip install -r requirements.txt && python reobj_track.py run examples/room/room.mp4 "
+    "pip install -r requirements.txt -e . && python reobj_track.py run examples/room/room.mp4 "
     "--detections examples/room/detections.npz -o out": "test_commands.py, .ci/run",
     'pip install -e ".[dev]" && python -m pytest': ".ci/run",
     'pip install -e ".[docs]" && mkdocs serve': ".ci/run builds the site",
-    "pip install -r requirements.txt": ".ci/run",
+    "pip install -r requirements.txt -e .": ".ci/run",
     "pip install torch matplotlib onnx": ".ci/run installs them with the extras",
-    "pip install 'reobj-track[video]'": "an extra of pyproject.toml, checked below",
-    "pip install 'reobj-track[viewer]'": "an extra of pyproject.toml, checked below",
-    "pip install 'reobj-track[validate]'": "an extra of pyproject.toml, checked below",
+    "pip install av": "in the extra dev, which .ci/run installs",
+    "pip install trimesh rerun-sdk": "in the extra dev, which .ci/run installs",
+    "pip install jsonschema": "in the extra dev, which .ci/run installs",
     "python -m pytest benchmarks/tests": "it takes minutes",
     "python reobj_track.py --options": "test_commands.py",
     "python reobj_track.py models": "test_commands.py",
