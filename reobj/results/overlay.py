@@ -56,6 +56,8 @@ def film_layers(text: str) -> frozenset[str]:
 # ---- Boxes and labels --------------------------------------------------------------------------
 
 FONT = (cv2.FONT_HERSHEY_SIMPLEX, 0.45)  # and its scale: readable at 640 px width
+SMALL_AREA = 4  # relative to that of a label: a label would cover a quarter of the box or more
+DIRECTIONS = np.array([[0, -1], [0, 1], [1, 0], [-1, 0], [1, -1], [-1, -1], [1, 1], [-1, 1]])
 
 
 def draw_tracks(
@@ -70,7 +72,8 @@ def draw_tracks(
 ) -> None:
     """Draw the boxes and identities of one frame's rows, in place; interpolated boxes are dashed.
 
-    Labels do not overlap: one without free space at its box is left out.
+    Labels overlap neither each other nor small boxes; one without free space at its box gets a
+    line to it, one without any is left out.
 
     Args:
         labels: text of each identity; scale: image pixels per pixel of the tracks.
@@ -96,9 +99,11 @@ def draw_tracks(
     texts = [labels.get(obj, str(obj)) for obj in ids]
     sizes = np.array([_text_size(text) for text in texts], int).reshape(-1, 2)
     spots = place_labels(ids, sizes, boxes, (image.shape[1], image.shape[0]), positions)
-    for obj, text, spot in zip(ids, texts, spots, strict=True):
+    for obj, text, spot, size, box in zip(ids, texts, spots, sizes, boxes, strict=True):
         if spot is not None:
-            _draw_label(image, text, spot, marks.get(obj, object_color(obj)))
+            color = marks.get(obj, object_color(obj))
+            _draw_leader(image, np.array([*spot, *(spot + size)]), box, color)
+            _draw_label(image, text, spot, color)
 
 
 def _draw_box(image: Image, box: IntArray, color: Color, thickness: int, dashed: bool) -> None:
@@ -146,7 +151,9 @@ def place_labels(
     image_size: tuple[int, int],
     positions: dict[int, int],
 ) -> list[tuple[int, int] | None]:
-    """Choose a position for each label at its box, inside the image and free of other labels.
+    """Choose a position for each label near its box, inside the image.
+
+    It is free of other labels and of small boxes: those of less than SMALL_AREA times its area.
 
     Args:
         sizes: (N, 2) of the labels, boxes: (N, 4), both pixels.
@@ -157,10 +164,12 @@ def place_labels(
     taken = np.empty((0, 4), int)
     spots: list[tuple[int, int] | None] = []
     limit = np.array(image_size)
+    areas = (boxes[:, 2:] - boxes[:, :2]).prod(1)
     for obj, size, box in zip(ids, sizes, boxes, strict=True):
         corners = _label_corners(box, size).clip(0, np.maximum(limit - size, 0))  # (P, 2)
+        others = np.concatenate([taken, boxes[areas < SMALL_AREA * size.prod()]])
         free = (  # left of, above, right of or below all others
-            (corners[:, None] >= taken[:, 2:]) | (corners[:, None] + size <= taken[:, :2])
+            (corners[:, None] >= others[:, 2:]) | (corners[:, None] + size <= others[:, :2])
         ).any(2).all(1)  # fmt: skip
         order = [positions.get(obj, 0), *range(len(corners))]
         position = next((k for k in order if free[k]), None)
@@ -174,13 +183,26 @@ def place_labels(
 
 
 def _label_corners(box: IntArray, size: IntArray) -> IntArray:
-    """List the top-left corners (14, 2) of a label at a box, best first."""
+    """List the top-left corners (38, 2) of a label at a box, and away from it, best first."""
     x1, y1, x2, y2 = box.tolist()
     w, h = size.tolist()
     xs = (x1, x2 - w, (x1 + x2 - w) // 2)
     beside = ((x1 - w, y1), (x2, y1))
     rows = [(x, y) for y in (y1 - h, y1 + 2, y2 - h - 1, y2) for x in xs]
-    return np.array([*rows[:6], *beside, *rows[6:]])
+    near = np.array([*rows[:6], *beside, *rows[6:]])
+    middle = np.array([x1 + x2 - w, y1 + y2 - h]) / 2
+    reach = np.array([x2 - x1 + w, y2 - y1 + h]) / 2  # from there on it does not cover the box
+    away = [middle + DIRECTIONS * (reach + gap * h) for gap in (1, 2, 4)]
+    return np.concatenate([near, np.concatenate(away).round().astype(int)])
+
+
+def _draw_leader(image: Image, label: IntArray, box: IntArray, color: Color) -> None:
+    """Draw a line from a label (4,) to its box (4,) if they do not touch."""
+    nearest = box.reshape(2, 2).mean(0).clip(label[:2], label[2:])  # of the label
+    end = nearest.clip(box[:2], box[2:])
+    if np.abs(nearest - end).max() > 2:
+        start, stop = (tuple(p.round().astype(int).tolist()) for p in (nearest, end))
+        cv2.line(image, start, stop, color, 1, cv2.LINE_AA)
 
 
 # ---- Ellipses ----------------------------------------------------------------------------------
@@ -551,6 +573,16 @@ def _former_places(result: Result) -> dict[int, tuple[FormerPlaces, Array]]:
 # ---- The video ---------------------------------------------------------------------------------
 
 
+def film_fps(video: Video) -> float:
+    """Return the frame rate of the overlay video: that of the source.
+
+    Images without times: so that it lasts 20 s, with 2 to 10 a second, which all encoders keep.
+    """
+    if video.files and not video.times_are_known:
+        return min(max(video.expected / 20, 2.0), 10.0)
+    return (video.fps or IMAGE_FPS) / video.config.every
+
+
 class Overlay:
     """Draw the overlay video frame by frame.
 
@@ -562,7 +594,7 @@ class Overlay:
 
     def __init__(self, result: Result, path: Path, video: Video, layers: str = "solids") -> None:
         """Open the video; the suffix of `path` is replaced by that of the available format."""
-        self.fps = (video.fps or IMAGE_FPS) / video.config.every
+        self.fps = film_fps(video)
         self.writer = FilmWriter(path, self.fps, video.size)
         self.path = self.writer.path
         self.size = self.writer.size
