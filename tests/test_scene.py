@@ -518,6 +518,21 @@ def test_doubtful_objects_are_shown_on_request(browser: Browser, page: Path) -> 
     browser.eval("S.objects[2].status = 'ok'; replay()")
 
 
+def test_implausible_objects_are_marked_and_not_counted(browser: Browser, page: Path) -> None:
+    """Dashed and dim, with the reason; neither hidden nor part of the initial view."""
+    browser.open(page)
+    before = browser.eval("room.radius")
+    browser.eval("""Object.assign(S.objects[2], { status: 'implausible',
+        reason: 'size is 7.2 sigma', center: [40, 0, 0.3] }); replay(); fillScene(); VIEWS.reset(); draw()""")
+    assert browser.eval("[here[2].row.hidden, here[2].group.visible]") == [False, True]
+    assert browser.eval("here[2].row.innerText").endswith("implausible size")
+    assert browser.eval("here[2].row.title") == "size is 7.2 sigma"
+    dashed = "here.slice(0, 3).map(o => Boolean(o.group.parts.wire.material.dashed))"
+    assert browser.eval(dashed) == [False, False, True]
+    assert browser.eval("room.radius") < 1.5 * before
+    assert "suitcase 0" in browser.eval("$('classes').textContent")
+
+
 def test_a_distance_has_the_sigma_of_both_ends_and_of_the_scale(
     browser: Browser, page: Path
 ) -> None:

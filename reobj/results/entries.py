@@ -32,8 +32,9 @@ class Object:
         id: identity in the tracks, from 1. class_name: with the largest sum of scores.
         score: mean of the boxes.
         status: "ok", "prior_dominated" (some size depends mainly on the category's prior),
-            "doubtful" (probably a false positive), "rejected" (no shape), "tracked" (2D: no
-            cameras). reason: for the status.
+            "implausible" (size more than 4 sigma from the usual ones of its category), "doubtful"
+            (probably a false positive), "rejected" (no shape), "tracked" (2D: no cameras).
+            reason: for the status.
         confidence: probability that it is a real, separate object; None without cameras.
         classes: probabilities of the two most likely. support: "box", "cylinder" or "ellipsoid".
         center, half_axes: (3,) of the ellipsoid; quat_wxyz: (4,) world_from_obj.
@@ -84,8 +85,13 @@ class Object:
         return f"Object({', '.join(facts)})"
 
     @property
+    def counted(self) -> bool:
+        """True if it is one of the objects found: neither doubtful nor implausible."""
+        return self.status not in ("doubtful", "implausible")
+
+    @property
     def located(self) -> bool:
-        """True if a shape was fitted and the object is not doubtful."""
+        """True if a shape was fitted and the object is neither doubtful nor implausible."""
         return self.status in ("ok", "prior_dominated")
 
     def to_json(self) -> dict[str, Any]:

@@ -16,13 +16,14 @@ if TYPE_CHECKING:
 
 def summary(result: Result) -> str:
     """Write the report that `run` prints."""
-    counted = [o for o in result.objects if o.status != "doubtful"]
+    counted = [o for o in result.objects if o.counted]
     lines = _table(result, counted)
     lines += _reasons(counted)
     lines += _class_counts(result, counted)
     if result.changes is not None:
         lines += wrapped(result.changes.summary())
-    doubtful = len(result.objects) - len(counted)
+    lines += _implausible(result)
+    doubtful = sum(o.status == "doubtful" for o in result.objects)
     if doubtful > 0:
         lines.append(f"low confidence: {doubtful} more, probably false positives (objects.json)")
     lines += _cameras(result)
@@ -104,6 +105,13 @@ def _reasons(counted: Sequence[Object]) -> list[str]:
     for reason, ids in objects_of.items():
         lines += wrapped(f"{reason}: {', '.join(map(str, ids))}")
     return lines
+
+
+def _implausible(result: Result) -> list[str]:
+    """List the objects that are not counted because of their size, with the reason of each."""
+    odd = [o for o in result.objects if o.status == "implausible"]
+    texts = [f"{o.class_name} {o.id} ({o.reason})" for o in odd]
+    return wrapped(f"implausible, not counted: {', '.join(texts)}") if texts else []
 
 
 def _class_counts(result: Result, counted: Sequence[Object]) -> list[str]:

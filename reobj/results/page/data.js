@@ -86,6 +86,7 @@ function pointsOf(part) {                        // level positions, colours
 
 const seenAt = (o, step) => o.seen.some((s, i) => i % 2 === 0 && s <= step
   && step <= o.seen[i + 1]);
+const counted = (o) => o.status !== "doubtful" && o.status !== "implausible";  // as in entries.py
 const allowed = (o) => !state.hidden.has(o.class) && !hiddenByKind(changeOf(o))
   && ($("doubtful").checked || o.status !== "doubtful");
 const shown = () => solid.filter(allowed);
