@@ -46,15 +46,29 @@ def test_without_poses_objects_equal_the_tracks() -> None:
         assert (found.status, found.reason) == ("tracked", "") and not found.located
         assert found.center is None and found.size_m is None and found.views == 0
         assert found.tracklet_ids == [found.id, found.id + 10] and found.frames_seen == 8
-        assert found.visits == [[0, 4], [5, 7]] and found.score == 0.9
+        assert found.visits == [[0, 7]] and found.score == 0.9
     assert result.world.units is None and result.world.to_json()["registered_frames"] == 0
 
 
-def test_visits_are_in_the_order_of_time() -> None:
-    """A later tracklet may have the smaller number."""
-    tracks = tracks_of(walk(8))
-    tracks = with_columns(tracks, tracklet_id=np.where(tracks.frame > 4, 1, 7))
-    assert fitted(tracks, None).objects[0].visits == [[0, 4], [5, 7]]
+@pytest.mark.parametrize(
+    ("every", "gap", "visits"),
+    [
+        (1, 60, [[0, 199]]),  # 2 s at 30 Hz
+        (1, 61, [[0, 50], [111, 199]]),
+        (90, 90, [[0, 17910]]),  # every frame with detections is 3 s after the one before
+        (90, 180, [[0, 4500], [4680, 17910]]),
+    ],
+)
+def test_visits_are_times_in_view_with_short_gaps(
+    every: int, gap: int, visits: list[list[int]]
+) -> None:
+    """Of object 1, whatever its tracklets are; the others are seen in all frames."""
+    tracks = tracks_of(walk(200))
+    tracks = with_columns(tracks, frame=every * tracks.frame, tracklet_id=tracks.frame % 19)
+    inside = (tracks.frame > 50 * every) & (tracks.frame < 50 * every + gap)
+    found = fitted(tracks[(tracks.track_id > 1) | ~inside], None).objects
+    assert found[0].visits == visits and len(found[0].tracklet_ids) == 19
+    assert found[1].visits == [[0, 199 * every]]
 
 
 def test_views_are_frames_with_a_pose() -> None:

@@ -523,7 +523,8 @@ def test_implausible_objects_are_marked_and_not_counted(browser: Browser, page: 
     browser.open(page)
     before = browser.eval("room.radius")
     browser.eval("""Object.assign(S.objects[2], { status: 'implausible',
-        reason: 'size is 7.2 sigma', center: [40, 0, 0.3] }); replay(); fillScene(); VIEWS.reset(); draw()""")
+        reason: 'size is 7.2 sigma', center: [40, 0, 0.3] });
+        replay(); fillScene(); VIEWS.reset(); draw()""")
     assert browser.eval("[here[2].row.hidden, here[2].group.visible]") == [False, True]
     assert browser.eval("here[2].row.innerText").endswith("implausible size")
     assert browser.eval("here[2].row.title") == "size is 7.2 sigma"
@@ -666,7 +667,8 @@ def test_corrections_made_in_the_viewer_are_applied(
     browser.eval("edit(edits.delete(objects.find(o => o.id === 6)))")
     browser.press("u")
     assert browser.eval("objects.map(o => o.id)") == [1, 2, 3, 6]
-    assert browser.eval("objects.find(o => o.id === 2).visits.length") == 2
+    merged = "(o => [o.visits.length, o.tracklets.length])(objects.find(o => o.id === 2))"
+    assert browser.eval(merged) == [1, 2]
     browser.picture(SCREENSHOTS / "edit.png")
     browser.send("Page.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
     browser.eval("$('save').click()")
@@ -683,8 +685,8 @@ def test_corrections_made_in_the_viewer_are_applied(
     browser.open(out / "scene.html")
     assert browser.eval("[objects.map(o => [o.id, o.class]), S.edits.length]") == [shown, 3]
     browser.eval("document.querySelector('#edits li button').click()")  # take the merge back
-    browser.eval("edit(edits.split(objects[1], [objects[1].visits[1]]))")
-    assert browser.eval("objects.map(o => [o.id, o.visits.length])")[-1] == [7, 1]
+    browser.eval("edit(edits.splitTracklet(objects[1], objects[1].tracklets[1][0]))")
+    assert browser.eval("objects.map(o => [o.id, o.tracklets.length])")[-1] == [7, 1]
     assert [e["do"] for e in json.loads(browser.eval("editsFile()"))["edits"]] == [
         "rename", "delete", "split"
     ]  # fmt: skip
@@ -693,6 +695,51 @@ def test_corrections_made_in_the_viewer_are_applied(
     before = browser.asked
     browser.open(out / "scene.html")  # unsaved corrections: the browser shows a dialog
     assert browser.asked == before + 1
+
+
+def test_a_visit_is_split_at_the_slider(
+    browser: Browser, parted_folder: Path, tmp_path: Path
+) -> None:
+    """The preview has the frames that the split gives in Python, also after a second split."""
+    out = shutil.copytree(parted_folder, tmp_path / "out")
+    browser.open(out / "scene.html")
+    browser.eval("select(here[1]); goTo(0)")
+    assert browser.eval("$('cut').innerText").startswith("To split a visit, move the slider")
+    browser.eval("goTo(13)")
+    assert browser.eval("$('cut').innerText") == "split at frame 13"
+    browser.eval("$('cut').querySelector('button').click()")
+    assert browser.eval("pending.map(said)") == ["split frames 13–39 off 2"]
+    browser.eval("select(here.find(o => o.id === 7)); goTo(30)")
+    browser.eval("$('cut').querySelector('button').click()")
+    browser.eval("edit(edits.rename(objects.find(o => o.id === 8), 'stool'))")
+    browser.picture(SCREENSHOTS / "split.png")
+    shown = browser.eval("objects.map(o => [o.id, o.class, o.visits, pairs(o.seen)])")
+    assert {i: v for i, _, v, _ in shown if i in (2, 7, 8)} == {
+        2: [[0, 12]], 7: [[13, 29]], 8: [[30, 39]],
+    }  # fmt: skip
+    assert all(visits == seen for _, _, visits, seen in shown)  # each step is a frame here
+    (tmp_path / "e.json").write_text(browser.eval("editsFile()"))
+    assert rt.main(["objects", str(out), "--edits", str(tmp_path / "e.json")]) == 0
+    found = [[o.id, o.class_name, o.visits] for o in rt.Result.load(out).objects]
+    assert found == [row[:3] for row in shown] and complaints(browser) == []
+    browser.eval("saved = true")
+
+
+def test_tracklets_are_listed_below_the_visits(browser: Browser, page: Path) -> None:
+    """Object 2 has two tracklets with a gap of .2 s: one visit. Two boxes are a split preview."""
+    browser.open(page)
+    browser.eval("select(objects[1])")
+    text = browser.eval("$('panel').textContent")
+    assert "Visits (1), frames0–23" in text and "tracklets (2)2: 0–8" in text and "6: 15–23" in text
+    assert "split off" not in browser.eval("document.querySelector('.visit').innerText")
+    browser.eval("[...document.querySelectorAll('#panel details button')].at(-1).click()")
+    halves = browser.eval("objects.filter(o => o.edited).map(o => [o.id, o.visits, o.tracks])")
+    assert halves == [[2, [[0, 8]], [2]], [5, [[15, 23]], [6]]]
+    browser.eval("undo(); edit(edits.merge(objects[0], objects[1]))")
+    joined = "(o => [o.visits, o.tracks, o.tracklets.length, o.refs.length])(objects[0])"
+    assert browser.eval(joined) == [[[0, 23]], [1, 2, 6], 3, 42]
+    browser.eval("saved = true")
+    assert complaints(browser) == []
 
 
 def test_classes_can_be_hidden(browser: Browser, page: Path) -> None:
@@ -808,7 +855,7 @@ def test_a_2d_result_opens(browser: Browser, tmp_path: Path) -> None:
     browser.eval("here[1].row.click(); goTo(3)")
     browser.settle()
     assert browser.eval("document.querySelectorAll('.crops img').length") == 8
-    assert browser.eval("here[1].row.querySelectorAll('.bar span:not(.head)').length") == 2
+    assert browser.eval("here[1].row.querySelectorAll('.bar span:not(.head)').length") == 1
     rows = "[...document.querySelectorAll('.row')].map((row) => row.className.split(' ')[1])"
     assert set(browser.eval(rows)) == {"tracked"}
     assert "tracked" in browser.eval("$('panel').innerText")

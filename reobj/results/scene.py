@@ -27,7 +27,7 @@ from reobj.cameras import Camera, Poses, invert_rigid, place_of, undistort_boxes
 from reobj.files import Progress, atomic, base64_text, rounded, significant
 from reobj.poses.floor import NOISE
 from reobj.results.changes import EarlierSession
-from reobj.results.entries import Object, World
+from reobj.results.entries import Object, World, visit_gap
 from reobj.results.origin import centred
 from reobj.results.overlay import Overlay, film_layers
 from reobj.results.report import sides
@@ -261,6 +261,7 @@ def write_scene(
         "thumbs": [[frame, data, _boxes_in(result, frame)] for frame, data in pictures.frames],
         "doubtful": doubtful,
         "size": {"width": result.video.width, "height": result.video.height},
+        "visit_gap": visit_gap(result.tracks.frame, result.video.fps),
         "edits": [] if result.edits is None else result.edits.entries,
         "map": "" if result.poses is None else result.poses.map_id,
         "why_flat": _why_flat(result),
@@ -348,8 +349,8 @@ def _scene_object(
     """Collect the data of an object for the viewer.
 
     Its entry of objects.json, colour, crops, size as text, the steps in which it is seen (first,
-    last, first, last ...), and its visits, each with its best box, the reference of edits (first,
-    last, frame, x1, y1, x2, y2).
+    last, first, last ...), its tracklets (number, first, last frame), and boxes by which edits
+    refer to it (frame, tracklet, x1, y1, x2, y2).
     """
     rows_of_object = tracks[tracks.track_id == obj.id]
     seen = np.isin(steps, rows_of_object.frame)
@@ -358,20 +359,38 @@ def _scene_object(
     detected = rows_of_object
     if detected.score.any():  # without interpolated boxes
         detected = detected[detected.score > 0]
-    visits = []
-    for rows in rows_by(detected.tracklet_id):
-        best = rows[detected.score[rows].argmax()]
-        box = detected.xyxy[best].round(1).tolist()
-        visits.append([*detected.frame[rows[[0, -1]]].tolist(), int(detected.frame[best]), *box])
+    tracklets = [
+        [int(detected.tracklet_id[rows[0]]), *detected.frame[rows[[0, -1]]].tolist()]
+        for rows in rows_by(detected.tracklet_id)
+    ]
     return obj.to_json() | {
         "center": None if obj.center is None else (obj.center - origin).tolist(),
         "cov": "" if obj.cov is None else base64_text(obj.cov, "<f4"),
         "color": object_color(obj.id)[::-1],
         "sides": sides(obj),
         "seen": runs.tolist(),
-        "visits": sorted(visits),
+        "visits": obj.visits,
+        "tracklets": sorted(tracklets, key=lambda tracklet: tracklet[1:]),
+        "refs": _references(detected),
         "crops": pictures.crops[obj.id],
     }
+
+
+def _references(detected: Tracks, most: int = 100) -> list[list[float]]:
+    """Choose boxes of an object, by time: the best one of each tracklet, and `most` spread evenly.
+
+    Args:
+        most: 100 boxes of 50 objects are .2 MB of the page.
+    Returns:
+        frame, tracklet, x1, y1, x2, y2 of each, native pixels.
+    """
+    best = [rows[detected.score[rows].argmax()] for rows in rows_by(detected.tracklet_id)]
+    even = np.linspace(0, len(detected) - 1, min(most, len(detected))).round().astype(np.int64)
+    row = np.union1d(np.array(best, np.int64), even)
+    row = row[np.argsort(detected.frame[row], kind="stable")]
+    numbers = zip(detected.frame[row].tolist(), detected.tracklet_id[row].tolist(), strict=True)
+    boxes = detected.xyxy[row].round(1).tolist()
+    return [[*pair, *box] for pair, box in zip(numbers, boxes, strict=True)]
 
 
 def _earlier_sessions(

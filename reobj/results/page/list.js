@@ -106,7 +106,7 @@ function facts(o) {
   if (o.parallax_deg !== null) rows.push(["parallax", `${o.parallax_deg}°`]);
   if (o.reprojection_iou_median !== null) rows.push(["box overlap", o.reprojection_iou_median]);
   if (o.dropped_boxes) rows.push(["boxes left out", o.dropped_boxes]);
-  return rows.concat([["tracklets", o.tracks.join(", ")]]);
+  return rows;
 }
 
 function select(o) {
@@ -135,4 +135,5 @@ function select(o) {
     ...(o.then ? [] : [...editButtons(o), ...visitRows(o)]),
     ...(links.length ? [el("h3", {}, "Merges and splits"),
       el("ul", {}, ...links.map((l) => el("li", {}, evidence(l))))] : []));
+  fillCut();
 }

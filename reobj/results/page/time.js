@@ -37,6 +37,7 @@ function goTo(step) {
   }
   $("list").style.setProperty("--now", `${100 * (frameOf(step) - first) / (last - first + 1)}%`);
   here.forEach((o) => o.row.classList.toggle("now", seenAt(o, step)));
+  fillCut();
   if (state.follow && after && !state.ride) followTo(before, after);
   redraw();
 }
