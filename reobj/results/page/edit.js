@@ -49,7 +49,7 @@ const hue = (id) => {                            // `object_color` in types.py
 };
 const sure = (o) => o.status !== "doubtful" ? {} : { status: o.center ? "ok" : "tracked", reason: "" };
 const NO_SOLID = { center: null, half_axes: null, size: null, size_m: null, sides: [],
-  status: "tracked", reason: "its solid is fitted by objects OUT --edits" };
+  status: "tracked", reason: SERVED ? "its solid is fitted by Save" : "its solid is fitted by objects OUT --edits" };
 
 const APPLY = {
   merge(list, { object, with: other }) {
@@ -63,7 +63,8 @@ const APPLY = {
       visits: joined(both("visits")), tracklets, crops: both("crops"), refs: both("refs"),
       frames_seen: kept.frames_seen + gone.frames_seen,
       seen: stepsOf([...pairs(kept.seen), ...pairs(gone.seen)].map((run) => run.map(frameOf))),
-      tracks: [...kept.tracks, ...gone.tracks], ids: [...kept.ids, ...gone.ids], edited: true };
+      tracks: [...kept.tracks, ...gone.tracks], ids: [...kept.ids, ...gone.ids],
+      sources: [...kept.sources, ...gone.sources], edited: true };
     return list.filter((o) => o !== gone).map((o) => o === kept ? made : o);
   },
   split(list, { object, frames, visits }) {
@@ -109,7 +110,7 @@ function splitTracklets(o, visits) {             // the tracklets of these boxes
 function replay() {                              // from the objects of the page
   const chosen = state.selected?.id;
   objects = pending.reduce((list, edit) => APPLY[edit.do](list, edit),
-    S.objects.map((o) => ({ ...o, ids: [o.id] })));
+    S.objects.map((o) => ({ ...o, ids: [o.id], sources: [o.id] })));
   Object.assign(state, { selected: null, merging: null, measured: [] });
   gather();
   if (renderer) fillSolids();
@@ -144,24 +145,53 @@ const said = (e) => ({
 function fillEdits() {
   const bar = $("edits"), earlier = S.edits.map((e, i) => el("li",
     { className: takenBack.has(i) ? "undone" : "dim" }, `${said(e)} (applied) `,
-    el("button", { title: "undo; visible after the next fit", onclick: () => {
+    el("button", { title: SERVED ? "undo with Save" : "undo; visible after the next fit", onclick: () => {
       takenBack[takenBack.has(i) ? "delete" : "add"](i);
       saved = false;
       fillEdits();
     } }, takenBack.has(i) ? "keep" : "×")));
-  bar.hidden = !pending.length && !S.edits.length;
+  bar.hidden = !pending.length && !S.edits.length && !job.undo && !job.text;
   const changed = pending.length || takenBack.size;
   bar.replaceChildren(el("b", {}, "Corrections"),
     el("ol", {}, ...earlier, ...pending.map((e) => el("li", {}, said(e)))),
-    el("button", { id: "undo", disabled: !pending.length, onclick: undo }, "Undo"),
-    el("button", { id: "save", className: "main", disabled: !changed, onclick: save },
-      "Save edits.json"));
+    el("span", { id: "job", hidden: !job.text, className: job.failed ? "fault" : "dim" }, job.text),
+    el("button", { id: "undo", disabled: !pending.length || job.running, onclick: undo }, "Undo"),
+    ...(SERVED ? [el("button", { id: "undo-saved", disabled: !job.undo || changed || job.running,
+      title: "restore the result before the last saved corrections",
+      onclick: () => send("undo", "") }, "Undo the last save")] : []),
+    el("button", { id: "save", className: "main", disabled: !changed || job.running, onclick: save },
+      SERVED ? "Save" : "Save edits.json"));
 }
 
 const editsFile = () => JSON.stringify({ format: "reobj-edits", version: 1, map: S.map,
   edits: [...S.edits.filter((_, i) => !takenBack.has(i)), ...pending] }, null, 1) + "\n";
 
+// ---- Served: the corrections are applied at once ----
+let job = SERVED ? SERVED.state : {};            // {running, failed, text, undo, version}
+const refused = (answer) => answer.text().then((text) => Promise.reject(new Error(text.trim())));
+const answered = (answer) => answer.ok ? answer.json() : refused(answer);
+
+function failed(error) {
+  job = { ...job, running: false, failed: true, text: error.message };
+  fillEdits();
+}
+function send(what, body) {                      // "edits" or "undo"
+  fetch(`${what}?version=${SERVED.state.version}`, { method: "POST", body }).then(answered)
+    .then((state) => { job = state; watchJob(); }).catch(failed);
+}
+function watchJob() {                            // until the result is new; the page is then read again
+  fillEdits();
+  if (job.running) {
+    setTimeout(() => fetch("state").then(answered).then((state) => { job = state; watchJob(); })
+      .catch(failed), 300);
+  } else if (!job.failed) {
+    saved = true;
+    location.reload();
+  }
+}
+
 function save() {
+  if (SERVED) { send("edits", editsFile()); return; }
   const url = URL.createObjectURL(new Blob([editsFile()], { type: "application/json" }));
   el("a", { href: url, download: "edits.json" }).click();
   setTimeout(() => URL.revokeObjectURL(url), 10000);

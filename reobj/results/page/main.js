@@ -14,7 +14,7 @@ function gather() {                              // the objects of the part
 function enter(part) {                           // show one part of the cameras' path, a world
   if (here) select(null);
   if (state.ride) setRide(false);
-  Object.assign(state, { part, step: -1, measured: [] });
+  Object.assign(state, { part, step: -1, seat: -1, measured: [] });
   setFollow(false);
   level = levelFrame(part);
   $("session").hidden = !EARLIER.length || !inMap(part);
@@ -137,7 +137,7 @@ startChanges();
 startSessions();
 $("doubtful").checked = S.doubtful;
 $("doubtful-label").hidden = !S.objects.some((o) => o.status === "doubtful");
-objects = S.objects.map((o) => ({ ...o, ids: [o.id] }));
+objects = S.objects.map((o) => ({ ...o, ids: [o.id], sources: [o.id] }));
 if (S.why_flat || !prepare()) {
   document.body.classList.add("flat");
   $("view").prepend(el("p", { id: "why" }, `No 3D view: ${S.why_flat || "no WebGL here"}. Below: `
@@ -145,4 +145,4 @@ if (S.why_flat || !prepare()) {
 }
 for (const id of ["follow", "ride", "measure"]) press(id, false);
 enter(0);
-fillEdits();
+if (job.running) watchJob(); else fillEdits();

@@ -240,9 +240,9 @@ function sit(cam) {                              // the seat sees what the camer
   seat.updateMatrixWorld(true);
 }
 
-const riding = () => Boolean(state.ride && cams[state.step]);
+const riding = () => Boolean(state.ride && cams[state.seat]);
 function viewpoint() {
-  if (riding()) { sit(cams[state.step]); return seat; }
+  if (riding()) { sit(cams[state.seat]); return seat; }
   const reach = orbit.position.distanceTo(controls.target);
   orbit.aspect = canvas.clientWidth / Math.max(canvas.clientHeight, 1);
   orbit.near = reach / 100;
