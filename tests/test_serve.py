@@ -71,10 +71,12 @@ class Client:
         return json.loads(self.get("/state")[2])
 
     def finished(self) -> Any:
-        """Wait for the worker; return the state."""
+        """Wait for the worker; return the state with all texts before it as `texts`."""
+        texts = []
         for _ in range(600):
             if not (state := self.state())["running"]:
-                return state
+                return state | {"texts": texts}
+            texts.append(state["text"])
             time.sleep(0.1)
         raise AssertionError("the worker does not end")
 
@@ -150,7 +152,10 @@ def test_saved_corrections_are_applied_and_undone(out: Path) -> None:
         for text, left in ((first, [1, 2, 3, 4, 5]), (both, [1, 3, 4, 5])):
             status, answer = client.post(f"/edits?version={client.state()['version']}", text)
             assert status == 200 and json.loads(answer)["running"], answer
-            assert not client.finished()["failed"] and ids(out) == left
+            state = client.finished()
+            assert not state["failed"] and ids(out) == left
+            assert state["texts"][0] == "starting"
+            assert any(re.match(r"(objects|write) .*%", text) for text in state["texts"])
         assert client.state()["undo"] == 2
         for left in ([1, 2, 3, 4, 5], [1, 2, 3, 4, 5, 6]):
             status, _ = client.post(f"/undo?version={client.state()['version']}")
@@ -337,12 +342,16 @@ def test_a_file_that_is_not_the_recording_is_not_sent(film_folder: Path, tmp_pat
     """A folder that names another file as its recording, and a recording that changed."""
     out = shutil.copytree(film_folder, tmp_path / "out")
     binding = json.loads((out / "cache/source.json").read_text())
-    secret = tmp_path / "secret.txt"
-    secret.write_text("secret")
-    (out / "cache/source.json").write_text(json.dumps(binding | {"source": str(secret)}))
-    with serving(out) as client:
-        assert client.get("/recording")[0] == 404
-        assert b'"recording": ""' in client.get("/")[2]
+    recording = Path(binding["source"])
+    text = tmp_path / "secret.txt"
+    text.write_text("secret")
+    other = shutil.copy(recording, tmp_path / "secret.webm")
+    same_name = shutil.copy(recording, tmp_path / recording.name)  # of another time
+    for source in (text, other, same_name):
+        (out / "cache/source.json").write_text(json.dumps(binding | {"source": str(source)}))
+        with serving(out) as client:
+            assert client.get("/recording")[0] == 404
+            assert b'"recording": ""' in client.get("/")[2]
 
 
 # ---- In the browser ----
@@ -446,7 +455,8 @@ def test_the_recording_plays_behind_the_shapes(browser: Browser, film_folder: Pa
             }}, 15); }})""")
         browser.eval("play()")
         seen = np.array(browser.eval("seen"))
-        assert len(set(seen[:, 0])) > 3 and np.abs(seen[:, 1] - 20 * seen[:, 0]).max() < 8
+        fits = np.abs(seen[:, 1] - 20 * seen[:, 0]) < 8
+        assert len(set(seen[:, 0])) > 3 and fits.mean() > 0.9  # a busy machine may miss a frame
         assert browser.eval("[playing, film.paused]") == [None, True]
         assert own_complaints(browser) == []
 

@@ -2,7 +2,7 @@
 // of the page. The view moves to a step when its picture is there.
 const SERVED = JSON.parse($("served").textContent);   // what the server of `serve` offers, or null
 const film = $("film");
-let filmed = false, backdrop = null;             // {step, image}: the picture of state.seat
+let filmed = false, backdrop = null;             // {step, image, raw: not undistorted} of state.seat
 const timeOf = (step) => S.steps.time[step];
 const HALF_FRAME_S = 0.5 * S.steps.frame_s;
 
@@ -18,6 +18,7 @@ function startFilm() {                           // at the first ride: nothing i
   film.onseeked = () => {
     const { sought, asked } = state;
     state.sought = null;
+    if (playing === -1 || sought === null) return;  // the film goes on: `followFilm` has its frames
     if (asked !== sought) seek(asked); else arrive(sought, film);
   };
   film.onended = () => { if (playing) playFilm(steps[0]); };
@@ -49,7 +50,7 @@ function arrive(step, image) {
     [still.width, still.height] = [film.videoWidth, film.videoHeight];
     still.getContext("2d").drawImage(film, 0, 0);
   }
-  backdrop = { step, image: image === film ? still : image };
+  backdrop = { step, image: image === film ? still : image, raw: everyFrame() };
   state.seat = step;
   redraw();
 }
@@ -70,10 +71,10 @@ function followFilm(_, { mediaTime }) {
 
 // ---- Drawing: frames of the recording are undistorted cell by cell, as the shapes are ----
 const LENS = S.camera?.lens ? floats(S.camera.lens.grid) : null;   // distorted place of each corner, 0 to 1
-function paint(canvas, image) {
+function paint(canvas, { image, raw }) {
   const pen = canvas.getContext("2d"), { width, height } = canvas;
   const [w, h] = [image.naturalWidth || image.width, image.naturalHeight || image.height];
-  if (!LENS || !everyFrame()) { pen.drawImage(image, 0, 0, width, height); return; }
+  if (!LENS || !raw) { pen.drawImage(image, 0, 0, width, height); return; }
   const { columns, rows } = S.camera.lens;
   const corner = (i, j, k) => LENS[2 * (j * (columns + 1) + i) + k];
   pen.clearRect(0, 0, width, height);
@@ -95,10 +96,10 @@ function placePicture(inside) {
   const { scale, x, y } = pictureRect(), { width, height } = S.camera;
   if (!back.hidden) {
     const size = [width, height].map((side) => Math.round(side * scale * devicePixelRatio));
-    const key = `${frameOf(state.seat)} ${size} ${everyFrame()}`;
+    const key = `${frameOf(state.seat)} ${size} ${backdrop.raw}`;
     if (back.dataset.key !== key) {
       [back.width, back.height] = size;
-      paint(back, backdrop.image);
+      paint(back, backdrop);
     }
     Object.assign(back.dataset, { key, frame: frameOf(state.seat) });
     Object.assign(back.style, { left: `${x}px`, top: `${y}px`, width: `${width * scale}px`,
