@@ -127,7 +127,7 @@ class RobustOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StatusLimits:
-    """Limits of the status of a fit: "rejected", "prior_dominated" or "ok".
+    """Limits of the status of a fit: "rejected", "implausible", "prior_dominated" or "ok".
 
     Attributes:
         max_noise: Noise factor above which a fit is rejected: the errors of its boxes are about a
@@ -135,6 +135,8 @@ class StatusLimits:
         min_inlier_share: Fraction of inlier views below which it is rejected.
         absurd_size: Growth over the size prior (sigma) above which it is rejected.
         odd_size: Distance from the size prior (sigma) above which `reason` reports the size.
+        implausible_size: The same above which the status is "implausible": the shape is wrong, or
+            the category.
         loose_size: Sigma of a log axis above which its size counts as not measured: the status is
             "prior_dominated", and the category is not overruled.
         min_parallax_deg: Parallax (deg) below which the depth rests on the size prior.
@@ -144,6 +146,7 @@ class StatusLimits:
     min_inlier_share: float = 0.4
     absurd_size: float = 6.0
     odd_size: float = 3.5
+    implausible_size: float = 4.0
     loose_size: float = 0.35
     min_parallax_deg: float = 1.0
 
@@ -2105,7 +2108,7 @@ class ObjectFits:
     support: npt.NDArray[np.str_]  # (O,) shape, one of SUPPORTS
     inlier: BoolArray  # (F, O)
     rms_px: Array  # (O,) of the inlier edges
-    status: npt.NDArray[np.str_]  # (O,) "ok" | "prior_dominated" | "rejected"
+    status: npt.NDArray[np.str_]  # (O,) "ok" | "prior_dominated" | "implausible" | "rejected"
     reason: list[str]  # (O,)
     parallax_deg: Array  # (O,) widest angle between inlier viewing rays
     prior_share: Array  # (O, 3) posterior / prior sigma of each log axis; 1: the data add nothing
@@ -2340,7 +2343,7 @@ def _status(
     Args:
         parallax: (B,) deg; seen: (B,) number of views.
     Returns:
-        "ok", "prior_dominated" or "rejected", and the reason (empty: none), B each.
+        "ok", "prior_dominated", "implausible" or "rejected", and the reason (empty: none), B each.
     """
     weak = posterior.prior_share > np.sqrt(0.5)  # more information from the prior than from data
     weak |= posterior.size_sigma > limits.loose_size
@@ -2360,7 +2363,11 @@ def _status(
             doubt.append(f"{guessed} guessed from the category")
         if parallax[b] < limits.min_parallax_deg:
             doubt.append(f"distance guessed from the category, parallax {parallax[b]:.1f} deg")
-        status.append("rejected" if rejection else "prior_dominated" if doubt else "ok")
+        status.append("prior_dominated" if doubt else "ok")
+        if deviation[b] > limits.implausible_size:
+            status[b] = "implausible"
+        if rejection:
+            status[b] = "rejected"
         if deviation[b] > limits.odd_size:
             why = "another object?" if growth[b] > 0.7 * deviation[b] else "partly occluded?"
             doubt.append(f"size is {deviation[b]:.1f} sigma from its category's: {why}")

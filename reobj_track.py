@@ -48,6 +48,7 @@ import re
 import sys
 import time
 import traceback
+import webbrowser
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -139,6 +140,7 @@ from reobj.results.saving import (
     write_trajectories,
 )
 from reobj.results.scene import write_pictures
+from reobj.results.serve import Server
 from reobj.results.stages import collect_tracks, detect_all, detections_key, keep_detections
 from reobj.results.workspace import Workspace
 from reobj.sources.detection_files import DetectConfig, read_detections, read_tracks
@@ -1740,7 +1742,7 @@ def _write(job: _Job, result: Result) -> Result:
 def _parser() -> argparse.ArgumentParser:
     commands = {
         "run": _cmd_run, "track": _cmd_run, "poses": _cmd_poses, "objects": _cmd_objects,
-        "eval": _cmd_eval, "export": _cmd_export, "map": _cmd_map,
+        "serve": _cmd_serve, "eval": _cmd_eval, "export": _cmd_export, "map": _cmd_map,
         "models": _cmd_models,
     }  # fmt: skip
     return make_parser(Config(), commands, tuple(EXPORTS), tuple(MAP_EXPORTS))
@@ -1781,6 +1783,18 @@ def _cmd_objects(args: argparse.Namespace) -> int:
         return 2 if faults else 0
     config = config_from_args(_last_config(args.out), args)
     print(refit(args.out, config, args.tracks, args.edits).summary())
+    return 0
+
+
+def _cmd_serve(args: argparse.Namespace) -> int:
+    with Server(args.out, args.port, [sys.executable, __file__]) as server:
+        print(f"viewer of {args.out}: {server.url}\nCtrl-C ends it", flush=True)
+        if args.open:
+            webbrowser.open(server.url)
+        try:
+            server.serve_forever()
+        except KeyboardInterrupt:
+            server.corrections.stop()
     return 0
 
 

@@ -336,7 +336,7 @@ def score_case(case: Case, data: Path, out: Path, folder: Path) -> Figures:
         return score_lists(truth, folder)
     figures = score_as_eval(truth, folder)
     if not case.data and case.seed is None:
-        names = [o.class_name for o in rt.Result.load(folder).without_doubtful().objects]
+        names = [o.class_name for o in rt.Result.load(folder).objects if o.counted]
         counts = Counter(names)
         figures["counts"] = {name: counts[name] for name in ("chair", "tv", "cup")}
     return figures
@@ -487,7 +487,7 @@ def score_lists(truth_folder: Path, folder: Path) -> Figures:
     truth = read_truth(truth_folder / "gt_mot.txt", rt.COCO_NAMES, 0.0)
     result = rt.Result.load(folder)
     every = judge(truth, kinds, read_result(folder / WITH_DOUBTFUL), result.objects)
-    listed = [o for o in result.objects if o.status != "doubtful"]
+    listed = [o for o in result.objects if o.counted]
     verdicts = judge(truth, kinds, read_result(folder), listed)
     frames = {k: int((truth.identity == k).sum()) for k in kinds}
     needed = {k for k, kind in kinds.items() if kind.needed and not kind.ignore}
@@ -650,7 +650,7 @@ def score_solids(truth_folder: Path, folder: Path) -> Figures:
     )
     truth, found, every = (x[np.isin(x.name, WALK_KINDS)] for x in boxes)
     placed = Placed.of(rt.Result.load(folder), truth_folder / "poses_c2w.txt")
-    listed = placed[np.array([o.status != "doubtful" for o in placed.objects], bool)]
+    listed = placed[np.array([o.counted for o in placed.objects], bool)]
     chairs = [t for t in true if t["coco"] == "chair"]
     matched = match_solids(chairs, listed)
     return {

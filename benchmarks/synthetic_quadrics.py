@@ -387,7 +387,8 @@ def is_honest(fits: quadrics.ObjectFits) -> BoolArray:
 
 def fuzz(n: int, rng: np.random.Generator) -> dict[str, int]:
     """Fit n random, mostly absurd objects; count the statuses and the dishonest results."""
-    counts = {"objects": 0, "bad": 0, "ok": 0, "prior_dominated": 0, "rejected": 0}
+    counts = {"objects": 0, "bad": 0, "ok": 0, "prior_dominated": 0,
+              "implausible": 0, "rejected": 0}  # fmt: skip
     priors = quadrics.load_priors()
     while counts["objects"] < n:
         f, o = int(rng.choice([1, 2, 3, 5, 8])), int(rng.choice([1, 10, 200]))
@@ -409,7 +410,7 @@ def fuzz(n: int, rng: np.random.Generator) -> dict[str, int]:
         quadrics.reprojection_iou(fits, boxes, cams, (640, 480))
         counts["objects"] += o
         counts["bad"] += int((~is_honest(fits)).sum())
-        for status in ("ok", "prior_dominated", "rejected"):
+        for status in ("ok", "prior_dominated", "implausible", "rejected"):
             counts[status] += int((fits.status == status).sum())
     return counts
 

@@ -123,7 +123,7 @@ class Output:
         if (out / "tracks.txt").read_text().strip():
             rows = np.loadtxt(out / "tracks.txt", delimiter=",", ndmin=2)
         boxes = np.column_stack([rows[:, 0] - 1, rows[:, 1:4], rows[:, 2:4] + rows[:, 4:6]])
-        listed = [o for o in data["objects"] if o["status"] != "doubtful"]
+        listed = [o for o in data["objects"] if o["status"] not in ("doubtful", "implausible")]
         centres = {}
         if (out / "poses.txt").exists():
             for t, *centre in np.loadtxt(out / "poses.txt", ndmin=2)[:, :4].tolist():

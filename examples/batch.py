@@ -48,7 +48,7 @@ ROOT = Path(__file__).resolve().parent.parent
 COLUMNS = ("path", "out", "detections", "poses", "tracks", "options", "command")
 FILES = ("detections", "poses", "tracks")
 MARKER = "batch.json"  # in the folder of a finished video; written last, whole or not at all
-KINDS = ("ok", "prior_dominated", "rejected", "doubtful", "tracked")  # statuses of objects
+KINDS = ("ok", "prior_dominated", "implausible", "rejected", "doubtful", "tracked")  # statuses
 FACTS = ("frames", "frames_with_pose", "objects", *KINDS, "metres_per_unit", "warnings")
 SUMMARY = ("name", "status", "attempts", "seconds", *FACTS, "path", "out", "error")
 
@@ -180,7 +180,7 @@ def facts(found: rt.Result) -> dict[str, Any]:
     return {
         "frames": len(set(found.tracks.frame.tolist())),
         "frames_with_pose": found.world.registered_frames,
-        "objects": len(status) - status.count("doubtful"),
+        "objects": sum(o.counted for o in found.objects),
         **{s: status.count(s) for s in KINDS},
         "metres_per_unit": found.world.scale.value if found.world.scale else None,
         "warnings": len(found.warnings),

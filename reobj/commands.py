@@ -182,6 +182,11 @@ def make_parser(
     add("--validate", action="store_true", help=text)
     _add_tracks(add)
     add("--edits", help="file of corrections, saved by scene.html; later fits apply it too")
+    text = "show the viewer on this machine; saved corrections are applied at once"
+    add = command("serve", text, "out --open")
+    add("out", type=Path, help="output folder of an earlier `run`")
+    add("--port", type=int, default=0, help="port of 127.0.0.1 (default: a free one)")
+    add("--open", action="store_true", help="open the page in the browser")
     text = "compare with ground truth: HOTA, IDF1, MOTA, O3D ..."
     add = command("eval", text, "out --gt gt.txt")
     add("out", type=Path, help="output folder of an earlier `run`, or a tracks.txt")

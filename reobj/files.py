@@ -371,8 +371,9 @@ class Progress:
         self._recent_steps = 0.0  # weighted, as the next
         self._recent_s = 0.0
         self._is_terminal = sys.stderr is not None and sys.stderr.isatty()
+        log_every_s = float(os.environ.get("REOBJ_PROGRESS_S", LOG_EVERY_S))  # of `serve`
         self._every_s = (
-            0.1 if self._is_terminal else math.inf if sys.stderr is None else LOG_EVERY_S
+            0.1 if self._is_terminal else math.inf if sys.stderr is None else log_every_s
         )
 
     def __enter__(self) -> Progress:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from browser import CHROMIUM, Browser
 from front_door.room import CAMERA, FEW, ROOM
 from simulated import SIZE, finished, fitted, tracks_of, unlinked, walk
 
@@ -31,6 +33,16 @@ os.environ["REOBJ_RAISE"] = "1"  # an internal error while drawing fails the tes
 def no_points(monkeypatch: pytest.MonkeyPatch) -> None:
     """Supplied poses get no triangulated points, so that no child process is started."""
     monkeypatch.setattr("reobj.poses.stage.triangulate", lambda poses, *_, **__: poses)
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    """One page of a headless Chromium, for the tests of a file."""
+    if CHROMIUM is None:
+        pytest.skip("no chromium here: apt-get install chromium")
+    page = Browser(tmp_path_factory.mktemp("profile"))
+    yield page
+    page.close()
 
 
 @pytest.fixture(scope="session")

@@ -132,10 +132,10 @@ def test_the_summary_equals_the_results_of_the_run(tmp_path: Path) -> None:
     status = [o["status"] for o in data["objects"]]
     assert (result["frames"], result["frames_with_pose"]) == (30, 25)
     assert result["metres_per_unit"] == 1.0 and result["warnings"] == len(data["warnings"])
-    kinds = ("ok", "prior_dominated", "rejected", "doubtful", "tracked")
+    kinds = ("ok", "prior_dominated", "implausible", "rejected", "doubtful", "tracked")
     assert [result[kind] for kind in kinds] == [status.count(kind) for kind in kinds]
     assert result["prior_dominated"] and result["doubtful"]
-    assert result["objects"] == len(status) - result["doubtful"]
+    assert result["objects"] == len(status) - result["doubtful"] - result["implausible"]
 
 
 def wait_for(path: Path, process: subprocess.Popen[str]) -> str:

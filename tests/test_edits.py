@@ -63,6 +63,7 @@ def members(made: Any) -> dict[int, set[int]]:
 ALL = {1: {10}, 2: {20, 21}, 3: {30, 31, 32}}
 MERGE = {"do": "merge", "object": ref(3, 4), "with": ref(1, 9)}
 SPLIT = {"do": "split", "object": ref(3, 2), "visits": [ref(3, 6), ref(3, 9)]}
+CUT = {"do": "split", "object": ref(2, 2), "frames": [3, 5]}
 RENAME = {"do": "rename", "object": ref(2, 0), "class": "mug"}
 DELETE = {"do": "delete", "object": ref(2, 7)}
 
@@ -80,6 +81,9 @@ DELETE = {"do": "delete", "object": ref(2, 7)}
         ((MERGE, MERGE), {1: {30, 31, 32}, 2: {20, 21}}),  # and merged already
         ((MERGE, {**SPLIT, "object": ref(1, 3)}), {1: {10, 30}, 2: {20, 21}, 3: {31, 32}}),
         ((DELETE, SPLIT), {1: {10}, 3: {30}, 4: {31, 32}}),
+        ((CUT,), {1: {10}, 2: {20, 21}, 3: {30, 31, 32}, 4: {20, 21}}),
+        ((CUT, {"do": "delete", "object": ref(2, 5, 4)}), ALL),
+        ((CUT, CUT), {1: {10}, 2: {20, 21}, 3: {30, 31, 32}, 4: {20, 21}}),
     ],
 )  # fmt: skip
 def test_identities_after_edits(
@@ -91,6 +95,13 @@ def test_identities_after_edits(
     frames = made.tracks[made.keep]
     pairs = list(zip(frames.frame.tolist(), frames.track_id.tolist(), strict=True))
     assert len(pairs) == len(set(pairs))
+
+
+def test_a_tracklet_is_split_at_a_frame(tmp_path: Path) -> None:
+    """The frames 3 to 5, in which two tracklets of the object meet, become an object of its own."""
+    made = applied(tmp_path, CUT)
+    frames = {i: made.tracks.frame[made.tracks.track_id == i].tolist() for i in (2, 4)}
+    assert frames == {2: [0, 1, 2, 6, 7, 8, 9], 4: [3, 4, 5]} and made.keep.all()
 
 
 def test_a_merge_of_simultaneous_objects_is_reported(tmp_path: Path) -> None:
@@ -119,7 +130,8 @@ def test_among_equal_boxes_the_id_decides(tmp_path: Path) -> None:
     [
         ({**DELETE, "object": ref(7, 2)}, "no object has the box 142.3"),
         ({**DELETE, "object": ref(2, 77)}, "in frame 77"),
-        ({**SPLIT, "visits": [ref(3, 1), ref(3, 6), ref(3, 9)]}, "all visits of the object"),
+        ({**SPLIT, "visits": [ref(3, 1), ref(3, 6), ref(3, 9)]}, "all boxes of the object"),
+        ({**CUT, "frames": [0, 9]}, "all boxes of the object"),
         ({**MERGE, "with": ref(1, 30)}, "edit 1 (merge 3 with 1)"),
     ],
 )
@@ -147,6 +159,11 @@ def test_unmatched_edits_are_reported(tmp_path: Path, edit: dict[str, Any], said
         ([{**RENAME, "class": "a\nb"}], "cannot be printed"),
         ([{**RENAME, "class": 3}], "class 3 is no name"),
         ([{**SPLIT, "visits": []}], "visits is empty"),
+        ([{**SPLIT, "frames": [1, 2]}], "edit 1: has frames, object, visits"),
+        ([{**CUT, "frames": [5, 3]}], r"frames \[5, 3\] are not in order"),
+        ([{**CUT, "frames": [-1, 3]}], "not in order"),
+        ([{**CUT, "frames": [1.5, 3]}], "not two whole numbers"),
+        ([{**CUT, "frames": 3}], "not two whole numbers; expected object, frames"),
         ([{**DELETE, "object": {"frame": 1, "box": [1, 2, 3]}}], "is no box"),
         ([{**DELETE, "object": {"frame": 1, "box": [1, 2, 3e300, 4]}}], "is no box"),
         ([{**DELETE, "object": {"frame": 1, "box": [1, 2, 3, "x"]}}], "edit 1"),
@@ -202,7 +219,7 @@ def test_edits_are_stored_in_the_folder(folder: Path, tmp_path: Path, capsys: An
     expected = [(1, "chair"), (2, "stool"), (3, "chair"), (4, "chair")]
     result = rt.Result.load(folder)
     assert listed(folder) == expected
-    assert len(result.objects[0].visits) == 2 and result.objects[0].part == 0
+    assert len(result.objects[0].tracklet_ids) == 2 and result.objects[0].part == 0
     assert result.objects[1].confidence == 1.0
     assert result.objects[2].confidence == before.objects[2].confidence
     assert set(result.tracks.track_id) == {1, 2, 3, 4}

@@ -46,15 +46,29 @@ def test_without_poses_objects_equal_the_tracks() -> None:
         assert (found.status, found.reason) == ("tracked", "") and not found.located
         assert found.center is None and found.size_m is None and found.views == 0
         assert found.tracklet_ids == [found.id, found.id + 10] and found.frames_seen == 8
-        assert found.visits == [[0, 4], [5, 7]] and found.score == 0.9
+        assert found.visits == [[0, 7]] and found.score == 0.9
     assert result.world.units is None and result.world.to_json()["registered_frames"] == 0
 
 
-def test_visits_are_in_the_order_of_time() -> None:
-    """A later tracklet may have the smaller number."""
-    tracks = tracks_of(walk(8))
-    tracks = with_columns(tracks, tracklet_id=np.where(tracks.frame > 4, 1, 7))
-    assert fitted(tracks, None).objects[0].visits == [[0, 4], [5, 7]]
+@pytest.mark.parametrize(
+    ("every", "gap", "visits"),
+    [
+        (1, 60, [[0, 199]]),  # 2 s at 30 Hz
+        (1, 61, [[0, 50], [111, 199]]),
+        (90, 90, [[0, 17910]]),  # every frame with detections is 3 s after the one before
+        (90, 180, [[0, 4500], [4680, 17910]]),
+    ],
+)
+def test_visits_are_times_in_view_with_short_gaps(
+    every: int, gap: int, visits: list[list[int]]
+) -> None:
+    """Of object 1, whatever its tracklets are; the others are seen in all frames."""
+    tracks = tracks_of(walk(200))
+    tracks = with_columns(tracks, frame=every * tracks.frame, tracklet_id=tracks.frame % 19)
+    inside = (tracks.frame > 50 * every) & (tracks.frame < 50 * every + gap)
+    found = fitted(tracks[(tracks.track_id > 1) | ~inside], None).objects
+    assert found[0].visits == visits and len(found[0].tracklet_ids) == 19
+    assert found[1].visits == [[0, 199 * every]]
 
 
 def test_views_are_frames_with_a_pose() -> None:
@@ -334,6 +348,23 @@ def test_up_comes_from_the_fit_or_the_poses(
     assert world.up_source == source
     flat = describe_world(poses, [None], [])
     assert flat.scale is None and flat.up_source == ("poses" if poses_know else "none")
+
+
+@pytest.mark.parametrize(
+    ("scale", "status", "sigma"), [(1.0, "ok", "3.9"), (0.95, "implausible", "4.1")]
+)
+def test_a_size_beyond_four_sigma_is_implausible(scale: float, status: str, sigma: str) -> None:
+    """A chair that the detector calls a couch, in a world of two sizes."""
+    poses = walk()
+    cams = poses.cam_from_world.copy()
+    cams[:, :, 3] *= scale
+    couch = rt.COCO_NAMES.index("couch")
+    tracks = tracks_of(poses)
+    tracks = with_columns(tracks, class_id=np.where(tracks.track_id == 2, couch, tracks.class_id))
+    found = fitted(tracks, dataclasses.replace(poses, cam_from_world=cams)).objects
+    assert found[1].status == status and f"size is {sigma} sigma" in found[1].reason
+    assert [o.counted and o.located for o in found] == [True, status == "ok", True]
+    assert all(o.center is not None and o.size_m is not None for o in found)
 
 
 @pytest.mark.parametrize(("confidence", "status"), [(0.9, "ok"), (0.4, "doubtful")])

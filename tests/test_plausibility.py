@@ -87,9 +87,11 @@ def test_unmatched_boxes_of_other_classes_prevent_the_warning() -> None:
     assert len(said(result({CHAIR: 20}), untracked=rows(1, 0, FRIDGE, 0.1))) == 1
 
 
-def test_doubtful_objects_are_not_counted() -> None:
+@pytest.mark.parametrize("status", ["doubtful", "implausible"])
+def test_doubtful_and_implausible_objects_are_not_counted(status: str) -> None:
     found = result({FRIDGE: 9, CHAIR: 5}, boxes=2)
-    found.objects[:2] = [dataclasses.replace(o, status="doubtful") for o in found.objects[:2]]
+    assert len(said(found)) == 1
+    found.objects[:2] = [dataclasses.replace(o, status=status) for o in found.objects[:2]]
     assert said(found) == []
 
 

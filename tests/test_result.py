@@ -53,6 +53,29 @@ def test_doubtful_objects_are_in_the_list_and_not_in_the_tracks(
         assert set(found.tracks.track_id) >= {o.id for o in rest}
 
 
+def test_implausible_objects_keep_their_tracks_and_are_not_counted(
+    chairs: rt.Result, tmp_path: Path
+) -> None:
+    first, *rest = chairs.objects
+    why = "size is 7.2 sigma from its category's: another object?"
+    odd = dataclasses.replace(first, status="implausible", reason=why)
+    result = copy_of(chairs, objects=[odd, *rest], fits=None)
+    result.save(tmp_path)
+    assert validate_objects(tmp_path / "objects.json") == []
+    found = rt.Result.load(tmp_path)
+    assert [o.status for o in found.objects] == ["implausible", "ok", "ok"]
+    assert first.id in found.tracks.track_id and [o.id for o in found.located] == [2, 3]
+    lines = " ".join(found.summary().split())
+    assert f"implausible, not counted: chair 1 ({why})" in lines
+    assert "distinct objects: 2 chair" in lines and "low confidence" not in lines
+    assert not any(line.split()[:1] == ["1"] for line in found.summary().splitlines())
+    data = json.loads((tmp_path / "objects.json").read_text())
+    data["objects"][0]["center"] = None
+    (tmp_path / "objects.json").write_text(json.dumps(data))
+    with pytest.raises(rt.ReobjError, match="object 1 is implausible without a shape"):
+        rt.Result.load(tmp_path)
+
+
 def test_save_then_load_gives_the_same(chairs: rt.Result, tmp_path: Path) -> None:
     poses = dataclasses.replace(chairs.poses, points=np.eye(3), colors=np.eye(3, dtype=np.uint8),
                                 messages=("a gap",))  # fmt: skip

@@ -697,7 +697,7 @@ def test_examples_in_docstrings(room: str) -> None:
     assert doctest.testmod(importlib.import_module(room)).failed == 0
 
 
-COMMANDS = ["", "run", "track", "poses", "objects", "eval", "export", "map", "models"]
+COMMANDS = ["", "run", "track", "poses", "objects", "serve", "eval", "export", "map", "models"]
 
 
 @pytest.mark.parametrize("command", COMMANDS)

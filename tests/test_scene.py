@@ -1,19 +1,12 @@
-"""The 3D viewer in a real browser, and its file: content, size and escaping.
-
-The browser is controlled by Chromium's DevTools protocol over two pipes, without a package.
-"""
+"""The 3D viewer in a real browser, and its file: content, size and escaping."""
 
 from __future__ import annotations
 
 import base64
-import contextlib
 import dataclasses
 import json
-import os
 import re
-import select
 import shutil
-import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,6 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from browser import Browser, complaints
 from scipy.spatial.transform import Rotation
 from simulated import fitted, into_part, tracks_of, walk, with_columns
 
@@ -42,148 +36,7 @@ from reobj.results.scene import (
 )
 from reobj.types import object_color
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-FLAGS = (
-    "--headless --no-sandbox --disable-gpu --enable-unsafe-swiftshader --use-angle=swiftshader "
-    "--disable-quic --no-first-run --disable-background-networking --disable-component-update "
-    "--disable-sync --hide-scrollbars --remote-debugging-pipe"
-)
 EVIL = "</script><script>window.hacked=1</script><img src=x onerror=hacked=1>"
-
-
-class Browser:
-    """One page of a headless Chromium."""
-
-    def __init__(self, profile: Path) -> None:
-        (theirs_in, self.out), (self.inp, theirs_out) = os.pipe(), os.pipe()
-        command = f'exec "$0" {FLAGS} --user-data-dir="$1" 3<&{theirs_in} 4>&{theirs_out}'
-        self.process = subprocess.Popen(
-            ["bash", "-c", command, str(CHROMIUM), str(profile)],
-            pass_fds=(theirs_in, theirs_out),
-            stderr=subprocess.DEVNULL,
-        )
-        os.close(theirs_in)
-        os.close(theirs_out)
-        self.rest, self.number, self.session = b"", 0, ""
-        self.errors: list[str] = []
-        self.asked = 0  # number of unload dialogs of the page
-        target = self.send("Target.createTarget", url="about:blank")["targetId"]
-        attach = {"targetId": target, "flatten": True}
-        self.session = self.send("Target.attachToTarget", **attach)["sessionId"]
-        for domain in ("Page", "Runtime", "Log", "Network"):
-            self.send(f"{domain}.enable")
-
-    def send(self, method: str, **params: Any) -> dict[str, Any]:
-        """Send a command and wait for its answer."""
-        self.number += 1
-        message: dict[str, Any] = {"id": self.number, "method": method, "params": params}
-        if self.session:
-            message["sessionId"] = self.session
-        os.write(self.out, json.dumps(message).encode() + b"\0")
-        while True:
-            answer = self.receive()
-            if answer.get("id") == self.number:
-                assert "error" not in answer, answer
-                return dict(answer["result"])
-
-    def receive(self, seconds: float = 60) -> dict[str, Any]:
-        """Read the next message; errors and network requests of the page are recorded."""
-        while b"\0" not in self.rest:
-            assert select.select([self.inp], [], [], seconds)[0], "the browser does not answer"
-            chunk = os.read(self.inp, 1 << 20)
-            assert chunk, "the browser is gone"
-            self.rest += chunk
-        text, self.rest = self.rest.split(b"\0", 1)
-        message = json.loads(text)
-        kind, about = message.get("method"), message.get("params", {})
-        if kind == "Runtime.exceptionThrown":
-            self.errors.append(json.dumps(about))
-        if kind == "Runtime.consoleAPICalled" and about["type"] in ("error", "warning", "assert"):
-            self.errors.append(json.dumps(about["args"]))
-        if kind == "Log.entryAdded" and about["entry"]["level"] in ("error", "warning"):
-            self.errors.append(about["entry"]["text"])
-        if kind == "Page.javascriptDialogOpening":  # "leave without saving?"
-            answer = {"id": 0, "method": "Page.handleJavaScriptDialog", "params": {"accept": True}}
-            os.write(self.out, json.dumps(answer | {"sessionId": self.session}).encode() + b"\0")
-            self.asked += 1
-        if kind == "Network.requestWillBeSent":
-            url = about["request"]["url"]
-            if not url.startswith(("data:", "file:", "about:")):
-                self.errors.append(f"asked the network for {url}")
-        return dict(message)
-
-    def open(self, path: Path, width: int = 1280, height: int = 800, phone: bool = False) -> None:
-        """Load a file in a window of this size."""
-        self.send(
-            "Emulation.setDeviceMetricsOverride",
-            width=width,
-            height=height,
-            deviceScaleFactor=2 if phone else 1,
-            mobile=phone,
-        )
-        self.send("Emulation.setTouchEmulationEnabled", enabled=phone)
-        self.send("Page.navigate", url=path.resolve().as_uri())
-        while self.receive().get("method") != "Page.loadEventFired":
-            pass
-        self.settle()
-
-    def eval(self, expression: str) -> Any:
-        """Value of a JavaScript expression in the page."""
-        wanted = {"expression": expression, "returnByValue": True, "awaitPromise": True}
-        answer = self.send("Runtime.evaluate", **wanted)
-        assert "exceptionDetails" not in answer, answer
-        return answer["result"].get("value")
-
-    def settle(self) -> None:
-        """Wait until two frames are drawn."""
-        self.eval("new Promise(f => requestAnimationFrame(() => requestAnimationFrame(f)))")
-
-    def mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
-        self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)
-
-    def click(self, x: float, y: float) -> None:
-        for kind in ("mousePressed", "mouseReleased"):
-            self.mouse(kind, x, y, button="left", clickCount=1)
-        self.settle()
-
-    def drag(self, start: tuple[float, float], end: tuple[float, float], button: str) -> None:
-        self.mouse("mousePressed", *start, button=button, clickCount=1)
-        buttons = {"left": 1, "right": 2}[button]
-        self.mouse("mouseMoved", *end, button=button, buttons=buttons)
-        self.mouse("mouseReleased", *end, button=button, clickCount=1)
-        self.settle()
-
-    def press(self, key: str) -> None:
-        """Press a key on the page."""
-        text = {"text": key} if len(key) == 1 else {}
-        self.send("Input.dispatchKeyEvent", type="keyDown", key=key, **text)
-        self.send("Input.dispatchKeyEvent", type="keyUp", key=key)
-        self.settle()
-
-    def touch(self, kind: str, *points: tuple[float, float]) -> None:
-        touches = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(points)]
-        self.send("Input.dispatchTouchEvent", type=kind, touchPoints=touches)
-        self.settle()
-
-    def picture(self, path: Path) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(base64.b64decode(self.send("Page.captureScreenshot")["data"]))
-
-    def close(self) -> None:
-        with contextlib.suppress(OSError):
-            os.close(self.out)
-        self.process.terminate()
-        self.process.wait(20)
-        os.close(self.inp)
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    if CHROMIUM is None:
-        pytest.skip("no chromium here: apt-get install chromium")
-    page = Browser(tmp_path_factory.mktemp("profile"))
-    yield page
-    page.close()
 
 
 # ---- A small scene ----
@@ -268,6 +121,7 @@ class Facts:
     """Replaces a video of which only the metadata are used."""
 
     config, fps, scale, source, is_live = rt.InputConfig(), 30.0, 1.0, "a.mp4", False
+    files, has_images = (), True
     size = (WIDTH, HEIGHT)
 
 
@@ -275,11 +129,6 @@ VIDEO: Any = Facts()
 VIEW = """[controls.getAzimuthalAngle(), controls.getPolarAngle(), controls.getDistance(),
     ...controls.target]"""
 SCREENSHOTS = Path(__file__).resolve().parent.parent / "build/screenshots"
-
-
-def complaints(browser: Browser) -> list[str]:
-    """Errors of the page, without the driver's message on screenshots."""
-    return [e for e in browser.errors if "GPU stall due to ReadPixels" not in e]
 
 
 def center_of(browser: Browser, number: int) -> tuple[float, float]:
@@ -518,6 +367,22 @@ def test_doubtful_objects_are_shown_on_request(browser: Browser, page: Path) -> 
     browser.eval("S.objects[2].status = 'ok'; replay()")
 
 
+def test_implausible_objects_are_marked_and_not_counted(browser: Browser, page: Path) -> None:
+    """Dashed and dim, with the reason; neither hidden nor part of the initial view."""
+    browser.open(page)
+    before = browser.eval("room.radius")
+    browser.eval("""Object.assign(S.objects[2], { status: 'implausible',
+        reason: 'size is 7.2 sigma', center: [40, 0, 0.3] });
+        replay(); fillScene(); VIEWS.reset(); draw()""")
+    assert browser.eval("[here[2].row.hidden, here[2].group.visible]") == [False, True]
+    assert browser.eval("here[2].row.innerText").endswith("implausible size")
+    assert browser.eval("here[2].row.title") == "size is 7.2 sigma"
+    dashed = "here.slice(0, 3).map(o => Boolean(o.group.parts.wire.material.dashed))"
+    assert browser.eval(dashed) == [False, False, True]
+    assert browser.eval("room.radius") < 1.5 * before
+    assert "suitcase 0" in browser.eval("$('classes').textContent")
+
+
 def test_a_distance_has_the_sigma_of_both_ends_and_of_the_scale(
     browser: Browser, page: Path
 ) -> None:
@@ -651,7 +516,8 @@ def test_corrections_made_in_the_viewer_are_applied(
     browser.eval("edit(edits.delete(objects.find(o => o.id === 6)))")
     browser.press("u")
     assert browser.eval("objects.map(o => o.id)") == [1, 2, 3, 6]
-    assert browser.eval("objects.find(o => o.id === 2).visits.length") == 2
+    merged = "(o => [o.visits.length, o.tracklets.length])(objects.find(o => o.id === 2))"
+    assert browser.eval(merged) == [1, 2]
     browser.picture(SCREENSHOTS / "edit.png")
     browser.send("Page.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
     browser.eval("$('save').click()")
@@ -668,8 +534,8 @@ def test_corrections_made_in_the_viewer_are_applied(
     browser.open(out / "scene.html")
     assert browser.eval("[objects.map(o => [o.id, o.class]), S.edits.length]") == [shown, 3]
     browser.eval("document.querySelector('#edits li button').click()")  # take the merge back
-    browser.eval("edit(edits.split(objects[1], [objects[1].visits[1]]))")
-    assert browser.eval("objects.map(o => [o.id, o.visits.length])")[-1] == [7, 1]
+    browser.eval("edit(edits.splitTracklet(objects[1], objects[1].tracklets[1][0]))")
+    assert browser.eval("objects.map(o => [o.id, o.tracklets.length])")[-1] == [7, 1]
     assert [e["do"] for e in json.loads(browser.eval("editsFile()"))["edits"]] == [
         "rename", "delete", "split"
     ]  # fmt: skip
@@ -678,6 +544,55 @@ def test_corrections_made_in_the_viewer_are_applied(
     before = browser.asked
     browser.open(out / "scene.html")  # unsaved corrections: the browser shows a dialog
     assert browser.asked == before + 1
+
+
+def test_a_visit_is_split_at_the_slider(
+    browser: Browser, parted_folder: Path, tmp_path: Path
+) -> None:
+    """The preview has the frames that the split gives in Python, also after a second split."""
+    out = shutil.copytree(parted_folder, tmp_path / "out")
+    browser.open(out / "scene.html")
+    browser.eval("select(here[1]); goTo(0)")
+    assert browser.eval("$('cut').innerText").startswith("To split a visit, move the slider")
+    browser.eval("goTo(13)")
+    assert browser.eval("$('cut').innerText") == "split at frame 13"
+    browser.eval("$('cut').querySelector('button').click()")
+    assert browser.eval("pending.map(said)") == ["split frames 13\u201339 off 2"]
+    browser.eval("select(here.find(o => o.id === 7)); goTo(30)")
+    browser.eval("$('cut').querySelector('button').click()")
+    browser.eval("edit(edits.rename(objects.find(o => o.id === 8), 'stool'))")
+    browser.picture(SCREENSHOTS / "split.png")
+    shown = browser.eval("objects.map(o => [o.id, o.class, o.visits, pairs(o.seen)])")
+    assert {i: v for i, _, v, _ in shown if i in (2, 7, 8)} == {
+        2: [[0, 12]], 7: [[13, 29]], 8: [[30, 39]],
+    }  # fmt: skip
+    assert all(visits == seen for _, _, visits, seen in shown)  # each step is a frame here
+    (tmp_path / "e.json").write_text(browser.eval("editsFile()"))
+    assert rt.main(["objects", str(out), "--edits", str(tmp_path / "e.json")]) == 0
+    found = [[o.id, o.class_name, o.visits] for o in rt.Result.load(out).objects]
+    assert found == [row[:3] for row in shown] and complaints(browser) == []
+    browser.eval("saved = true")
+
+
+def test_tracklets_are_listed_below_the_visits(browser: Browser, page: Path) -> None:
+    """Object 2 has two tracklets with a gap of .2 s: one visit. Two boxes are a split preview."""
+    browser.open(page)
+    browser.eval("select(objects[1])")
+    text = browser.eval("$('panel').textContent")
+    assert (
+        "Visits (1), frames0\u201323" in text
+        and "tracklets (2)2: 0\u20138" in text
+        and "6: 15\u201323" in text
+    )
+    assert "split off" not in browser.eval("document.querySelector('.visit').innerText")
+    browser.eval("[...document.querySelectorAll('#panel details button')].at(-1).click()")
+    halves = browser.eval("objects.filter(o => o.edited).map(o => [o.id, o.visits, o.tracks])")
+    assert halves == [[2, [[0, 8]], [2]], [5, [[15, 23]], [6]]]
+    browser.eval("undo(); edit(edits.merge(objects[0], objects[1]))")
+    joined = "(o => [o.visits, o.tracks, o.tracklets.length, o.refs.length])(objects[0])"
+    assert browser.eval(joined) == [[[0, 23]], [1, 2, 6], 3, 42]
+    browser.eval("saved = true")
+    assert complaints(browser) == []
 
 
 def test_classes_can_be_hidden(browser: Browser, page: Path) -> None:
@@ -793,7 +708,7 @@ def test_a_2d_result_opens(browser: Browser, tmp_path: Path) -> None:
     browser.eval("here[1].row.click(); goTo(3)")
     browser.settle()
     assert browser.eval("document.querySelectorAll('.crops img').length") == 8
-    assert browser.eval("here[1].row.querySelectorAll('.bar span:not(.head)').length") == 2
+    assert browser.eval("here[1].row.querySelectorAll('.bar span:not(.head)').length") == 1
     rows = "[...document.querySelectorAll('.row')].map((row) => row.className.split(' ')[1])"
     assert set(browser.eval(rows)) == {"tracked"}
     assert "tracked" in browser.eval("$('panel').innerText")
@@ -1171,7 +1086,7 @@ def test_same_input_gives_the_same_page(page: Path, tmp_path: Path) -> None:
 
 def test_names_are_escaped_in_the_data(page: Path) -> None:
     text = page.read_text()
-    assert EVIL not in text and text.count("</script>") == 3 and text.count("<script") == 3
+    assert EVIL not in text and text.count("</script>") == text.count("<script") == 4
     assert data_of(page)["objects"][1]["class"] == EVIL
     hosts = set(re.findall(r"https?://([\w.]+)", text))
     assert hosts == {"www.w3.org"} and "default-src 'none'" in text  # names of XML
@@ -1204,11 +1119,12 @@ def test_the_page_contains_the_scene(page: Path) -> None:
     assert part["facts"] == "cameras of 23 of 24 frames · scale from poses, ± 0 %"
     assert data["steps"] == {
         "frame": list(range(24)), "seconds": pytest.approx(1 / 30), "part": [0] * 24,
+        "time": pytest.approx(np.arange(24) / 30, abs=1e-4), "frame_s": pytest.approx(1 / 30),
     }  # fmt: skip
     cov = np.frombuffer(base64.b64decode(data["objects"][0]["cov"]), "<f4").reshape(9, 9)
     assert (np.diag(cov) > 0).all() and data["objects"][3]["cov"] == data["why_flat"] == ""
     assert data["camera"] == {"width": 320, "height": 240, "fx": 250, "fy": 250,
-                              "cx": 170, "cy": 112}  # fmt: skip
+                              "cx": 170, "cy": 112, "lens": None}  # fmt: skip
     assert 0.02 < part["point_sigma"] < 0.1 and "floor" not in part  # too few points for a floor
 
 
@@ -1327,8 +1243,10 @@ def test_frames_are_downscaled_without_boxes(tmp_path: Path) -> None:
     image = cv2.imdecode(np.frombuffer(base64.b64decode(text), np.uint8), cv2.IMREAD_COLOR)
     assert image.shape == (480, 640, 3) and image.max() < 9
     write_scene(result, pictures, tmp_path / "a.html", video)
-    ((frame, _, boxes),) = data_of(tmp_path / "a.html")["thumbs"]
-    assert (frame, boxes) == (0, [[1, 300, 300, 600, 600]])
+    data = data_of(tmp_path / "a.html")
+    ((frame, _),) = data["thumbs"]
+    boxes = np.frombuffer(base64.b64decode(data["objects"][0]["boxes"]), "<f4")
+    assert (frame, boxes.tolist()) == (0, [300, 300, 600, 600])
 
 
 def test_background_frames_are_undistorted(tmp_path: Path) -> None:
@@ -1418,6 +1336,7 @@ class Source:
     """A video that counts the reads of its frames, and can be interrupted."""
 
     has_images = True
+    files = ()
 
     def __init__(self, video: Any, live: bool = False) -> None:
         self.config, self.size, self.scale, self.fps = (

@@ -16,8 +16,10 @@ from reobj.objects.config import ObjectsConfig
 from reobj.objects.likelihood import CLASS_KEPT
 from reobj.objects.observations import Views
 from reobj.poses.floor import floor_of
+from reobj.results.entries import visit_gap, visits_of
 from reobj.results.result import Object, Part, World
-from reobj.types import Array, IntArray, LinkEvent, Tracks, object_classes, rows_by
+from reobj.sources.image_files import IMAGE_FPS
+from reobj.types import Array, IntArray, LinkEvent, Tracks, object_classes
 
 
 def describe_objects(
@@ -29,6 +31,7 @@ def describe_objects(
     confidence: Mapping[int, float] | None = None,
     component: int = 0,
     view_count: IntArray | None = None,
+    fps: float = IMAGE_FPS,
 ) -> list[Object]:
     """Describe every identity of the tracks: class, visits, and its shape or why it has none.
 
@@ -38,6 +41,7 @@ def describe_objects(
         fits, views: of the identities in ascending order; None without cameras.
         confidence: of identities, where it is known. component: of the trajectory.
         view_count: (O,) views of the identities if `views` has some of the frames; None: all.
+        fps: frame rate of the source, Hz.
     Returns:
         one `Object` per identity, by id.
     """
@@ -47,9 +51,9 @@ def describe_objects(
         cameras = (views.img_from_world, views.image_size)
         iou = quadrics.reprojection_iou(fits, views.boxes, *cameras)  # (V, O)
     class_count = len(np.unique(tracks.class_id))
+    gap = visit_gap(tracks.frame, fps)
     for i, (identity, class_id) in enumerate(object_classes(tracks).items()):
         rows = tracks[tracks.track_id == identity]
-        frames_of_tracklets = [rows.frame[r] for r in rows_by(rows.tracklet_id)]
         class_name = name_of(class_names, class_id)
         moves = class_name in config.moving_classes
         fields: dict[str, Any] = {"status": "tracked", "reason": ""}
@@ -67,7 +71,7 @@ def describe_objects(
                 score=round(float(rows.score.mean()), 4),
                 frames_seen=len(np.unique(rows.frame)),
                 tracklet_ids=np.unique(rows.tracklet_id).tolist(),
-                visits=sorted([int(f.min()), int(f.max())] for f in frames_of_tracklets),
+                visits=visits_of(rows.frame, gap),
                 classes=_likeliest_classes(rows, class_names, class_count),
                 part=component,
                 **fields,

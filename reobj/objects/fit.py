@@ -91,7 +91,14 @@ def link_and_fit(
     for component in components:
         rows = np.flatnonzero(component_of_object[object_of_row] == component.number)
         described, fit = _fit_component(
-            component, rows, linked, edited.class_names, priors, config, reach(component)
+            component,
+            rows,
+            linked,
+            edited.class_names,
+            priors,
+            config,
+            reach(component),
+            result.video.fps,
         )
         objects += described
         fits.append(fit)
@@ -416,11 +423,13 @@ def _fit_component(
     priors: quadrics.Priors,
     config: ObjectsConfig,
     reach: Reach,
+    fps: float,
 ) -> tuple[list[Object], quadrics.ObjectFits | None]:
     """Fit and describe the objects of a component.
 
     Args:
         rows: of its objects in the linked tracks. reach: reports the progress.
+        fps: frame rate of the source, Hz.
     """
     number, poses, fit = component
     tracks = linked.tracks[rows]
@@ -458,7 +467,7 @@ def _fit_component(
         fits = fit(views, categories, Scene(floor, None if floor is None else floor.normal))
     reach("fit", 1.0)
     described = describe_objects(
-        tracks, class_names, fits, views, config, linked.confidence, number, view_count
+        tracks, class_names, fits, views, config, linked.confidence, number, view_count, fps
     )
     reach("describe", 1.0)
     if fits is not None and views is not None and poses is not None:

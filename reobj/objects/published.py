@@ -58,7 +58,14 @@ def solve_again(result: Result, config: ObjectsConfig) -> Result:
         fits = _as_fits(ellipsoids, views, np.array(parallax, np.float64), scale, reason)
         confidence = {i: o.confidence for i, o in before.items() if o.confidence is not None}
         objects += describe_objects(
-            rows, result.class_names, fits, views, config, confidence, component=k
+            rows,
+            result.class_names,
+            fits,
+            views,
+            config,
+            confidence,
+            component=k,
+            fps=result.video.fps,
         )
     warning = f"objects.solver={config.solver}: {text}"
     return dataclasses.replace(

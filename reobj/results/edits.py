@@ -30,10 +30,11 @@ from reobj.types import (
 HEADER = {"format": "reobj-edits", "version": 1}
 FIELDS = {  # keys of an edit besides `do`
     "merge": ("object", "with"),
-    "split": ("object", "visits"),
+    "split": ("object", "frames"),
     "rename": ("object", "class"),
     "delete": ("object",),
 }
+SPLIT_TRACKLETS = ("object", "visits")  # the keys of a split by tracklets
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,14 +57,16 @@ class Edit:
 
     Attributes:
         do: "merge", "split", "rename" or "delete". object: the object to correct.
-        other: of a merge: the other object. visits: of a split: a box of each visit that becomes
-            another object. class_name: of a rename.
+        other: of a merge: the other object. class_name: of a rename.
+        frames: of a split: first and last frame in which it is another object; visits: instead, a
+            box of each tracklet that is another object.
     """
 
     do: str
     object: BoxRef
     other: BoxRef | None = None
     visits: tuple[BoxRef, ...] = ()
+    frames: tuple[int, int] | None = None
     class_name: str = ""
 
     @property
@@ -119,12 +122,14 @@ def _expected(entry: Any) -> str:
     do = entry.get("do") if isinstance(entry, dict) else None
     if not isinstance(do, str) or do not in FIELDS:
         return f'"do": one of {", ".join(FIELDS)}'
-    return ", ".join(FIELDS[do]) + ' (an object or visit: "id", "frame", "box": [x1, y1, x2, y2])'
+    keys = ", ".join(FIELDS[do])
+    keys += ' ([first, last], or "visits")' if do == "split" else ""
+    return keys + ' (an object or visit: "id", "frame", "box": [x1, y1, x2, y2])'
 
 
 def _parse(entry: Any) -> Edit:
     do = entry["do"]
-    fields = FIELDS[do]
+    fields = SPLIT_TRACKLETS if do == "split" and "visits" in entry else FIELDS[do]
     if set(entry) != {"do", *fields}:
         raise ValueError(f"has {shortened(sorted(set(entry) - {'do'}))}")
     name = entry.get("class", "")
@@ -138,7 +143,18 @@ def _parse(entry: Any) -> Edit:
     if "visits" in fields and not visits:
         raise ValueError("visits is empty")
     other = _box_ref(entry["with"]) if "with" in fields else None
-    return Edit(do, _box_ref(entry["object"]), other, visits, name.strip())
+    frames = _frames(entry["frames"]) if "frames" in fields else None
+    return Edit(do, _box_ref(entry["object"]), other, visits, frames, name.strip())
+
+
+def _frames(item: Any) -> tuple[int, int]:
+    """Read the first and the last frame of a split."""
+    if not isinstance(item, list) or [type(frame) for frame in item] != [int, int]:
+        raise ValueError(f"frames {item} are not two whole numbers")
+    first, last = item
+    if not 0 <= first <= last:
+        raise ValueError(f"frames {item} are not in order")
+    return first, last
 
 
 def _box_ref(item: Any) -> BoxRef:
@@ -185,7 +201,7 @@ class Edited:
 def apply_edits(tracks: Tracks, class_names: tuple[str, ...], edits: Edits) -> Edited:
     """Correct identities and classes of tracks.
 
-    A merged object keeps the lower identity; the visits split off get the next free one; other
+    A merged object keeps the lower identity; what is split off gets the next free one; other
     identities stay. Where two merged objects have boxes in the same frame, the box of lower score
     is dropped.
 
@@ -230,7 +246,7 @@ class _Tables:
             self.class_id[self.identity == identity] = self.names.index(edit.class_name)
             self.confirmed.add(identity)
         elif edit.do == "split":
-            self._split(identity, edit.visits)
+            self._split(identity, edit)
         elif edit.other is not None:  # merge; without effect if the linker has merged them since
             kept, removed = sorted((identity, int(self.identity[self._row_of(edit.other)])))
             self.identity[self.identity == removed] = kept
@@ -248,12 +264,18 @@ class _Tables:
             raise LookupError(f"no object has the box {box} in frame {ref.frame}")
         return int(rows[np.lexsort((-iou, self.identity[rows] != ref.id))[0]])
 
-    def _split(self, identity: int, visits: tuple[BoxRef, ...]) -> None:
-        rows = [row for visit in visits if self.identity[row := self._row_of(visit)] == identity]
-        tracklets = self.tracks.tracklet_id[np.array(rows, np.int64)]
-        moved = (self.identity == identity) & np.isin(self.tracks.tracklet_id, tracklets)
-        if not ((self.identity == identity) & ~moved).any():
-            raise LookupError("these are all visits of the object")
+    def _split(self, identity: int, edit: Edit) -> None:
+        of_object = self.identity == identity  # (N,)
+        if edit.frames is None:
+            refs = [self._row_of(visit) for visit in edit.visits]
+            rows = [row for row in refs if of_object[row]]
+            tracklets = self.tracks.tracklet_id[np.array(rows, np.int64)]
+            moved = of_object & np.isin(self.tracks.tracklet_id, tracklets)
+        else:
+            first, last = edit.frames
+            moved = of_object & (first <= self.tracks.frame) & (self.tracks.frame <= last)
+        if not (of_object & ~moved).any():
+            raise LookupError("these are all boxes of the object")
         if moved.any():  # else they are another object already
             self.identity[moved] = self.identity.max() + 1
 

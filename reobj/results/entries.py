@@ -15,7 +15,15 @@ import quadrics
 from reobj.files import rounded, shortened
 from reobj.poses.floor import Floor
 from reobj.sources.video import Video
-from reobj.types import Array, LinkEvent, ReobjError, counted, printable, visible_name
+from reobj.types import (
+    Array,
+    IntArray,
+    LinkEvent,
+    ReobjError,
+    counted,
+    printable,
+    visible_name,
+)
 
 # keys of objects.json and changes.json that differ from the names of our fields
 _JSON_KEYS = {
@@ -32,8 +40,9 @@ class Object:
         id: identity in the tracks, from 1. class_name: with the largest sum of scores.
         score: mean of the boxes.
         status: "ok", "prior_dominated" (some size depends mainly on the category's prior),
-            "doubtful" (probably a false positive), "rejected" (no shape), "tracked" (2D: no
-            cameras). reason: for the status.
+            "implausible" (size more than 4 sigma from the usual ones of its category), "doubtful"
+            (probably a false positive), "rejected" (no shape), "tracked" (2D: no cameras).
+            reason: for the status.
         confidence: probability that it is a real, separate object; None without cameras.
         classes: probabilities of the two most likely. support: "box", "cylinder" or "ellipsoid".
         center, half_axes: (3,) of the ellipsoid; quat_wxyz: (4,) world_from_obj.
@@ -45,7 +54,8 @@ class Object:
         frames_seen: frames in which it was detected.
         parallax_deg: largest angle between two of its viewing rays.
         reprojection_iou_median: IoU of the projected shape with the boxes.
-        tracklet_ids: its unbroken tracks; visits: first and last frame of each, by time.
+        tracklet_ids: its unbroken tracks.
+        visits: first and last frame of each time in view, by time (`visits_of`).
         part: component of the trajectory (`Poses.part`), whose world and units its lengths are in.
     """
 
@@ -84,14 +94,46 @@ class Object:
         return f"Object({', '.join(facts)})"
 
     @property
+    def counted(self) -> bool:
+        """True if it is one of the objects found: neither doubtful nor implausible."""
+        return self.status not in ("doubtful", "implausible")
+
+    @property
     def located(self) -> bool:
-        """True if a shape was fitted and the object is not doubtful."""
+        """True if a shape was fitted and the object is neither doubtful nor implausible."""
         return self.status in ("ok", "prior_dominated")
 
     def to_json(self) -> dict[str, Any]:
         """Return the entry of objects.json."""
         values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         return {_JSON_KEYS.get(k, k): _plain(v) for k, v in values.items()}
+
+
+VISIT_GAP_S = 2.0  # between two visits of an object; a detector misses objects for shorter times
+
+
+def visit_gap(frame: IntArray, fps: float) -> float:
+    """Return the longest gap within a visit, in frames of the source.
+
+    VISIT_GAP_S, or the usual distance of two frames with detections if that is longer.
+
+    Args:
+        frame: (N,) of all detections. fps: of the source, Hz.
+    """
+    steps = np.diff(np.unique(frame))
+    usual = float(np.median(steps)) if len(steps) else 1.0
+    return max(VISIT_GAP_S * fps, usual)
+
+
+def visits_of(frame: IntArray, gap: float) -> list[list[int]]:
+    """Join the frames (N,) of an object to visits: times in view with gaps of at most `gap` frames.
+
+    >>> visits_of(np.array([0, 1, 5, 30, 31]), 10.0)
+    [[0, 5], [30, 31]]
+    """
+    frames = np.unique(frame)
+    runs = np.split(frames, np.flatnonzero(np.diff(frames) > gap) + 1)
+    return [[int(run[0]), int(run[-1])] for run in runs if len(run)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

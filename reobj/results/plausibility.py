@@ -25,7 +25,7 @@ def implausible(
         high_score: boxes of lower scores are often false positives. moving: classes without 3D
             objects, often many. new_score: least score at which a track starts.
     """
-    still = [o for o in result.objects if o.status != "doubtful" and o.class_name not in moving]
+    still = [o for o in result.objects if o.counted and o.class_name not in moving]
     texts = [_few_cameras(result), _nothing_measured(result, still)]
     if not result.identities_given:  # given identities are not questioned
         texts += [_one_class(result, still), _unexplained(result, high_score, new_score)]

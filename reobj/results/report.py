@@ -23,8 +23,9 @@ SIZE_WORDS = {"ok": "measured", "prior_dominated": "guessed", "rejected": "none"
 
 def summary(result: Result) -> str:
     """Write the report that `run` prints: what was found, where to look, and the table."""
-    counted = [o for o in result.objects if o.status != "doubtful"]
+    counted = [o for o in result.objects if o.counted]
     lines = _counts(result, counted)
+    lines += _implausible(result)
     if result.changes is not None:
         lines += _wrapped(result.changes.summary())
     if result.out is not None:
@@ -116,6 +117,13 @@ def _reasons(counted: Sequence[Object]) -> list[str]:
     return lines
 
 
+def _implausible(result: Result) -> list[str]:
+    """List the objects that are not counted because of their size, with the reason of each."""
+    odd = [o for o in result.objects if o.status == "implausible"]
+    texts = [f"{o.class_name} {o.id} ({o.reason})" for o in odd]
+    return _wrapped(f"implausible, not counted: {', '.join(texts)}") if texts else []
+
+
 def _counts(result: Result, counted: Sequence[Object]) -> list[str]:
     """Format the number of objects, in all and of each class, most frequent first."""
     counts = sorted(Counter(o.class_name for o in counted).items(), key=lambda c: (-c[1], c[0]))
@@ -124,7 +132,7 @@ def _counts(result: Result, counted: Sequence[Object]) -> list[str]:
     text = f"{len(counted)} {noun}: {names}" if counted else "objects: none"
     if len(result.world.parts) > 1:
         text += " (each component counted separately)"
-    if doubtful := len(result.objects) - len(counted):
+    if doubtful := sum(o.status == "doubtful" for o in result.objects):
         text += f"; {doubtful} more of low confidence, probably false positives (objects.json)"
     return _wrapped(text)
 

@@ -106,7 +106,7 @@ class Result:
 
     @property
     def located(self) -> list[Object]:
-        """Objects that have a shape and are not doubtful, by id."""
+        """Objects that have a shape and are neither doubtful nor implausible, by id."""
         return [o for o in self.objects if o.located]
 
     def of_part(self, part: int) -> Result:

@@ -278,10 +278,11 @@ def _contradiction(entries: ObjectsFile, poses: Poses | None) -> str:
     described = len(entries.world.parts)
     if component_count not in (1, described):
         return f"{described} components of a trajectory that has {component_count}"
-    statuses = ("ok", "prior_dominated", "doubtful", "rejected", "tracked")
+    statuses = ("ok", "prior_dominated", "implausible", "doubtful", "rejected", "tracked")
     for o in entries.objects:
         shape = (o.center, o.half_axes, o.size, o.quat_wxyz)
-        if o.status not in statuses or (o.located and any(value is None for value in shape)):
+        has_shape = o.located or o.status == "implausible"
+        if o.status not in statuses or (has_shape and any(value is None for value in shape)):
             return f"object {o.id} is {o.status} without a shape"
         # rounded to six digits its length is off by 1e-6
         if o.quat_wxyz is not None and abs(np.linalg.norm(o.quat_wxyz) - 1) > 1e-3:

@@ -24,10 +24,10 @@ import numpy.typing as npt
 
 import quadrics
 from reobj.cameras import Camera, Poses, invert_rigid, place_of, undistort_boxes
-from reobj.files import Progress, atomic, base64_text, rounded, significant
+from reobj.files import Progress, atomic, base64_text, read_text, rounded, significant
 from reobj.poses.floor import NOISE
 from reobj.results.changes import EarlierSession
-from reobj.results.entries import Object, World
+from reobj.results.entries import Object, World, visit_gap
 from reobj.results.origin import centred
 from reobj.results.overlay import Overlay, film_layers
 from reobj.results.report import sides
@@ -35,6 +35,7 @@ from reobj.sources.image_files import IMAGE_FPS
 from reobj.sources.video import Video, shrunk
 from reobj.types import (
     Array,
+    BoolArray,
     Frame,
     Image,
     IntArray,
@@ -50,6 +51,9 @@ if TYPE_CHECKING:
     from reobj.results.result import Result
 
 
+PAGE_VERSION = 1  # of the page's data: `serve` shows them in the page of this version
+
+
 class Pictures:
     """Collect crops of the objects and whole frames for the viewer while the video is read.
 
@@ -60,6 +64,7 @@ class Pictures:
         crops: [frame number, base64] of each object's crops, by identity, in temporal order.
         frames: [frame number, base64] of whole frames, undistorted.
         best: frame number of the best box of each object, by identity.
+        time_s: of each frame that was read, by its number.
     """
 
     def __init__(self, result: Result, video: Video, max_crops: int = 480) -> None:
@@ -90,9 +95,11 @@ class Pictures:
         self.whole = set(shown[:: math.ceil(len(shown) / 60) or 1].tolist())
         self.camera = None if cameras is None else cameras.camera
         self.grid: npt.NDArray[np.float32] | None = None  # of undistorted pixels, made once
+        self.time_s: dict[int, float] = {}
 
     def take(self, frame: Frame) -> None:
         """Crop the wanted boxes of this frame, and keep the frame if it is one of `whole`."""
+        self.time_s[frame.index] = frame.time_s
         rows = self.wanted[self.tracks.frame[self.wanted] == frame.index]
         for obj, box in zip(self.tracks.track_id[rows], self.tracks.xyxy[rows], strict=True):
             crop = _crop(frame.image, box * self.scale, 112)
@@ -119,10 +126,32 @@ def _distorted_grid(camera: Camera, width: int, height: int) -> npt.NDArray[np.f
     In OpenCV's pixels: the centre of the first one is (0, 0).
     """
     small = camera.resized((width, height))
-    xy = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).reshape(-1, 2) + 0.5
-    rays = np.hstack([xy, np.ones((len(xy), 1))]) @ np.linalg.inv(small.K).T  # (N, 3)
-    distorted = np.asarray(small.to_pycolmap().img_from_cam(rays), np.float64) - 0.5
-    return np.nan_to_num(distorted, nan=-1.0).reshape(height, width, 2).astype(np.float32)
+    xy = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).reshape(-1, 2)
+    distorted = _distorted(small, np.asarray(xy + 0.5, np.float64)) - 0.5
+    return distorted.reshape(height, width, 2).astype(np.float32)
+
+
+def _distorted(camera: Camera, xy: Array) -> Array:
+    """Return the distorted pixels (N, 2) of pixels (N, 2) of the pinhole camera; -.5: none."""
+    rays = np.hstack([xy, np.ones((len(xy), 1))]) @ np.linalg.inv(camera.K).T  # (N, 3)
+    distorted = np.asarray(camera.to_pycolmap().img_from_cam(rays), np.float64)
+    return np.asarray(np.nan_to_num(distorted, nan=-0.5))
+
+
+def _lens(camera: Camera, columns: int = 64, rows: int = 48) -> dict[str, Any] | None:
+    """Return where the corners of a grid over the pinhole picture lie in a frame; None: the same.
+
+    Args:
+        columns, rows: of cells; within one the viewer neglects that its sides are inclined: a tenth
+            of a pixel of the screen at the distortion of a phone.
+    """
+    if camera.model in ("PINHOLE", "SIMPLE_PINHOLE"):
+        return None
+    x = np.linspace(0, camera.width, columns + 1)
+    y = np.linspace(0, camera.height, rows + 1)
+    corners = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+    share = _distorted(camera, corners) / [camera.width, camera.height]
+    return {"columns": columns, "rows": rows, "grid": base64_text(share, "<f4")}
 
 
 def _crop(image: Image, box: Array, size_px: int) -> bytes:
@@ -216,15 +245,26 @@ def scene_steps(result: Result) -> IntArray:
     return frames[:: math.ceil(len(frames) / 1500) or 1]
 
 
-def page_text() -> str:
-    """Return the page without its data: page.html, with each `@{file}` replaced by the file."""
+# What the page may load, besides its styles and scripts: of a file the recording beside it
+OF_A_FILE = "img-src data:; media-src 'self' file:"
+OF_A_SERVER = "img-src data: 'self'; media-src 'self'; connect-src 'self'"
+
+
+def page_text(served: dict[str, Any] | None = None) -> str:
+    """Return the page without its data: page.html, with each `@{file}` replaced by the file.
+
+    Args:
+        served: what the server of `serve` offers to the page; None: the page is a file.
+    """
     folder = Path(__file__).with_name("page")
     text = (folder / "page.html").read_text(encoding="utf-8")
 
     def text_of(match: re.Match[str]) -> str:
         return (folder / match[1]).read_text(encoding="utf-8").strip()
 
-    return re.sub(r"@\{([\w.]+)\}", text_of, text)
+    text = re.sub(r"@\{([\w.]+)\}", text_of, text)
+    text = text.replace("@ALLOWED@", OF_A_FILE if served is None else OF_A_SERVER)
+    return text.replace("@SERVED@", json.dumps(served).replace("<", "\\u003c"))
 
 
 def write_scene(
@@ -248,6 +288,7 @@ def write_scene(
     thin = math.ceil(0 if poses is None else len(poses.points) / 20_000) or 1
     parts, origins = zip(*(centred(part) for part in result.parts()), strict=True)
     data = {
+        "version": PAGE_VERSION,
         "title": Path(str(video.source)).name,
         "warnings": result.warnings,
         "links": [
@@ -255,16 +296,23 @@ def write_scene(
             for link in result.world.to_json()["links"]
         ],
         "objects": [
-            _scene_object(o, origins[o.part], result.tracks, steps, pictures)
-            for o in result.objects
+            _scene_object(o, origins[o.part], result, steps, pictures) for o in result.objects
         ],
-        "thumbs": [[frame, data, _boxes_in(result, frame)] for frame, data in pictures.frames],
+        "thumbs": pictures.frames,
+        "film": Path(str(video.source)).name if _is_file(video) else "",
         "doubtful": doubtful,
         "size": {"width": result.video.width, "height": result.video.height},
+        "visit_gap": visit_gap(result.tracks.frame, result.video.fps),
         "edits": [] if result.edits is None else result.edits.entries,
         "map": "" if result.poses is None else result.poses.map_id,
         "why_flat": _why_flat(result),
-        "steps": {"frame": steps.tolist(), "seconds": seconds, "part": of_part.tolist()},
+        "steps": {
+            "frame": steps.tolist(),
+            "time": _times(result, pictures, steps),
+            "frame_s": 1 / (video.fps or IMAGE_FPS),
+            "seconds": seconds,
+            "part": of_part.tolist(),
+        },
         **_scene_cameras(result, steps, np.array(origins)),
         "parts": [
             _scene_part(k, part, thin) | {"origin": origin.tolist()}
@@ -277,21 +325,48 @@ def write_scene(
         data["earlier"] = _earlier_sessions(result.earlier)
         for entry in data["objects"]:
             entry["best"] = pictures.best.get(entry["id"])
+    with atomic(path) as part:
+        part.write_text(_page_of(data, None), encoding="utf-8")
+
+
+def _page_of(data: dict[str, Any], served: dict[str, Any] | None) -> str:
+    """Return the page with its data; "<" is escaped: no name can end the script element."""
     text = json.dumps(data, separators=(",", ":"), allow_nan=False)
-    head, tail = page_text().split("@DATA@")
-    with atomic(path) as part:  # "<" is escaped: no name can end the script element
-        part.write_text(head + text.replace("<", "\\u003c") + tail, encoding="utf-8")
+    head, tail = page_text(served).split("@DATA@")
+    return head + text.replace("<", "\\u003c") + tail
 
 
-def _boxes_in(result: Result, frame: int) -> list[list[float]]:
-    """List the detections of a frame: identity, x1, y1, x2, y2, undistorted, native pixels."""
-    rows = result.tracks[(result.tracks.frame == frame) & (result.tracks.score > 0)]
-    box = rows.xyxy if result.poses is None else undistort_boxes(rows.xyxy, result.poses.camera)
-    finite = np.isfinite(box).all(1)
-    return [
-        [i, *b]
-        for i, b in zip(rows.track_id[finite].tolist(), box[finite].round(1).tolist(), strict=True)
-    ]
+def served_page(path: Path, served: dict[str, Any]) -> str:
+    """Return the page of a scene.html for `serve`: its data, in the page of this version.
+
+    No script of the file is used.
+
+    Args:
+        served: what the server offers to the page.
+    Raises:
+        ReobjError: the file is not a viewer of this version.
+    """
+    text = read_text(path)
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)
+    try:
+        data = json.loads(found[1]) if found else None
+    except ValueError:
+        data = None
+    if not isinstance(data, dict) or data.get("version") != PAGE_VERSION:
+        advice = "`objects OUT` makes it again"
+        raise ReobjError(f"{path}: not a viewer that this version wrote; {advice}")
+    return _page_of(data, served)
+
+
+def _is_file(video: Video) -> bool:
+    """Whether the recording is a video file, which the viewer can play."""
+    return video.has_images and not video.is_live and not video.files
+
+
+def _times(result: Result, pictures: Pictures, steps: IntArray) -> list[float]:
+    """Return the times of the steps in the recording, s; by the frame rate where not read."""
+    fps = result.video.fps or IMAGE_FPS
+    return [round(pictures.time_s.get(step, step / fps), 4) for step in steps.tolist()]
 
 
 def _scene_cameras(result: Result, steps: IntArray, origins: Array) -> dict[str, Any]:
@@ -309,7 +384,8 @@ def _scene_cameras(result: Result, steps: IntArray, origins: Array) -> dict[str,
     shown = invert_rigid(poses.cam_from_world[rows])
     shown[:, :, 3] -= origins[poses.part[rows]]
     pinhole = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
-    return {"camera": size | pinhole, "poses": base64_text(shown, "<f4")}
+    camera = size | pinhole | {"lens": _lens(poses.camera)}
+    return {"camera": camera, "poses": base64_text(shown, "<f4")}
 
 
 def _scene_part(number: int, part: Result, thin: int) -> dict[str, Any]:
@@ -343,35 +419,67 @@ def _scene_part(number: int, part: Result, thin: int) -> dict[str, Any]:
 
 
 def _scene_object(
-    obj: Object, origin: Array, tracks: Tracks, steps: IntArray, pictures: Pictures
+    obj: Object, origin: Array, result: Result, steps: IntArray, pictures: Pictures
 ) -> dict[str, Any]:
     """Collect the data of an object for the viewer.
 
     Its entry of objects.json, colour, crops, size as text, the steps in which it is seen (first,
-    last, first, last ...), and its visits, each with its best box, the reference of edits (first,
-    last, frame, x1, y1, x2, y2).
+    last, first, last ...), its boxes in these steps, the steps in which they fill a gap, its
+    tracklets (number, first, last frame), and boxes by which edits refer to it (frame, tracklet,
+    x1, y1, x2, y2).
     """
-    rows_of_object = tracks[tracks.track_id == obj.id]
+    rows_of_object = result.tracks[result.tracks.track_id == obj.id]
     seen = np.isin(steps, rows_of_object.frame)
-    runs = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]])))
-    runs[1::2] -= 1
+    frames, first = np.unique(rows_of_object.frame, return_index=True)
+    shown = rows_of_object[first[np.isin(frames, steps)]]
+    box = shown.xyxy
+    if result.poses is not None:
+        box = undistort_boxes(box, result.poses.camera)
+    filled = np.isin(steps, shown.frame[shown.score == 0])
     detected = rows_of_object
     if detected.score.any():  # without interpolated boxes
         detected = detected[detected.score > 0]
-    visits = []
-    for rows in rows_by(detected.tracklet_id):
-        best = rows[detected.score[rows].argmax()]
-        box = detected.xyxy[best].round(1).tolist()
-        visits.append([*detected.frame[rows[[0, -1]]].tolist(), int(detected.frame[best]), *box])
+    tracklets = [
+        [int(detected.tracklet_id[rows[0]]), *detected.frame[rows[[0, -1]]].tolist()]
+        for rows in rows_by(detected.tracklet_id)
+    ]
     return obj.to_json() | {
         "center": None if obj.center is None else (obj.center - origin).tolist(),
         "cov": "" if obj.cov is None else base64_text(obj.cov, "<f4"),
         "color": object_color(obj.id)[::-1],
         "sides": sides(obj),
-        "seen": runs.tolist(),
-        "visits": sorted(visits),
+        "seen": _runs(seen),
+        "filled": _runs(filled),
+        "boxes": base64_text(box, "<f4"),
+        "visits": obj.visits,
+        "tracklets": sorted(tracklets, key=lambda tracklet: tracklet[1:]),
+        "refs": _references(detected),
         "crops": pictures.crops[obj.id],
     }
+
+
+def _runs(mask: BoolArray) -> list[int]:
+    """Return first and last index of each run of True in a mask (S,)."""
+    runs = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]])))
+    runs[1::2] -= 1
+    return [int(at) for at in runs]
+
+
+def _references(detected: Tracks, most: int = 100) -> list[list[float]]:
+    """Choose boxes of an object, by time: the best one of each tracklet, and `most` spread evenly.
+
+    Args:
+        most: 100 boxes of 50 objects are .2 MB of the page.
+    Returns:
+        frame, tracklet, x1, y1, x2, y2 of each, native pixels.
+    """
+    best = [rows[detected.score[rows].argmax()] for rows in rows_by(detected.tracklet_id)]
+    even = np.linspace(0, len(detected) - 1, min(most, len(detected))).round().astype(np.int64)
+    row = np.union1d(np.array(best, np.int64), even)
+    row = row[np.argsort(detected.frame[row], kind="stable")]
+    numbers = zip(detected.frame[row].tolist(), detected.tracklet_id[row].tolist(), strict=True)
+    boxes = detected.xyxy[row].round(1).tolist()
+    return [[*pair, *box] for pair, box in zip(numbers, boxes, strict=True)]
 
 
 def _earlier_sessions(

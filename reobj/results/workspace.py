@@ -53,6 +53,7 @@ class _Binding:
 
     source: str
     input: dict[str, int]
+    content: str = ""
     frames: _Frames | None = None
 
 
@@ -154,6 +155,11 @@ class Workspace:
             return binding.source, InputConfig(**binding.input)
         except TypeError as error:  # an option of another version
             raise ReobjError(f"{self._source_file}: {written_by(self.out)} ({error})") from error
+
+    @property
+    def fingerprint(self) -> str:
+        """Fingerprint of the video that the folder is bound to."""
+        return self._read_binding().content
 
     def video(self) -> Video:
         """Open the video that the folder is bound to, with the options of that run."""

@@ -428,7 +428,9 @@ def printed_by(capsys: pytest.CaptureFixture[str], *words: str) -> str:
 def test_all_commands_are_tested_here(capsys: pytest.CaptureFixture[str]) -> None:
     """A new command needs tests here."""
     commands = re.findall(r"^    (\w+) ", printed_by(capsys, "--help"), re.M)
-    assert commands == ["run", "track", "poses", "objects", "eval", "export", "map", "models"]
+    assert commands == [
+        "run", "track", "poses", "objects", "serve", "eval", "export", "map", "models",
+    ]  # fmt: skip
 
 
 def test_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:

@@ -85,6 +85,8 @@ ELSEWHERE = {
     "python reobj_track.py models": "test_commands.py",
     "python reobj_track.py objects out --solver lfd": "test_commands.py, with all solvers",
     "python reobj_track.py objects out --edits edits.json": "below, of OUT",
+    "python reobj_track.py serve out": "test_serve.py; it runs until Ctrl-C",
+    "python reobj_track.py serve OUT --open": "test_serve.py; it opens a browser",
     "python reobj_track.py run phone.mp4 -o out --map flat.map": "test_map.py",
     "python reobj_track.py run monday.mp4 -o monday --map flat.map": "test_map.py",
     "python reobj_track.py run tuesday.mp4 -o tuesday --map flat.map": "test_map.py",

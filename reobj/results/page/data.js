@@ -51,7 +51,7 @@ const sizeText = (o) => o.sides.length
   ? `${o.sides.map(([side]) => side).join(" × ")} ${o.size_m ? "m" : "units"}` : "";
 
 // ---- The selected component in its level frame: z up, 0 on the floor, metres if known ----
-const state = { part: -1, step: -1, session: null, selected: null, ghost: null, hidden: new Set(),
+const state = { part: -1, step: -1, seat: -1, asked: null, sought: null, session: null, selected: null, ghost: null, hidden: new Set(),
   hiddenKinds: new Set(["not_seen"]), measured: [] };
 let objects = S.objects;                         // as the edits have them
 let here, solid, steps, cams, posed, level;      // of the part: objects, with a solid, steps, cameras
@@ -86,6 +86,7 @@ function pointsOf(part) {                        // level positions, colours
 
 const seenAt = (o, step) => o.seen.some((s, i) => i % 2 === 0 && s <= step
   && step <= o.seen[i + 1]);
+const counted = (o) => o.status !== "doubtful" && o.status !== "implausible";  // as in entries.py
 const allowed = (o) => !state.hidden.has(o.class) && !hiddenByKind(changeOf(o))
   && ($("doubtful").checked || o.status !== "doubtful");
 const shown = () => solid.filter(allowed);

@@ -1,7 +1,7 @@
 // The list of objects and the panel of the chosen one.
 const nameOf = (o) => `${o.class} ${o.id}`;
 const NOTE = { ok: "", prior_dominated: "", rejected: "no solid", doubtful: "doubtful",
-  tracked: "in 2D only" };
+  implausible: "implausible size",   tracked: "in 2D only" };
 
 function bar(o) {                                // when the object was seen, over the part's frames
   const first = S.steps.frame[steps[0]], span = S.steps.frame[steps.at(-1)] - first + 1;
@@ -52,7 +52,7 @@ function fillList() {
       filterList();
       redraw();
     } });
-    const count = here.filter((o) => o.class === name && o.status !== "doubtful").length;
+    const count = here.filter((o) => o.class === name && counted(o)).length;
     return el("label", {}, box, `${name} ${count}`);
   }));
   $("legend").hidden = Boolean(state.session);
@@ -106,7 +106,7 @@ function facts(o) {
   if (o.parallax_deg !== null) rows.push(["parallax", `${o.parallax_deg}°`]);
   if (o.reprojection_iou_median !== null) rows.push(["box overlap", o.reprojection_iou_median]);
   if (o.dropped_boxes) rows.push(["boxes left out", o.dropped_boxes]);
-  return rows.concat([["tracklets", o.tracks.join(", ")]]);
+  return rows;
 }
 
 function select(o) {
@@ -135,4 +135,5 @@ function select(o) {
     ...(o.then ? [] : [...editButtons(o), ...visitRows(o)]),
     ...(links.length ? [el("h3", {}, "Merges and splits"),
       el("ul", {}, ...links.map((l) => el("li", {}, evidence(l))))] : []));
+  fillCut();
 }

@@ -14,7 +14,7 @@ function gather() {                              // the objects of the part
 function enter(part) {                           // show one part of the cameras' path, a world
   if (here) select(null);
   if (state.ride) setRide(false);
-  Object.assign(state, { part, step: -1, measured: [] });
+  Object.assign(state, { part, step: -1, seat: -1, measured: [] });
   setFollow(false);
   level = levelFrame(part);
   $("session").hidden = !EARLIER.length || !inMap(part);
@@ -129,8 +129,7 @@ dark.addEventListener("change", () => {
 });
 
 // ---- Start ----
-document.title = $("title").textContent = `${S.title}: ${S.objects.filter(
-  (o) => o.status !== "doubtful").length} objects`
+document.title = $("title").textContent = `${S.title}: ${S.objects.filter(counted).length} objects`
   + (S.parts.length > 1 ? ` in ${S.parts.length} components` : "");
 $("part").append(...S.parts.map(({ name }, value) => el("option", { value }, name)));
 $("part").hidden = S.parts.length < 2;
@@ -138,7 +137,7 @@ startChanges();
 startSessions();
 $("doubtful").checked = S.doubtful;
 $("doubtful-label").hidden = !S.objects.some((o) => o.status === "doubtful");
-objects = S.objects.map((o) => ({ ...o, ids: [o.id] }));
+objects = S.objects.map((o) => ({ ...o, ids: [o.id], sources: [o.id] }));
 if (S.why_flat || !prepare()) {
   document.body.classList.add("flat");
   $("view").prepend(el("p", { id: "why" }, `No 3D view: ${S.why_flat || "no WebGL here"}. Below: `
@@ -146,4 +145,4 @@ if (S.why_flat || !prepare()) {
 }
 for (const id of ["follow", "ride", "measure"]) press(id, false);
 enter(0);
-fillEdits();
+if (job.running) watchJob(); else fillEdits();

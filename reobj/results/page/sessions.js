@@ -6,7 +6,7 @@ const inMap = (part) => Boolean(S.changes?.components.includes(part));
 function objectsThen(session) {                  // as objects of the part, without visits and tracks
   const { origin } = S.parts[state.part];
   return session.objects.map((o) => ({ ...o, center: add(o.center, origin, -1), then: session,
-    part: state.part, ids: [o.id], color: hue(o.id), status: "ok", reason: "", confidence: null,
+    part: state.part, ids: [o.id], sources: [], color: hue(o.id), status: "ok", reason: "", confidence: null,
     classes: {}, visits: [], seen: [], tracks: [], frames_seen: 0,
     crops: [] }));
 }

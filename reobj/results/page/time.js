@@ -1,20 +1,12 @@
 // Time: the slider, play, the frames of the video, Follow and Ride along.
 const frameOf = (step) => S.steps.frame[step];
-const pictured = () => S.thumbs.map(([frame]) => S.steps.frame.indexOf(frame))
-  .filter((step) => S.steps.part[step] === state.part && cams[step]);
 
 function pictureAt(step) {                       // [frame, picture, boxes]: the last one until then
   const first = frameOf(steps[0]);
   return S.thumbs.findLast(([frame]) => first <= frame && frame <= frameOf(step));
 }
 
-function boxesOf(thumb) {                        // detections of a frame, in its pixels
-  return thumb[2].map(([id, x1, y1, x2, y2]) => [objects.find((o) => o.ids.includes(id)),
-    { x: x1, y: y1, width: x2 - x1, height: y2 - y1 }]).filter(([o]) => o && allowed(o))
-    .map(([o, box]) => svg("rect", { class: "box", ...box, stroke: rgb(o) }));
-}
-
-function goTo(step) {
+function goTo(step, image = null) {              // image: of the step, where it is here already
   if (S.steps.part[step] !== state.part) enter(S.steps.part[step]);
   if (state.ride && pictured().length) {         // only frames with a picture show whether it fits
     const gap = (s) => Math.abs(s - step);
@@ -32,11 +24,15 @@ function goTo(step) {
     const drawing = $("frame").querySelector("svg");
     const size = S.camera || S.size;
     drawing.setAttribute("viewBox", `0 0 ${size.width} ${size.height}`);
-    drawing.replaceChildren(...boxesOf(thumb).map((box) => { box.style.strokeDasharray = "none";
-      return box; }));
+    drawing.replaceChildren(...boxesAt(S.steps.frame.indexOf(thumb[0])).map((box) => {
+      box.style.strokeDasharray = "none"; return box; }));
   }
   $("list").style.setProperty("--now", `${100 * (frameOf(step) - first) / (last - first + 1)}%`);
   here.forEach((o) => o.row.classList.toggle("now", seenAt(o, step)));
+  fillCut();
+  if (image) arrive(step, image);
+  else if (state.ride) ask(step);
+  else state.seat = step;
   if (state.follow && after && !state.ride) followTo(before, after);
   redraw();
 }
@@ -50,7 +46,12 @@ function onward(by = 1) {
 }
 function play() {
   $("play").textContent = playing ? "▶" : "⏸";
-  if (playing) { playing = clearInterval(playing); return; }
+  if (playing) { playing = clearInterval(playing); film.pause(); return; }
+  if (state.ride && filmed && film.requestVideoFrameCallback) {
+    playing = -1;                                // no timer
+    playFilm(Math.max(state.step, steps[0]));
+    return;
+  }
   const stride = state.ride ? Math.max(1, steps.length / Math.max(pictured().length, 1)) : 1;
   playing = setInterval(onward, S.steps.seconds * 1000 * stride);
 }
@@ -84,22 +85,9 @@ function setRide(on) {
   state.ride = on;
   press("ride", on);
   if (on) setFollow(false);
+  if (on) startFilm();
   if (playing) { play(); play(); }               // at the pace of the pictures
   document.body.classList.toggle("riding", on);
   if (on) goTo(Math.max(state.step, steps[0]));
   redraw();
-}
-
-function placePicture(inside) {
-  const thumb = inside && pictureAt(state.step), back = $("back");
-  back.hidden = !thumb || thumb[0] !== frameOf(state.step);
-  $("drawn").querySelectorAll(".box").forEach((box) => box.remove());
-  if (back.hidden) return;
-  const { scale, x, y } = pictureRect(), { width, height } = S.camera;
-  if (back.dataset.frame !== String(thumb[0])) back.src = picture(thumb[1]);
-  back.dataset.frame = thumb[0];
-  Object.assign(back.style, { left: `${x}px`, top: `${y}px`, width: `${width * scale}px`,
-    height: `${height * scale}px` });
-  if ($("boxes").checked) $("drawn").append(...boxesOf(thumb).map((box) => {
-    box.setAttribute("transform", `translate(${x} ${y}) scale(${scale})`); return box; }));
 }

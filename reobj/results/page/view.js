@@ -63,7 +63,7 @@ function solidOf(o) {                            // group of an object: faces, e
     0, 0, 0, 1);
   const pale = (opacity) => new THREE.MeshBasicMaterial(
     { color, transparent: true, opacity, depthWrite: false, side: THREE.DoubleSide });
-  const wire = WIRES[o.support], doubt = o.status === "doubtful" || o.kind, ink = color.clone();
+  const wire = WIRES[o.support], doubt = !counted(o) || o.kind, ink = color.clone();
   if (!dark.matches && !o.kind) ink.multiplyScalar(0.6);    // pale lines would be lost on white
   group.parts = {
     faces: new THREE.Mesh(FACES[o.support], pale(0.06)),
@@ -115,7 +115,7 @@ function gridOf() {                              // on the floor, or under every
   const step = level.metres && span < 30 && span > 3 ? 0.5 : nice(span / 10), thin = [], bold = [];
   const from = [0, 1].map((i) => Math.floor((low[i] - 0.05 * span) / step));
   const to = [0, 1].map((i) => Math.ceil((high[i] + 0.05 * span) / step));
-  const bottoms = solid.filter((o) => o.status !== "doubtful").map((o) => level.place(o.center)[2]
+  const bottoms = solid.filter(counted).map((o) => level.place(o.center)[2]
     - level.size * Math.hypot(...axesOf(o.quat_wxyz).map((a, i) => level.turn(a)[2] * o.half_axes[i])));
   const z = level.floor ? 0 : Math.min(low[2], bottoms.length ? quantile(bottoms, 0.1) : low[2]);
   for (let i = from[0]; i <= to[0]; i++) (i % 2 ? thin : bold).push(
@@ -131,7 +131,7 @@ function extent(points) {                        // box without outliers: of poi
   const axes = [0, 1, 2].map((i) => {
     const own = [], stride = 3 * Math.ceil(points.length / 15000);
     for (let k = i; k < points.length; k += stride) own.push(points[k]);
-    const anchors = own.length > 100 ? own : solid.filter((o) => o.status !== "doubtful")
+    const anchors = own.length > 100 ? own : solid.filter(counted)
       .map((o) => level.place(o.center)[i]);
     const path = posed.map((c) => c.at[i]), ends = anchors.length
       ? [quantile(anchors, 0.05), quantile(anchors, 0.95)] : [];
@@ -143,7 +143,7 @@ function extent(points) {                        // box without outliers: of poi
   for (let k = 0; k < points.length; k += 3 * Math.ceil(points.length / 3000)) {
     anchors.push([...points.subarray(k, k + 3)]);
   }
-  anchors.push(...posed.map((c) => c.at), ...solid.map((o) => level.place(o.center)));
+  anchors.push(...posed.map((c) => c.at), ...solid.filter(counted).map((o) => level.place(o.center)));
   const kept = anchors.filter(inside);
   return { low, high, middle: times(add(low, high), 0.5), anchors: kept.length ? kept : [low, high],
     radius: Math.hypot(...add(high, low, -1)) / 2 || 1 };
@@ -240,9 +240,9 @@ function sit(cam) {                              // the seat sees what the camer
   seat.updateMatrixWorld(true);
 }
 
-const riding = () => Boolean(state.ride && cams[state.step]);
+const riding = () => Boolean(state.ride && cams[state.seat]);
 function viewpoint() {
-  if (riding()) { sit(cams[state.step]); return seat; }
+  if (riding()) { sit(cams[state.seat]); return seat; }
   const reach = orbit.position.distanceTo(controls.target);
   orbit.aspect = canvas.clientWidth / Math.max(canvas.clientHeight, 1);
   orbit.near = reach / 100;

@@ -1,0 +1,470 @@
+"""`serve OUT`: the viewer on this machine, where saved corrections are applied at once.
+
+The standard library's HTTP server on 127.0.0.1. It has a fixed list of addresses: the page, the
+recording, frames of an image folder, the state of the worker, corrections, undo. No address is a
+path of a file.
+"""
+
+from __future__ import annotations
+
+import hmac
+import http.cookies
+import json
+import os
+import re
+import secrets
+import subprocess
+import threading
+from collections.abc import Sequence
+from functools import partial
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any, BinaryIO
+from urllib.parse import parse_qs, urlsplit
+
+import cv2
+
+from reobj.files import atomic
+from reobj.results.edits import HEADER, read_edits
+from reobj.results.names import OutputFile
+from reobj.results.scene import served_page
+from reobj.results.workspace import Workspace
+from reobj.sources.image_files import read_image
+from reobj.sources.video import Video, shrunk, source_fingerprint
+from reobj.types import ReobjError, log, one_line
+
+HOST = "127.0.0.1"
+EDITS_MAX = 16 << 20  # bytes of a file of corrections; 10,000 splits take 3 MB
+FRAME_PX = 1280  # longer side of the frames of an image folder
+CHUNK = 1 << 18  # bytes of the recording that are in memory
+PROGRESS_S = 0.5  # between two lines of progress of the worker
+VIDEO_TYPES = {".webm": "video/webm", ".mkv": "video/webm", ".ogv": "video/ogg"}  # else mp4
+HEADERS = {
+    "Cache-Control": "no-store",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Content-Security-Policy": "frame-ancestors 'none'",
+}
+
+
+class Recording:
+    """The recording of an output folder, as far as it is unchanged: a video file, or images.
+
+    Attributes:
+        file: of a video; None. images: files of an image folder by frame number.
+    """
+
+    def __init__(self, workspace: Workspace) -> None:
+        self.file: Path | None = None
+        self.images: list[Path] = []
+        source, config = workspace.source
+        # the fingerprint holds the time of the file: who made up this folder cannot know it
+        if workspace.fingerprint != source_fingerprint(source):
+            return
+        try:
+            video = Video(source, config)
+        except ReobjError:
+            return
+        if video.files:
+            self.images = video.files
+        elif not video.is_live and Path(source).is_file():
+            self.file = Path(source)
+
+    def frame(self, number: int) -> bytes:
+        """Return a frame of an image folder as JPEG; b"": there is none."""
+        image = read_image(self.images[number]) if number < len(self.images) else None
+        if image is None:
+            return b""
+        return cv2.imencode(".jpg", shrunk(image, FRAME_PX))[1].tobytes()
+
+
+class Corrections:
+    """Corrections of an output folder: one at a time in a child process, and what undoes them.
+
+    Before corrections replace those of the folder, these are stored in OUT/cache/undo: 1.json, and
+    so on. Undo applies the last file and removes it.
+
+    Args:
+        command: program and first arguments that run the tool.
+    """
+
+    def __init__(self, out: Path, command: Sequence[str]) -> None:
+        self.out = out
+        self.folder = out / "cache" / "undo"
+        self._command = command
+        self._lock = threading.Lock()
+        self._process: subprocess.Popen[str] | None = None
+        self._text = ""  # progress of the worker, or its error
+        self._is_running = False
+        self._failed = False
+
+    def state(self) -> dict[str, Any]:
+        """Return what the page shows: progress or error, and how much can be undone."""
+        with self._lock:
+            state = {"running": self._is_running, "failed": self._failed, "text": self._text}
+        return state | {"undo": len(self._stack()), "version": self.version}
+
+    @property
+    def version(self) -> str:
+        """Version of the result, which the page sends with its corrections."""
+        try:
+            return str((self.out / OutputFile.OBJECTS).stat().st_mtime_ns)
+        except OSError:
+            return ""
+
+    def _stack(self) -> list[Path]:
+        """List the stored corrections, the latest last."""
+        files = [p for p in self.folder.glob("*.json") if p.stem.isdecimal()]
+        return sorted(files, key=lambda path: int(path.stem))
+
+    def save(self, text: bytes) -> None:
+        """Start to apply corrections.
+
+        Args:
+            text: of a file of edits.
+        Raises:
+            ReobjError: they are invalid, or others are being applied.
+        """
+        self._start()
+        try:
+            new = self._temporary(text)
+            read_edits(new)
+            before = self.out / OutputFile.EDITS
+            old = before.read_bytes() if before.is_file() else _no_edits()
+        except ReobjError as error:
+            self._end(str(error))
+            raise
+        self._run(new, partial(self._push, old))
+
+    def undo(self) -> None:
+        """Start to restore the corrections before the last ones.
+
+        Raises:
+            ReobjError: there are none, or others are being applied.
+        """
+        self._start()
+        stack = self._stack()
+        if not stack:
+            self._end("")
+            raise ReobjError("nothing to undo")
+        last = stack[-1]
+        self._run(self._temporary(last.read_bytes()), last.unlink)
+
+    def stop(self) -> None:
+        """End the worker; the result stays as it was."""
+        with self._lock:
+            process = self._process
+        if process is not None and process.poll() is None:
+            process.kill()
+            process.wait()
+
+    def _start(self) -> None:
+        with self._lock:
+            if self._is_running:
+                raise ReobjError("corrections are being applied; wait for them")
+            self._is_running = True
+            self._failed = False
+            self._text = "starting"
+
+    def _end(self, fault: str) -> None:
+        with self._lock:
+            self._is_running = False
+            self._failed = bool(fault)
+            self._text = fault
+
+    def _temporary(self, text: bytes) -> Path:
+        """Write the file that the worker reads, and `_work` removes."""
+        path = self.out / "cache" / "new-edits.json"
+        with atomic(path) as part:
+            part.write_bytes(text)
+        return path
+
+    def _push(self, old: bytes) -> None:
+        """Store the corrections that were replaced."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        number = 1 + max((int(path.stem) for path in self._stack()), default=0)
+        with atomic(self.folder / f"{number}.json") as part:
+            part.write_bytes(old)
+
+    def _run(self, edits: Path, done: Any) -> None:
+        """Start the worker; `done` is called after its success."""
+        threading.Thread(target=self._work, args=(edits, done), daemon=True).start()
+
+    def _work(self, edits: Path, done: Any) -> None:
+        """Apply a file of edits in a child process, as the command line does."""
+        command = [*self._command, "objects", str(self.out), "--edits", str(edits)]
+        environment = os.environ | {"REOBJ_PROGRESS_S": str(PROGRESS_S)}
+        fault = "the worker could not be started"
+        try:
+            with subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                text=True,
+                errors="replace",
+                env=environment,
+                start_new_session=True,  # Ctrl-C ends the server, which ends the worker
+            ) as process:
+                with self._lock:
+                    self._process = process
+                fault = self._follow(process, edits)
+            if not fault:
+                done()
+        except OSError as error:
+            fault = one_line(str(error))
+        finally:
+            edits.unlink(missing_ok=True)
+            self._end(fault)
+
+    def _follow(self, process: subprocess.Popen[str], edits: Path) -> str:
+        """Show the progress of the worker; return its error, "" after a success."""
+        assert process.stderr is not None
+        line = ""
+        for text in process.stderr:
+            line = text.strip().replace(str(edits), OutputFile.EDITS) or line
+            if not line.startswith("warning:"):
+                with self._lock:
+                    self._text = line
+        if process.wait() == 0:
+            return ""
+        return line.removeprefix("error: ") or f"the worker ended with {process.returncode}"
+
+
+def _no_edits() -> bytes:
+    """Return a file of edits that removes all."""
+    return json.dumps(HEADER | {"edits": []}).encode()
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """Answer a request of the page; every other one is refused."""
+
+    server: Server
+    protocol_version = "HTTP/1.1"
+    server_version = "reobj_track"
+    sys_version = ""
+    timeout = 60  # s, of a connection without a request
+
+    def log_message(self, text: str, *args: Any) -> None:
+        """Log requests with --debug, without the token."""
+        log.debug("serve: %s", (text % args).replace(self.server.token, "TOKEN"))
+
+    def do_HEAD(self) -> None:
+        self.do_GET()
+
+    def do_GET(self) -> None:
+        if not self._may_read():
+            return
+        path = urlsplit(self.path).path
+        frame = re.fullmatch(r"/frame/(\d{1,9})", path)
+        if path == "/":
+            self._page()
+        elif path == "/state":
+            self._json(self.server.corrections.state())
+        elif path == "/recording" and self.server.recording.file is not None:
+            self._recording(self.server.recording.file)
+        elif frame and (picture := self.server.recording.frame(int(frame[1]))):
+            self._answer(HTTPStatus.OK, picture, "image/jpeg")
+        else:
+            self._refuse(HTTPStatus.NOT_FOUND, "no such page")
+
+    def do_POST(self) -> None:
+        self.close_connection = True  # an unread body is no next request
+        if not self._may_read():
+            return
+        if self.headers.get("Origin") not in self.server.origins:
+            self._refuse(HTTPStatus.FORBIDDEN, "from another page")
+            return
+        length = self.headers.get("Content-Length", "")
+        if not length.isdecimal() or int(length) > EDITS_MAX:
+            self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"at most {EDITS_MAX >> 20} MB")
+            return
+        parts = urlsplit(self.path)
+        version = parse_qs(parts.query).get("version", [""])[0]
+        text = self.rfile.read(int(length))
+        corrections = self.server.corrections
+        if parts.path not in ("/edits", "/undo"):
+            self._refuse(HTTPStatus.NOT_FOUND, "no such page")
+            return
+        if version != corrections.version:
+            self._refuse(HTTPStatus.CONFLICT, "the result has changed: reload this page")
+            return
+        try:
+            if parts.path == "/edits":
+                corrections.save(text)
+            else:
+                corrections.undo()
+        except ReobjError as error:
+            self._refuse(HTTPStatus.CONFLICT, str(error))
+            return
+        self._json(corrections.state())
+
+    # ---- Who asks --------------------------------------------------------------------------------
+
+    def _may_read(self) -> bool:
+        """Check the name of the server, which a foreign page cannot give, and the token."""
+        if self.headers.get("Host", "").lower() not in self.server.hosts:
+            self._refuse(HTTPStatus.FORBIDDEN, "unknown host")
+            return False
+        if not any(hmac.compare_digest(t, self.server.token.encode()) for t in self._tokens()):
+            self._refuse(HTTPStatus.FORBIDDEN, "no token: open the address that `serve` printed")
+            return False
+        return True
+
+    def _tokens(self) -> list[bytes]:
+        """Return the tokens of the address and of the cookie."""
+        found = parse_qs(urlsplit(self.path).query).get("token", [])
+        try:
+            cookies = http.cookies.SimpleCookie(self.headers.get("Cookie", ""))
+        except http.cookies.CookieError:
+            cookies = http.cookies.SimpleCookie()
+        if self.server.cookie in cookies:
+            found = [*found, cookies[self.server.cookie].value]
+        return [token.encode("utf-8", "replace") for token in found]
+
+    # ---- Answers ---------------------------------------------------------------------------------
+
+    def _page(self) -> None:
+        """Send the page; the token of the address moves to a cookie."""
+        cookie = f"{self.server.cookie}={self.server.token}; HttpOnly; SameSite=Lax; Path=/"
+        if urlsplit(self.path).query:
+            more = {"Location": "/", "Set-Cookie": cookie}
+            self._answer(HTTPStatus.SEE_OTHER, b"", "text/plain", more)
+            return
+        try:
+            page = self.server.page()
+        except ReobjError as error:
+            self._refuse(HTTPStatus.CONFLICT, str(error))
+            return
+        self._answer(HTTPStatus.OK, page.encode(), "text/html; charset=utf-8")
+
+    def _json(self, data: dict[str, Any]) -> None:
+        self._answer(HTTPStatus.OK, json.dumps(data).encode(), "application/json")
+
+    def _refuse(self, status: HTTPStatus, why: str) -> None:
+        self._answer(status, f"{one_line(why)}\n".encode(), "text/plain; charset=utf-8")
+
+    def _answer(
+        self, status: HTTPStatus, body: bytes, kind: str, more: dict[str, str] | None = None
+    ) -> None:
+        self._head(status, len(body), kind, more)
+        if self.command != "HEAD":
+            self.wfile.write(body)
+
+    def _head(
+        self, status: HTTPStatus, length: int, kind: str, more: dict[str, str] | None = None
+    ) -> None:
+        self.send_response(status)
+        headers = {"Content-Type": kind, "Content-Length": str(length)}
+        for name, value in (HEADERS | headers | (more or {})).items():
+            self.send_header(name, value)
+        self.end_headers()
+
+    def _recording(self, path: Path) -> None:
+        """Send the video file, or the range of it that is requested."""
+        try:
+            file = path.open("rb")
+        except OSError:
+            self._refuse(HTTPStatus.NOT_FOUND, "the recording cannot be read")
+            return
+        with file:
+            size = os.fstat(file.fileno()).st_size
+            span = _range(self.headers.get("Range", ""), size)
+            more = {"Accept-Ranges": "bytes"}
+            if span is None:
+                more["Content-Range"] = f"bytes */{size}"
+                self._head(HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE, 0, "text/plain", more)
+                return
+            first, last = span
+            status = HTTPStatus.OK
+            if "Range" in self.headers:
+                status = HTTPStatus.PARTIAL_CONTENT
+                more["Content-Range"] = f"bytes {first}-{last}/{size}"
+            kind = VIDEO_TYPES.get(path.suffix.lower(), "video/mp4")
+            self._head(status, last + 1 - first, kind, more)
+            if self.command != "HEAD":
+                self._copy(file, first, last)
+
+    def _copy(self, file: BinaryIO, first: int, last: int) -> None:
+        """Send bytes of a file; the browser may end the connection when it has enough."""
+        file.seek(first)
+        left = last + 1 - first
+        try:
+            while left > 0 and (data := file.read(min(CHUNK, left))):
+                self.wfile.write(data)
+                left -= len(data)
+        except OSError:
+            self.close_connection = True
+        if left > 0:
+            self.close_connection = True
+
+
+def _range(text: str, size: int) -> tuple[int, int] | None:
+    """Return first and last byte of a Range header; None if no byte is in the file.
+
+    >>> _range("bytes=2-", 10), _range("bytes=-3", 10), _range("", 10), _range("bytes=10-", 10)
+    ((2, 9), (7, 9), (0, 9), None)
+    """
+    found = re.fullmatch(r"bytes=(\d{0,18})-(\d{0,18})", text.replace(" ", ""))
+    if found is None or not (found[1] or found[2]):  # several ranges: the whole file
+        return 0, size - 1
+    if not found[1]:
+        first = max(size - int(found[2]), 0)
+        last = size - 1
+    else:
+        first = int(found[1])
+        last = min(int(found[2] or size), size - 1)
+    return (first, last) if first <= last else None
+
+
+class Server(ThreadingHTTPServer):
+    """The server of one output folder.
+
+    Attributes:
+        token: that every request must have. hosts, origins: names of this server.
+    """
+
+    daemon_threads = True
+    allow_reuse_address = os.name == "posix"  # elsewhere it lets two programs use one port
+
+    def __init__(self, out: Path, port: int, command: Sequence[str]) -> None:
+        self.viewer = out / "scene.html"
+        with Workspace.open(out) as workspace:
+            self.recording = Recording(workspace)
+        self.corrections = Corrections(out, command)
+        self.token = secrets.token_urlsafe(32)
+        self.page()
+        try:
+            super().__init__((HOST, port), _Handler)
+        except (OSError, OverflowError) as error:
+            why = getattr(error, "strerror", None) or "0 to 65535 are possible"
+            raise ReobjError(f"--port {port}: {why}; give another one, or none") from error
+        number = self.server_address[1]
+        self.cookie = f"reobj_{number}"  # cookies do not distinguish ports
+        self.hosts = {f"{name}:{number}" for name in (HOST, "localhost")}
+        self.origins = {f"http://{host}" for host in self.hosts}
+
+    @property
+    def url(self) -> str:
+        """Address of the page with its token."""
+        return f"http://{HOST}:{self.server_address[1]}/?token={self.token}"
+
+    def page(self) -> str:
+        """Return the page.
+
+        Raises:
+            ReobjError: there is none of this version in the folder.
+        """
+        path = self.viewer
+        if not path.is_file():
+            raise ReobjError(f"{path}: no such file; make it with `objects {path.parent}`")
+        if path.resolve().parent != path.parent.resolve():
+            raise ReobjError(f"{path}: is a link out of the folder")
+        served = {
+            "recording": "recording" if self.recording.file else "",
+            "frames": bool(self.recording.images),
+            "state": self.corrections.state(),
+        }
+        return served_page(path, served)
