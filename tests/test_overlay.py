@@ -522,9 +522,7 @@ def moving_rows(count: int, step: int = 6) -> rt.Tracks:
     return rt.Tracks(np.arange(count), one, one, boxes, one * 0.9, one * 0, one * 0)
 
 
-def test_trails_show_the_last_second(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_trails_show_the_last_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("reobj.results.overlay.film_fps", lambda _: 30.0)
     count, video = 45, rt.Video(frames(tmp_path / "f", 45, (320, 240)))
     result = rt.Result(moving_rows(count), (), VideoInfo("f", 320, 240, 30.0))
