@@ -28,7 +28,6 @@ from reobj.sources.detectors import open_detections
 
 CASES = [
     real_rooms.Case("kitchen", "hololens_kitchen", supplied=True),
-    real_rooms.Case("kitchen-own", "hololens_kitchen"),
     real_rooms.Case("redkitchen", "redkitchen_7scenes", supplied=True),
     real_rooms.Case("office", "office_loop"),
     real_rooms.Case("livingroom", "livingroom13"),

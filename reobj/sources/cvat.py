@@ -18,7 +18,7 @@ from reobj.sources.image_frames import frames_of_names
 from reobj.sources.masks import NO_RUNS, Counts, crop_runs, polygon_runs
 from reobj.sources.recorded import RecordedDetections, scale_to
 from reobj.sources.video import Video
-from reobj.types import COORDINATE_MAX, Array, ReobjError
+from reobj.types import Array, ReobjError
 
 
 def read_cvat(path: Path, video: Video, first: str = "") -> RecordedDetections:
@@ -147,31 +147,38 @@ def _runs(shape: ET.Element, scale: Array, size: tuple[int, int], where: str) ->
     """Return the mask of a polygon or a mask as run lengths; of other shapes none.
 
     Args:
-        scale: (2,) pixels of the video for each of the annotation. size: (w, h) of the video.
+        scale: (2,) pixels of the video for each of the annotation. size: (w, h) of the video,
+            (0, 0): unknown, no mask.
     """
+    if size == (0, 0):
+        return NO_RUNS
     try:
         if shape.tag == "polygon":
             return polygon_runs([(_corners(shape) * scale).ravel().tolist()], size)
-        if shape.tag != "mask":
-            return NO_RUNS
-        left, top, width, height = (
-            int(float(shape.attrib[key])) for key in ("left", "top", "width", "height")
-        )
-        if not (0 < width <= COORDINATE_MAX and 0 < height * width <= COORDINATE_MAX):
-            raise ValueError(f"a mask of {width}x{height} pixels")
-        counts = np.array(shape.attrib["rle"].split(","), np.int64)  # along the rows, zeros first
-        if counts.sum() != width * height or (counts < 0).any():
-            raise ValueError(f"run lengths of {counts.sum()} pixels for {width}x{height}")
-        crop = np.repeat(np.arange(len(counts)) % 2, counts).reshape(height, width)
-        if (scale != 1).any():
-            low = np.array([left, top]) * scale
-            high = np.array([left + width, top + height]) * scale
-            left, top = low.round().astype(int).tolist()
-            scaled = np.maximum((high.round() - low.round()).astype(int), 1).tolist()
-            crop = cv2.resize(crop.astype(np.uint8), scaled, interpolation=cv2.INTER_NEAREST)
-        return crop_runs(crop > 0, (left, top), size)
+        return _mask_runs(shape, scale, size) if shape.tag == "mask" else NO_RUNS
     except (KeyError, OverflowError, ValueError) as error:
         raise ReobjError(f"{where}: {shape.tag} cannot be read ({error!r:.120})") from error
+
+
+def _mask_runs(shape: ET.Element, scale: Array, size: tuple[int, int]) -> Counts:
+    """Return a mask as run lengths down the columns of the image; the file's follow its rows."""
+    left, top, width, height = (
+        int(float(shape.attrib[key])) for key in ("left", "top", "width", "height")
+    )
+    low = np.array([left, top], np.float64) * scale
+    high = np.array([left + width, top + height], np.float64) * scale
+    if width < 1 or height < 1 or (low < -scale).any() or (high > size + scale).any():
+        raise ValueError(f"{width}x{height} pixels from {left}, {top} on, beyond the image")
+    counts = np.array(shape.attrib["rle"].split(","), np.int64)
+    if counts.min() < 0 or counts.max() > width * height or counts.sum() != width * height:
+        raise ValueError(f"run lengths of {counts.sum()} pixels for {width}x{height}")
+    crop = np.repeat(np.arange(len(counts)) % 2 > 0, counts).reshape(height, width)
+    corner = low.round().astype(int)
+    if (scale != 1).any():
+        scaled = np.maximum(high.round().astype(int) - corner, 1).tolist()
+        small = crop.astype(np.uint8)
+        crop = cv2.resize(small, scaled, interpolation=cv2.INTER_NEAREST) > 0
+    return crop_runs(crop, (int(corner[0]), int(corner[1])), size)
 
 
 def _rotated_bounds(centre: Array, half: Array, angle_deg: float, box: bool) -> Array:
