@@ -6,6 +6,7 @@ import json
 import os
 import re
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import pytest
 
 import reobj_track as rt
 from reobj.results.export_labels import BOXER_HEADER
+from reobj.results.truth import read_truth
 from reobj.sources import coco, cvat, recorded, tables
 from reobj.sources.recorded import RecordedDetections
 
@@ -259,6 +261,93 @@ def test_coco_masks(tmp_path: Path, video: rt.Video) -> None:
             masks[0] | mask
         ).sum() > 0.94  # polygons: half a pixel around
     assert found.at(3).masks is None and found.at(4).masks is None
+
+
+TRIANGLE = [(100.0, 60.0), (180.0, 60.0), (100.0, 100.0)]  # in 640x480, right angle at (100, 60)
+
+
+def yolo_triangle(folder: Path) -> Path:
+    (folder / "labels").mkdir()
+    corners = " ".join(f"{x / 640:.9f} {y / 480:.9f}" for x, y in TRIANGLE)
+    (folder / "labels/im0.txt").write_text(f"56 {corners} 0.9\n0 .5 .5 .1 .1 0.8\n")
+    return folder / "labels"
+
+
+def cvat_triangle(folder: Path, shape: str, size: tuple[int, int] = (640, 480)) -> Path:
+    """A triangle and a box in the first frame, drawn on images of this size."""
+    side = "<width>{}</width><height>{}</height>".format(*size)
+    box = '<box frame="0" outside="0" xtl="32" ytl="24" xbr="64" ybr="48"/>'
+    (folder / "task.xml").write_text(
+        f"<annotations><meta><task><original_size>{side}</original_size></task></meta>"
+        f'<track id="0" label="chair">{shape}</track><track id="1" label="person">{box}</track>'
+        "</annotations>"
+    )
+    return folder / "task.xml"
+
+
+def cvat_polygon(folder: Path) -> Path:
+    points = ";".join(f"{x},{y}" for x, y in TRIANGLE)
+    return cvat_triangle(folder, f'<polygon frame="0" outside="0" points="{points}"/>')
+
+
+def cvat_runs(step: int) -> str:
+    """Rows of the triangle, each shorter by two pixels, in images `step` times as small."""
+    side = 80 // step
+    rows = range(0, side, 2)
+    runs = "0," + ",".join(f"{side - row},{row}" for row in rows)  # zeros first: none
+    place = f'left="{100 // step}" top="{60 // step}" width="{side}" height="{side // 2}"'
+    return f'<mask frame="0" outside="0" rle="{runs}" {place}/>'
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        yolo_triangle,
+        cvat_polygon,
+        lambda folder: cvat_triangle(folder, cvat_runs(1)),
+        lambda folder: cvat_triangle(folder, cvat_runs(2), (320, 240)),
+    ],
+    ids=["YOLO", "CVAT polygon", "CVAT mask", "CVAT mask at half the size"],
+)
+def test_outlines_of_label_tools_are_masks(
+    tmp_path: Path, video: rt.Video, make: Callable[[Path], Path]
+) -> None:
+    found = rt.read_detections(make(tmp_path), video).at(0)
+    row = int((found.xyxy[:, 2] - found.xyxy[:, 0]).argmax())  # the other is a box
+    assert found.xyxy[row] == pytest.approx([100, 60, 180, 100], abs=0.01)
+    y, x = np.mgrid[:480, :640] + 0.5
+    true = (x > 100) & (y > 60) & (x + 2 * y < 300)
+    assert found.masks is not None
+    mask = found.masks[row]
+    assert (mask & true).sum() / (mask | true).sum() > 0.92
+    y, x = np.nonzero(mask)
+    assert (x.mean() + 0.5, y.mean() + 0.5) == pytest.approx((100 + 80 / 3, 60 + 40 / 3), abs=1.2)
+    assert not found.masks[1 - row].any()  # a plain box has none
+
+
+def test_masks_of_cvat_are_ground_truth_of_an_unknown_image(tmp_path: Path) -> None:
+    truth = read_truth(cvat_triangle(tmp_path, cvat_runs(1)), (), 0.0)
+    assert truth.xyxy.tolist() == [[100, 60, 180, 100], [32, 24, 64, 48]]
+
+
+@pytest.mark.parametrize(
+    ("rle", "said"),
+    [
+        ("0,1600", "run lengths of 1600 pixels for 30x40"),
+        ("0,x", "x"),
+        ("-1,1201", "run lengths of 1200 pixels"),
+        ("9223372036854775807,9223372036854775807,1202", "run lengths"),  # 1200 modulo 2^64
+        ('0,1200" left="620', "30x40 pixels from 620, 20 on, beyond the image"),
+    ],
+)
+def test_broken_masks_of_cvat_are_refused(
+    tmp_path: Path, video: rt.Video, rle: str, said: str
+) -> None:
+    left = "" if "left" in rle else 'left="10"'
+    sides = f'{left} top="20" width="30" height="40"'
+    path = cvat_triangle(tmp_path, f'<mask frame="0" outside="0" rle="{rle}" {sides}/>')
+    with pytest.raises(rt.ReobjError, match=f"task.xml, box 0: mask cannot be read .*{said}"):
+        rt.read_detections(path, video)
 
 
 def test_npz(tmp_path: Path, video: rt.Video) -> None:

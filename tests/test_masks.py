@@ -89,3 +89,21 @@ def test_several_polygons_are_one_mask() -> None:
     both, first, second = (masks.rle_decode(run, (20, 10)) for run in runs)
     np.testing.assert_array_equal(both, first | second)
     assert first.any() and second.any() and not (first & second).any()
+
+
+@pytest.mark.parametrize(
+    ("corner", "size"),
+    [((3, 2), (12, 9)), ((0, 0), (5, 7)), ((7, 2), (12, 9)), ((-2, -3), (12, 9)), ((9, 5), (12, 9)),
+     ((20, 20), (12, 9)), ((-9, 0), (12, 9))],
+)  # fmt: skip
+def test_part_of_an_image(corner: tuple[int, int], size: tuple[int, int]) -> None:
+    """Runs of a part are those of the whole mask, wherever the part lies."""
+    rng = np.random.default_rng(3)
+    for density in (0.0, 0.3, 1.0):
+        part = rng.random((7, 5)) <= density
+        whole = np.zeros((60, 60), bool)
+        whole[20 + corner[1] : 27 + corner[1], 20 + corner[0] : 25 + corner[0]] = part
+        expected = whole[20 : 20 + size[1], 20 : 20 + size[0]]
+        assert masks.crop_runs(part, corner, size).tolist() == (
+            masks.rle_encode(expected.copy()).tolist()
+        )

@@ -1,4 +1,4 @@
-"""CVAT for video 1.1 and for images 1.1: boxes, and bounding boxes of other shapes."""
+"""CVAT for video 1.1 and for images 1.1: boxes, masks, and bounding boxes of other shapes."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
+import cv2
 import numpy as np
 
 from reobj.files import MEMORY_MAX, check_unpacked
 from reobj.sources.class_names import check_length
 from reobj.sources.image_frames import frames_of_names
-from reobj.sources.masks import NO_RUNS
+from reobj.sources.masks import NO_RUNS, Counts, crop_runs, polygon_runs
 from reobj.sources.recorded import RecordedDetections, scale_to
 from reobj.sources.video import Video
 from reobj.types import Array, ReobjError
@@ -23,7 +24,8 @@ from reobj.types import Array, ReobjError
 def read_cvat(path: Path, video: Video, first: str = "") -> RecordedDetections:
     """Read all shapes that are not "outside"; the identity is the track id + 1.
 
-    Shapes other than upright boxes become their bounding boxes, and are counted in a message.
+    Polygons and masks have a mask. Other shapes than these and upright boxes become their bounding
+    boxes, and are counted in a message.
 
     Args:
         path: XML, or CVAT's zip. first: number of the first frame, "": 0.
@@ -69,9 +71,13 @@ def read_cvat(path: Path, video: Video, first: str = "") -> RecordedDetections:
     n = len(shapes)
     size_of = np.tile(image_size, (n, 1))
     scale = scale_to(video.size, size_of, np.ones(n, bool), str(path), messages)
+    runs = [
+        _runs(shape, ratio, video.size, f"{path}, box {at}")
+        for at, ((_, _, _, shape), ratio) in enumerate(zip(shapes, scale[:, :2], strict=True))
+    ]
     return RecordedDetections(
         frame, np.array(boxes, np.float64) * scale, np.ones(n), class_id.astype(np.int64),
-        [NO_RUNS] * n, tuple(names.tolist()), video.size, video.working_size, np.arange(n), "box",
+        runs, tuple(names.tolist()), video.size, video.working_size, np.arange(n), "box",
         messages, ids if (ids > 0).any() else np.empty(0, np.int64),
     )  # fmt: skip
 
@@ -102,7 +108,7 @@ def _shapes(parent: ET.Element) -> list[ET.Element]:
 
 
 def _bounds(shape: ET.Element, bounded: Counter[str]) -> Array:
-    """Return the bounding box (4,) of a shape; count shapes other than upright boxes."""
+    """Return the bounding box (4,) of a shape; count shapes that have no mask and are no box."""
     attributes = shape.attrib
     if shape.tag == "box":
         sides = [float(attributes[key]) for key in ("xtl", "ytl", "xbr", "ybr")]
@@ -112,7 +118,8 @@ def _bounds(shape: ET.Element, bounded: Counter[str]) -> Array:
             return np.hstack([low, high])
         bounded["turned boxes"] += 1
         return _rotated_bounds((low + high) / 2, (high - low) / 2, angle, box=True)
-    bounded[shape.tag + "s" * (shape.tag != "points")] += 1
+    if shape.tag not in ("polygon", "mask"):
+        bounded[shape.tag + "s" * (shape.tag != "points")] += 1
     if shape.tag == "ellipse":
         centre = np.array([float(attributes["cx"]), float(attributes["cy"])])
         radii = np.array([float(attributes["rx"]), float(attributes["ry"])])
@@ -126,9 +133,52 @@ def _bounds(shape: ET.Element, bounded: Counter[str]) -> Array:
         x, y = ([float(v) for k, v in attributes.items() if re.fullmatch(axis + "[tb][lr][12]", k)]
                 for axis in "xy")  # fmt: skip
         return np.array([min(x), min(y), max(x), max(y)])
-    pairs = [pair.split(",") for pair in attributes["points"].split(";") if pair]
-    corners = np.array(pairs, np.float64)
+    corners = _corners(shape)
     return np.hstack([corners.min(0), corners.max(0)])
+
+
+def _corners(shape: ET.Element) -> Array:
+    """Return the points (K, 2) of a polygon, a polyline or points."""
+    pairs = [pair.split(",") for pair in shape.attrib["points"].split(";") if pair]
+    return np.array(pairs, np.float64)
+
+
+def _runs(shape: ET.Element, scale: Array, size: tuple[int, int], where: str) -> Counts:
+    """Return the mask of a polygon or a mask as run lengths; of other shapes none.
+
+    Args:
+        scale: (2,) pixels of the video for each of the annotation. size: (w, h) of the video,
+            (0, 0): unknown, no mask.
+    """
+    if size == (0, 0):
+        return NO_RUNS
+    try:
+        if shape.tag == "polygon":
+            return polygon_runs([(_corners(shape) * scale).ravel().tolist()], size)
+        return _mask_runs(shape, scale, size) if shape.tag == "mask" else NO_RUNS
+    except (KeyError, OverflowError, ValueError) as error:
+        raise ReobjError(f"{where}: {shape.tag} cannot be read ({error!r:.120})") from error
+
+
+def _mask_runs(shape: ET.Element, scale: Array, size: tuple[int, int]) -> Counts:
+    """Return a mask as run lengths down the columns of the image; the file's follow its rows."""
+    left, top, width, height = (
+        int(float(shape.attrib[key])) for key in ("left", "top", "width", "height")
+    )
+    low = np.array([left, top], np.float64) * scale
+    high = np.array([left + width, top + height], np.float64) * scale
+    if width < 1 or height < 1 or (low < -scale).any() or (high > size + scale).any():
+        raise ValueError(f"{width}x{height} pixels from {left}, {top} on, beyond the image")
+    counts = np.array(shape.attrib["rle"].split(","), np.int64)
+    if counts.min() < 0 or counts.max() > width * height or counts.sum() != width * height:
+        raise ValueError(f"run lengths of {counts.sum()} pixels for {width}x{height}")
+    crop = np.repeat(np.arange(len(counts)) % 2 > 0, counts).reshape(height, width)
+    corner = low.round().astype(int)
+    if (scale != 1).any():
+        scaled = np.maximum(high.round().astype(int) - corner, 1).tolist()
+        small = crop.astype(np.uint8)
+        crop = cv2.resize(small, scaled, interpolation=cv2.INTER_NEAREST) > 0
+    return crop_runs(crop, (int(corner[0]), int(corner[1])), size)
 
 
 def _rotated_bounds(centre: Array, half: Array, angle_deg: float, box: bool) -> Array:

@@ -14,7 +14,7 @@ import numpy as np
 from reobj.files import LINES_MAX, read_lines
 from reobj.sources.class_names import is_yaml, load_class_names
 from reobj.sources.image_frames import frames_of_names
-from reobj.sources.masks import NO_RUNS
+from reobj.sources.masks import NO_RUNS, polygon_runs
 from reobj.sources.recorded import NORMALISED_MAX, RecordedDetections
 from reobj.sources.video import Video
 from reobj.types import COCO_NAMES, Array, IntArray, ReobjError, xyxy_from_cxcywh
@@ -85,15 +85,18 @@ def read_label_folder(
                 of_file.append(at)
         if len(rows) > LINES_MAX:
             raise ReobjError(f"{path}: more than {LINES_MAX} boxes; take fewer frames")
-    box, score, identity = _columns(rows)
+    box, score, identity, polygons = _columns(rows)
     stems = [str(file.relative_to(path)) for file in files]
     usual = 1 if video_files else None
     frame, text = frames_of_names(stems, video, str(path), first, usual, not video_files)
     messages += [text] if text else []
     scaled = xyxy_from_cxcywh(box) * np.tile(np.array(video.size, np.float64), 2)
+    runs = [NO_RUNS] * len(rows)
+    for row, corners in polygons.items():
+        runs[row] = polygon_runs([(corners * video.size).ravel().tolist()], video.size)
     return RecordedDetections(
         frame[np.array(of_file, np.int64)], scaled, score,
-        np.array([row[0] for row in rows], np.float64).astype(np.int64), [NO_RUNS] * len(rows),
+        np.array([row[0] for row in rows], np.float64).astype(np.int64), runs,
         tuple(names or COCO_NAMES), video.size, video.working_size, np.array(lines, object), "line",
         messages, identity,
     )  # fmt: skip
@@ -116,8 +119,12 @@ def _row(cells: Sequence[str], where: str) -> list[float]:
     return row
 
 
-def _columns(rows: Sequence[Sequence[float]]) -> tuple[Array, Array, IntArray]:
+def _columns(
+    rows: Sequence[Sequence[float]],
+) -> tuple[Array, Array, IntArray, dict[int, Array]]:
     """Split rows into boxes (N, 4) cx, cy, w, h, scores (N,) and identities (N,), -1: none.
+
+    The corners (K, 2) of polygons are returned by the number of their row.
 
     Rows of up to seven numbers are boxes with optional confidence (at most 1) and identity (whole);
     if a seventh number is not whole, rows of seven are triangles. Longer rows are polygons, also
@@ -127,6 +134,7 @@ def _columns(rows: Sequence[Sequence[float]]) -> tuple[Array, Array, IntArray]:
     box = np.zeros((count, 4))
     score = np.ones(count)
     identity = np.full(count, -1, np.int64)
+    polygons: dict[int, Array] = {}
     seventh = [row[6] for row in rows if len(row) == 7]
     triangles = any(value % 1 for value in seventh)
     for i, row in enumerate(rows):
@@ -137,6 +145,7 @@ def _columns(rows: Sequence[Sequence[float]]) -> tuple[Array, Array, IntArray]:
             low = corners.min(0)
             high = corners.max(0)
             box[i] = *(low + high) / 2, *(high - low)
+            polygons[i] = corners
         else:
             box[i] = row[1:5]
         for value in rest:
@@ -144,7 +153,7 @@ def _columns(rows: Sequence[Sequence[float]]) -> tuple[Array, Array, IntArray]:
                 identity[i] = int(value)
             else:
                 score[i] = value
-    return box, score, identity
+    return box, score, identity, polygons
 
 
 def _tail(row: Sequence[float]) -> Sequence[float]:

@@ -55,16 +55,51 @@ def coco_runs(text: str) -> Counts:
     return np.array(runs, np.uint32)
 
 
+def crop_runs(mask: BoolArray, corner: tuple[int, int], size: tuple[int, int]) -> Counts:
+    """Encode an (h, w) part of the mask of an image; what lies outside the image is cut off.
+
+    Args:
+        corner: (x, y) of its first pixel in the image. size: (w, h) of the image.
+    """
+    width, height = size
+    x, y = corner
+    mask = mask[max(-y, 0) : max(height - y, 0), max(-x, 0) : max(width - x, 0)]
+    if not mask.size:
+        return NO_RUNS
+    x = max(x, 0)
+    y = max(y, 0)
+    strip = np.zeros((height, mask.shape[1]), bool)  # whole columns: runs follow them
+    strip[y : y + len(mask)] = mask
+    counts = rle_encode(strip)
+    if not len(counts):
+        return NO_RUNS
+    counts[0] += x * height
+    rest = (width - x - mask.shape[1]) * height
+    if not rest:
+        return counts
+    if len(counts) % 2:  # ends with zeros
+        counts[-1] += rest
+        return counts
+    return np.append(counts, np.uint32(rest))
+
+
 def polygon_runs(rings: Sequence[Sequence[float]], size: tuple[int, int]) -> Counts:
     """Fill polygons (x, y, x, y, ... in px, corner convention) in a (w, h) image."""
-    flat = np.concatenate([np.empty(0), *(np.asarray(ring, np.float64).ravel() for ring in rings)])
+    corners = [np.reshape(np.asarray(ring, np.float64), (-1, 2)) for ring in rings]
+    flat = np.concatenate([np.empty((0, 2)), *corners])
     if not (np.abs(flat) <= COORDINATE_MAX).all():
         raise ValueError(
             f"a polygon with corners that are not finite, or beyond {COORDINATE_MAX:g}"
         )
-    canvas = np.zeros(size[::-1], np.uint8)
+    if not len(flat):
+        return NO_RUNS
+    low = np.clip(np.floor(flat.min(0)) - 1, 0, size).astype(int)  # only the part with the polygon
+    high = np.clip(np.ceil(flat.max(0)) + 1, low, size).astype(int)
+    canvas = np.zeros((high - low)[::-1], np.uint8)
+    if not canvas.size:
+        return NO_RUNS
     bits = 4  # of fractions of a pixel, 1/16 px: finer than annotations
-    for ring in rings:  # OpenCV's first pixel has its centre at (0, 0), ours at (0.5, 0.5)
-        corners = np.round((np.reshape(ring, (-1, 2)) - 0.5) * (1 << bits)).astype(np.int32)
-        cv2.fillPoly(canvas, [corners], 1, shift=bits)
-    return rle_encode(canvas > 0)
+    for ring in corners:  # OpenCV's first pixel has its centre at (0, 0), ours at (0.5, 0.5)
+        fixed = np.round((ring - low - 0.5) * (1 << bits)).astype(np.int32)
+        cv2.fillPoly(canvas, [fixed], 1, shift=bits)
+    return crop_runs(canvas > 0, (int(low[0]), int(low[1])), size)

@@ -631,6 +631,14 @@ def cvat_points(tag: str) -> Callable[[int], str]:
     return shape
 
 
+def cvat_mask(f: int) -> str:
+    """The triangle below the diagonal of the box, run lengths along its rows."""
+    x, y, *_ = box(f)
+    rle = ",".join(f"{39 - row},{1 + row}" for row in range(40))
+    sides = f'left="{x:g}" top="{y:g}" width="40" height="40"'
+    return f'<mask frame="{f}" outside="0" rle="{rle}" {sides}/>'
+
+
 def cvat_ellipse(f: int) -> str:
     return f'<ellipse frame="{f}" outside="0" cx="{30 + 4 * f}" cy="40" rx="20" ry="20"/>'
 
@@ -646,7 +654,8 @@ def cvat_turned(f: int) -> str:
     ("shape", "said"),
     [
         (cvat_box, ""),
-        (cvat_points("polygon"), "8 polygons taken as their bounding boxes"),
+        (cvat_points("polygon"), ""),
+        (cvat_mask, ""),
         (cvat_points("polyline"), "8 polylines taken as"),
         (cvat_points("points"), "8 points taken as"),
         (cvat_ellipse, "8 ellipses taken as"),
