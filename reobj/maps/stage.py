@@ -17,6 +17,7 @@ from reobj.files import Progress
 from reobj.maps.corrections import with_edits
 from reobj.maps.earlier import earlier_sessions
 from reobj.maps.fusion import scale_of
+from reobj.maps.object_placement import place_by_objects
 from reobj.maps.object_points import object_views, triangulated
 from reobj.maps.placement import (
     ImageFeatures,
@@ -27,7 +28,7 @@ from reobj.maps.placement import (
     place,
     points_with_descriptors,
 )
-from reobj.maps.room_map import RoomMap, map_lock
+from reobj.maps.room_map import RoomMap, Session, map_lock
 from reobj.maps.single_frames import locate_frames, locate_rest
 from reobj.maps.update import Recording, add_recording
 from reobj.results.changes import Changes
@@ -118,6 +119,13 @@ class Placed:
     placement: Placement | None
     scale: quadrics.Scale | None = None
 
+    @property
+    def unmatched(self) -> bool:
+        """True if the images of the recording match too few points of the map."""
+        if self.placement is None or not self.poses.known.any():
+            return False
+        return self.placement.unmatched
+
 
 def place_recording(
     opened: OpenMap,
@@ -153,6 +161,17 @@ def place_recording(
             placement = locate_frames(poses, features, points, camera, options, report=line.step)
     if not placement.refused and placement.poses.source == "map":
         placement = _all_frames(placement, video, progress)
+    return _placed(room, poses, features, placement)
+
+
+def _placed(
+    room: RoomMap, poses: Poses, features: tuple[ImageFeatures, ...], placement: Placement
+) -> Placed:
+    """Give the cameras of a recording that was placed the units and gravity of the map.
+
+    Args:
+        poses: before. placement: refused ones leave them as they are.
+    """
     if placement.refused:
         return Placed(poses, features, placement)
     known = scale_of(room)
@@ -171,6 +190,18 @@ def place_recording(
         map_id=room.map_id,
     )
     return Placed(moved, features, placement, scale)
+
+
+def place_objects(room: RoomMap, result: Result, embedder: str, placed: Placed) -> Placed:
+    """Place a recording by its objects, as too few points of its images match.
+
+    Args:
+        result: with the objects of the recording, in its own world. embedder: of the recording.
+        placed: refused, by points.
+    """
+    assert placed.placement is not None
+    placement = place_by_objects(room, result, embedder, placed.placement)
+    return _placed(room, placed.poses, placed.features, placement)
 
 
 def _denser(
@@ -367,11 +398,12 @@ def _recording(
             opened.path, name, session_key(video), embedder,
             np.zeros((7, 7)) if old is None else old.alignment_cov,
             0 if old is None else old.localised_frames, 0 if old is None else old.tried_frames,
-            scale, None,
+            scale, None, placed_by=_placed_by(opened.room, old),
         )  # fmt: skip
     poses = placed.poses
     points = None  # of a recording located by the map's points: it has no others
-    if poses.source != "map":
+    by_objects = placed.placement is not None and placed.placement.by == "objects"
+    if poses.source != "map" and not by_objects:  # objects do not locate points well enough
         points = points_with_descriptors(poses.of_part(0), _of_first_component(placed), 0)
     if placed.placement is None:
         own = result.world.scale or none
@@ -389,8 +421,15 @@ def _recording(
         scale = placed.scale or none
     return Recording(
         opened.path, name, session_key(video), embedder, best.similarity.cov,
-        len(best.images), best.tried, scale, points,
+        len(best.images), best.tried, scale, points, placed_by=placed.placement.by,
     )  # fmt: skip
+
+
+def _placed_by(room: RoomMap, session: Session | None) -> str:
+    """Say by what a session of the map was placed; "": it made the map, or is not in it."""
+    if session is None or session.number == min(s.number for s in room.sessions):
+        return ""
+    return "points" if session.localised_frames else "objects"
 
 
 def _of_first_component(placed: Placed) -> list[ImageFeatures]:
