@@ -87,10 +87,15 @@ class ImageFeatures:
 def keyframe_features(
     poses: Poses, video: Video, options: PlacementOptions, line: Progress, most: int = 200
 ) -> list[ImageFeatures]:
-    """Extract RootSIFT features of every second keyframe, of all of few.
+    """Extract RootSIFT features of the frames of `keyframe_rows`."""
+    return image_features(poses, video, keyframe_rows(poses, options, most), options, line)
+
+
+def keyframe_rows(poses: Poses, options: PlacementOptions, most: int = 200) -> IntArray:
+    """Choose every second keyframe, all of few; return their rows in the poses.
 
     Every second one shows .95 to .98 of the sparse points (measured on four recordings). Without
-    observed points: of images spread over all frames.
+    observed points: images spread over all frames.
 
     Args:
         most: images; more cover long recordings more densely and take longer.
@@ -98,7 +103,16 @@ def keyframe_features(
     rows = np.unique(poses.visibility[:, 0])
     rows = rows[poses.measured[rows]] if len(rows) else np.arange(len(poses.frame))
     step = max(2 if len(rows) > options.images else 1, -(-len(rows) // most))
-    return image_features(poses, video, rows[::step], options, line)
+    return np.asarray(rows[::step], np.int64)
+
+
+def compared_rows(poses: Poses, rows: IntArray, options: PlacementOptions) -> IntArray:
+    """Return the rows that `place` compares with the map, of those that have features."""
+    chosen = [np.empty(0, np.int64)]
+    for part in range(poses.part_count):
+        of_part = rows[(poses.part[rows] == part) & poses.known[rows]]
+        chosen.append(of_part[:: max(1, -(-len(of_part) // options.images))])
+    return np.sort(np.concatenate(chosen))
 
 
 def image_features(

@@ -23,8 +23,9 @@ from reobj.maps.placement import (
     ImageFeatures,
     Placement,
     PlacementOptions,
+    compared_rows,
     image_features,
-    keyframe_features,
+    keyframe_rows,
     place,
     points_with_descriptors,
 )
@@ -34,7 +35,7 @@ from reobj.maps.update import Recording, add_recording
 from reobj.results.changes import Changes
 from reobj.results.result import Result
 from reobj.results.scene import best_pictures
-from reobj.sources.video import Video
+from reobj.sources.video import Video, content_fingerprint
 from reobj.types import ReobjError, option
 
 
@@ -145,8 +146,12 @@ def place_recording(
     options = options or PlacementOptions()
     if not video.has_images:
         return Placed(poses, (), None)
-    features = tuple(keyframe_features(poses, video, options, progress("map features", 0)))
     room = opened.room
+    rows = keyframe_rows(poses, options)
+    if opened.frozen and poses.known.any():  # a map that learns needs features of all of them
+        rows = compared_rows(poses, rows, options)
+    line = progress("map features", 0)
+    features = tuple(image_features(poses, video, rows, options, line))
     if not room.sessions:
         return Placed(dataclasses.replace(poses, map_id=room.map_id), features, None)
     with progress("map", 0) as line:
@@ -218,7 +223,8 @@ def _denser(
         most: images, spread over the frames with a pose; more find shorter times and take longer.
     """
     rows = np.flatnonzero(poses.known)
-    rows = np.setdiff1d(rows[:: -(-len(rows) // most)], [image.row for image in features])
+    rows = np.union1d(rows[:: -(-len(rows) // most)], keyframe_rows(poses, options))
+    rows = np.setdiff1d(rows, [image.row for image in features])
     added = image_features(poses, video, rows, options, progress("map features", 0))
     return tuple(sorted([*features, *added], key=lambda image: image.row))
 
@@ -375,8 +381,9 @@ def session_name(video: Video) -> str:
 
 
 def session_key(video: Video) -> str:
-    """Identify a recording: the content of its file, and the part of it that is read."""
-    return f"{video.fingerprint} {video.config.start}-{video.config.stop}"
+    """Identify a recording: the content of its files, and the part of it that is read."""
+    content = content_fingerprint(video.source) or video.fingerprint
+    return f"{content} {video.config.start}-{video.config.stop}"
 
 
 def _recording(
