@@ -124,7 +124,7 @@ from reobj.poses.stage import (
 from reobj.poses.supplied.imageless import open_video
 from reobj.poses.supplied.interpretation import PoseReading
 from reobj.poses.supplied.readers import read_poses
-from reobj.results.changes import Change, Changes
+from reobj.results.changes import Change, Changes, read_changes
 from reobj.results.checkpoint import Checkpoint
 from reobj.results.edits import kept_edits, read_edits
 from reobj.results.evaluation import evaluate, score_report
@@ -1704,7 +1704,10 @@ def _finish(
             result = _fit_objects(job, result)
     if room is not None:
         with job.timed("map"):
-            result = finish_map(room, result, job.video, _embedder_key(job), placed, job.progress)
+            path = job.workspace.out / OutputFile.CHANGES
+            before = read_changes(path) if placed is None and path.is_file() else None
+            embedder = _embedder_key(job)
+            result = finish_map(room, result, job.video, embedder, placed, job.progress, before)
     warnings = [*result.warnings, *_warnings(job.config, result)]
     result = dataclasses.replace(result, warnings=warnings, out=job.workspace.out)
     with job.timed("write"):

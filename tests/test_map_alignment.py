@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from map_rooms import changed, landmarks, simulated_room
+from map_alignment import changed, simulated_room
+from map_alignment import measured as landmarks
 from scipy.spatial.transform import Rotation
 from test_map_run import CAMERA, ROOM
 
@@ -195,3 +196,19 @@ def test_a_run_is_placed_by_its_objects(bare, tmp_path):
     assert again.placed_by == "objects" and again.sigma_m == pytest.approx(
         changes.sigma_m, rel=0.01
     )
+
+
+def test_a_frozen_map_leaves_the_placement_to_the_output_folder(bare, tmp_path):
+    """`objects OUT` knows by what the recording was placed, and how well."""
+    path, moved = bare
+    boxes = ROOM / "detections.npz"
+    before = path.read_bytes()
+    result = rt.run(
+        ROOM / "room.mp4", tmp_path, with_poses(3, moved), detections=boxes, map=path,
+        map_frozen=True,
+    )  # fmt: skip
+    again = rt.refit(tmp_path).changes
+    assert path.read_bytes() == before
+    assert again.placed_by == result.changes.placed_by == "objects"
+    assert again.sigma_m == pytest.approx(result.changes.sigma_m, rel=0.01)
+    assert {c.id for c in again.stayed} == {c.id for c in result.changes.stayed}

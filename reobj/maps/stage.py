@@ -293,6 +293,7 @@ def finish_map(
     embedder: str,
     placed: Placed | None,
     progress: Callable[[str, int], Progress] = Progress,
+    before: Changes | None = None,
 ) -> Result:
     """Number the objects of a recording, write the map, and return the result with `changes`.
 
@@ -300,6 +301,7 @@ def finish_map(
 
     Args:
         placed: None: the cameras are those of the last run, with the points that the map has.
+        before: of the last run if `placed` is None; a frozen map does not have its alignment.
     """
     room = opened.room
     name = session_name(video)
@@ -318,6 +320,7 @@ def finish_map(
     if result.edits is not None:
         room = with_edits(room, result.edits)
     recording = _recording(opened, result, video, name, embedder, placed)
+    recording = _as_placed_before(recording, before, room)
     if placed is not None and video.has_images:
         recording = _with_object_points(recording, result, video, progress, opened.frozen)
     if opened.pictures and not opened.frozen:
@@ -430,6 +433,25 @@ def _recording(
         opened.path, name, session_key(video), embedder, best.similarity.cov,
         len(best.images), best.tried, scale, points, placed_by=placed.placement.by,
     )  # fmt: skip
+
+
+def _as_placed_before(recording: Recording, before: Changes | None, room: RoomMap) -> Recording:
+    """Return a recording that the map does not have, with the placement of its last run.
+
+    Args:
+        before: of the last run; of the covariance of the placement it has that of the shift. None:
+            the recording was placed in this run.
+    """
+    if before is None or room.session_of(recording.fingerprint) is not None:
+        return recording
+    sigma = (before.sigma_m or 0.0) / scale_of(room).value  # of a vector
+    return dataclasses.replace(
+        recording,
+        alignment_cov=np.diag([0, 0, 0, 1, 1, 1, 0]) * sigma**2 / 3,
+        localised_frames=before.localised_frames,
+        tried_frames=before.tried_frames,
+        placed_by=before.placed_by,
+    )
 
 
 def _placed_by(room: RoomMap, session: Session | None) -> str:
