@@ -40,6 +40,8 @@ class AlignmentOptions:
             another place. An object whose position has a larger sigma is not used.
         gate: largest squared Mahalanobis distance of centre and size (4 degrees of freedom: one in
             100 exceeds it).
+        chance: log likelihood ratio over an object anywhere in the room, in nats, above which two
+            objects coincide (3: the margin of `CompareOptions`).
         floor_m, extent_share: standard deviation of a centre besides its covariance, and the same
             as a fraction of the mean half axis (as in `CompareOptions`).
         size_floor: standard deviation of the mean log half axis besides its covariance.
@@ -58,6 +60,7 @@ class AlignmentOptions:
     elsewhere_m: float = 0.5
     elsewhere_rad: float = 0.3
     gate: float = 13.3
+    chance: float = 3.0
     floor_m: float = 0.02
     extent_share: float = 0.05
     size_floor: float = 0.1
@@ -217,10 +220,12 @@ class _Search:
         self.alike = found.classes @ of_map.classes.T >= options.overlap  # (M, N)
         self.size = of_map.log_size - found.log_size[:, None]
         self.size_var = of_map.log_size_var + found.log_size_var[:, None] + options.size_floor**2
-        logit = SimilarityCalibration(weight=3.0).logit(
-            np.asarray(found.looks @ of_map.looks.T, np.float64)
-        )
-        self.looks = np.where(np.isfinite(logit), logit.clip(-options.looks, options.looks), 0.0)
+        self.looks = np.zeros(self.alike.shape)  # log likelihood ratio
+        if found.looks.shape[1]:
+            cosine = np.asarray(found.looks @ of_map.looks.T, np.float64)
+            logit = SimilarityCalibration(weight=3.0).logit(cosine)
+            known = np.isfinite(logit)
+            self.looks[known] = logit[known].clip(-options.looks, options.looks)
         self.room = float((np.ptp(of_map.center, axis=0) + 1.0).prod())  # m^3
 
     def best(self) -> tuple[_Places, IntArray, int]:
@@ -295,7 +300,7 @@ class _Search:
         Args:
             own: (H, M) variance of a coordinate of the objects by the error of the place.
         Returns:
-            (H,) sum of log likelihood ratios over objects anywhere in the room.
+            (H,) sum of log likelihood ratios over objects anywhere in the room, each less `chance`.
             (H, M) row of the map that coincides, or -1; one to one.
         """
         scale = abs(places.turn)[:, None]
@@ -307,7 +312,7 @@ class _Search:
         off = abs(xy[:, :, None] - self.map_xy) ** 2 / across
         off += (z[:, :, None] - self.map_z) ** 2 / high
         gain = np.log(self.room) - 0.5 * off - np.log(across) - 0.5 * np.log(high)
-        gain += self.looks - 1.5 * np.log(2 * np.pi)
+        gain += self.looks - 1.5 * np.log(2 * np.pi) - self.options.chance
         off += (self.size - np.log(scale)[:, :, None]) ** 2 / self.size_var
         gain = np.where(self.alike & (off < self.options.gate), gain, 0.0).clip(min=0)
         partner = gain.argmax(2)  # (H, M)
