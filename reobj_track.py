@@ -92,6 +92,7 @@ from reobj.maps.stage import (
     finish_map,
     move_models,
     opened_map,
+    place_objects,
     place_recording,
 )
 from reobj.objects.config import ObjectsConfig
@@ -124,7 +125,7 @@ from reobj.poses.stage import (
 from reobj.poses.supplied.imageless import open_video
 from reobj.poses.supplied.interpretation import PoseReading
 from reobj.poses.supplied.readers import read_poses
-from reobj.results.changes import Change, Changes
+from reobj.results.changes import Change, Changes, read_changes
 from reobj.results.checkpoint import Checkpoint
 from reobj.results.edits import kept_edits, read_edits
 from reobj.results.evaluation import evaluate, score_report
@@ -1393,9 +1394,15 @@ def run(
         if not tracks:
             result = _track_video(job, detected, poses, viewer)
         log.info("identities: %d", len(np.unique(result.tracks.track_id)))
-        warnings = [*result.warnings, *workspace.save_last(result, poses, models)]
-        result = dataclasses.replace(result, poses=poses, warnings=warnings)
-        result = _finish(job, result, room, placed)
+        result = dataclasses.replace(result, poses=poses)
+        fitted = None
+        if room is not None and placed is not None and placed.unmatched:
+            fitted, placed, models = _place_by_objects(job, room, result, placed, models)
+            poses = placed.poses
+        warnings = workspace.save_last(result, poses, models)
+        result = dataclasses.replace(result, poses=poses) if fitted is None else fitted
+        result = dataclasses.replace(result, warnings=[*result.warnings, *warnings])
+        result = _finish(job, result, room, placed, fit=fitted is None)
         if viewer is not None:
             viewer.show(result.without_doubtful(), Path("rerun"), images=not viewer.followed)
             viewer.close()
@@ -1538,7 +1545,7 @@ class _Job:
             interruption.add_note(f"in the stage {stage}, which keeps {kept[0]}")
             raise
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.monotonic() - started
-        steps: dict[str, float] = {}
+        steps = self.step_seconds.get(stage, {})
         for line in self.lines:
             steps[line.stage] = steps.get(line.stage, 0.0) + line.seconds
         if steps or may_be_cached:
@@ -1657,20 +1664,63 @@ def _place(job: _Job, room: OpenMap, poses: Poses, models: list[Path]) -> tuple[
         camera = parse_camera(job.config.poses.camera, job.video.size)
         options = PlacementOptions(size_px=job.config.poses.size_px)
         placed = place_recording(room, poses, job.video, options, job.progress, camera)
-        folder = job.workspace.path("placed", job.video.fingerprint).with_suffix(".sparse")
-        return placed, move_models(models, poses, placed, lambda k: part_path(folder, k))
+        return placed, _moved_models(job, models, poses, placed)
+
+
+def _moved_models(job: _Job, models: list[Path], poses: Poses, placed: Placed) -> list[Path]:
+    """Copy the COLMAP models into the world of the map.
+
+    Args:
+        poses: before they were placed.
+    """
+    folder = job.workspace.path("placed", job.video.fingerprint).with_suffix(".sparse")
+    return move_models(models, poses, placed, lambda k: part_path(folder, k))
+
+
+def _place_by_objects(
+    job: _Job, room: OpenMap, result: Result, placed: Placed, models: list[Path]
+) -> tuple[Result | None, Placed, list[Path]]:
+    """Place the cameras by the objects of the recording, fitted in its own world.
+
+    Returns:
+        the fitted result, None if the cameras moved; cameras and COLMAP models.
+    """
+    poses = placed.poses
+    with job.timed("objects"):
+        fitted = _fit_objects(job, result)
+    with job.timed("map"):
+        placed = place_objects(room.room, fitted, _embedder_key(job), placed)
+        models = _moved_models(job, models, poses, placed)
+    refused = placed.placement is not None and placed.placement.refused
+    return fitted if refused else None, placed, models
+
+
+def _embedder_key(job: _Job) -> str:
+    """Name the model of the embeddings, for the map."""
+    return f"{job.config.embed.model} {job.config.embed.head}"
 
 
 def _finish(
-    job: _Job, result: Result, room: OpenMap | None = None, placed: Placed | None = None
+    job: _Job,
+    result: Result,
+    room: OpenMap | None = None,
+    placed: Placed | None = None,
+    fit: bool = True,
 ) -> Result:
-    """Link tracklets, fit one shape per object, and write the map and the output folder."""
-    with job.timed("objects"):
-        result = _fit_objects(job, result)
+    """Link tracklets, fit one shape per object, and write the map and the output folder.
+
+    Args:
+        fit: False: the result has the objects already.
+    """
+    if fit:
+        with job.timed("objects"):
+            result = _fit_objects(job, result)
     if room is not None:
         with job.timed("map"):
-            embedder = f"{job.config.embed.model} {job.config.embed.head}"
-            result = finish_map(room, result, job.video, embedder, placed, job.progress)
+            path = job.workspace.out / OutputFile.CHANGES
+            before = read_changes(path) if placed is None and path.is_file() else None
+            embedder = _embedder_key(job)
+            result = finish_map(room, result, job.video, embedder, placed, job.progress, before)
     warnings = [*result.warnings, *_warnings(job.config, result)]
     result = dataclasses.replace(result, warnings=warnings, out=job.workspace.out)
     with job.timed("write"):

@@ -119,7 +119,7 @@ def test_images_between_keyframes_place_a_recording(made, monkeypatch):
         Camera("PINHOLE", *video.size, tuple(map(float, CAMERA.split(",")))),
         np.arange(12, 24), np.arange(12, 24) / 12, truth, np.full(12, "user"), "user",
     )  # fmt: skip
-    monkeypatch.setattr(stage, "keyframe_features", lambda *args: [])
+    monkeypatch.setattr(stage, "keyframe_rows", lambda *args: np.empty(0, np.int64))
     room = rt.RoomMap.load(path)
     placed = stage.place_recording(stage.OpenMap(path, room, True), supplied, video)
     assert placed.placement.refused == "" and len(placed.features) == 12

@@ -393,6 +393,21 @@ def test_a_file_with_glob_characters_in_its_name(tmp_path: Path) -> None:
     assert fingerprint(tmp_path / "det[1].txt") != before
 
 
+def test_copies_have_the_same_content_fingerprint(movie: Path, tmp_path: Path) -> None:
+    """Whatever their folder and times; of another content of the same size it differs."""
+    fingerprint = video_room.content_fingerprint
+    for name in ("one", "other"):
+        (tmp_path / name).mkdir()
+        for k in range(20):
+            (tmp_path / name / f"{k:02d}.png").write_bytes(bytes([k]) * 10_000)
+        os.utime(tmp_path / name / "03.png", (len(name), 0))
+    first = fingerprint(tmp_path / "one")
+    assert fingerprint(tmp_path / "other") == first != fingerprint(movie)
+    (tmp_path / "other" / "03.png").write_bytes(bytes([3]) * 9_999 + b"x")
+    assert fingerprint(tmp_path / "other") != first
+    assert fingerprint("rtsp://camera/1") == fingerprint(0) == ""
+
+
 def test_fingerprints_of_urls_are_unique_without_secrets() -> None:
     urls = [f"http://me:secret@cam/v.mp4?id={i}&pwd=secret" for i in range(2)]
     first, second = map(video_room.source_fingerprint, urls)

@@ -87,10 +87,15 @@ class ImageFeatures:
 def keyframe_features(
     poses: Poses, video: Video, options: PlacementOptions, line: Progress, most: int = 200
 ) -> list[ImageFeatures]:
-    """Extract RootSIFT features of every second keyframe, of all of few.
+    """Extract RootSIFT features of the frames of `keyframe_rows`."""
+    return image_features(poses, video, keyframe_rows(poses, options, most), options, line)
+
+
+def keyframe_rows(poses: Poses, options: PlacementOptions, most: int = 200) -> IntArray:
+    """Choose every second keyframe, all of few; return their rows in the poses.
 
     Every second one shows .95 to .98 of the sparse points (measured on four recordings). Without
-    observed points: of images spread over all frames.
+    observed points: images spread over all frames.
 
     Args:
         most: images; more cover long recordings more densely and take longer.
@@ -98,7 +103,16 @@ def keyframe_features(
     rows = np.unique(poses.visibility[:, 0])
     rows = rows[poses.measured[rows]] if len(rows) else np.arange(len(poses.frame))
     step = max(2 if len(rows) > options.images else 1, -(-len(rows) // most))
-    return image_features(poses, video, rows[::step], options, line)
+    return np.asarray(rows[::step], np.int64)
+
+
+def compared_rows(poses: Poses, rows: IntArray, options: PlacementOptions) -> IntArray:
+    """Return the rows that `place` compares with the map, of those that have features."""
+    chosen = [np.empty(0, np.int64)]
+    for part in range(poses.part_count):
+        of_part = rows[(poses.part[rows] == part) & poses.known[rows]]
+        chosen.append(of_part[:: max(1, -(-len(of_part) // options.images))])
+    return np.sort(np.concatenate(chosen))
 
 
 def image_features(
@@ -373,6 +387,7 @@ class ComponentPlacement:
     Attributes:
         similarity: None: refused. images: that agree. tried: images compared. reason: of a refusal.
         support: fraction of the points in view that were found again, median over the images.
+        unmatched: refused as too few images match points of the map, which contradicts no place.
     """
 
     similarity: Similarity | None
@@ -380,6 +395,7 @@ class ComponentPlacement:
     tried: int
     reason: str = ""
     support: float = 0.0
+    unmatched: bool = False
 
 
 def place_component(
@@ -403,7 +419,7 @@ def place_component(
         reason = (
             f"{len(located)} of {len(tried)} images match points of the map, {needed} are needed"
         )
-        return ComponentPlacement(None, tuple(located), len(tried), reason)
+        return ComponentPlacement(None, tuple(located), len(tried), reason, unmatched=True)
     guess, agrees, rival = _agreement(poses, located, options)
     agreeing = [image for image, good in zip(located, agrees, strict=True) if good]
     count = f"{len(agreeing)} of {len(tried)} images agree on a position in the map"
@@ -530,17 +546,20 @@ def refine_similarity(
     few = len(images) / max(len(images) - 1, 1)
     cov = bread * max(independent, few * common)
     scale, rotation, translation = moved(fit.x)
-    # from a correction about `origin` to one about the origin of the map's world
+    return Similarity(scale, rotation, translation, about_origin(cov, origin))
+
+
+def about_origin(cov: Array, point: Array) -> Array:
+    """Convert the covariance of a small similarity about a point to that of one about the origin.
+
+    Args:
+        cov: (7, 7) of rotation vector, translation and log scale.
+    """
+    x, y, z = point
     about = np.eye(7)
-    about[3:6, :3] = _cross(origin)
-    about[3:6, 6] = -origin
-    return Similarity(scale, rotation, translation, about @ cov @ about.T)
-
-
-def _cross(v: Array) -> Array:
-    """Return the matrix (3, 3) of the cross product with a vector."""
-    x, y, z = v
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0.0]])
+    about[3:6, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
+    about[3:6, 6] = -point
+    return np.asarray(about @ cov @ about.T)
 
 
 # ---- The recording -----------------------------------------------------------------------------
@@ -553,12 +572,19 @@ class Placement:
     Attributes:
         poses: placed components are one component, the first, in the world of the map; the others
             follow as they are. components: how each was placed, in their order before.
-        refused: why no component was placed; "": some was.
+        refused: why no component was placed; "": some was. by: "points" or "objects".
     """
 
     poses: Poses
     components: tuple[ComponentPlacement, ...]
     refused: str = ""
+    by: str = "points"
+
+    @property
+    def unmatched(self) -> bool:
+        """True if it was refused only as too few images match points of the map."""
+        tried = [c for c in self.components if c.tried]
+        return bool(self.refused and tried) and all(c.unmatched for c in tried)
 
     @property
     def best(self) -> ComponentPlacement:
@@ -593,7 +619,7 @@ def place(
     placed = [k for k, found in enumerate(components) if found.similarity is not None]
     if not placed:
         return Placement(poses, tuple(components), components[0].reason)
-    return Placement(_joined(poses, components, placed), tuple(components))
+    return Placement(joined(poses, components, placed), tuple(components))
 
 
 def _matched(points: MapPoints, most: int) -> MapPoints:
@@ -606,7 +632,7 @@ def _matched(points: MapPoints, most: int) -> MapPoints:
     return points[np.sort(np.concatenate(chosen))]
 
 
-def _joined(poses: Poses, components: Sequence[ComponentPlacement], placed: Sequence[int]) -> Poses:
+def joined(poses: Poses, components: Sequence[ComponentPlacement], placed: Sequence[int]) -> Poses:
     """Move the placed components into the world of the map, as one component, the first."""
     cam_from_world = poses.cam_from_world.copy()
     points = poses.points.copy()

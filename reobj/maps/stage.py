@@ -17,23 +17,25 @@ from reobj.files import Progress
 from reobj.maps.corrections import with_edits
 from reobj.maps.earlier import earlier_sessions
 from reobj.maps.fusion import scale_of
+from reobj.maps.object_placement import place_by_objects
 from reobj.maps.object_points import object_views, triangulated
 from reobj.maps.placement import (
     ImageFeatures,
     Placement,
     PlacementOptions,
+    compared_rows,
     image_features,
-    keyframe_features,
+    keyframe_rows,
     place,
     points_with_descriptors,
 )
-from reobj.maps.room_map import RoomMap, map_lock
+from reobj.maps.room_map import RoomMap, Session, map_lock
 from reobj.maps.single_frames import locate_frames, locate_rest
 from reobj.maps.update import Recording, add_recording
 from reobj.results.changes import Changes
 from reobj.results.result import Result
 from reobj.results.scene import best_pictures
-from reobj.sources.video import Video
+from reobj.sources.video import Video, content_fingerprint
 from reobj.types import ReobjError, option
 
 
@@ -118,6 +120,13 @@ class Placed:
     placement: Placement | None
     scale: quadrics.Scale | None = None
 
+    @property
+    def unmatched(self) -> bool:
+        """True if the images of the recording match too few points of the map."""
+        if self.placement is None or not self.poses.known.any():
+            return False
+        return self.placement.unmatched
+
 
 def place_recording(
     opened: OpenMap,
@@ -137,8 +146,12 @@ def place_recording(
     options = options or PlacementOptions()
     if not video.has_images:
         return Placed(poses, (), None)
-    features = tuple(keyframe_features(poses, video, options, progress("map features", 0)))
     room = opened.room
+    rows = keyframe_rows(poses, options)
+    if opened.frozen and poses.known.any():  # a map that learns needs features of all of them
+        rows = compared_rows(poses, rows, options)
+    line = progress("map features", 0)
+    features = tuple(image_features(poses, video, rows, options, line))
     if not room.sessions:
         return Placed(dataclasses.replace(poses, map_id=room.map_id), features, None)
     with progress("map", 0) as line:
@@ -153,6 +166,17 @@ def place_recording(
             placement = locate_frames(poses, features, points, camera, options, report=line.step)
     if not placement.refused and placement.poses.source == "map":
         placement = _all_frames(placement, video, progress)
+    return _placed(room, poses, features, placement)
+
+
+def _placed(
+    room: RoomMap, poses: Poses, features: tuple[ImageFeatures, ...], placement: Placement
+) -> Placed:
+    """Give the cameras of a recording that was placed the units and gravity of the map.
+
+    Args:
+        poses: before. placement: refused ones leave them as they are.
+    """
     if placement.refused:
         return Placed(poses, features, placement)
     known = scale_of(room)
@@ -173,6 +197,18 @@ def place_recording(
     return Placed(moved, features, placement, scale)
 
 
+def place_objects(room: RoomMap, result: Result, embedder: str, placed: Placed) -> Placed:
+    """Place a recording by its objects, as too few points of its images match.
+
+    Args:
+        result: with the objects of the recording, in its own world. embedder: of the recording.
+        placed: refused, by points.
+    """
+    assert placed.placement is not None
+    placement = place_by_objects(room, result, embedder, placed.placement)
+    return _placed(room, placed.poses, placed.features, placement)
+
+
 def _denser(
     features: Sequence[ImageFeatures],
     poses: Poses,
@@ -187,7 +223,8 @@ def _denser(
         most: images, spread over the frames with a pose; more find shorter times and take longer.
     """
     rows = np.flatnonzero(poses.known)
-    rows = np.setdiff1d(rows[:: -(-len(rows) // most)], [image.row for image in features])
+    rows = np.union1d(rows[:: -(-len(rows) // most)], keyframe_rows(poses, options))
+    rows = np.setdiff1d(rows, [image.row for image in features])
     added = image_features(poses, video, rows, options, progress("map features", 0))
     return tuple(sorted([*features, *added], key=lambda image: image.row))
 
@@ -256,6 +293,7 @@ def finish_map(
     embedder: str,
     placed: Placed | None,
     progress: Callable[[str, int], Progress] = Progress,
+    before: Changes | None = None,
 ) -> Result:
     """Number the objects of a recording, write the map, and return the result with `changes`.
 
@@ -263,6 +301,7 @@ def finish_map(
 
     Args:
         placed: None: the cameras are those of the last run, with the points that the map has.
+        before: of the last run if `placed` is None; a frozen map does not have its alignment.
     """
     room = opened.room
     name = session_name(video)
@@ -281,6 +320,7 @@ def finish_map(
     if result.edits is not None:
         room = with_edits(room, result.edits)
     recording = _recording(opened, result, video, name, embedder, placed)
+    recording = _as_placed_before(recording, before, room)
     if placed is not None and video.has_images:
         recording = _with_object_points(recording, result, video, progress, opened.frozen)
     if opened.pictures and not opened.frozen:
@@ -344,8 +384,9 @@ def session_name(video: Video) -> str:
 
 
 def session_key(video: Video) -> str:
-    """Identify a recording: the content of its file, and the part of it that is read."""
-    return f"{video.fingerprint} {video.config.start}-{video.config.stop}"
+    """Identify a recording: the content of its files, and the part of it that is read."""
+    content = content_fingerprint(video.source) or video.fingerprint
+    return f"{content} {video.config.start}-{video.config.stop}"
 
 
 def _recording(
@@ -367,11 +408,12 @@ def _recording(
             opened.path, name, session_key(video), embedder,
             np.zeros((7, 7)) if old is None else old.alignment_cov,
             0 if old is None else old.localised_frames, 0 if old is None else old.tried_frames,
-            scale, None,
+            scale, None, placed_by=_placed_by(opened.room, old),
         )  # fmt: skip
     poses = placed.poses
     points = None  # of a recording located by the map's points: it has no others
-    if poses.source != "map":
+    by_objects = placed.placement is not None and placed.placement.by == "objects"
+    if poses.source != "map" and not by_objects:  # objects do not locate points well enough
         points = points_with_descriptors(poses.of_part(0), _of_first_component(placed), 0)
     if placed.placement is None:
         own = result.world.scale or none
@@ -389,8 +431,34 @@ def _recording(
         scale = placed.scale or none
     return Recording(
         opened.path, name, session_key(video), embedder, best.similarity.cov,
-        len(best.images), best.tried, scale, points,
+        len(best.images), best.tried, scale, points, placed_by=placed.placement.by,
     )  # fmt: skip
+
+
+def _as_placed_before(recording: Recording, before: Changes | None, room: RoomMap) -> Recording:
+    """Return a recording that the map does not have, with the placement of its last run.
+
+    Args:
+        before: of the last run; of the covariance of the placement it has that of the shift. None:
+            the recording was placed in this run.
+    """
+    if before is None or room.session_of(recording.fingerprint) is not None:
+        return recording
+    sigma = (before.sigma_m or 0.0) / scale_of(room).value  # of a vector
+    return dataclasses.replace(
+        recording,
+        alignment_cov=np.diag([0, 0, 0, 1, 1, 1, 0]) * sigma**2 / 3,
+        localised_frames=before.localised_frames,
+        tried_frames=before.tried_frames,
+        placed_by=before.placed_by,
+    )
+
+
+def _placed_by(room: RoomMap, session: Session | None) -> str:
+    """Say by what a session of the map was placed; "": it made the map, or is not in it."""
+    if session is None or session.number == min(s.number for s in room.sessions):
+        return ""
+    return "points" if session.localised_frames else "objects"
 
 
 def _of_first_component(placed: Placed) -> list[ImageFeatures]:

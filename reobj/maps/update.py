@@ -39,6 +39,7 @@ class Recording:
         views: features in boxes of its objects, in which the points of map objects are recognised.
         object_points: triangulated from the views, with the identities of the recording.
         pictures: JPEG of its objects, by identity; None: those that the map has are kept.
+        placed_by: as in `Changes`.
     """
 
     map_path: Path
@@ -53,6 +54,7 @@ class Recording:
     views: tuple[ObjectView, ...] = ()
     object_points: MapPoints = field(default_factory=MapPoints.empty)
     pictures: Mapping[int, bytes] | None = field(default_factory=dict)
+    placed_by: str = ""
 
 
 def add_recording(room: RoomMap, result: Result, recording: Recording) -> tuple[RoomMap, Result]:
@@ -75,7 +77,7 @@ def add_recording(room: RoomMap, result: Result, recording: Recording) -> tuple[
     states = states_for(room, own)
     before = _states_before(room, number)
     objects = [o for o in result.located if o.part == 0]
-    found = _with_motions(_found_objects(result, objects), states, result, room, recording)
+    found = _with_motions(found_objects(result, objects), states, result, room, recording)
     is_first = not room.sessions
     visibility = visibility_of(states, result.poses, shapes_of(objects), result.looked)
     tracked = result.tracks
@@ -179,7 +181,7 @@ def _as_before(
 # ---- Objects of the recording ------------------------------------------------------------------
 
 
-def _found_objects(result: Result, objects: Sequence[Object]) -> list[FoundObject]:
+def found_objects(result: Result, objects: Sequence[Object]) -> list[FoundObject]:
     """Collect shape, classes and mean embeddings of objects."""
     identity = result.tracks.track_id[result.embedding_row]
     found = []
@@ -509,6 +511,7 @@ def _changes(
     changes = Changes(
         str(recording.map_path),
         recording.name,
+        placed_by=recording.placed_by,
         localised_frames=recording.localised_frames,
         tried_frames=recording.tried_frames,
         sigma_m=None if metres is None else metres * sigma,

@@ -118,6 +118,8 @@ class Changes:
     Attributes:
         map_path, session: of the map, and the name of this recording in it.
         refused: why the recording was not placed in the map; "": it was placed.
+        placed_by: "points" of the map in its images, or its "objects"; "": it made the map, or was
+            refused.
         localised_frames, tried_frames: that agree with the map, and that were compared with it.
         components: components of the trajectory (`Object.part`) that were placed in the map.
         sigma_m: standard deviation of positions due to the alignment with the map, metres.
@@ -131,6 +133,7 @@ class Changes:
     map_path: str
     session: str
     refused: str = ""
+    placed_by: str = ""
     localised_frames: int = 0
     tried_frames: int = 0
     components: Sequence[int] = (0,)
@@ -155,6 +158,8 @@ class Changes:
             if c.id not in counts
         ]
         faults += [fault for kind, c in each if (fault := c.fault(kind))]
+        if self.placed_by not in ("", "points", "objects"):
+            faults.append(f"placed_by is {self.placed_by!r}")
         if faults:
             raise ReobjError(faults[0])
 
@@ -170,6 +175,7 @@ class Changes:
             "map": self.map_path,
             "session": self.session,
             "refused": self.refused,
+            "placed_by": self.placed_by,
             "localised_frames": self.localised_frames,
             "tried_frames": self.tried_frames,
             "components": list(self.components),
