@@ -104,9 +104,9 @@ from reobj.options import (
     check_known_size,
     check_shape,
     config_from_args,
-    load_size_priors,
     parse_known_size,
     parse_up,
+    priors_used,
     read_config,
     unused_sizes,
     write_config,
@@ -189,6 +189,7 @@ from reobj.types import (
     without_secrets,
     xyxy_from_cxcywh,
 )
+from reobj.words import among
 
 __all__ = [
     "COCO_NAMES", "Camera", "Change", "Changes", "Config", "CropEmbedder", "DetectConfig",
@@ -1371,7 +1372,7 @@ def run(
             detected, boxes = _detect(job, detections, in_3d)
             class_names = tuple(detected.class_names)
         sizes = config.objects
-        check_known_size(sizes.known_size, sizes.priors, class_names)
+        check_known_size(sizes.known_size, sizes.size_priors(), class_names)
         poses: Poses | None = None
         models: list[Path] = []
         if readings:
@@ -1417,7 +1418,7 @@ def refit(
         config = dataclasses.replace(as_config(_last_config(out), config), input=video.config)
         _check_objects(config.objects)
         sizes = config.objects
-        check_known_size(sizes.known_size, sizes.priors, last.class_names)
+        check_known_size(sizes.known_size, sizes.size_priors(), last.class_names)
         result = last
         if tracks:
             result = _given_tracks(tracks, video, config.detect, last)
@@ -1538,7 +1539,7 @@ class _Job:
 
 def _check_objects(config: ObjectsConfig) -> None:
     """Validate the options of the fit before the earlier stages take minutes."""
-    load_size_priors(config.priors)
+    config.size_priors()
     if config.up:
         parse_up(config.up)
     check_shape(config.support)
@@ -1579,7 +1580,7 @@ def _reconstructed_cameras(
         poses, and the folders of the COLMAP models.
     """
     with job.timed("poses", may_be_cached=True):
-        moving = np.isin([*class_names, ""], job.config.objects.moving_classes)[boxes.class_id]
+        moving = among([*class_names, ""], job.config.objects.moving_classes)[boxes.class_id]
         rows = boxes[moving & (boxes.score >= job.config.tracker.high_score)]
         return reconstruct_cached(job.video, job.config.poses, job.workspace, rows, job.progress)
 
@@ -1692,8 +1693,9 @@ def _warnings(config: Config, result: Result) -> list[str]:
     moving = config.objects.moving_classes
     of_objects = implausible(result, tracker.high_score, moving, tracker.new_score)
     located = [o.class_name for o in result.located]
-    of_sizes = unused_sizes(config.objects.known_size, config.objects.priors, located)
-    return [*of_cameras, *of_objects, *of_sizes]
+    fit = config.objects
+    of_sizes = unused_sizes(fit.known_size, fit.size_priors(), located)
+    return [*of_cameras, *of_objects, *of_sizes, *priors_used(fit.priors, fit.prior, located)]
 
 
 def _write(job: _Job, result: Result) -> Result:

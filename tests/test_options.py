@@ -960,6 +960,20 @@ def _(lab: Lab) -> None:
     assert scales[1] / scales[0] == pytest.approx(2, rel=0.02)
 
 
+@shows("objects.prior")
+def _(lab: Lab) -> None:
+    """The scale of a world without one follows the size that the user gives to chairs."""
+    last = shutil.copytree(lab.room, lab.path / "room") / "cache" / "last-poses.npz"
+    save_poses(last, dataclasses.replace(load_poses(last), metric=False))
+    lab.room = lab.path / "room"
+    scales = []
+    for value in ("chair=.5x.5x.8m", "armchair=2x2x2m;chair=100x100x160cm"):
+        scale = lab.refit(value).world.scale
+        assert scale is not None and scale.source == "priors"
+        scales.append(scale.value)
+    assert scales[1] / scales[0] == pytest.approx(2, rel=0.02)
+
+
 @shows("objects.known_size")
 def _(lab: Lab) -> None:
     scale = lab.refit("chair=1.64m").world.scale

@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 import quadrics
 import reobj
 import reobj_track as rt
-from reobj.options import read_config
+from reobj.options import as_config, read_config
 from reobj.poses import stage
 from reobj.results import stages as stages_module
 from reobj.results.saving import validate_objects
@@ -798,8 +798,8 @@ def test_options_are_stored_in_the_folder(
     ("option", "said"),
     [
         (("--known-size", "chair=nan"), "--known-size 'chair=nan': expected"),
-        (("--known-size", "chair=9999m"), "cm or mm, from 0.001 to 1000 m, such as door=2.0m"),
-        (("--known-size", "chair=.9mm"), "'chair=.9mm': expected CATEGORY=HEIGHT in m, cm or mm"),
+        (("--known-size", "chair=9999m"), "mm, ft, in, from 0.001 to 1000 m, such as door=2.0m"),
+        (("--known-size", "chair=.9mm"), "'chair=.9mm': expected CATEGORY=HEIGHT in m, cm"),
         (("--priors", ROOT / "README.md"), "README.md, line 1: not valid JSON"),
         (("--support", "cube"), "--shape cube: expected one of auto, ellipsoid"),
         (("--set", "objects.up=1,2"), "objects.up=1,2: expected a direction"),
@@ -830,6 +830,43 @@ def test_a_known_size_without_effect_is_reported(
     assert cli("run", frames, "-o", tmp_path / "out", *args, *QUICK, *names, *size) == 0
     assert "warning: --known-size door: no door was located" in capsys.readouterr().err
     assert "no door" in " ".join(rt.Result.load(tmp_path / "out").warnings)
+
+
+@pytest.mark.usefixtures("no_points")
+def test_words_of_the_user_get_size_priors(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By size, by a category, or none; the run says once which word got which."""
+    frames, _, path = rendered_tracks(tmp_path, "right")
+    word = ("espresso machine", "red toolbox", "extension lead", "extension lead", "chair")
+    lines = (tmp_path / "det.txt").read_text().splitlines()  # five balls in each frame
+    boxes = [line.split(",") for line in lines]
+    rows = [[b[0], *b[2:6], "0.9", word[k % 5]] for k, b in enumerate(boxes)]
+    text = "frame,left,top,width,height,score,class\n" + "\n".join(map(",".join, rows))
+    (tmp_path / "det.csv").write_text(text + "\n")
+    out = tmp_path / "out"
+    args = ("--detections", tmp_path / "det.csv", "--poses", path, "--camera", "300,300,160,120")
+    words = ("--prior", "Espresso_Machine=35x30x40 cm", "--prior", "red toolbox=luggage;vcr=tv")
+    assert cli("run", frames, "-o", out, *args, *QUICK, *words) == 0
+    err = capsys.readouterr().err
+    assert {o.class_name for o in rt.Result.load(out).located} == set(word)
+    for said in (
+        "espresso machine: size prior .35 x .3 x .4 m (--prior)",
+        "red toolbox: size prior of luggage (--prior)",
+        "extension lead: no size prior",
+    ):
+        assert err.count(said) == 1
+    assert "chair: " not in err
+    assert "--prior vcr: no object of this class has a shape" in err
+    config = as_config(rt.Config(), {"objects": {"prior": {"vcr": "tv", "mixer": "1x2x3m"}}})
+    assert config.objects.prior == "vcr=tv,mixer=1x2x3m"
+    for bad, said in (
+        ("mixer=.2x.3m", "--prior 'mixer=.2x.3m': expected WORD=WIDTHxDEPTHxHEIGHT in m, cm"),
+        ("mixer=suitcse", "no size prior of suitcse; did you mean suitcase?"),
+    ):
+        other = tmp_path / "bad"
+        assert cli("run", frames, "-o", other, *args, *QUICK, "--prior", bad) == 2
+        assert said in capsys.readouterr().err and not other.exists()
 
 
 @pytest.mark.usefixtures("no_points")

@@ -18,6 +18,7 @@ from reobj.objects.observations import Views
 from reobj.poses.floor import floor_of
 from reobj.results.result import Object, Part, World
 from reobj.types import Array, IntArray, LinkEvent, Tracks, object_classes, rows_by
+from reobj.words import among
 
 
 def describe_objects(
@@ -51,7 +52,7 @@ def describe_objects(
         rows = tracks[tracks.track_id == identity]
         frames_of_tracklets = [rows.frame[r] for r in rows_by(rows.tracklet_id)]
         class_name = name_of(class_names, class_id)
-        moves = class_name in config.moving_classes
+        moves = bool(among([class_name], config.moving_classes)[0])
         fields: dict[str, Any] = {"status": "tracked", "reason": ""}
         if fits is not None and views is not None:
             count = None if view_count is None else int(view_count[i])

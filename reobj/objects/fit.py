@@ -62,7 +62,7 @@ def link_and_fit(
     Raises:
         ReobjError: an edit made now does not find its object.
     """
-    priors = quadrics.load_priors(config.priors or None)
+    priors = config.size_priors()
     poses = result.poses
     components = _split_trajectory(poses, config, result.class_names)
 

@@ -43,6 +43,7 @@ from reobj.types import (
     option,
     rows_by,
 )
+from reobj.words import meant
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,18 +89,17 @@ def unnamed_class(class_id: int, count: int) -> str:
 
 
 def class_filter(wanted: str, names: Sequence[str]) -> IntArray:
-    """Return the ids of comma-separated class names; case does not matter.
+    """Return the ids of comma-separated class names, or of their synonyms (`words.meant`).
 
     Raises:
         ReobjError: a name that is not among `names`.
     """
-    id_of = {name.lower().replace("_", " "): i for i, name in enumerate(names)}
-    chosen = [name.strip().lower().replace("_", " ") for name in wanted.split(",") if name.strip()]
-    unknown = [name for name in chosen if name not in id_of]
+    chosen = {name.strip(): meant(name, names) for name in wanted.split(",") if name.strip()}
+    unknown = [name for name, ids in chosen.items() if not ids]
     if unknown:
-        close = did_you_mean(unknown[0], id_of) or f" among {', '.join(names)}"
+        close = did_you_mean(unknown[0], names) or f" among {', '.join(names)}"
         raise ReobjError(f"--classes: no class {', '.join(unknown)}{close}")
-    return np.array([id_of[name] for name in chosen], np.int64)
+    return np.array([i for ids in chosen.values() for i in ids], np.int64)
 
 
 def read_detections(

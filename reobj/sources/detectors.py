@@ -60,6 +60,7 @@ from reobj.types import (
     text_labels,
     visible_name,
 )
+from reobj.words import among
 
 
 class OnnxDetector:
@@ -384,7 +385,8 @@ def open_detections(
             raise fixed_classes(config.model)
         if is_function(config.model):
             function = user_function(config.model)
-            return _filtered(as_source(function, names), config)
+            is_open = not (names or _stated_names(function))  # its labels are the class names
+            return _filtered(as_source(function, names), config, is_open)
         path = model_path(config.model, offline)
         detector = OnnxDetector("", config, threads, offline, device)
         key = _cache_key(config, path.name, path.stat().st_size, device)
@@ -396,12 +398,18 @@ def open_detections(
     return as_source(detections, names)
 
 
-def _filtered(source: DetectionSource, config: DetectConfig) -> DetectionSource:
+def _filtered(
+    source: DetectionSource, config: DetectConfig, is_open: bool = False
+) -> DetectionSource:
     """Clip the detections of a source to the image; select them by score, area, class and number.
 
     Best first.
+
+    Args:
+        is_open: the class names are not known in advance.
     """
-    allowed = class_filter(config.classes, source.class_names) if config.classes else None
+    wanted = config.classes
+    allowed = class_filter(wanted, source.class_names) if wanted and not is_open else None
 
     def detect(frame: Frame) -> Detections | None:
         found = source.detect(frame)
@@ -411,6 +419,8 @@ def _filtered(source: DetectionSource, config: DetectConfig) -> DetectionSource:
         use = (found.score >= config.min_score) & (boxes[:, 2:] > boxes[:, :2]).all(1)
         if allowed is not None:
             use &= np.isin(found.class_id, allowed)
+        elif wanted:
+            use &= among(source.class_names, wanted.split(","))[found.class_id]
         rows = np.flatnonzero(use)
         rows = rows[best_rows(found.score[rows])][: config.max_detections or None]
         return dataclasses.replace(found, xyxy=boxes)[rows]

@@ -453,10 +453,9 @@ def _text_classes(table: Table, names: Sequence[str]) -> tuple[IntArray, list[st
         known = [*base, *new]
         index = {name: i for i, name in reversed(list(enumerate(known)))}
         class_id[~blank] = [index[cell] for cell in filled]
-        if new and base:
-            table.messages.append(
-                f"{len(new)} class names not in the list: {printable(shortened(new))}"
-            )
+        if new and names:
+            text = f"{len(new)} class names that detect.class_names does not have"
+            table.messages.append(f"{text}: {printable(shortened(new))}")
     return _with_unnamed(class_id, blank, known, table)
 
 
