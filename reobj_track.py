@@ -141,6 +141,7 @@ from reobj.results.saving import (
 from reobj.results.scene import write_pictures
 from reobj.results.stages import collect_tracks, detect_all, detections_key, keep_detections
 from reobj.results.workspace import Workspace
+from reobj.sources.boxes_3d import boxes_3d_of, has_boxes_3d, read_boxes_3d
 from reobj.sources.detection_files import DetectConfig, read_detections, read_tracks
 from reobj.sources.detectors import (
     DetectionSource,
@@ -1364,12 +1365,15 @@ def run(
         viewer = Viewer(VideoInfo.of(video)) if show else None
         in_3d = in_3d and config.poses.mode != "none"
         readings = supplied_poses(video, config.poses) if in_3d else []
+        if readings and isinstance(detections, str | Path) and has_boxes_3d(Path(detections)):
+            readings = [_reading_of_boxes(Path(detections), video, readings)]
         if tracks:
             result = _given_tracks(tracks, video, config.detect, workspace.last_tracks)
             boxes = result.tracks
             class_names = result.class_names
         else:
-            detected, boxes = _detect(job, detections, in_3d)
+            cameras = readings[0].poses if readings else None
+            detected, boxes = _detect(job, detections, in_3d, cameras)
             class_names = tuple(detected.class_names)
         sizes = config.objects
         check_known_size(sizes.known_size, sizes.size_priors(), class_names)
@@ -1385,6 +1389,9 @@ def run(
             poses = placed.poses
         if not tracks:
             result = _track_video(job, detected, poses, viewer)
+        if placed is not None and result.boxes_3d is not None:
+            text = "the 3D boxes are used as 2D boxes only: the map has another world"
+            result = dataclasses.replace(result, boxes_3d=None, warnings=[*result.warnings, text])
         warnings = [*result.warnings, *workspace.save_last(result, poses, models)]
         result = dataclasses.replace(result, poses=poses, warnings=warnings)
         result = _finish(job, result, room, placed)
@@ -1547,20 +1554,30 @@ def _check_objects(config: ObjectsConfig) -> None:
 
 
 def _detect(
-    job: _Job, detections: str | Path | Callable[[Image], Any] | None, in_3d: bool
+    job: _Job,
+    detections: str | Path | Callable[[Image], Any] | None,
+    in_3d: bool,
+    poses: Poses | None,
 ) -> tuple[DetectionSource, Tracks]:
     """Open the detections; if cameras are estimated, detect in all frames of a recorded video.
 
+    Args:
+        poses: supplied cameras.
     Returns:
         the source, and the boxes of all frames (empty if they are detected frame by frame): the
         reconstruction leaves out moving objects, and supplied poses are checked with boxes.
     """
-    opened = open_detections(job.video, job.config.detect, detections, *job.runtime)
+    opened = open_detections(job.video, job.config.detect, detections, *job.runtime, poses)
     source = keep_detections(opened, job.video, job.workspace)
     if not in_3d or job.video.is_live:
         return source, Tracks.empty()
     with job.timed("detect", may_be_cached=source.recorded is None):
         return detect_all(source, job.video, job.workspace, job.progress)
+
+
+def _reading_of_boxes(path: Path, video: Video, readings: list[PoseReading]) -> PoseReading:
+    """Choose the interpretation of the user's poses in which most boxes in 3D are visible."""
+    return readings[read_boxes_3d(path, video, [one.poses for one in readings])[1]]
 
 
 def _supplied_cameras(job: _Job, readings: list[PoseReading], boxes: Tracks) -> Poses:
@@ -1610,6 +1627,7 @@ def _track_video(
         if viewer is not None:
             steps = viewer.follow(steps, source.class_names, video, poses)
         result = collect_tracks(steps, tracker, video, source, job.progress, checkpoint)
+        result = dataclasses.replace(result, boxes_3d=boxes_3d_of(source.recorded))
         result.save_tracked(path)
         if checkpoint is not None:
             checkpoint.remove()

@@ -28,6 +28,7 @@ import reobj_track as rt
 from reobj.options import as_config, read_config
 from reobj.poses import stage
 from reobj.results import stages as stages_module
+from reobj.results.export_labels import BOXER_HEADER
 from reobj.results.saving import validate_objects
 from reobj.results.stages import detect_all
 from reobj.results.workspace import Workspace
@@ -830,6 +831,56 @@ def test_a_known_size_without_effect_is_reported(
     assert cli("run", frames, "-o", tmp_path / "out", *args, *QUICK, *names, *size) == 0
     assert "warning: --known-size door: no door was located" in capsys.readouterr().err
     assert "no door" in " ".join(rt.Result.load(tmp_path / "out").warnings)
+
+
+def boxer_file(folder: Path, rng: np.random.Generator, sigma: float = 0.0) -> Path:
+    """Boxes in 3D of the five balls of `rendered_tracks` in each frame, as Boxer writes them."""
+    lines = [BOXER_HEADER]
+    for i, k in np.ndindex(30, 5):
+        center = CENTERS[k] + sigma * rng.normal(size=3)
+        size = 0.5 * np.exp(sigma * rng.normal(size=3))
+        numbers = ",".join(f"{v:.9g}" for v in (*center, 1, 0, 0, 0, *size))
+        lines.append(f"{round(i / 30 * 1e9)},{numbers},hassock,-1,0,0.8")
+    path = folder / "boxer_3dbbs.csv"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.usefixtures("no_points")
+def test_boxes_in_3d_of_another_program(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Identities are ours, boxes those of the file; `objects` and `export` know them too."""
+    frames, _, path = rendered_tracks(tmp_path, "right")
+    out = tmp_path / "out"
+    files = ("--detections", boxer_file(tmp_path, np.random.default_rng(0), 0.01))
+    cameras = ("--poses", path, "--camera", "300,300,160,120")
+    assert cli("run", frames, "-o", out, *files, *cameras, *QUICK) == 0
+    result = rt.Result.load(out)
+    assert len(result.located) == 5 and {o.class_name for o in result.located} == {"hassock"}
+    refit = rt.refit(out, {"objects": {"up": "0,-1,0"}})
+    for found in (result, refit):
+        for o in found.located:
+            off = np.linalg.norm(CENTERS - np.array(o.center), axis=1)
+            assert off.min() < 0.02 and o.support == "box" and o.status == "ok"
+            assert np.array(o.size) == pytest.approx(0.5, rel=0.03)
+            assert np.isfinite(o.cov).all() and max(o.size_rel_sigma) < 0.07
+    assert cli("export", out, "--to", "boxer", "-o", tmp_path / "again.csv") == 0
+    capsys.readouterr()
+    text = files[1].read_text()
+    rows = text.splitlines()
+    for name, changed, command, said in (
+        ("a", text, "track", "3D boxes in the world, which need its cameras: `run` with --det"),
+        ("b", re.sub(r"(?m)^(\d+),", r"9\g<1>000000000,", text), "run", "no time stamp ("),
+        ("c", text.replace(",1,0,0,0,", ",1,1,0,0,"), "run", "line 2: extents"),
+        ("d", re.sub("(?m),[^,]*$", "", text), "run", "3D boxes without the columns prob"),
+        ("e", "\n".join([rows[0], *(re.sub("^([0-9]+),[^,]*", r"\1,9e4", r) for r in rows[1:])]),
+         "run", "no box is in the image of its frame"),
+    ):  # fmt: skip
+        file = tmp_path / f"{name}.csv"
+        file.write_text(changed)
+        more = cameras if command == "run" else ()
+        call = (command, frames, "-o", tmp_path / "x", "--overwrite", "--detections", file)
+        assert cli(*call, *more, *QUICK) == 2
+        assert said in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("no_points")

@@ -23,11 +23,13 @@ from reobj.objects.component import ComponentObjects, associate_component, find_
 from reobj.objects.config import ObjectsConfig, make_fit
 from reobj.objects.description import describe_objects, describe_world
 from reobj.objects.frames import informative_frames, only_frames
+from reobj.objects.given_boxes import with_given_boxes
 from reobj.objects.observations import MIN_SCORE, Fit, Scene, gather_views, points_on
 from reobj.objects.occlusion import occluded_edges
 from reobj.objects.phases import PhasesOfFit, Reach, ignore
 from reobj.results.edits import Edits, apply_edits
 from reobj.results.result import Object, Result
+from reobj.sources.boxes_3d import Boxes3D
 from reobj.tracking.interpolation import fill_from_objects, fill_gaps
 from reobj.tracking.linking import FRAGMENT_GAP, link
 from reobj.types import (
@@ -91,7 +93,14 @@ def link_and_fit(
     for component in components:
         rows = np.flatnonzero(component_of_object[object_of_row] == component.number)
         described, fit = _fit_component(
-            component, rows, linked, edited.class_names, priors, config, reach(component)
+            component,
+            rows,
+            linked,
+            result.boxes_3d,
+            edited.class_names,
+            priors,
+            config,
+            reach(component),
         )
         objects += described
         fits.append(fit)
@@ -412,6 +421,7 @@ def _fit_component(
     component: _Component,
     rows: IntArray,
     linked: _Linked,
+    boxes_3d: Boxes3D | None,
     class_names: Sequence[str],
     priors: quadrics.Priors,
     config: ObjectsConfig,
@@ -420,7 +430,8 @@ def _fit_component(
     """Fit and describe the objects of a component.
 
     Args:
-        rows: of its objects in the linked tracks. reach: reports the progress.
+        rows: of its objects in the linked tracks. boxes_3d: of the detections. reach: reports the
+            progress.
     """
     number, poses, fit = component
     tracks = linked.tracks[rows]
@@ -456,6 +467,7 @@ def _fit_component(
         new[np.searchsorted(views.frame, tracks.frame[rows]), group[rows]] = True
         views = dataclasses.replace(views, boxes=np.where(new[..., None], views.boxes, np.nan))
         fits = fit(views, categories, Scene(floor, None if floor is None else floor.normal))
+        fits = with_given_boxes(fits, boxes_3d, tracks, group)
     reach("fit", 1.0)
     described = describe_objects(
         tracks, class_names, fits, views, config, linked.confidence, number, view_count

@@ -16,8 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
+from reobj.cameras import Poses
 from reobj.files import did_you_mean, load_json, shortened
 from reobj.sources import coco, tables
+from reobj.sources.boxes_3d import has_boxes_3d, read_boxes_3d
 from reobj.sources.class_names import check_length, load_class_names
 from reobj.sources.cvat import read_cvat
 from reobj.sources.label_folders import label_files, read_label_folder
@@ -103,19 +105,26 @@ def class_filter(wanted: str, names: Sequence[str]) -> IntArray:
 
 
 def read_detections(
-    path: str | Path, video: Video, config: DetectConfig | None = None
+    path: str | Path,
+    video: Video,
+    config: DetectConfig | None = None,
+    poses: Poses | None = None,
 ) -> RecordedDetections:
     """Read recorded detections of a video, in any of the formats.
 
     Args:
         path: the file, or a folder of YOLO labels; boxes in px and frame numbers of the source.
         config: min_score, classes, class_names, first_frame and max_detections apply.
+        poses: cameras that project boxes in 3D (Boxer's CSV).
     Raises:
         ReobjError: the file, the line and what was expected.
     """
     path = Path(path)
     config = config or DetectConfig()
-    recorded = _read(path, video, config)
+    if poses is not None and has_boxes_3d(path):
+        recorded = read_boxes_3d(path, video, [poses], _names(config))[0]
+    else:
+        recorded = _read(path, video, config)
     _note_looked(recorded, video.frame_count)
     _check(recorded, path, config, video.frame_count)
     return recorded
@@ -127,13 +136,16 @@ def _read(path: Path, video: Video, config: DetectConfig) -> RecordedDetections:
         raise ReobjError(f"{path}: no such file of detections")
     if config.first_frame not in ("", "0", "1"):
         raise ReobjError(f"detect.first_frame {config.first_frame}: expected 0 or 1")
-    names = load_class_names(config.class_names) if config.class_names else ()
     try:
-        return _read_kind(path, names, video, config.first_frame)
+        return _read_kind(path, _names(config), video, config.first_frame)
     except ReobjError:
         raise
     except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
         raise ReobjError(f"{path}: an entry cannot be read: {error!r}") from error
+
+
+def _names(config: DetectConfig) -> tuple[str, ...]:
+    return load_class_names(config.class_names) if config.class_names else ()
 
 
 def _note_looked(recorded: RecordedDetections, frame_count: int) -> None:

@@ -19,6 +19,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from reobj.cameras import Poses
 from reobj.files import did_you_mean, save_npz
 from reobj.sources.class_names import Vocabulary, check_length, load_class_names
 from reobj.sources.detection_files import (
@@ -362,6 +363,7 @@ def open_detections(
     threads: int = 0,
     offline: bool = False,
     device: str = "cpu",
+    poses: Poses | None = None,
 ) -> DetectionSource:
     """Open the source of the detections of a video.
 
@@ -370,7 +372,7 @@ def open_detections(
             which `config` gives only the class names; a detector of `with_detector`; or None: the
             ONNX model of `config`.
         threads: of onnxruntime (0: all cores). offline: never download weights. device: of the
-            ONNX model, cpu, cuda, coreml, ...
+            ONNX model, cpu, cuda, coreml, ... poses: for files of boxes in 3D.
     """
     config, detections = with_detector(config, detections)
     names = load_class_names(config.class_names) if config.class_names else ()
@@ -392,7 +394,7 @@ def open_detections(
         key = _cache_key(config, path.name, path.stat().st_size, device)
         return dataclasses.replace(as_source(detector), key=key, slow=True)
     if isinstance(detections, str | Path):
-        recorded = read_detections(detections, video, config)
+        recorded = read_detections(detections, video, config, poses)
         key = _cache_key(config, recorded.fingerprint())
         return dataclasses.replace(as_source(recorded), key=key)
     return as_source(detections, names)
