@@ -93,6 +93,7 @@ from reobj.maps.stage import (
     opened_map,
     place_recording,
 )
+from reobj.objects.confidence import scores_far_off
 from reobj.objects.config import ObjectsConfig
 from reobj.objects.description import components_message
 from reobj.objects.fit import fill, link_and_fit
@@ -1713,6 +1714,7 @@ def _warnings(config: Config, result: Result) -> list[str]:
     located = [o.class_name for o in result.located]
     fit = config.objects
     of_sizes = unused_sizes(fit.known_size, fit.size_priors(), located)
+    of_objects += scores_far_off(result)
     return [*of_cameras, *of_objects, *of_sizes, *priors_used(fit.priors, fit.prior, located)]
 
 
@@ -1855,7 +1857,8 @@ def _cmd_models(args: argparse.Namespace) -> int:
             w = row.weights
             size = f"{w.size / 1e6:.1f}" if w.size else "?"
             facts = f"{w.name:<15} {w.role:<9} {size:>5} MB  {w.licence:<11}"
-            print("\n".join(wrapped(f"{facts} {row.state:<9} {w.note}")))
+            note = "; ".join(filter(None, (w.note, w.verified)))
+            print("\n".join(wrapped(f"{facts} {row.state:<9} {note}")))
     return 0
 
 

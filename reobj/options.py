@@ -246,7 +246,7 @@ def list_options(config: Any, width: int = 120, name_width: int = 32) -> str:
     """
     lines = []
     for name, f in every_option(config).items():
-        default = str(f.default) if len(str(f.default)) < 12 else f"{str(f.default)[:9]}..."
+        default = str(f.default) if len(str(f.default)) <= 12 else f"{str(f.default)[:9]}..."
         text = textwrap.wrap(f.metadata["help"], width - name_width - 1)
         lines.append(f"{f'{name}={default}':<{name_width}} {text[0]}")
         lines += [" " * (name_width + 1) + more for more in text[1:]]

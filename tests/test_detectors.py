@@ -859,7 +859,7 @@ def test_no_detections_named_and_no_network(
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.delenv("REOBJ_MODELS", raising=False)
-    expected = "deimv2-n is not in .*, and --offline .*; or take .* --detector fast$"
+    expected = "deimv2-femto is not in .*, and --offline .*; or take .* --detector fast$"
     with pytest.raises(rt.ReobjError, match=expected):
         open_detections(clip, rt.DetectConfig(), offline=True)
 

@@ -147,8 +147,8 @@ def test_a_device_of_onnxruntime_is_refused(video: rt.Video, device: str) -> Non
 
 
 def test_words_need_a_detector_of_free_text(video: rt.Video) -> None:
-    with pytest.raises(rt.ReobjError, match=r"--words: deimv2-n has fixed classes; .*grounding"):
-        detect(video, "deimv2-n", words="toolbox")
+    with pytest.raises(rt.ReobjError, match=r"--words: deimv2-femto has .*grounding"):
+        detect(video, "deimv2-femto", words="toolbox")
     with pytest.raises(rt.ReobjError, match="--words: rfdetr:nano has fixed classes"):
         detect(video, "rfdetr:nano", words="toolbox")
 

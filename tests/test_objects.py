@@ -14,6 +14,7 @@ from simulated import SIZE, chair_solids, fitted, tracks_of, walk, with_columns
 
 import quadrics
 import reobj_track as rt
+from reobj.objects.confidence import scores_far_off
 from reobj.objects.config import make_fit
 from reobj.objects.description import describe_objects, describe_world
 from reobj.objects.given_boxes import mean_box
@@ -348,6 +349,22 @@ def test_low_confidence_is_a_status_of_its_own(confidence: float, status: str) -
     found = described(confidence={1: confidence}, **rejected)
     assert found.status == ("rejected" if status == "ok" else "doubtful")
     assert "too few" in found.reason
+
+
+@pytest.mark.parametrize(
+    ("score", "said"), [(0.5, False), (0.9, False), (0.99, True), (0.03, True)]
+)
+def test_scores_unlike_those_of_the_confidence_are_reported(
+    chairs: rt.Result, score: float, said: bool
+) -> None:
+    tracks = with_columns(chairs.tracks, score=np.full(len(chairs.tracks), score),
+                          detection_index=np.zeros(len(chairs.tracks), np.int64))  # fmt: skip
+    sure = [dataclasses.replace(o, confidence=0.9) for o in chairs.objects]
+    result = dataclasses.replace(chairs, tracks=tracks, objects=sure, untracked=rt.Tracks.empty())
+    texts = scores_far_off(result)
+    assert len(texts) == said and all(f"is {score:.2g}, that of" in text for text in texts)
+    unsure = [dataclasses.replace(o, confidence=None) for o in chairs.objects]
+    assert scores_far_off(dataclasses.replace(result, objects=unsure)) == []
 
 
 # ---- Boxes in 3D of a detector ----

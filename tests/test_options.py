@@ -73,7 +73,7 @@ def test_every_option_is_documented() -> None:
     flags = [f.metadata["flag"] for f in options.values() if f.metadata["flag"]]
     assert len(set(flags)) == len(flags) and all(flag.startswith("--") for flag in flags)
     text = list_options(rt.Config())
-    assert "tracker.coast_frames=30 " in text and "detect.model=deimv2-n " in text
+    assert "tracker.coast_frames=30 " in text and "detect.model=deimv2-femto " in text
 
 
 # ---- How they are set ----
@@ -463,7 +463,7 @@ def _(lab: Lab) -> None:
 @shows("detect.words")
 def _(lab: Lab) -> None:
     video = rt.Video(images(lab.path / "images", 1))
-    with pytest.raises(rt.ReobjError, match="--words: deimv2-n has fixed classes"):
+    with pytest.raises(rt.ReobjError, match="--words: deimv2-femto has fixed classes"):
         rt.open_detections(video, lab.config("red toolbox").detect)
 
 

@@ -53,8 +53,8 @@ class DetectConfig:
     """Detector, and filter of detections, recorded ones included."""
 
     model: str = option(
-        "deimv2-n",
-        "detector: a name of `models`, fast (deimv2-femto), a .onnx file, a model of an installed "
+        "deimv2-femto",
+        "detector: a name of `models`, fast (deimv2-atto), a .onnx file, a model of an installed "
         "library (FILE.pt or ultralytics:MODEL, rfdetr:MODEL, torchvision:MODEL, hf:MODEL), or "
         "module:function of a BGR image",
         "--detector",
