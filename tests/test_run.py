@@ -7,6 +7,7 @@ import doctest
 import errno
 import importlib
 import io
+import itertools
 import json
 import pkgutil
 import re
@@ -16,6 +17,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -1037,6 +1039,42 @@ def test_damaged_boxes_are_detected_again(clip: Path, tmp_path: Path) -> None:
     np.savez(path, **(stored | {"xyxy": stored["xyxy"] * np.nan}))
     _, rows = detect_all(source, video, workspace)
     assert np.isfinite(rows.xyxy).all() and len(asked) == 2 * FRAMES
+
+
+def test_detection_beside_decoding_is_that_of_a_loop(clip: Path, tmp_path: Path) -> None:
+    """The same frames, each once, in order; an error of either side and Ctrl-C end it."""
+    loop = [(frame.index, frame.image.tobytes()) for frame in rt.Video(clip)]
+    seen = []
+
+    def detect(frame: rt.Frame) -> rt.Detections:
+        seen.append((frame.index, frame.image.tobytes()))
+        return rt.Detections.from_array([[100, 60, 140, 110 + frame.index, 0.9, 56]])
+
+    workspace = Workspace(tmp_path / "out")
+    _, rows = detect_all(rt.DetectionSource(detect), rt.Video(clip), workspace)
+    assert seen == loop and rows.frame.tolist() == list(range(FRAMES))
+    assert rows.xyxy[:, 3].tolist() == [110 + i for i in range(FRAMES)]
+
+    def stops(error: BaseException) -> rt.DetectionSource:
+        def detect(frame: rt.Frame) -> rt.Detections:
+            if frame.index == 3:
+                raise error
+            return rt.Detections.empty()
+
+        return rt.DetectionSource(detect)
+
+    for error in (KeyboardInterrupt(), rt.ReobjError("no memory")):
+        with pytest.raises(type(error)) as caught:
+            detect_all(stops(error), rt.Video(clip), workspace)
+        assert caught.value is error
+
+    class Damaged(rt.Video):
+        def __iter__(self) -> Any:
+            yield from itertools.islice(super().__iter__(), 2)
+            raise rt.ReobjError("frame 2 is damaged")
+
+    with pytest.raises(rt.ReobjError, match="frame 2 is damaged"):
+        detect_all(rt.DetectionSource(detect), Damaged(clip), workspace)
 
 
 def test_damaged_poses_are_computed_again(

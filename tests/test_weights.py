@@ -501,6 +501,37 @@ def test_unavailable_devices_are_named() -> None:
         weights.onnx_session(REOBJ, 1, "cuda")
 
 
+@pytest.mark.parametrize(
+    ("device", "package"),
+    [
+        ("cuda", "onnxruntime-gpu"),
+        ("tensorrt", "onnxruntime-gpu"),
+        ("coreml", "onnxruntime, on a Mac"),
+        ("directml", "onnxruntime-directml"),
+        ("openvino", "onnxruntime-openvino"),
+        ("migraphx", "onnxruntime-migraphx"),
+    ],
+)
+def test_a_missing_device_is_one_line(
+    device: str,
+    package: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """From the command line: what this onnxruntime has, and the package to install."""
+    import onnxruntime
+
+    monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: ["CPUExecutionProvider"])
+    cv2.imwrite(str(tmp_path / "0.png"), np.zeros((48, 64, 3), np.uint8))
+    words = ["track", str(tmp_path), "-o", str(tmp_path / "out"), "--device", device]
+    assert rt.main([*words, "--detector", str(REOBJ)]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith(f"error: --device {device}: this onnxruntime has cpu only; ")
+    assert line.endswith(f"comes with {package} (in place of onnxruntime)")
+    assert not (tmp_path / "out" / "tracks.txt").exists()
+
+
 @pytest.mark.parametrize("starts", [True, False])
 def test_a_device_selects_its_provider(monkeypatch: pytest.MonkeyPatch, starts: bool) -> None:
     """onnxruntime falls back to the CPU if a provider fails: that must be reported."""

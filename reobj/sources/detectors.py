@@ -127,7 +127,12 @@ class OnnxDetector:
         """Run the network once, on the whole image."""
         size = self._input_size(image.shape[1], image.shape[0])
         canvas, geometry = fit_image(image, size, self._layout.fit)
-        outputs = self._session.run(None, self._feeds(canvas, geometry.image_size, self._layout))
+        feeds = self._feeds(canvas, geometry.image_size, self._layout)
+        try:
+            outputs = self._session.run(None, feeds)
+        except Exception as error:  # no memory on the device, a shape that the network refuses
+            reason = str(error).partition("\n")[0]
+            raise ReobjError(f"{self.path} failed: {reason}") from error
         decoded = self._layout.decode(outputs, geometry)
         boxes = np.clip(decoded.xyxy, 0, np.tile(geometry.image_size, 2))
         label = decoded.class_id - self._layout.first
