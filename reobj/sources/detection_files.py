@@ -90,13 +90,19 @@ def unnamed_class(class_id: int, count: int) -> str:
             "--set detect.class_names=FILE")  # fmt: skip
 
 
-def class_filter(wanted: str, names: Sequence[str]) -> IntArray:
+def class_filter(wanted: str, names: Sequence[str], present: IntArray | None = None) -> IntArray:
     """Return the ids of comma-separated class names, or of their synonyms (`words.meant`).
 
+    Args:
+        present: ids of the classes that occur, if known: synonyms among them go before a name that
+            does not occur.
     Raises:
         ReobjError: a name that is not among `names`.
     """
-    chosen = {name.strip(): meant(name, names) for name in wanted.split(",") if name.strip()}
+    words = [word.strip() for word in wanted.split(",") if word.strip()]
+    occur = set(range(len(names)) if present is None else present.tolist())
+    here = [name if i in occur else "" for i, name in enumerate(names)]
+    chosen = {word: meant(word, here) or meant(word, names) for word in words}
     unknown = [name for name, ids in chosen.items() if not ids]
     if unknown:
         close = did_you_mean(unknown[0], names) or f" among {', '.join(names)}"
@@ -232,7 +238,9 @@ def _check(
         recorded.messages.append(f"{text} (detect.min_score): left out")
     keep &= recorded.score >= config.min_score
     if config.classes:
-        keep &= np.isin(recorded.class_id, class_filter(config.classes, recorded.class_names))
+        present = np.unique(recorded.class_id)
+        chosen = class_filter(config.classes, recorded.class_names, present)
+        keep &= np.isin(recorded.class_id, chosen)
     if not len(recorded):
         recorded.messages.append("no detections in this file")
     elif not keep.any():
