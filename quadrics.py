@@ -38,7 +38,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from pathlib import Path
@@ -458,23 +458,41 @@ class Priors:
     log_cov: Array  # (C, 3, 3)
     ratio_mean: Array  # (C, 2) mean of log(w/h), log(d/h)
     ratio_cov: Array  # (C, 2, 2)
-    support: IntArray  # (C,) `Shape`
+    support: IntArray  # (C,) `Shape`; Shape.BY_EVIDENCE ("auto"): by model selection
     yaw_symmetric: BoolArray  # (C,)
     upright: BoolArray  # (C,)
     on_floor: BoolArray  # (C,) objects of the category stand on the floor
 
     def index(self, categories: Sequence[str | None]) -> IntArray:
-        """Find the row of each category (O,); -1 where the priors do not have it."""
+        """Find the row of each category (O,): of its name, else of what it is a synonym of; or -1.
+
+        A synonym may have a row: "monitor" means the same as "tv", but is smaller.
+        """
         row_of = {_normalised(name): k for k, name in enumerate(self.names)}
-        names = self.canonical([c or "" for c in categories])
+        aliases = self._aliases()
+        names = [_followed(_normalised(c or ""), aliases, row_of) for c in categories]
         return np.array([row_of.get(name, -1) for name in names], np.int64)
 
     def canonical(self, names: Sequence[str]) -> list[str]:
-        """Replace synonyms by the category's name, in lower case; other names stay."""
-        known = {_normalised(name) for name in self.names}
-        aliases = {_normalised(alias): _normalised(name) for alias, name in self.aliases.items()}
-        normalised = [_normalised(name) for name in names]
-        return [name if name in known else aliases.get(name, name) for name in normalised]
+        """Replace synonyms by one name of their category, in lower case; other names stay.
+
+        Names that mean the same get the same name.
+        """
+        aliases = self._aliases()
+        return [_followed(_normalised(name), aliases) for name in names]
+
+    def meant(self, word: str, names: Sequence[str]) -> list[int]:
+        """List the rows of names that a word means: of that name, else of its synonyms."""
+        same = [k for k, name in enumerate(names) if _normalised(name) == _normalised(word)]
+        if same:
+            return same
+        one = self.canonical([word])[0]
+        return [k for k, name in enumerate(self.canonical(names)) if name == one]
+
+    def _aliases(self) -> dict[str, str]:
+        """Return the normalised name for each normalised synonym."""
+        pairs = ((_normalised(alias), _normalised(name)) for alias, name in self.aliases.items())
+        return {alias: name for alias, name in pairs if alias != name}
 
 
 def _normalised(name: str) -> str:
@@ -482,10 +500,27 @@ def _normalised(name: str) -> str:
     return re.sub(r"[\s_\-]+", " ", name.strip().lower())
 
 
-def load_priors(path: str | Path | None = None) -> Priors:
+def _followed(name: str, aliases: Mapping[str, str], known: Container[str] = ()) -> str:
+    """Follow synonyms from a normalised name, as far as a known name; a circle ends somewhere."""
+    for _ in aliases:
+        if name in known or name not in aliases:
+            break
+        name = aliases[name]
+    return name
+
+
+def load_priors(
+    path: str | Path | None = None, more: Mapping[str, Mapping[str, Any] | str] | None = None
+) -> Priors:
     """Read a priors.json (default: the one beside this file).
 
     Keys "about" and "aliases" are reserved; every other key is a category.
+
+    Args:
+        more: entries of the same form that are added or replaced; a string: the entry of that
+            category.
+    Raises:
+        QuadricsError: no such JSON, a field is missing or invalid, or no such category.
     """
     path = Path(__file__).with_name("priors.json") if path is None else Path(path)
     fault = "not valid JSON"
@@ -494,6 +529,7 @@ def load_priors(path: str | Path | None = None) -> Priors:
         aliases = {a: str(name) for a, name in dict(table.pop("aliases", {})).items()}
         table.pop("about", None)
         fault = "a category has a missing or invalid field"
+        table = _with_more(table, aliases, more or {})
         rows = [_prior_row(entry) for entry in table.values()]
     except (AttributeError, LookupError, TypeError, ValueError, RecursionError) as error:
         raise QuadricsError(f"{path}: {fault} ({error}); see docs/quadrics.md") from error
@@ -502,6 +538,23 @@ def load_priors(path: str | Path | None = None) -> Priors:
         columns = [np.zeros(s) for s in ((0, 3), (0, 3, 3), (0, 2), (0, 2, 2))]
         columns += [np.zeros(0, np.int64), *(np.zeros(0, bool) for _ in range(3))]
     return Priors(tuple(table), aliases, *columns)
+
+
+def _with_more(
+    table: dict[str, Any], aliases: Mapping[str, str], more: Mapping[str, Mapping[str, Any] | str]
+) -> dict[str, Any]:
+    """Add or replace entries of the table of a priors.json."""
+    known = {_normalised(name): name for name in table}
+    synonyms = {_normalised(a): _normalised(name) for a, name in aliases.items()}
+    entries = {}
+    for word, entry in more.items():
+        if isinstance(entry, str):
+            like = _followed(_normalised(entry), synonyms, known)
+            if like not in known:
+                raise QuadricsError(f"{entry}: no such category of size priors")
+            entry = table[known[like]]
+        entries[_normalised(word)] = entry
+    return {name: e for name, e in table.items() if _normalised(name) not in entries} | entries
 
 
 @np.errstate(over="ignore", invalid="ignore")  # values that are not finite are refused below
@@ -528,7 +581,8 @@ def _prior_row(entry: Mapping[str, Any]) -> tuple[Any, ...]:
     ]
     if not np.isfinite([*log_mean, *ratios[0]]).all() or min(variances) <= 0:
         raise ValueError("sizes and variances must be finite and positive")
-    code = SUPPORTS.index(entry.get("support", "ellipsoid"))
+    support = entry.get("support", "ellipsoid")
+    code = int(Shape.BY_EVIDENCE) if support == "auto" else SUPPORTS.index(support)
     round_ = bool(entry.get("yaw_symmetric", False))
     upright = bool(entry.get("upright", True))
     return log_mean, log_cov, *ratios, code, round_, upright, entry.get("stands_on") == "floor"
@@ -2207,19 +2261,21 @@ def _known_sizes(
 ) -> list[tuple[int, int, float]]:  # fmt: skip
     """Assign the sizes that the user measured to live objects: (row, axis, metres) each."""
 
-    def same(a: str, b: str) -> bool:
-        names = [_normalised(a), _normalised(b)] if priors is None else priors.canonical([a, b])
-        return names[0] == names[1]
+    names = ["" if categories is None else categories[n] or "" for n in live.tolist()]
+
+    def rows_of(key: str | int) -> list[int]:
+        if not isinstance(key, str):
+            return [int(row) for row in np.flatnonzero(live == key)]
+        if priors is not None:
+            return priors.meant(key, names)
+        return [row for row, name in enumerate(names) if _normalised(name) == _normalised(key)]
 
     sizes = []
     for key, (name, metres) in (known_size or {}).items():
         axis = name if isinstance(name, int) else "wdh".find(name[:1].lower())
         if axis not in (0, 1, 2) or not metres > 0:
             raise QuadricsError(f"known_size[{key!r}] = {name, metres}: give (w|d|h, metres > 0)")
-        for row, number in enumerate(live.tolist()):
-            category = None if categories is None else categories[number]
-            if key == number or (isinstance(key, str) and same(key, category or "")):
-                sizes.append((row, axis, metres))
+        sizes += [(row, axis, metres) for row in rows_of(key)]
     return sizes
 
 

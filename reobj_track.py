@@ -95,6 +95,7 @@ from reobj.maps.stage import (
     place_objects,
     place_recording,
 )
+from reobj.objects.confidence import scores_far_off
 from reobj.objects.config import ObjectsConfig
 from reobj.objects.description import components_message
 from reobj.objects.fit import fill, link_and_fit
@@ -106,9 +107,9 @@ from reobj.options import (
     check_known_size,
     check_shape,
     config_from_args,
-    load_size_priors,
     parse_known_size,
     parse_up,
+    priors_used,
     read_config,
     unused_sizes,
     write_config,
@@ -144,6 +145,7 @@ from reobj.results.scene import write_pictures
 from reobj.results.serve import Server
 from reobj.results.stages import collect_tracks, detect_all, detections_key, keep_detections
 from reobj.results.workspace import Workspace
+from reobj.sources.boxes_3d import boxes_3d_of, has_boxes_3d, read_boxes_3d
 from reobj.sources.detection_files import DetectConfig, read_detections, read_tracks
 from reobj.sources.detectors import (
     DetectionSource,
@@ -193,6 +195,7 @@ from reobj.types import (
     without_secrets,
     xyxy_from_cxcywh,
 )
+from reobj.words import among
 
 __all__ = [
     "COCO_NAMES", "Camera", "Change", "Changes", "Config", "CropEmbedder", "DetectConfig",
@@ -1368,17 +1371,18 @@ def run(
         log.debug("options that differ from the defaults: %s", changed_options(config))
         viewer = Viewer(VideoInfo.of(video)) if show else None
         in_3d = in_3d and config.poses.mode != "none"
-        readings = supplied_poses(video, config.poses) if in_3d else []
+        readings = _pose_readings(video, config.poses, detections) if in_3d else []
         if tracks:
             result = _given_tracks(tracks, video, config.detect, workspace.last_tracks)
             boxes = result.tracks
             class_names = result.class_names
         else:
-            detected, boxes = _detect(job, detections, in_3d)
+            cameras = readings[0].poses if readings else None
+            detected, boxes = _detect(job, detections, in_3d, cameras)
             class_names = tuple(detected.class_names)
             log.info("detections: %d, of %d classes", len(boxes), len(np.unique(boxes.class_id)))
         sizes = config.objects
-        check_known_size(sizes.known_size, sizes.priors, class_names)
+        check_known_size(sizes.known_size, sizes.size_priors(), class_names)
         poses: Poses | None = None
         models: list[Path] = []
         if readings:
@@ -1395,12 +1399,11 @@ def run(
             result = _track_video(job, detected, poses, viewer)
         log.info("identities: %d", len(np.unique(result.tracks.track_id)))
         result = dataclasses.replace(result, poses=poses)
-        fitted = None
-        if room is not None and placed is not None and placed.unmatched:
-            fitted, placed, models = _place_by_objects(job, room, result, placed, models)
-            poses = placed.poses
-        warnings = workspace.save_last(result, poses, models)
-        result = dataclasses.replace(result, poses=poses) if fitted is None else fitted
+        fitted: Result | None = None
+        if room is not None and placed is not None:
+            result, placed, models, fitted = _place_by_objects(job, room, result, placed, models)
+        warnings = workspace.save_last(result, result.poses, models)
+        result = fitted or result
         result = dataclasses.replace(result, warnings=[*result.warnings, *warnings])
         result = _finish(job, result, room, placed, fit=fitted is None)
         if viewer is not None:
@@ -1433,7 +1436,7 @@ def refit(
         config = dataclasses.replace(as_config(_last_config(out), config), input=video.config)
         _check_objects(config.objects)
         sizes = config.objects
-        check_known_size(sizes.known_size, sizes.priors, last.class_names)
+        check_known_size(sizes.known_size, sizes.size_priors(), last.class_names)
         result = last
         if tracks:
             result = _given_tracks(tracks, video, config.detect, last)
@@ -1558,7 +1561,7 @@ class _Job:
 
 def _check_objects(config: ObjectsConfig) -> None:
     """Validate the options of the fit before the earlier stages take minutes."""
-    load_size_priors(config.priors)
+    config.size_priors()
     if config.up:
         parse_up(config.up)
     check_shape(config.support)
@@ -1566,20 +1569,38 @@ def _check_objects(config: ObjectsConfig) -> None:
 
 
 def _detect(
-    job: _Job, detections: str | Path | Callable[[Image], Any] | None, in_3d: bool
+    job: _Job,
+    detections: str | Path | Callable[[Image], Any] | None,
+    in_3d: bool,
+    poses: Poses | None,
 ) -> tuple[DetectionSource, Tracks]:
     """Open the detections; if cameras are estimated, detect in all frames of a recorded video.
 
+    Args:
+        poses: supplied cameras.
     Returns:
         the source, and the boxes of all frames (empty if they are detected frame by frame): the
         reconstruction leaves out moving objects, and supplied poses are checked with boxes.
     """
-    opened = open_detections(job.video, job.config.detect, detections, *job.runtime)
+    opened = open_detections(job.video, job.config.detect, detections, *job.runtime, poses)
     source = keep_detections(opened, job.video, job.workspace)
     if not in_3d or job.video.is_live:
         return source, Tracks.empty()
     with job.timed("detect", may_be_cached=source.recorded is None):
         return detect_all(source, job.video, job.workspace, job.progress)
+
+
+def _pose_readings(video: Video, config: PosesConfig, detections: Any) -> list[PoseReading]:
+    """List the interpretations of the user's poses.
+
+    With boxes in 3D: only the one in which most of them are visible.
+    """
+    readings = supplied_poses(video, config)
+    if not readings or not isinstance(detections, str | Path):
+        return readings
+    if not has_boxes_3d(path := Path(detections)):
+        return readings
+    return [readings[read_boxes_3d(path, video, [one.poses for one in readings])[1]]]
 
 
 def _supplied_cameras(job: _Job, readings: list[PoseReading], boxes: Tracks) -> Poses:
@@ -1599,7 +1620,7 @@ def _reconstructed_cameras(
         poses, and the folders of the COLMAP models.
     """
     with job.timed("poses", may_be_cached=True):
-        moving = np.isin([*class_names, ""], job.config.objects.moving_classes)[boxes.class_id]
+        moving = among([*class_names, ""], job.config.objects.moving_classes)[boxes.class_id]
         rows = boxes[moving & (boxes.score >= job.config.tracker.high_score)]
         return reconstruct_cached(job.video, job.config.poses, job.workspace, rows, job.progress)
 
@@ -1629,6 +1650,7 @@ def _track_video(
         if viewer is not None:
             steps = viewer.follow(steps, source.class_names, video, poses)
         result = collect_tracks(steps, tracker, video, source, job.progress, checkpoint)
+        result = dataclasses.replace(result, boxes_3d=boxes_3d_of(source.recorded))
         result.save_tracked(path)
         if checkpoint is not None:
             checkpoint.remove()
@@ -1679,20 +1701,27 @@ def _moved_models(job: _Job, models: list[Path], poses: Poses, placed: Placed) -
 
 def _place_by_objects(
     job: _Job, room: OpenMap, result: Result, placed: Placed, models: list[Path]
-) -> tuple[Result | None, Placed, list[Path]]:
-    """Place the cameras by the objects of the recording, fitted in its own world.
+) -> tuple[Result, Placed, list[Path], Result | None]:
+    """Place the cameras by the objects of the recording, if its points match too few images.
 
     Returns:
-        the fitted result, None if the cameras moved; cameras and COLMAP models.
+        result, cameras, COLMAP models; and the result with fitted objects, None if the cameras moved
+        or points placed them.
     """
+    if result.boxes_3d is not None:
+        text = "the 3D boxes are used as 2D boxes only: the map has another world"
+        result = dataclasses.replace(result, boxes_3d=None, warnings=[*result.warnings, text])
+    if not placed.unmatched:
+        return result, placed, models, None
     poses = placed.poses
     with job.timed("objects"):
         fitted = _fit_objects(job, result)
     with job.timed("map"):
         placed = place_objects(room.room, fitted, _embedder_key(job), placed)
         models = _moved_models(job, models, poses, placed)
-    refused = placed.placement is not None and placed.placement.refused
-    return fitted if refused else None, placed, models
+    if placed.placement is not None and placed.placement.refused:
+        return result, placed, models, fitted
+    return dataclasses.replace(result, poses=placed.poses), placed, models, None
 
 
 def _embedder_key(job: _Job) -> str:
@@ -1755,8 +1784,10 @@ def _warnings(config: Config, result: Result) -> list[str]:
     moving = config.objects.moving_classes
     of_objects = implausible(result, tracker.high_score, moving, tracker.new_score)
     located = [o.class_name for o in result.located]
-    of_sizes = unused_sizes(config.objects.known_size, config.objects.priors, located)
-    return [*of_cameras, *of_objects, *of_sizes]
+    fit = config.objects
+    of_sizes = unused_sizes(fit.known_size, fit.size_priors(), located)
+    of_objects += scores_far_off(result)
+    return [*of_cameras, *of_objects, *of_sizes, *priors_used(fit.priors, fit.prior, located)]
 
 
 def _write(job: _Job, result: Result) -> Result:
@@ -1910,7 +1941,8 @@ def _cmd_models(args: argparse.Namespace) -> int:
             w = row.weights
             size = f"{w.size / 1e6:.1f}" if w.size else "?"
             facts = f"{w.name:<15} {w.role:<9} {size:>5} MB  {w.licence:<11}"
-            print("\n".join(wrapped(f"{facts} {row.state:<9} {w.note}")))
+            note = "; ".join(filter(None, (w.note, w.verified)))
+            print("\n".join(wrapped(f"{facts} {row.state:<9} {note}")))
     return 0
 
 

@@ -413,7 +413,7 @@ def embedding_rows(source: str, frames: int) -> tuple[Array, IntArray]:
     from reobj.appearance.embedding import Backbone
 
     cv2.setNumThreads(1)
-    detector, embedder = rt.OnnxDetector("fast", threads=1), rt.Embedder(threads=1)
+    detector, embedder = rt.OnnxDetector("deimv2-femto", threads=1), rt.Embedder(threads=1)
     tracker, clock = rt.Tracker(embedder=embedder), Clock()
     clock.wrap(Backbone, "__call__", "map", lambda *_: 1)
     clock.wrap(Backbone, "embed", "head", lambda *_: 1)
@@ -434,7 +434,7 @@ def embedding_rows(source: str, frames: int) -> tuple[Array, IntArray]:
 
 
 def embedding_table(sources: list[str], frames: int) -> str:
-    """Format what the embedding adds to `--detector fast` in `run`, one thread each."""
+    """Format what the embedding adds to deimv2-femto in `run`, one thread each."""
     cells = []
     for source in sources:
         ms, embedded = embedding_rows(source, frames)

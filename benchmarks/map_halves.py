@@ -115,7 +115,7 @@ def command(part: Part, data: Path, work: Path) -> list[str]:
         source, boxes = flip(source, boxes, work)
     words = ["run", str(source), "--every", str(part.every), "--start", str(part.start)]
     words += ["--stop", str(part.stop)] if part.stop else []
-    words += ["--detections", str(boxes)] if part.boxes else ["--detector", "fast"]
+    words += ["--detections", str(boxes)] if part.boxes else ["--detector", "deimv2-femto"]
     if part.poses:
         folder = (data / part.images).parent
         write_poses(folder, work / "poses", part.moved)

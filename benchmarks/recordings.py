@@ -5,10 +5,10 @@
         [--write-floors]
 
 Every row is one command, as a user types it, in a process of its own: with the small detector
-(--detector fast, weights in REOBJ_MODELS) or recorded boxes, and with reconstructed or supplied
-cameras. benchmarks/truth.py compares the output files with the ground truth. The exit code is 1
-if a command fails or a score misses its threshold in recordings.json beside this file; run times
-are only printed. --write-floors derives new thresholds from this run with the margins of
+(--detector deimv2-femto, weights in REOBJ_MODELS) or recorded boxes, and with reconstructed or
+supplied cameras. benchmarks/truth.py compares the output files with the ground truth. The exit code
+is 1 if a command fails or a score misses its threshold in recordings.json beside this file;
+run times are only printed. --write-floors derives new thresholds from this run with the margins of
 `floors_of`.
 
     IDF1     boxes of tracks.txt; overlap .5 (.4 on office_loop, livingroom13 and studio_room, .3 on
@@ -152,7 +152,7 @@ def command(case: Case, data: Path, work: Path) -> list[str]:
     if case.stop:
         words += ["--stop", str(case.stop)]
     if case.boxes == FAST:
-        words += ["--detector", "fast"]
+        words += ["--detector", "deimv2-femto"]
     elif case.boxes == MOT:
         words += ["--detections", str(recorded_people(case, data))]
     else:

@@ -19,6 +19,7 @@ import numpy as np
 import quadrics
 from reobj.files import atomic, did_you_mean, load_json, read_text, shortened
 from reobj.types import Array, ReobjError
+from reobj.words import canonical, synonyms
 
 C = TypeVar("C")
 
@@ -44,7 +45,7 @@ def value_of(config: Any, name: str) -> Any:
 def with_option(config: C, name: str, value: Any, where: str = "--set ") -> C:
     """Return the config with one option changed; a string is converted to the option's type.
 
-    A list of strings for an option of type str is joined by commas.
+    For an option of type str, a list of strings is joined by commas, a dict as key=value.
 
     Args:
         where: source of the option; begins the message of an error.
@@ -81,7 +82,9 @@ def with_option(config: C, name: str, value: Any, where: str = "--set ") -> C:
 
 
 def _text(value: Any) -> str:
-    """Convert the value of an option of type str: a string, path, number or a list of strings."""
+    """Convert the value of an option of type str: a string, path, number, list or dict of them."""
+    if isinstance(value, Mapping):
+        value = [f"{key}={_text(item)}" for key, item in value.items()]
     if isinstance(value, list | tuple):
         return ",".join(map(_text, value))
     if not isinstance(value, str | Path | float | int):
@@ -208,6 +211,8 @@ def add_flags(parser: argparse.ArgumentParser, config: Any, sections: Iterable[s
             settings: dict[str, Any] = {"type": kind, "metavar": kind.__name__.upper()}
             if kind is bool:
                 settings = {"action": "store_true"}
+            elif f.metadata["repeated"]:
+                settings["action"] = "append"
             default = f" (default: {f.default})" if f.default else ""
             text = f"{f.metadata['help']}{default}".replace("%", "%%")
             flags = filter(None, (flag, f.metadata["old_flag"]))
@@ -241,7 +246,7 @@ def list_options(config: Any, width: int = 120, name_width: int = 32) -> str:
     """
     lines = []
     for name, f in every_option(config).items():
-        default = str(f.default) if len(str(f.default)) < 12 else f"{str(f.default)[:9]}..."
+        default = str(f.default) if len(str(f.default)) <= 12 else f"{str(f.default)[:9]}..."
         text = textwrap.wrap(f.metadata["help"], width - name_width - 1)
         lines.append(f"{f'{name}={default}':<{name_width}} {text[0]}")
         lines += [" " * (name_width + 1) + more for more in text[1:]]
@@ -251,15 +256,115 @@ def list_options(config: Any, width: int = 120, name_width: int = 32) -> str:
 # ---- Values of the object stage ----
 
 
-def load_size_priors(path: str) -> quadrics.Priors:
-    """Load size priors, "": those that are bundled.
+PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0, "ft": 1 / 0.3048, "in": 1 / 0.0254}
+LENGTHS_M = (0.001, 1000.0)  # m, of the objects of a room or a street
+PRIORS_SHOWN = 8  # words in a message
+USUAL_LOG_STD = 0.25  # of each side of a size that the user gives: median of the bundled priors
 
+
+def load_size_priors(path: str, given: str = "") -> quadrics.Priors:
+    """Load size priors with the bundled synonyms, and those that the user gives by word.
+
+    Args:
+        path: JSON, "": the bundled priors. given: as of `parse_priors`.
     Raises:
-        ReobjError, QuadricsError: no JSON, too large, or no priors.
+        ReobjError, QuadricsError: no JSON, too large, or no priors; an invalid word, size or
+            category.
     """
     if path:
         load_json(Path(path))  # checks the size of the file
-    return quadrics.load_priors(path or None)
+    plain = quadrics.load_priors(path or None)
+    plain = dataclasses.replace(plain, aliases=_with_synonyms(plain))
+    entries = dict[str, dict[str, Any] | str]()
+    for word, prior in parse_priors(given).items():
+        name, like = (_category(plain, text) for text in (word, str(prior)))
+        if isinstance(prior, str) and not like:
+            close = did_you_mean(prior, plain.names) or ", expected a size, such as .35x.30x.40m"
+            raise ReobjError(f"--prior {word}={prior}: no size prior of {prior}{close}")
+        entries[name or word] = like if isinstance(prior, str) else _entry(prior)
+    if not entries:
+        return plain
+    return dataclasses.replace(quadrics.load_priors(path or None, entries), aliases=plain.aliases)
+
+
+def _category(priors: quadrics.Priors, word: str) -> str:
+    """Return the category of priors that a word means; "": none."""
+    row = priors.index([word])[0]
+    return priors.names[row] if row >= 0 else ""
+
+
+def _entry(size_m: tuple[float, ...]) -> dict[str, Any]:
+    """Return an entry of priors.json for a size (3,) in metres; model selection finds its shape."""
+    spread = {"log_std": [USUAL_LOG_STD] * 3, "corr": [0.3] * 3}
+    return {"size_m": {"mean": list(size_m), **spread}, "support": "auto"}
+
+
+def _with_synonyms(priors: quadrics.Priors) -> dict[str, str]:
+    """Return the synonyms of priors and the bundled ones, which lead to a category of the priors.
+
+    A file of the user may name its category "sofa": "couch" leads there.
+    """
+    named = {" ".join(re.split(r"[\s_-]+", name.lower())) for name in priors.names}
+    led = {canonical(name): name for name in priors.names if canonical(name) not in named}
+    kept = {word: name for word, name in synonyms().items() if word != led.get(canonical(word))}
+    return kept | led | dict(priors.aliases)
+
+
+def parse_priors(text: str) -> dict[str, tuple[float, ...] | str]:
+    """Parse sizes (width, depth, height in metres) of words, or the category that a word is like.
+
+    >>> parse_priors("espresso machine=.35x.30x.40m; red toolbox=suitcase")
+    {'espresso machine': (0.35, 0.3, 0.4), 'red toolbox': 'suitcase'}
+    """
+    found: dict[str, tuple[float, ...] | str] = {}
+    number = r"\s*([0-9]*\.?[0-9]+|[0-9]+\.)\s*"
+    for item in filter(None, (entry.strip() for entry in re.split("[,;]", text))):
+        word, _, value = (part.strip() for part in item.partition("="))
+        size = re.fullmatch(rf"{number}x{number}x{number}({'|'.join(PER_METRE)})", value)
+        sides = tuple(float(size[k]) / PER_METRE[size[4]] for k in (1, 2, 3)) if size else ()
+        in_range = all(LENGTHS_M[0] <= side <= LENGTHS_M[1] for side in sides)
+        if not word or not (size or value[:1].isalpha()) or not in_range:
+            raise _no_prior(item)
+        found[word] = sides or value
+    return found
+
+
+def _no_prior(item: str) -> ReobjError:
+    units = ", ".join(PER_METRE)
+    expected = f"WORD=WIDTHxDEPTHxHEIGHT in {units}, or WORD=CATEGORY, such as mixer=.2x.3x.4m"
+    limits = "each from {:g} to {:g} m".format(*LENGTHS_M)
+    return ReobjError(f"--prior {item!r}: expected {expected}; {limits}")
+
+
+def priors_used(path: str, given: str, names: Sequence[str]) -> list[str]:
+    """Describe the priors of words that the file of priors does not have, and unused ones.
+
+    Args:
+        path, given: as of `load_size_priors`. names: of the classes of the objects.
+    """
+    of_words = parse_priors(given)
+    plain = load_size_priors(path)
+    priors = load_size_priors(path, given)
+    word_of = dict(zip(priors.index(list(of_words)).tolist(), of_words, strict=True))
+    texts = []
+    used = set[str]()
+    for name in dict.fromkeys(names):
+        word = word_of.get(int(priors.index([name])[0]))
+        if word is not None:
+            used.add(word)
+            texts.append(f"{name}: size prior {_prior_text(of_words[word])} (--prior)")
+        elif not _category(plain, name) and name != "object":
+            texts.append(f"{name}: no size prior")
+    unused = [f"--prior {word}: no object of this class has a shape" for word in of_words
+              if word not in used]  # fmt: skip
+    more = f"; and {len(texts) - PRIORS_SHOWN} more" * (len(texts) > PRIORS_SHOWN)
+    return [*(["; ".join(texts[:PRIORS_SHOWN]) + more] if texts else []), *unused]
+
+
+def _prior_text(prior: tuple[float, ...] | str) -> str:
+    if isinstance(prior, str):
+        return f"of {prior}"
+    return " x ".join(f"{side:.3g}".removeprefix("0") for side in prior) + " m"
 
 
 def parse_up(text: str) -> Array:
@@ -286,41 +391,35 @@ def parse_known_size(text: str) -> dict[str | int, tuple[str | int, float]]:
     >>> parse_known_size("door=2.0m, chair=82cm")
     {'door': ('h', 2.0), 'chair': ('h', 0.82)}
     """
-    per_metre = {"m": 1, "cm": 100, "mm": 1000}
-    limits_m = (0.001, 1000.0)  # beyond the objects of a room or a street
     sizes: dict[str | int, tuple[str | int, float]] = {}
+    value = rf"([0-9]*\.?[0-9]+|[0-9]+\.)\s*({'|'.join(PER_METRE)})"
     for item in filter(None, (entry.strip() for entry in text.split(","))):
-        found = re.fullmatch(r"(.+?)\s*=\s*([0-9]*\.?[0-9]+|[0-9]+\.)\s*(m|cm|mm)", item)
-        height_m = float(found[2]) / per_metre[found[3]] if found else 0.0
-        if found is None or not limits_m[0] <= height_m <= limits_m[1]:
-            expected = "CATEGORY=HEIGHT in m, cm or mm, from {:g} to {:g} m, such as door=2.0m"
-            raise ReobjError(f"--known-size {item!r}: expected {expected.format(*limits_m)}")
+        found = re.fullmatch(rf"(.+?)\s*=\s*{value}", item)
+        height_m = float(found[2]) / PER_METRE[found[3]] if found else 0.0
+        if found is None or not LENGTHS_M[0] <= height_m <= LENGTHS_M[1]:
+            expected = f"CATEGORY=HEIGHT in {', '.join(PER_METRE)}, from "
+            expected += "{:g} to {:g} m, such as door=2.0m".format(*LENGTHS_M)
+            raise ReobjError(f"--known-size {item!r}: expected {expected}")
         sizes[found[1]] = ("h", height_m)
     return sizes
 
 
-def check_known_size(text: str, priors_path: str, class_names: Sequence[str]) -> None:
+def check_known_size(text: str, priors: quadrics.Priors, class_names: Sequence[str]) -> None:
     """Raise ReobjError for a known size of a category that the detector does not have."""
-    names = list(map(str, parse_known_size(text)))
-    priors = load_size_priors(priors_path)
-    available = set(priors.canonical(class_names))
-    for name, canonical in zip(names, priors.canonical(names), strict=True):
-        if available and canonical not in available:
+    for name in map(str, parse_known_size(text)):
+        if class_names and not priors.meant(name, class_names):
             close = did_you_mean(name, class_names) or f"; there are {shortened(class_names)}"
             raise ReobjError(f"--known-size {name}: no such class{close}")
 
 
-def unused_sizes(text: str, priors_path: str, located: Sequence[str]) -> list[str]:
+def unused_sizes(text: str, priors: quadrics.Priors, located: Sequence[str]) -> list[str]:
     """Return warnings of known sizes that set no scale: no object of their category has a shape.
 
     Args:
         located: class names of the objects that have a shape.
     """
-    priors = load_size_priors(priors_path)
-    used = set(priors.canonical(located))
-    names = list(map(str, parse_known_size(text)))
     return [
         f"--known-size {name}: no {name} was located, so this sets no scale"
-        for name, canonical in zip(names, priors.canonical(names), strict=True)
-        if canonical not in used
+        for name in map(str, parse_known_size(text))
+        if not priors.meant(name, located)
     ]

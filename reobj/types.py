@@ -115,12 +115,16 @@ COCO_NAMES: tuple[str, ...] = tuple(name.replace("_", " ") for name in (
 ).split())  # fmt: skip
 
 
-def option(default: Any, text: str, flag: str = "", old_flag: str = "") -> Any:
+def option(
+    default: Any, text: str, flag: str = "", old_flag: str = "", repeated: bool = False
+) -> Any:
     """Declare a config field: default, help text and, for common options, a flag.
 
-    old_flag: an earlier name of the flag that still works.
+    old_flag: an earlier name of the flag that still works. repeated: the flag may be given several
+    times; its values are joined by commas.
     """
-    return field(default=default, metadata={"help": text, "flag": flag, "old_flag": old_flag})
+    metadata = {"help": text, "flag": flag, "old_flag": old_flag, "repeated": repeated}
+    return field(default=default, metadata=metadata)
 
 
 @dataclass(frozen=True, slots=True)

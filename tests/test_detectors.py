@@ -689,6 +689,21 @@ def test_a_wrong_answer_names_the_frame() -> None:
         as_source(lambda image: [[*BOX, 0.5]])(frame(7))
 
 
+def test_a_network_that_fails_names_the_frame(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    detector = rt.OnnxDetector(model(tmp_path, {"o": np.zeros((1, 7, 42))}, shape=(1, 3, 32, 64)))
+
+    class Full:
+        def run(self, *_: Any) -> None:
+            raise RuntimeError("CUDA failure 2: out of memory\nat line 3")
+
+    monkeypatch.setattr(detector, "_session", Full())
+    with pytest.raises(rt.ReobjError) as caught:
+        as_source(detector)(frame(7))
+    assert str(caught.value) == f"frame 7: {detector.path} failed: CUDA failure 2: out of memory"
+
+
 @pytest.mark.parametrize("other", ["det.txt", None, 3])
 def test_invalid_detectors_are_refused(other: Any) -> None:
     with pytest.raises(rt.ReobjError, match="is no detector: expected a function"):
@@ -859,7 +874,7 @@ def test_no_detections_named_and_no_network(
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.delenv("REOBJ_MODELS", raising=False)
-    expected = "deimv2-n is not in .*, and --offline .*; or take .* --detector fast$"
+    expected = "deimv2-femto is not in .*, and --offline .*; or take .* --detector fast$"
     with pytest.raises(rt.ReobjError, match=expected):
         open_detections(clip, rt.DetectConfig(), offline=True)
 

@@ -147,8 +147,8 @@ def test_a_device_of_onnxruntime_is_refused(video: rt.Video, device: str) -> Non
 
 
 def test_words_need_a_detector_of_free_text(video: rt.Video) -> None:
-    with pytest.raises(rt.ReobjError, match=r"--words: deimv2-n has fixed classes; .*grounding"):
-        detect(video, "deimv2-n", words="toolbox")
+    with pytest.raises(rt.ReobjError, match=r"--words: deimv2-femto has .*grounding"):
+        detect(video, "deimv2-femto", words="toolbox")
     with pytest.raises(rt.ReobjError, match="--words: rfdetr:nano has fixed classes"):
         detect(video, "rfdetr:nano", words="toolbox")
 
@@ -196,3 +196,48 @@ def test_a_library_without_a_file_is_one_line(
     monkeypatch.setattr(libraries.importlib.metadata, "version", lambda name: "1")
     with pytest.raises(rt.ReobjError, match=r"^--detector no\.pt: no such file: no\.pt$"):
         detect(video, "no.pt")
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (RuntimeError("CUDA out of memory.\nTried to allocate 2 GiB"), "CUDA out of memory."),
+        (KeyError("pred_boxes"), "KeyError: 'pred_boxes'"),
+        (MemoryError(), "MemoryError: "),
+    ],
+)
+def test_a_failure_of_a_library_is_one_line(
+    video: rt.Video,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    error: Exception,
+    said: str,
+) -> None:
+    """While it detects: the detector, the frame and the library's message; also while it opens."""
+    calls = []
+
+    def detect(image: Any) -> Any:
+        calls.append(image)
+        if len(calls) > 1:
+            raise error
+        return np.empty((0, 6))
+
+    def opens(options: libraries.LibraryOptions) -> libraries.LibraryDetector:
+        if options.model == "broken":
+            raise error
+        return libraries.LibraryDetector(detect, ("cup",))
+
+    stub = libraries.Library(opens, "ultralytics", "yolo11n.pt")
+    monkeypatch.setitem(libraries.LIBRARIES, "ultralytics", stub)
+    monkeypatch.setattr(libraries.importlib.metadata, "version", lambda name: "1")
+    images = tmp_path / "two"
+    images.mkdir()
+    for i in range(2):
+        cv2.imwrite(str(images / f"{i}.png"), np.full((48, 64, 3), 90 + i, np.uint8))
+    for model, text in (("m", f"frame 1: --detector ultralytics:m failed: {said}"),
+                        ("broken", f"--detector ultralytics:broken: {said}")):  # fmt: skip
+        words = ["track", str(images), "-o", str(tmp_path / model), "--embed", "none"]
+        assert rt.main([*words, "--detector", f"ultralytics:{model}"]) == 2
+        line = capsys.readouterr().err.strip().splitlines()[-1]
+        assert line == f"error: {text}".strip()

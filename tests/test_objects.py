@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,8 +14,10 @@ from simulated import SIZE, chair_solids, fitted, tracks_of, walk, with_columns
 
 import quadrics
 import reobj_track as rt
+from reobj.objects.confidence import scores_far_off
 from reobj.objects.config import make_fit
 from reobj.objects.description import describe_objects, describe_world
+from reobj.objects.given_boxes import mean_box
 from reobj.objects.observations import Scene, Views, gather_views
 from reobj.options import parse_known_size, parse_up
 
@@ -377,3 +380,70 @@ def test_low_confidence_is_a_status_of_its_own(confidence: float, status: str) -
     found = described(confidence={1: confidence}, **rejected)
     assert found.status == ("rejected" if status == "ok" else "doubtful")
     assert "too few" in found.reason
+
+
+@pytest.mark.parametrize(
+    ("score", "said"), [(0.5, False), (0.9, False), (0.99, True), (0.03, True)]
+)
+def test_scores_unlike_those_of_the_confidence_are_reported(
+    chairs: rt.Result, score: float, said: bool
+) -> None:
+    tracks = with_columns(chairs.tracks, score=np.full(len(chairs.tracks), score),
+                          detection_index=np.zeros(len(chairs.tracks), np.int64))  # fmt: skip
+    sure = [dataclasses.replace(o, confidence=0.9) for o in chairs.objects]
+    result = dataclasses.replace(chairs, tracks=tracks, objects=sure, untracked=rt.Tracks.empty())
+    texts = scores_far_off(result)
+    assert len(texts) == said and all(f"is {score:.2g}, that of" in text for text in texts)
+    unsure = [dataclasses.replace(o, confidence=None) for o in chairs.objects]
+    assert scores_far_off(dataclasses.replace(result, objects=unsure)) == []
+
+
+# ---- Boxes in 3D of a detector ----
+
+
+def boxes_of(center: Any, size: Any, yaw_deg: Any, count: int = 40) -> np.ndarray:
+    """Boxes (n, 15) of one object, turned about z."""
+    yaw = np.broadcast_to(np.radians(yaw_deg), count)
+    turn = Rotation.from_rotvec(yaw[:, None] * [0, 0, 1]).as_matrix().reshape(-1, 9)
+    columns = [np.broadcast_to(v, (count, 3)) for v in (center, np.array(size) / 2)]
+    return np.hstack([*columns, turn])
+
+
+def test_the_mean_box_ignores_outliers_and_the_order_of_axes() -> None:
+    rng = np.random.default_rng(0)
+    truth = np.array([1.0, 0.4, 0.8])
+    yaw = 20 + 90 * rng.integers(0, 4, 40) + rng.normal(size=40)
+    swapped = np.round((yaw - 20) / 90).astype(int) % 2 == 1
+    size = np.where(swapped[:, None], truth[[1, 0, 2]], truth) * np.exp(
+        0.02 * rng.normal(size=(40, 3))
+    )
+    center = np.array([2.0, 3.0, 0.4]) + 0.01 * rng.normal(size=(40, 3))
+    box = boxes_of(center, size, yaw)
+    score = np.full(40, 0.8)
+    box[:4, :3] += 2.0  # in another place
+    box[4:8, 3:6] *= 3.0  # of another size
+    mean, half, turn, cov = mean_box(box, score, np.array([0, 0, 1.0]))
+    assert np.abs(mean - [2, 3, 0.4]).max() < 0.01
+    order = [0, 1, 2] if half[0] > half[1] else [1, 0, 2]
+    assert np.abs(2 * half[order] / truth - 1).max() < 0.02
+    assert abs(turn[2, 2]) > 0.999 and np.linalg.det(turn) == pytest.approx(1)
+    degrees = np.degrees(np.arctan2(turn[1, order[0]], turn[0, order[0]])) % 180
+    assert degrees == pytest.approx(20, abs=1)
+    assert (np.sqrt(np.diag(cov)) >= 0.05 * 0.2).all() and (np.linalg.eigvalsh(cov) > 0).all()
+
+
+def test_the_covariance_of_the_mean_box_follows_scatter_and_score() -> None:
+    rng = np.random.default_rng(1)
+    up = np.array([0, 0, 1.0])
+
+    def sigma(spread: float, score: float, count: int = 40) -> float:
+        size = np.exp(spread * rng.normal(size=(count, 3)))
+        cov = mean_box(boxes_of(0.0, size, 0.0, count), np.full(count, score), up)[3]
+        return float(np.sqrt(np.diag(cov)[3:6]).mean())
+
+    assert sigma(0.0, 0.9) == pytest.approx(0.05, rel=0.01)  # the error common to all boxes
+    assert sigma(0.3, 0.9) > 1.5 * sigma(0.05, 0.9)
+    assert sigma(0.3, 0.3) > sigma(0.3, 0.9)
+    lying = boxes_of(0.0, [1.0, 2.0, 3.0], 0.0, 1)
+    half = mean_box(lying, np.ones(1), np.array([1.0, 0, 0]))[1]
+    assert half[2] == pytest.approx(0.5)  # the axis along up is the last one

@@ -73,7 +73,7 @@ def test_every_option_is_documented() -> None:
     flags = [f.metadata["flag"] for f in options.values() if f.metadata["flag"]]
     assert len(set(flags)) == len(flags) and all(flag.startswith("--") for flag in flags)
     text = list_options(rt.Config())
-    assert "tracker.coast_frames=30 " in text and "detect.model=deimv2-n " in text
+    assert "tracker.coast_frames=30 " in text and "detect.model=deimv2-femto " in text
 
 
 # ---- How they are set ----
@@ -463,7 +463,7 @@ def _(lab: Lab) -> None:
 @shows("detect.words")
 def _(lab: Lab) -> None:
     video = rt.Video(images(lab.path / "images", 1))
-    with pytest.raises(rt.ReobjError, match="--words: deimv2-n has fixed classes"):
+    with pytest.raises(rt.ReobjError, match="--words: deimv2-femto has fixed classes"):
         rt.open_detections(video, lab.config("red toolbox").detect)
 
 
@@ -955,6 +955,20 @@ def _(lab: Lab) -> None:
         path = lab.path / f"priors{factor}.json"
         path.write_text(json.dumps(entry))
         scale = lab.refit(str(path)).world.scale
+        assert scale is not None and scale.source == "priors"
+        scales.append(scale.value)
+    assert scales[1] / scales[0] == pytest.approx(2, rel=0.02)
+
+
+@shows("objects.prior")
+def _(lab: Lab) -> None:
+    """The scale of a world without one follows the size that the user gives to chairs."""
+    last = shutil.copytree(lab.room, lab.path / "room") / "cache" / "last-poses.npz"
+    save_poses(last, dataclasses.replace(load_poses(last), metric=False))
+    lab.room = lab.path / "room"
+    scales = []
+    for value in ("chair=.5x.5x.8m", "armchair=2x2x2m;chair=100x100x160cm"):
+        scale = lab.refit(value).world.scale
         assert scale is not None and scale.source == "priors"
         scales.append(scale.value)
     assert scales[1] / scales[0] == pytest.approx(2, rel=0.02)

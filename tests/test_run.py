@@ -7,6 +7,7 @@ import doctest
 import errno
 import importlib
 import io
+import itertools
 import json
 import pkgutil
 import re
@@ -16,6 +17,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -25,9 +27,10 @@ from scipy.spatial.transform import Rotation
 import quadrics
 import reobj
 import reobj_track as rt
-from reobj.options import read_config
+from reobj.options import as_config, read_config
 from reobj.poses import stage
 from reobj.results import stages as stages_module
+from reobj.results.export_labels import BOXER_HEADER
 from reobj.results.saving import validate_objects
 from reobj.results.stages import detect_all
 from reobj.results.workspace import Workspace
@@ -798,8 +801,8 @@ def test_options_are_stored_in_the_folder(
     ("option", "said"),
     [
         (("--known-size", "chair=nan"), "--known-size 'chair=nan': expected"),
-        (("--known-size", "chair=9999m"), "cm or mm, from 0.001 to 1000 m, such as door=2.0m"),
-        (("--known-size", "chair=.9mm"), "'chair=.9mm': expected CATEGORY=HEIGHT in m, cm or mm"),
+        (("--known-size", "chair=9999m"), "mm, ft, in, from 0.001 to 1000 m, such as door=2.0m"),
+        (("--known-size", "chair=.9mm"), "'chair=.9mm': expected CATEGORY=HEIGHT in m, cm"),
         (("--priors", ROOT / "README.md"), "README.md, line 1: not valid JSON"),
         (("--support", "cube"), "--shape cube: expected one of auto, ellipsoid"),
         (("--set", "objects.up=1,2"), "objects.up=1,2: expected a direction"),
@@ -830,6 +833,93 @@ def test_a_known_size_without_effect_is_reported(
     assert cli("run", frames, "-o", tmp_path / "out", *args, *QUICK, *names, *size) == 0
     assert "warning: --known-size door: no door was located" in capsys.readouterr().err
     assert "no door" in " ".join(rt.Result.load(tmp_path / "out").warnings)
+
+
+def boxer_file(folder: Path, rng: np.random.Generator, sigma: float = 0.0) -> Path:
+    """Boxes in 3D of the five balls of `rendered_tracks` in each frame, as Boxer writes them."""
+    lines = [BOXER_HEADER]
+    for i, k in np.ndindex(30, 5):
+        center = CENTERS[k] + sigma * rng.normal(size=3)
+        size = 0.5 * np.exp(sigma * rng.normal(size=3))
+        numbers = ",".join(f"{v:.9g}" for v in (*center, 1, 0, 0, 0, *size))
+        lines.append(f"{round(i / 30 * 1e9)},{numbers},hassock,-1,0,0.8")
+    path = folder / "boxer_3dbbs.csv"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.usefixtures("no_points")
+def test_boxes_in_3d_of_another_program(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Identities are ours, boxes those of the file; `objects` and `export` know them too."""
+    frames, _, path = rendered_tracks(tmp_path, "right")
+    out = tmp_path / "out"
+    files = ("--detections", boxer_file(tmp_path, np.random.default_rng(0), 0.01))
+    cameras = ("--poses", path, "--camera", "300,300,160,120")
+    assert cli("run", frames, "-o", out, *files, *cameras, *QUICK) == 0
+    result = rt.Result.load(out)
+    assert len(result.located) == 5 and {o.class_name for o in result.located} == {"hassock"}
+    refit = rt.refit(out, {"objects": {"up": "0,-1,0"}})
+    for found in (result, refit):
+        for o in found.located:
+            off = np.linalg.norm(CENTERS - np.array(o.center), axis=1)
+            assert off.min() < 0.02 and o.support == "box" and o.status == "ok"
+            assert np.array(o.size) == pytest.approx(0.5, rel=0.03)
+            assert np.isfinite(o.cov).all() and max(o.size_rel_sigma) < 0.07
+    assert cli("export", out, "--to", "boxer", "-o", tmp_path / "again.csv") == 0
+    capsys.readouterr()
+    text = files[1].read_text()
+    rows = text.splitlines()
+    for name, changed, command, said in (
+        ("a", text, "track", "3D boxes in the world, which need its cameras: `run` with --det"),
+        ("b", re.sub(r"(?m)^(\d+),", r"9\g<1>000000000,", text), "run", "no time stamp ("),
+        ("c", text.replace(",1,0,0,0,", ",1,1,0,0,"), "run", "line 2: extents"),
+        ("d", re.sub("(?m),[^,]*$", "", text), "run", "3D boxes without the columns prob"),
+        ("e", "\n".join([rows[0], *(re.sub("^([0-9]+),[^,]*", r"\1,9e4", r) for r in rows[1:])]),
+         "run", "no box is in the image of its frame"),
+    ):  # fmt: skip
+        file = tmp_path / f"{name}.csv"
+        file.write_text(changed)
+        more = cameras if command == "run" else ()
+        call = (command, frames, "-o", tmp_path / "x", "--overwrite", "--detections", file)
+        assert cli(*call, *more, *QUICK) == 2
+        assert said in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("no_points")
+def test_words_of_the_user_get_size_priors(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By size, by a category, or none; the run says once which word got which."""
+    frames, _, path = rendered_tracks(tmp_path, "right")
+    word = ("espresso machine", "red toolbox", "extension lead", "extension lead", "chair")
+    lines = (tmp_path / "det.txt").read_text().splitlines()  # five balls in each frame
+    boxes = [line.split(",") for line in lines]
+    rows = [[b[0], *b[2:6], "0.9", word[k % 5]] for k, b in enumerate(boxes)]
+    text = "frame,left,top,width,height,score,class\n" + "\n".join(map(",".join, rows))
+    (tmp_path / "det.csv").write_text(text + "\n")
+    out = tmp_path / "out"
+    args = ("--detections", tmp_path / "det.csv", "--poses", path, "--camera", "300,300,160,120")
+    words = ("--prior", "Espresso_Machine=35x30x40 cm", "--prior", "red toolbox=luggage;vcr=tv")
+    assert cli("run", frames, "-o", out, *args, *QUICK, *words) == 0
+    err = capsys.readouterr().err
+    assert {o.class_name for o in rt.Result.load(out).located} == set(word)
+    for said in (
+        "espresso machine: size prior .35 x .3 x .4 m (--prior)",
+        "red toolbox: size prior of luggage (--prior)",
+        "extension lead: no size prior",
+    ):
+        assert err.count(said) == 1
+    assert "chair: " not in err
+    assert "--prior vcr: no object of this class has a shape" in err
+    config = as_config(rt.Config(), {"objects": {"prior": {"vcr": "tv", "mixer": "1x2x3m"}}})
+    assert config.objects.prior == "vcr=tv,mixer=1x2x3m"
+    for bad, said in (
+        ("mixer=.2x.3m", "--prior 'mixer=.2x.3m': expected WORD=WIDTHxDEPTHxHEIGHT in m, cm"),
+        ("mixer=suitcse", "no size prior of suitcse; did you mean suitcase?"),
+    ):
+        other = tmp_path / "bad"
+        assert cli("run", frames, "-o", other, *args, *QUICK, "--prior", bad) == 2
+        assert said in capsys.readouterr().err and not other.exists()
 
 
 @pytest.mark.usefixtures("no_points")
@@ -949,6 +1039,42 @@ def test_damaged_boxes_are_detected_again(clip: Path, tmp_path: Path) -> None:
     np.savez(path, **(stored | {"xyxy": stored["xyxy"] * np.nan}))
     _, rows = detect_all(source, video, workspace)
     assert np.isfinite(rows.xyxy).all() and len(asked) == 2 * FRAMES
+
+
+def test_detection_beside_decoding_is_that_of_a_loop(clip: Path, tmp_path: Path) -> None:
+    """The same frames, each once, in order; an error of either side and Ctrl-C end it."""
+    loop = [(frame.index, frame.image.tobytes()) for frame in rt.Video(clip)]
+    seen = []
+
+    def detect(frame: rt.Frame) -> rt.Detections:
+        seen.append((frame.index, frame.image.tobytes()))
+        return rt.Detections.from_array([[100, 60, 140, 110 + frame.index, 0.9, 56]])
+
+    workspace = Workspace(tmp_path / "out")
+    _, rows = detect_all(rt.DetectionSource(detect), rt.Video(clip), workspace)
+    assert seen == loop and rows.frame.tolist() == list(range(FRAMES))
+    assert rows.xyxy[:, 3].tolist() == [110 + i for i in range(FRAMES)]
+
+    def stops(error: BaseException) -> rt.DetectionSource:
+        def detect(frame: rt.Frame) -> rt.Detections:
+            if frame.index == 3:
+                raise error
+            return rt.Detections.empty()
+
+        return rt.DetectionSource(detect)
+
+    for error in (KeyboardInterrupt(), rt.ReobjError("no memory")):
+        with pytest.raises(type(error)) as caught:
+            detect_all(stops(error), rt.Video(clip), workspace)
+        assert caught.value is error
+
+    class Damaged(rt.Video):
+        def __iter__(self) -> Any:
+            yield from itertools.islice(super().__iter__(), 2)
+            raise rt.ReobjError("frame 2 is damaged")
+
+    with pytest.raises(rt.ReobjError, match="frame 2 is damaged"):
+        detect_all(rt.DetectionSource(detect), Damaged(clip), workspace)
 
 
 def test_damaged_poses_are_computed_again(

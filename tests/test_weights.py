@@ -180,7 +180,7 @@ def test_another_detector_is_suggested_but_not_used(
 ) -> None:
     """The default is unavailable, the small one is installed: one line and exit code 2."""
     small = dataclasses.replace(weights.WEIGHTS[0], name="small", file="small.onnx", alias="fast")
-    default = dataclasses.replace(weights.WEIGHTS[0], name="deimv2-n", file="n.onnx")
+    default = dataclasses.replace(weights.WEIGHTS[0], name="deimv2-femto", file="n.onnx")
     monkeypatch.setattr(weights, "WEIGHTS", (default, small))
     server.folder.mkdir()
     (server.folder / "small.onnx").write_bytes(BLOB)
@@ -192,7 +192,7 @@ def test_another_detector_is_suggested_but_not_used(
     for offline, asked in (["--offline"], 0), ([], 1):
         assert rt.main([*command, *offline]) == 2
         error = capsys.readouterr().err.splitlines()[-1]
-        for part in ("deimv2-n is not in", str(server.folder), default.url, "--detector fast"):
+        for part in ("deimv2-femto is not in", str(server.folder), default.url, "--detector fast"):
             assert part in error
         assert len(server.asked) == asked and not (tmp_path / "out/tracks.txt").exists()
     monkeypatch.setattr(weights, "WEIGHTS", (dataclasses.replace(default, alias="fast"),))
@@ -429,10 +429,13 @@ def test_no_writable_folder(server: Any, monkeypatch: pytest.MonkeyPatch) -> Non
 
 def test_table_of_weights() -> None:
     names = [row.name for row in weights.WEIGHTS]
-    assert len(set(names)) == len(names) and rt.DetectConfig().model == "deimv2-n" == names[0]
+    assert len(set(names)) == len(names) and rt.DetectConfig().model == "deimv2-femto" == names[0]
     fast = weights.known_weights("fast")
-    assert fast is not None and fast.name == "deimv2-femto" and weights.known_weights("") is None
+    assert fast is not None and fast.name == "deimv2-atto" and weights.known_weights("") is None
+    run = {row.name for row in weights.WEIGHTS if row.verified.startswith("run here on ")}
+    assert {"deimv2-femto", "deimv2-atto"} < run and not run & {"deimv2-n", "deimv2-pico"}
     for row in weights.WEIGHTS:
+        assert (row.role == "detector") == bool(row.verified)
         assert re.fullmatch("[0-9a-f]{64}|[0-9a-f]{40}", row.digest)
         assert row.role in ("detector", "backbone") and (row.size > 0 or len(row.digest) == 40)
         layouts = [layout for layout in LAYOUTS if layout.name.startswith(row.layout)]
@@ -497,6 +500,37 @@ def test_unavailable_devices_are_named() -> None:
         pytest.skip("this onnxruntime has CUDA")
     with pytest.raises(rt.ReobjError, match=r"--device cuda: .* has cpu only; .*onnxruntime-gpu"):
         weights.onnx_session(REOBJ, 1, "cuda")
+
+
+@pytest.mark.parametrize(
+    ("device", "package"),
+    [
+        ("cuda", "onnxruntime-gpu"),
+        ("tensorrt", "onnxruntime-gpu"),
+        ("coreml", "onnxruntime, on a Mac"),
+        ("directml", "onnxruntime-directml"),
+        ("openvino", "onnxruntime-openvino"),
+        ("migraphx", "onnxruntime-migraphx"),
+    ],
+)
+def test_a_missing_device_is_one_line(
+    device: str,
+    package: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """From the command line: what this onnxruntime has, and the package to install."""
+    import onnxruntime
+
+    monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: ["CPUExecutionProvider"])
+    cv2.imwrite(str(tmp_path / "0.png"), np.zeros((48, 64, 3), np.uint8))
+    words = ["track", str(tmp_path), "-o", str(tmp_path / "out"), "--device", device]
+    assert rt.main([*words, "--detector", str(REOBJ)]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith(f"error: --device {device}: this onnxruntime has cpu only; ")
+    assert line.endswith(f"comes with {package} (in place of onnxruntime)")
+    assert not (tmp_path / "out" / "tracks.txt").exists()
 
 
 @pytest.mark.parametrize("starts", [True, False])

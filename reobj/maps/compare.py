@@ -17,6 +17,7 @@ from scipy.optimize import linear_sum_assignment
 from reobj.appearance.reid import SimilarityCalibration
 from reobj.maps.fusion import ObjectState
 from reobj.types import Array, BoolArray, Floats, IntArray, unit_rows
+from reobj.words import canonical, merged
 
 IMPOSSIBLE = -1e9  # nats; finite, for the solver
 
@@ -157,11 +158,11 @@ class CompareOptions:
     """
 
     fixed: tuple[str, ...] = (
-        "bed", "wardrobe", "cabinet", "bookshelf", "sink", "toilet", "bathtub", "refrigerator",
-        "oven", "stove", "washing machine", "dishwasher", "sofa", "couch", "table", "dining table",
-        "desk", "counter", "door", "window",
+        "bed", "cabinet", "bookshelf", "sink", "toilet", "bathtub", "refrigerator",
+        "oven", "stove", "washing machine", "dishwasher", "couch", "dining table", "desk",
+        "counter", "door", "window",
     )  # fmt: skip
-    movable: tuple[str, ...] = ("chair", "stool", "armchair", "office chair", "garbage bin")
+    movable: tuple[str, ...] = ("chair", "stool", "armchair", "garbage bin")
     carried: tuple[str, ...] = (
         "cup", "mug", "wine glass", "bottle", "bowl", "plate", "book", "laptop", "mouse", "remote",
         "cell phone", "backpack", "handbag", "bag", "umbrella", "scissors", "fork", "knife",
@@ -201,7 +202,7 @@ class CompareOptions:
 
     def fate(self, class_name: str) -> tuple[float, float, float]:
         """Return the probabilities that an object of a class stayed, moved, was taken away."""
-        name = class_name.lower()
+        name = canonical(class_name)
         if name in self.fixed:
             return self.fixed_fate
         if name in self.movable:
@@ -280,7 +281,7 @@ class _Pairs:
         self.visibility = visibility
         self.options = options
         of_all = [o.classes for o in states] + [o.classes for o in found]
-        self.names = sorted({name for classes in of_all for name in classes} | {""})
+        self.names = sorted({canonical(name) for classes in of_all for name in classes} | {""})
         self.of_map = _class_shares(states, self.names)  # (N, C)
         self.of_found = _class_shares(found, self.names)  # (M, C)
         fates = np.array([options.fate(name) for name in self.names])  # (C, 3)
@@ -483,7 +484,8 @@ class _Pairs:
 
 def _class_shares(objects: Sequence[ObjectState | FoundObject], names: list[str]) -> Array:
     """Return the class distributions (K, C); an object without classes has the class ""."""
-    weights = np.array([[o.classes.get(n, 0.0) for n in names] for o in objects])
+    of_objects = [merged(o.classes) for o in objects]
+    weights = np.array([[classes.get(n, 0.0) for n in names] for classes in of_objects])
     weights = weights.reshape(len(objects), len(names))
     weights[weights.sum(1) <= 0, 0] = 1.0  # the first name is ""
     return np.asarray(weights / weights.sum(1, keepdims=True))

@@ -11,12 +11,13 @@ from reobj.maps.fusion import ObjectState
 from reobj.maps.visibility import shapes_of
 from reobj.tracking.ellipsoid_map import EllipsoidMap
 from reobj.types import Embeddings, IntArray
+from reobj.words import meant
 
 
 def class_ids(states: Sequence[ObjectState], class_names: Sequence[str]) -> IntArray:
     """Return the class id (N,) of each object: of its likeliest class in the names, -1: none."""
-    id_of = {name: k for k, name in enumerate(class_names)}
-    found = [[id_of[name] for name in (s.class_name, *s.classes) if name in id_of] for s in states]
+    found = [[k for word in (s.class_name, *s.classes) for k in meant(word, class_names)[:1]]
+             for s in states]  # fmt: skip
     return np.array([ids[0] if ids else -1 for ids in found], np.int64)
 
 

@@ -22,6 +22,7 @@ from reobj.maps.placement import unit_descriptors
 from reobj.maps.room_map import MapPoints
 from reobj.maps.visibility import shapes_of
 from reobj.types import Array, BoolArray, Floats, IntArray
+from reobj.words import merged
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,9 +112,10 @@ def _in_place(
     reach = np.array(
         [[min(s.half_axes.max(), f.half_axes.max()) for f in found] for s in states]
     ).reshape(distance.shape)
-    common = np.array(
-        [[bool(set(s.classes) & set(f.classes)) for f in found] for s in states], bool
-    ).reshape(distance.shape)
+    of_states = [merged(s.classes).keys() for s in states]
+    of_found = [merged(f.classes).keys() for f in found]
+    common = np.array([[not a.isdisjoint(b) for b in of_found] for a in of_states], bool)
+    common = common.reshape(distance.shape)
     distance = np.where(common & (distance < share * reach), distance, np.inf)
     nearest = (distance == distance.min(1, keepdims=True, initial=np.inf)) & (
         distance == distance.min(0, keepdims=True, initial=np.inf)
@@ -171,7 +173,7 @@ class _Search:
         self.above = _above_bottom(self.points.xyz, self.owner, shapes, up, options.bottom)
         self.own = [np.flatnonzero((self.owner == k) & inside) for k in range(len(states))]
         self.usable = [k for k, rows in enumerate(self.own) if len(rows) >= options.points]
-        names = [set(s.classes) for s in states]
+        names = [merged(s.classes).keys() for s in states]
         self.group, self.first = np.unique(self.owner, return_index=True)
         self.rivals = np.array(
             [[g < 0 or not names[k] & names[g] for g in self.group] for k in range(len(states))]

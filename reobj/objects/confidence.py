@@ -6,12 +6,16 @@ import numpy as np
 
 from reobj.objects.association import Association
 from reobj.objects.likelihood import PosedDetections, logit
+from reobj.results.result import Result
 from reobj.types import Array, BoolArray, IntArray, Tracks, rows_by
 
 # Logistic regression of existence: intercept, log odds of the best scores, hit rate over the frames
 # where the object should be visible, see-through ratio (`occlusion.see_through_ratio`). Fitted to
 # 1,202 objects of 48 runs of 10 rooms (benchmarks/RESULTS.md)
 CONFIDENCE = (-1.0, 1.5, 1.8, -1.5)
+FITTED_TO = "YOLOv8s, deimv2-femto, rendered rooms"
+FITTED_SCORES = (0.13, 0.87)  # lowest and highest median score of a recording of these
+FAR_OFF = 1.0  # in log odds, beyond which a median is reported (chosen)
 USUAL_HIT_RATE = 0.75  # if it should be visible in no frame, as an always truncated table (mean)
 NO_SHAPE = -1.9  # instead of the intercept for identities without a 3D object (8 of 89 were real)
 # Number and least fraction of an object's detections that its score is taken from: most views of a
@@ -47,6 +51,22 @@ def log_best_odds(score: Array, group: IntArray, count: int) -> Array:
     odds = np.bincount(group[best], np.exp(logit(score[best])), count)
     with np.errstate(divide="ignore"):
         return np.asarray(np.log(odds / used.clip(1)))
+
+
+def scores_far_off(result: Result) -> list[str]:
+    """Return a warning if the scores are far from those that the confidence was fitted to."""
+    tracks = result.tracks
+    score = np.append(tracks.score[tracks.detection_index >= 0], result.untracked.score)
+    if not len(score) or all(o.confidence is None for o in result.objects):
+        return []
+    median = float(np.median(score))
+    low, log_odds, high = logit(np.array([FITTED_SCORES[0], median, FITTED_SCORES[1]]))
+    if low - FAR_OFF <= log_odds <= high + FAR_OFF:
+        return []
+    fitted = "{:g} to {:g}".format(*FITTED_SCORES)
+    return [f"the median score of the detections is {median:.2g}, that of the recordings that the "
+            f"confidence of objects was fitted to {fitted} ({FITTED_TO}): it may order objects, "
+            "but is no probability here"]  # fmt: skip
 
 
 def of_objects(found: Association, detections: PosedDetections, see_through: Array) -> Array:

@@ -29,6 +29,13 @@ class ObjectsConfig:
     """Fit one shape and its ellipsoid to every object, from tracks and cameras."""
 
     priors: str = option("", "size priors, JSON (default: the bundled priors.json)", "--priors")
+    prior: str = option(
+        "",
+        "usual size (width x depth x height) of objects of a word, 'mixer=.2x.3x.4m', or the "
+        "category that they are like, 'red toolbox=suitcase'; may be repeated",
+        "--prior",
+        repeated=True,
+    )
     known_size: str = option(
         "", "true heights that set the metric scale: 'chair=.82m,door=2m'", "--known-size"
     )
@@ -57,6 +64,10 @@ class ObjectsConfig:
         """Names in `moving`."""
         return tuple(filter(None, (name.strip() for name in self.moving.split(","))))
 
+    def size_priors(self) -> quadrics.Priors:
+        """Load the size priors, with those of `prior`."""
+        return load_size_priors(self.priors, self.prior)
+
 
 def make_fit(config: ObjectsConfig, poses: Poses, class_names: Sequence[str]) -> Fit:
     """Bind priors, known sizes, gravity and the kind of shape to `quadrics.fit_objects`.
@@ -64,7 +75,7 @@ def make_fit(config: ObjectsConfig, poses: Poses, class_names: Sequence[str]) ->
     Raises:
         ReobjError, QuadricsError: an option is invalid, or the priors file cannot be read.
     """
-    priors = load_size_priors(config.priors)
+    priors = config.size_priors()
     known_size = parse_known_size(config.known_size)
     if config.solver not in list(Solver):
         default, *published = Solver

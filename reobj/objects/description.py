@@ -20,6 +20,7 @@ from reobj.results.entries import visit_gap, visits_of
 from reobj.results.result import Object, Part, World
 from reobj.sources.image_files import IMAGE_FPS
 from reobj.types import Array, IntArray, LinkEvent, Tracks, object_classes
+from reobj.words import among
 
 
 def describe_objects(
@@ -55,7 +56,7 @@ def describe_objects(
     for i, (identity, class_id) in enumerate(object_classes(tracks).items()):
         rows = tracks[tracks.track_id == identity]
         class_name = name_of(class_names, class_id)
-        moves = class_name in config.moving_classes
+        moves = bool(among([class_name], config.moving_classes)[0])
         fields: dict[str, Any] = {"status": "tracked", "reason": ""}
         if fits is not None and views is not None:
             count = None if view_count is None else int(view_count[i])

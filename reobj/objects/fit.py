@@ -23,11 +23,13 @@ from reobj.objects.component import ComponentObjects, associate_component, find_
 from reobj.objects.config import ObjectsConfig, make_fit
 from reobj.objects.description import describe_objects, describe_world
 from reobj.objects.frames import informative_frames, only_frames
+from reobj.objects.given_boxes import with_given_boxes
 from reobj.objects.observations import MIN_SCORE, Fit, Scene, gather_views, points_on
 from reobj.objects.occlusion import occluded_edges
 from reobj.objects.phases import PhasesOfFit, Reach, ignore
 from reobj.results.edits import Edits, apply_edits
 from reobj.results.result import Object, Result
+from reobj.sources.boxes_3d import Boxes3D
 from reobj.tracking.interpolation import fill_from_objects, fill_gaps
 from reobj.tracking.linking import FRAGMENT_GAP, link
 from reobj.types import (
@@ -62,7 +64,7 @@ def link_and_fit(
     Raises:
         ReobjError: an edit made now does not find its object.
     """
-    priors = quadrics.load_priors(config.priors or None)
+    priors = config.size_priors()
     poses = result.poses
     components = _split_trajectory(poses, config, result.class_names)
 
@@ -94,6 +96,7 @@ def link_and_fit(
             component,
             rows,
             linked,
+            result.boxes_3d,
             edited.class_names,
             priors,
             config,
@@ -419,6 +422,7 @@ def _fit_component(
     component: _Component,
     rows: IntArray,
     linked: _Linked,
+    boxes_3d: Boxes3D | None,
     class_names: Sequence[str],
     priors: quadrics.Priors,
     config: ObjectsConfig,
@@ -428,8 +432,8 @@ def _fit_component(
     """Fit and describe the objects of a component.
 
     Args:
-        rows: of its objects in the linked tracks. reach: reports the progress.
-        fps: frame rate of the source, Hz.
+        rows: of its objects in the linked tracks. boxes_3d: of the detections. reach: reports the
+            progress. fps: frame rate of the source, Hz.
     """
     number, poses, fit = component
     tracks = linked.tracks[rows]
@@ -465,6 +469,7 @@ def _fit_component(
         new[np.searchsorted(views.frame, tracks.frame[rows]), group[rows]] = True
         views = dataclasses.replace(views, boxes=np.where(new[..., None], views.boxes, np.nan))
         fits = fit(views, categories, Scene(floor, None if floor is None else floor.normal))
+        fits = with_given_boxes(fits, boxes_3d, tracks, group)
     reach("fit", 1.0)
     described = describe_objects(
         tracks, class_names, fits, views, config, linked.confidence, number, view_count, fps

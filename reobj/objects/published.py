@@ -36,7 +36,7 @@ def solve_again(result: Result, config: ObjectsConfig) -> Result:
     if config.solver == Solver.SOLIDS or result.poses is None or result.fits is None:
         return result
     solve, text = SOLVERS[config.solver]
-    priors = quadrics.load_priors(config.priors or None)
+    priors = config.size_priors()
     objects = list[Object]()
     for k, component in enumerate(result.world.parts):
         before = {o.id: o for o in result.objects if o.part == k}

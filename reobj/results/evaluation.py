@@ -40,6 +40,7 @@ from reobj.types import (
     rows_by,
     unit_rows,
 )
+from reobj.words import meant
 
 MATCH_IOU = 0.5 - 1e-12  # least IoU of a match, except for HOTA (MOTChallenge: .5, inclusive)
 
@@ -412,11 +413,12 @@ def evaluate(
         truth, predicted = _looked_at(read, predicted, tracked.looked, notes)
         check_counts(truth, Path(gt), "none lies in a frame that the detector was run on")
     truth, predicted, named = with_common_names(truth, predicted, notes)
-    unknown = set(classes) - set(truth.name) - set(predicted.name)
-    if unknown:
+    known = sorted({*truth.name.tolist(), *predicted.name.tolist()} - {""})
+    if unknown := [word for word in classes if not meant(word, known)]:
         raise ReobjError(
             f"--classes: {', '.join(sorted(unknown))}: neither in the truth nor in the result"
         )
+    classes = list(dict.fromkeys(known[k] for word in classes for k in meant(word, known)))
     names_scored = list(classes) or sorted(set(truth.name[truth.role == Role.SCORED]) - {""})
     if classes:
         truth, predicted = _of_classes(truth, predicted, classes, named)
@@ -480,6 +482,7 @@ def score_appearance(tracked: Result, truth: LabelledBoxes) -> dict[str, float]:
     names = np.array([*tracked.class_names, ""])[tracks.class_id]  # -1: unknown
     role = np.full(len(tracks), Role.SCORED)
     predicted = LabelledBoxes(tracks.frame + 1, identity, tracks.xyxy, names, role)
+    truth, predicted, _ = with_common_names(truth, predicted, [])
     fused = np.concatenate([embeddings.foreground, embeddings.background], 1)
     rank = return_ranks(truth, predicted, unit_rows(fused))
     shares = {f"rank{k}": float((rank <= k).mean()) for k in (1, 5, 20, 50)} if len(rank) else {}

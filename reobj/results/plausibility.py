@@ -12,6 +12,7 @@ import numpy as np
 
 from reobj.results.result import Object, Result
 from reobj.types import BoolArray, IntArray, Tracks, box_iou, rows_by
+from reobj.words import among
 
 OTHER_BOXES = "another detector (--detector, or other boxes with --detections)"
 
@@ -25,7 +26,8 @@ def implausible(
         high_score: boxes of lower scores are often false positives. moving: classes without 3D
             objects, often many. new_score: least score at which a track starts.
     """
-    still = [o for o in result.objects if o.counted and o.class_name not in moving]
+    moves = among([o.class_name for o in result.objects], moving)
+    still = [o for o, m in zip(result.objects, moves, strict=True) if o.counted and not m]
     texts = [_few_cameras(result), _nothing_measured(result, still)]
     if not result.identities_given:  # given identities are not questioned
         texts += [_one_class(result, still), _unexplained(result, high_score, new_score)]

@@ -20,6 +20,7 @@ from reobj.results import notebook, report, saving, table
 from reobj.results.changes import Changes, EarlierSession
 from reobj.results.edits import Edits
 from reobj.results.entries import Object, Part, VideoInfo, World
+from reobj.sources.boxes_3d import Boxes3D
 from reobj.types import Embeddings, IntArray, ReobjError, Tracks, counted
 
 __all__ = ["Object", "Part", "Result", "VideoInfo", "World"]
@@ -40,6 +41,7 @@ class Result:
             inliers.
         embeddings: (n, E1) and (n, E2), fused: foreground and background of the rows
             `embedding_row` (n,) of the tracks that the tracker embedded.
+        boxes_3d: of the detections, if the detector gives some.
         looked: (F,) frames that the detector was run on, ascending; None: all that were read.
         identities_given: by the user; they are not joined, split or renumbered.
         seconds: wall time by stage. step_seconds: of the steps of a stage; {} if its result was
@@ -60,6 +62,7 @@ class Result:
     embeddings: Embeddings = field(default_factory=Embeddings.empty)
     embedding_row: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
     untracked: Tracks = field(default_factory=Tracks.empty)
+    boxes_3d: Boxes3D | None = None
     looked: IntArray | None = None
     identities_given: bool = False
     seconds: dict[str, float] = field(default_factory=dict)

@@ -38,6 +38,7 @@ from reobj.results.entries import Object, VideoInfo, World, decode
 from reobj.results.names import OutputFile
 from reobj.results.ply import write_ply
 from reobj.results.upright import component_of, upright_pose
+from reobj.sources.boxes_3d import Boxes3D
 from reobj.sources.tables import read_mot_rows
 from reobj.types import Embeddings, ReobjError, Tracks, printable, without_secrets
 
@@ -326,12 +327,17 @@ def _is_finite(_: Any, value: Any) -> bool:
 # ---- Tracks before linking ---------------------------------------------------------------------
 
 
+BOXES_3D_COLUMNS = tuple(f.name for f in dataclasses.fields(Boxes3D))
+
+
 def save_tracked(result: Result, path: Path) -> None:
     """Write tracks and embeddings, before they are linked and fitted, as npz."""
     looked = {} if result.looked is None else {"looked": result.looked}
     columns = {f.name: getattr(result.tracks, f.name) for f in dataclasses.fields(Tracks)}
     columns |= {f"untracked_{n}": getattr(result.untracked, n) for n in columns}
     columns |= {name: getattr(result.embeddings, name) for name in ("foreground", "background")}
+    if result.boxes_3d is not None:
+        columns |= {f"boxes_3d_{n}": getattr(result.boxes_3d, n) for n in BOXES_3D_COLUMNS}
     facts = {"class_names": result.class_names, "warnings": result.warnings,
              "identities_given": result.identities_given,
              "video": dataclasses.asdict(result.video), "version": __version__}  # fmt: skip
@@ -355,6 +361,9 @@ def load_tracked(kind: type[Result], path: Path) -> Result:
             embedding_row=data["embedding_row"],
             untracked=Tracks(*(data[f"untracked_{name}"] for name in names)),
             looked=data.get("looked"),
+            boxes_3d=Boxes3D(*(data[f"boxes_3d_{n}"] for n in BOXES_3D_COLUMNS))
+            if "boxes_3d_frame" in data
+            else None,
             identities_given=bool(facts["identities_given"]),
             warnings=list(facts["warnings"]),
         )

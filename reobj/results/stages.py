@@ -16,7 +16,7 @@ from reobj.results.checkpoint import Checkpoint, TrackedFrames
 from reobj.results.result import Result, VideoInfo
 from reobj.results.workspace import Workspace
 from reobj.sources.detectors import DetectionCache, DetectionSource
-from reobj.sources.video import Video
+from reobj.sources.video import Video, one_ahead
 from reobj.types import Array, Detections, Embeddings, Frame, IntArray, ReobjError, Tracks
 
 
@@ -63,7 +63,7 @@ def detect_all(
     steps = []
     try:
         with progress("detect", video.expected) as line:
-            for frame in video:
+            for frame in one_ahead(iter(video)):  # a thread decodes the next frame meanwhile
                 detected = source(frame)
                 frames += [frame.index] * len(detected)
                 steps.append((detected.xyxy / video.scale, detected.score, detected.class_id))

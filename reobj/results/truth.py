@@ -25,6 +25,7 @@ from reobj.results.result import Result
 from reobj.sources.cvat import read_cvat
 from reobj.sources.tables import read_mot_rows
 from reobj.types import CLASS_MAX, Array, BoolArray, IntArray, ReobjError
+from reobj.words import among, canonical
 
 
 class Role(enum.IntEnum):
@@ -360,8 +361,9 @@ def with_common_names(
 ) -> tuple[LabelledBoxes, LabelledBoxes, bool]:
     """Bring the class names of truth and result together.
 
-    Names that differ only in case, "_" or "-" are equal. If the result has no classes, or none in
-    common with the truth, classes are not compared: all names of the result become "".
+    Names that mean the same (`words.canonical`) become one: the result's first, else the truth's.
+    If the result has no classes, or none in common with the truth, classes are not compared: all
+    names of the result become "".
 
     Returns:
         truth, result, and whether classes are compared.
@@ -369,19 +371,18 @@ def with_common_names(
     unnamed = {"", "object"}  # names of boxes without a class
     our_names = sorted(set(predicted.name.tolist()) - unnamed)
     true_names = sorted(set(truth.name[truth.role == Role.SCORED].tolist()) - unnamed)
-    ours_of = {_normalised(name): name for name in our_names}
-    renamed = {name: ours_of.get(_normalised(name), name) for name in set(truth.name.tolist())}
-    names = np.array([renamed[name] for name in truth.name.tolist()], str)
-    truth = dataclasses.replace(truth, name=names)
-    if not true_names or not len(predicted) or {renamed[n] for n in true_names} & set(our_names):
+    names = list(dict.fromkeys([*our_names, *sorted(set(truth.name.tolist()))]))
+    one_of = {canonical(name): name for name in reversed(names)}
+    truth, predicted = (
+        dataclasses.replace(
+            boxes, name=np.array([one_of.get(canonical(n), n) for n in boxes.name.tolist()], str)
+        )
+        for boxes in (truth, predicted)
+    )
+    if not true_names or not len(predicted) or among(true_names, our_names).any():
         return truth, predicted, True
     why = "the result has no classes"
     if our_names:
         why = f"no class in common (truth: {shortened(true_names)}; result: {shortened(our_names)})"
     notes.append(f"{why}: boxes match whatever their class")
     return truth, dataclasses.replace(predicted, name=np.full(len(predicted), "")), False
-
-
-def _normalised(name: str) -> str:
-    """Normalise case, "_" and "-" of a name."""
-    return re.sub(r"[\s_-]+", " ", name.strip().casefold())

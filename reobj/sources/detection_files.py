@@ -16,8 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
+from reobj.cameras import Poses
 from reobj.files import did_you_mean, load_json, shortened
 from reobj.sources import coco, tables
+from reobj.sources.boxes_3d import has_boxes_3d, read_boxes_3d
 from reobj.sources.class_names import check_length, load_class_names
 from reobj.sources.cvat import read_cvat
 from reobj.sources.label_folders import label_files, read_label_folder
@@ -43,6 +45,7 @@ from reobj.types import (
     option,
     rows_by,
 )
+from reobj.words import meant
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,8 +53,8 @@ class DetectConfig:
     """Detector, and filter of detections, recorded ones included."""
 
     model: str = option(
-        "deimv2-n",
-        "detector: a name of `models`, fast (deimv2-femto), a .onnx file, a model of an installed "
+        "deimv2-femto",
+        "detector: a name of `models`, fast (deimv2-atto), a .onnx file, a model of an installed "
         "library (FILE.pt or ultralytics:MODEL, rfdetr:MODEL, torchvision:MODEL, hf:MODEL), or "
         "module:function of a BGR image",
         "--detector",
@@ -87,35 +90,47 @@ def unnamed_class(class_id: int, count: int) -> str:
             "--set detect.class_names=FILE")  # fmt: skip
 
 
-def class_filter(wanted: str, names: Sequence[str]) -> IntArray:
-    """Return the ids of comma-separated class names; case does not matter.
+def class_filter(wanted: str, names: Sequence[str], present: IntArray | None = None) -> IntArray:
+    """Return the ids of comma-separated class names, or of their synonyms (`words.meant`).
 
+    Args:
+        present: ids of the classes that occur, if known: synonyms among them go before a name that
+            does not occur.
     Raises:
         ReobjError: a name that is not among `names`.
     """
-    id_of = {name.lower().replace("_", " "): i for i, name in enumerate(names)}
-    chosen = [name.strip().lower().replace("_", " ") for name in wanted.split(",") if name.strip()]
-    unknown = [name for name in chosen if name not in id_of]
+    words = [word.strip() for word in wanted.split(",") if word.strip()]
+    occur = set(range(len(names)) if present is None else present.tolist())
+    here = [name if i in occur else "" for i, name in enumerate(names)]
+    chosen = {word: meant(word, here) or meant(word, names) for word in words}
+    unknown = [name for name, ids in chosen.items() if not ids]
     if unknown:
-        close = did_you_mean(unknown[0], id_of) or f" among {', '.join(names)}"
+        close = did_you_mean(unknown[0], names) or f" among {', '.join(names)}"
         raise ReobjError(f"--classes: no class {', '.join(unknown)}{close}")
-    return np.array([id_of[name] for name in chosen], np.int64)
+    return np.array([i for ids in chosen.values() for i in ids], np.int64)
 
 
 def read_detections(
-    path: str | Path, video: Video, config: DetectConfig | None = None
+    path: str | Path,
+    video: Video,
+    config: DetectConfig | None = None,
+    poses: Poses | None = None,
 ) -> RecordedDetections:
     """Read recorded detections of a video, in any of the formats.
 
     Args:
         path: the file, or a folder of YOLO labels; boxes in px and frame numbers of the source.
         config: min_score, classes, class_names, first_frame and max_detections apply.
+        poses: cameras that project boxes in 3D (Boxer's CSV).
     Raises:
         ReobjError: the file, the line and what was expected.
     """
     path = Path(path)
     config = config or DetectConfig()
-    recorded = _read(path, video, config)
+    if poses is not None and has_boxes_3d(path):
+        recorded = read_boxes_3d(path, video, [poses], _names(config))[0]
+    else:
+        recorded = _read(path, video, config)
     _note_looked(recorded, video.frame_count)
     _check(recorded, path, config, video.frame_count)
     return recorded
@@ -127,13 +142,16 @@ def _read(path: Path, video: Video, config: DetectConfig) -> RecordedDetections:
         raise ReobjError(f"{path}: no such file of detections")
     if config.first_frame not in ("", "0", "1"):
         raise ReobjError(f"detect.first_frame {config.first_frame}: expected 0 or 1")
-    names = load_class_names(config.class_names) if config.class_names else ()
     try:
-        return _read_kind(path, names, video, config.first_frame)
+        return _read_kind(path, _names(config), video, config.first_frame)
     except ReobjError:
         raise
     except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
         raise ReobjError(f"{path}: an entry cannot be read: {error!r}") from error
+
+
+def _names(config: DetectConfig) -> tuple[str, ...]:
+    return load_class_names(config.class_names) if config.class_names else ()
 
 
 def _note_looked(recorded: RecordedDetections, frame_count: int) -> None:
@@ -220,7 +238,9 @@ def _check(
         recorded.messages.append(f"{text} (detect.min_score): left out")
     keep &= recorded.score >= config.min_score
     if config.classes:
-        keep &= np.isin(recorded.class_id, class_filter(config.classes, recorded.class_names))
+        present = np.unique(recorded.class_id)
+        chosen = class_filter(config.classes, recorded.class_names, present)
+        keep &= np.isin(recorded.class_id, chosen)
     if not len(recorded):
         recorded.messages.append("no detections in this file")
     elif not keep.any():

@@ -19,6 +19,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from reobj.cameras import Poses
 from reobj.files import did_you_mean, save_npz
 from reobj.sources.class_names import Vocabulary, check_length, load_class_names
 from reobj.sources.detection_files import (
@@ -60,6 +61,7 @@ from reobj.types import (
     text_labels,
     visible_name,
 )
+from reobj.words import among
 
 
 class OnnxDetector:
@@ -125,7 +127,12 @@ class OnnxDetector:
         """Run the network once, on the whole image."""
         size = self._input_size(image.shape[1], image.shape[0])
         canvas, geometry = fit_image(image, size, self._layout.fit)
-        outputs = self._session.run(None, self._feeds(canvas, geometry.image_size, self._layout))
+        feeds = self._feeds(canvas, geometry.image_size, self._layout)
+        try:
+            outputs = self._session.run(None, feeds)
+        except Exception as error:  # no memory on the device, a shape that the network refuses
+            reason = str(error).partition("\n")[0]
+            raise ReobjError(f"{self.path} failed: {reason}") from error
         decoded = self._layout.decode(outputs, geometry)
         boxes = np.clip(decoded.xyxy, 0, np.tile(geometry.image_size, 2))
         label = decoded.class_id - self._layout.first
@@ -361,6 +368,7 @@ def open_detections(
     threads: int = 0,
     offline: bool = False,
     device: str = "cpu",
+    poses: Poses | None = None,
 ) -> DetectionSource:
     """Open the source of the detections of a video.
 
@@ -369,7 +377,7 @@ def open_detections(
             which `config` gives only the class names; a detector of `with_detector`; or None: the
             ONNX model of `config`.
         threads: of onnxruntime (0: all cores). offline: never download weights. device: of the
-            ONNX model, cpu, cuda, coreml, ...
+            ONNX model, cpu, cuda, coreml, ... poses: for files of boxes in 3D.
     """
     config, detections = with_detector(config, detections)
     names = load_class_names(config.class_names) if config.class_names else ()
@@ -384,24 +392,31 @@ def open_detections(
             raise fixed_classes(config.model)
         if is_function(config.model):
             function = user_function(config.model)
-            return _filtered(as_source(function, names), config)
+            is_open = not (names or _stated_names(function))  # its labels are the class names
+            return _filtered(as_source(function, names), config, is_open)
         path = model_path(config.model, offline)
         detector = OnnxDetector("", config, threads, offline, device)
         key = _cache_key(config, path.name, path.stat().st_size, device)
         return dataclasses.replace(as_source(detector), key=key, slow=True)
     if isinstance(detections, str | Path):
-        recorded = read_detections(detections, video, config)
+        recorded = read_detections(detections, video, config, poses)
         key = _cache_key(config, recorded.fingerprint())
         return dataclasses.replace(as_source(recorded), key=key)
     return as_source(detections, names)
 
 
-def _filtered(source: DetectionSource, config: DetectConfig) -> DetectionSource:
+def _filtered(
+    source: DetectionSource, config: DetectConfig, is_open: bool = False
+) -> DetectionSource:
     """Clip the detections of a source to the image; select them by score, area, class and number.
 
     Best first.
+
+    Args:
+        is_open: the class names are not known in advance.
     """
-    allowed = class_filter(config.classes, source.class_names) if config.classes else None
+    wanted = config.classes
+    allowed = class_filter(wanted, source.class_names) if wanted and not is_open else None
 
     def detect(frame: Frame) -> Detections | None:
         found = source.detect(frame)
@@ -411,6 +426,8 @@ def _filtered(source: DetectionSource, config: DetectConfig) -> DetectionSource:
         use = (found.score >= config.min_score) & (boxes[:, 2:] > boxes[:, :2]).all(1)
         if allowed is not None:
             use &= np.isin(found.class_id, allowed)
+        elif wanted:
+            use &= among(source.class_names, wanted.split(","))[found.class_id]
         rows = np.flatnonzero(use)
         rows = rows[best_rows(found.score[rows])][: config.max_detections or None]
         return dataclasses.replace(found, xyxy=boxes)[rows]

@@ -6,6 +6,7 @@ its own.
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import importlib.metadata
 import sys
@@ -42,15 +43,25 @@ class LibraryDetector:
 
     Attributes:
         detect: BGR image (H, W, 3) uint8 -> detections as `reobj.types.as_detections` accepts them.
-        class_names: by class id.
+        class_names: by class id. name: on the command line.
     """
 
     detect: Detect
     class_names: tuple[str, ...]
+    name: str = ""
 
     def __call__(self, image: Image) -> Any:
-        """Detect the objects in an image."""
-        return self.detect(image)
+        """Detect the objects in an image.
+
+        Raises:
+            ReobjError: the library failed; with its message.
+        """
+        try:
+            return self.detect(image)
+        except ReobjError:
+            raise
+        except Exception as error:  # libraries raise any kind
+            raise ReobjError(f"--detector {self.name} failed: {_message(error)}") from error
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,10 +240,20 @@ def library_detector(
         raise ReobjError(
             f"--detector {detector}: {error}; it needs: pip install {library.install}"
         ) from error
-    except (OSError, RuntimeError) as error:  # no such file, no download, no such device
-        raise ReobjError(f"--detector {detector}: {str(error).splitlines()[0]}") from error
+    except ReobjError:
+        raise
+    except Exception as error:  # no such file, no download, no such device, no model
+        raise ReobjError(f"--detector {detector}: {_message(error)}") from error
+    found = dataclasses.replace(found, name=detector)
     package = "transformers" if name == "hf" else name
     return found, f"{package} {importlib.metadata.version(package)}"
+
+
+def _message(error: Exception) -> str:
+    """Return the first line of an error, with its kind where that line says little."""
+    text = next((line.strip() for line in str(error).splitlines() if line.strip()), "")
+    kind = type(error).__name__
+    return text if isinstance(error, OSError | RuntimeError) and text else f"{kind}: {text}"
 
 
 def is_function(detector: str) -> bool:

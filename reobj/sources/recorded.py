@@ -33,6 +33,7 @@ class RecordedDetections:
         messages: about dropped rows and assumptions, for the user.
         identity: (N,) as in the file, or empty.
         looked: frames on which the detector was run, ascending; None: all.
+        boxes_3d: (N, 15) of `boxes_3d.Boxes3D`, or empty.
     """
 
     frame: IntArray
@@ -48,6 +49,7 @@ class RecordedDetections:
     messages: list[str] = field(default_factory=list)
     identity: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
     looked: IntArray | None = None
+    boxes_3d: Array = field(default_factory=lambda: np.empty((0, 15)))
 
     def __post_init__(self) -> None:
         self.class_names = tuple(map(visible_name, self.class_names))
@@ -58,6 +60,7 @@ class RecordedDetections:
     def select(self, rows: IntArray) -> None:
         """Select rows (n,), in this order."""
         self.identity = self.identity[rows] if len(self.identity) else self.identity
+        self.boxes_3d = self.boxes_3d[rows] if len(self.boxes_3d) else self.boxes_3d
         for name in ("frame", "xyxy", "score", "class_id", "line"):
             setattr(self, name, getattr(self, name)[rows])
         self.runs = [self.runs[row] for row in rows]
@@ -66,6 +69,7 @@ class RecordedDetections:
         """Hash the detections, independently of the format of the file."""
         digest = hashlib.sha256(repr((self.class_names, self.size)).encode())
         arrays: list[npt.NDArray[Any]] = [self.frame, self.xyxy, self.score, self.class_id]
+        arrays += [self.boxes_3d] if len(self.boxes_3d) else []
         for values in arrays + list(self.runs):
             digest.update(repr(values.shape).encode() + np.ascontiguousarray(values).tobytes())
         return digest.hexdigest()[:16]

@@ -37,6 +37,10 @@ from reobj.types import (
     xyxy_from_cxcywh,
 )
 
+BOXES_3D = (
+    "tx_world_object", "ty_world_object", "tz_world_object", "qw_world_object", "qx_world_object",
+    "qy_world_object", "qz_world_object", "scale_x", "scale_y", "scale_z",
+)  # fmt: skip
 ALIASES: dict[str, tuple[str, ...]] = {  # names of columns; the first one with values is used
     "frame": ("frame", "frame_id", "frame_index", "frame_number", "frame_idx", "frame_no",
               "frame_num", "frame_nr", "frameid", "framenumber"),
@@ -244,8 +248,7 @@ def _by_role(by_name: Mapping[str, list[str]], path: Path) -> dict[str, list[str
             cells[role] = by_name[used[0]]
     has_frame = any(role in cells for role in ("frame", "image", "time"))
     if "tx_world_object" in by_name:
-        fault = "these are 3D boxes in the world (Boxer, WildDet3D), expected 2D boxes in images"
-        raise ReobjError(f"{path}, line 1: {fault}; Boxer writes them to owl_2dbbs.csv")
+        return _of_boxes_3d(by_name, path)
     if not has_frame or not _box_roles(cells):
         missing = [role for role in ("x1", "y1", "x2", "y2") if role not in cells]
         missing = ["frame"] * (not has_frame) + missing
@@ -253,6 +256,16 @@ def _by_role(by_name: Mapping[str, list[str]], path: Path) -> dict[str, list[str
         example = "expected one such as frame,x1,y1,x2,y2,score,class"
         raise ReobjError(f"{path}, line 1: {text}: {example}")
     return cells
+
+
+def _of_boxes_3d(by_name: Mapping[str, list[str]], path: Path) -> dict[str, list[str]]:
+    """Find the columns of a table of boxes in the world (Boxer, WildDet3D)."""
+    role_of = {"time_ns": "time", "prob": "score", "name": "class"}
+    columns = (*BOXES_3D, *role_of)
+    if missing := [name for name in columns if name not in by_name]:
+        text = f"3D boxes without the columns {', '.join(missing)}"
+        raise ReobjError(f"{path}, line 1: {text}; expected those of Boxer's 3D boxes")
+    return {role_of.get(name, name): by_name[name] for name in columns}
 
 
 def _is_empty(cell: str) -> bool:
@@ -318,6 +331,9 @@ def recorded_table(
     table: Table, names: Sequence[str], video: Video, first: str = ""
 ) -> RecordedDetections:
     """Convert a table of any kind to detections."""
+    if BOXES_3D[0] in table.cells:
+        fault = "these are 3D boxes in the world, which need its cameras"
+        raise ReobjError(f"{table.path}, line 1: {fault}: `run` with --detections and --poses FILE")
     _drop_rows(table)
     xyxy = _boxes(table)
     count = len(table.line)
@@ -327,7 +343,7 @@ def recorded_table(
                          "CSV needs a header such as frame,x1,y1,x2,y2,score,class")  # fmt: skip
     identity = _identities(table)
     score = table.numbers("score") if "score" in table.cells else np.ones(count)
-    classes = _mot_classes(table, score, names) if mot else _text_classes(table, names)
+    classes = _mot_classes(table, score, names) if mot else text_classes(table, names)
     frame = _frames(table, video, first)
     recorded = RecordedDetections(
         frame, xyxy, score, classes[0], [NO_RUNS] * count, tuple(classes[1]), video.size,
@@ -431,7 +447,7 @@ def _frames_at(time_s: Array, video: Video, path: Path) -> IntArray:
 # ---- Classes -------------------------------------------------------------------------------------
 
 
-def _text_classes(table: Table, names: Sequence[str]) -> tuple[IntArray, list[str]]:
+def text_classes(table: Table, names: Sequence[str]) -> tuple[IntArray, list[str]]:
     """Read a column of class names or of numbers from 0; empty cells and -1: no class."""
     cells = table.cells.get("class", [""] * len(table.line))
     blank = np.array([_is_empty(cell) or cell == "-1" for cell in cells], bool)
@@ -453,10 +469,9 @@ def _text_classes(table: Table, names: Sequence[str]) -> tuple[IntArray, list[st
         known = [*base, *new]
         index = {name: i for i, name in reversed(list(enumerate(known)))}
         class_id[~blank] = [index[cell] for cell in filled]
-        if new and base:
-            table.messages.append(
-                f"{len(new)} class names not in the list: {printable(shortened(new))}"
-            )
+        if new and names:
+            text = f"{len(new)} class names that detect.class_names does not have"
+            table.messages.append(f"{text}: {printable(shortened(new))}")
     return _with_unnamed(class_id, blank, known, table)
 
 

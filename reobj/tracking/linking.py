@@ -23,6 +23,7 @@ from reobj.types import (
     nearest_of,
     rows_by,
 )
+from reobj.words import among
 
 # Chosen on examples/room and redkitchen (benchmarks/RESULTS.md) unless a source is given.
 DUPLICATE_IOU = 0.6  # boxes that overlap more may be two boxes of one object (NMS: .5 to .7)
@@ -120,7 +121,7 @@ class Linker:
         self.tracklets = self.tracks.tracklet_id[first]
         self.identity = self.tracks.track_id[first]
         self.classes = class_shares(self.tracks, self.fragment, len(first)).argmax(1)
-        moves = np.isin([*class_names, ""], list(moving))  # (C + 1,), the last: unknown
+        moves = among([*class_names, ""], moving)  # (C + 1,), the last: unknown
         self.moving = moves[self.classes.clip(max=len(class_names))]
 
     def _co_occurrence(self) -> tuple[BoolArray, BoolArray]:

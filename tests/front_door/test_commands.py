@@ -441,7 +441,8 @@ def test_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> N
 def test_models_lists_and_verifies(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli("models") == 0
     listed = capsys.readouterr().out
-    assert re.search(r"^deimv2-n +detector .*default", listed, re.M)
+    assert re.search(r"^deimv2-femto +detector .*default", listed, re.M)
+    assert "not run here; the layout of its family is verified" in " ".join(listed.split())
     assert re.search(r"^reobj +backbone .*verified", listed, re.M)
     assert cli("models", "reobj") == 0
     assert Path(capsys.readouterr().out.strip()).name == "reobj.onnx"

@@ -312,6 +312,30 @@ def test_coco_video(tmp_path: Path) -> None:
         rt.evaluate(out, path)
 
 
+def test_synonyms_are_one_class(tmp_path: Path) -> None:
+    """In the result, in the truth, and between the two; also for --classes and Rank-k."""
+    out = folder(tmp_path / "out", ("sofa",))
+    rows = "".join(
+        f'<track id="{i}" label="{name}">'
+        + "".join(
+            f'<box frame="{f - 1:.0f}" xtl="{x}" ytl="{y}" xbr="{x + w}" ybr="{y + h}" '
+            'outside="0" occluded="0" keyframe="1"/>'
+            for f, _, x, y, w, h in ROWS[ROWS[:, 1] == i].tolist()
+        )
+        + "</track>"
+        for i, name in enumerate(("couch", "Sofa", "sofa", "couch", "cup"), 1)
+    )
+    truth = tmp_path / "cvat.xml"
+    truth.write_text(f"<annotations>{rows}</annotations>")
+    found = rt.evaluate(out, truth)["tracks"]
+    assert sorted(found) == ["all", "cup", "sofa"]
+    assert found["sofa"]["DetA"] == pytest.approx(0.8) and found["cup"]["recall"] == 0
+    only = rt.evaluate(out, truth, classes=["couch"])["tracks"]["all"]
+    assert only == found["sofa"]
+    with pytest.raises(rt.ReobjError, match="--classes: table: neither in the truth nor"):
+        rt.evaluate(out, truth, classes=["table"])
+
+
 def test_cvat_for_video(tmp_path: Path) -> None:
     out = folder(tmp_path / "out")
     text = "<annotations>"

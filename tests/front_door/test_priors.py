@@ -14,8 +14,10 @@ from simulated import tracks_of, unlinked, walk
 import quadrics as q
 from reobj.objects.config import ObjectsConfig
 from reobj.objects.fit import link_and_fit
-from reobj.options import check_known_size, unused_sizes
+from reobj.options import check_known_size, load_size_priors, unused_sizes
 from reobj.results.edits import read_edits
+from reobj.sources.detection_files import class_filter
+from reobj.words import canonical
 
 UP = (0.0, 0.0, 1.0)
 PRIORS = q.load_priors()
@@ -100,15 +102,37 @@ def test_non_finite_boxes_are_ignored() -> None:
 
 
 def test_synonyms_are_one_category() -> None:
-    check_known_size("sofa=80cm", "", ["chair", "couch"])  # raises where there is none
+    check_known_size("sofa=80cm", PRIORS, ["chair", "couch"])  # raises where there is none
     with pytest.raises(ValueError, match="no such class"):
-        check_known_size("sofa=80cm", "", ["chair", "cup"])
-    assert unused_sizes("sofa=80cm", "", []) != []
+        check_known_size("sofa=80cm", PRIORS, ["chair", "cup"])
+    assert unused_sizes("sofa=80cm", PRIORS, []) != []
     words = ["Sofa", "fridge", "table", "phone", "plant", "television", "toaster"]
     usual = ["couch", "refrigerator", "dining table", "cell phone", "potted plant", "tv", "toaster"]
     assert PRIORS.canonical(words) == usual
     table = json.loads(Path(q.__file__).with_name("priors.json").read_text())
     assert set(table["aliases"].values()) <= set(PRIORS.names)
+
+
+def test_one_table_of_synonyms() -> None:
+    """ "monitor" means what "tv" means, but has its own size; a class of that name goes first."""
+    assert [canonical(w) for w in ("sofa", "Couch", "mobile_phone", "screen", "vcr")] == [
+        "couch", "couch", "cell phone", "tv", "vcr"
+    ]  # fmt: skip
+    row = PRIORS.index(["monitor", "tv", "screen", "television"]).tolist()
+    assert row[0] == row[2] != row[1] == row[3]
+    assert class_filter("monitor,sofa", ["tv", "couch", "chair"]).tolist() == [0, 1]
+    assert class_filter("monitor", ["tv", "monitor"]).tolist() == [1]
+
+
+def test_a_file_of_priors_takes_the_synonyms_of_its_words(tmp_path: Path) -> None:
+    """Its "sofa" is the prior of "couch" too; a word of the user replaces it."""
+    path = tmp_path / "p.json"
+    size = {"mean": [2.0, 1.0, 0.8], "log_std": [0.2] * 3}
+    path.write_text(json.dumps({"sofa": {"size_m": size}, "aliases": {"settee": "sofa"}}))
+    priors = load_size_priors(str(path))
+    assert priors.index(["couch", "Sofa", "settee", "chair"]).tolist() == [0, 0, 0, -1]
+    priors = load_size_priors(str(path), "couch=1x1x1m")
+    assert np.exp(priors.log_mean[priors.index(["sofa"])]).tolist() == [[1, 1, 1]]
 
 
 def test_known_size_takes_synonyms() -> None:

@@ -1,0 +1,184 @@
+"""Detections with a box in 3D: CSV of Boxer, which WildDet3D writes too.
+
+A row is a box in the world of the supplied cameras, seen in the frame of its time stamp. Its
+projection is a detection like any other; the boxes themselves are measurements of the objects'
+shapes (`objects.given_boxes`).
+
+Ref: github.com/facebookresearch/boxer, utils/file_io.py (`ObbCsvWriter2`): z up, full extents,
+quaternions w first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+import quadrics
+from reobj.cameras import Camera, Poses
+from reobj.sources.masks import NO_RUNS
+from reobj.sources.recorded import RecordedDetections
+from reobj.sources.tables import BOXES_3D, Table, read_cells, seconds, text_classes
+from reobj.sources.video import Video
+from reobj.types import Array, IntArray, ReobjError, Tracks
+
+COLUMNS_3D = 15  # of a row of `RecordedDetections.boxes_3d`: centre, half extents, rotation
+
+
+@dataclass(frozen=True, slots=True)
+class Boxes3D:
+    """Boxes in the world of the cameras, each of one detection of a video.
+
+    Attributes (N rows, by frame):
+        frame: (N,) source frame numbers. detection_index: (N,) as in `Tracks`.
+        box: (N, 15) centre (3), half extents (3) and rotation world_from_box (9, by rows).
+        score: (N,) in [0, 1].
+    """
+
+    frame: IntArray
+    detection_index: IntArray
+    box: Array
+    score: Array
+
+    def of_rows(self, tracks: Tracks) -> IntArray:
+        """Return the row of each detection (M,) of tracks; -1: it has no box in 3D."""
+        keys = zip(self.frame.tolist(), self.detection_index.tolist(), strict=True)
+        row_of = {key: row for row, key in enumerate(keys)}
+        wanted = zip(tracks.frame.tolist(), tracks.detection_index.tolist(), strict=True)
+        return np.array([row_of.get(key, -1) for key in wanted], np.int64)
+
+
+def boxes_3d_of(recorded: RecordedDetections | None) -> Boxes3D | None:
+    """Return the boxes in 3D of validated detections; None: they have none."""
+    if recorded is None or not len(recorded.boxes_3d):
+        return None
+    index = np.arange(len(recorded)) - np.searchsorted(recorded.frame, recorded.frame)
+    return Boxes3D(recorded.frame, index, recorded.boxes_3d, recorded.score)
+
+
+def has_boxes_3d(path: Path) -> bool:
+    """Test whether a file is a table of boxes in 3D."""
+    if path.suffix.lower() not in (".csv", ".txt") or not path.is_file():
+        return False
+    with path.open(errors="replace") as file:
+        return "tx_world_object" in file.readline(1000)
+
+
+def read_boxes_3d(
+    path: Path, video: Video, poses: Sequence[Poses], names: Sequence[str] = ()
+) -> tuple[RecordedDetections, int]:
+    """Read boxes in 3D and project them to the frames of their time stamps.
+
+    Args:
+        poses: readings of the supplied poses; the one in which most boxes are visible is used.
+        names: class names by number, (): not given.
+    Returns:
+        detections in px of the source, and the number of the reading.
+    Raises:
+        ReobjError: a value is invalid, or no box is visible in its frame.
+    """
+    table = read_cells(path)
+    box = _boxes(table)
+    time_s = seconds(table)
+    projected = [_projected(box, time_s, one, video) for one in poses]
+    best = int(np.argmax([np.isfinite(xyxy[:, 0]).sum() for _, xyxy in projected]))
+    frame, xyxy = projected[best]
+    visible = np.isfinite(xyxy[:, 0])
+    if len(box) and (frame < 0).all():
+        span = f"{time_s.min():.3f} to {time_s.max():.3f} s"
+        ours = _frame_times(poses[best], video)[1]
+        raise ReobjError(f"{path}: no time stamp ({span}) is that of a frame with a pose "
+                         f"({ours.min(initial=0):.3f} to {ours.max(initial=0):.3f} s)")  # fmt: skip
+    if len(box) and not visible.any():
+        raise ReobjError(f"{path}: no box is in the image of its frame: expected boxes in the "
+                         "world of --poses, at the times of its frames")  # fmt: skip
+    class_id, known = text_classes(table, names)
+    score = table.numbers("score")
+    recorded = RecordedDetections(
+        frame, xyxy, score, class_id, [NO_RUNS] * len(frame), tuple(known), video.size,
+        video.working_size, table.line, table.unit, table.messages, boxes_3d=box,
+    )  # fmt: skip
+    without = (frame < 0).sum()
+    if without:
+        recorded.messages.append(f"{without} boxes at times without a frame with a pose left out")
+    if hidden := (~visible & (frame >= 0)).sum():
+        recorded.messages.append(f"{hidden} boxes outside the image of their frame left out")
+    recorded.select(np.flatnonzero(visible))
+    return recorded, best
+
+
+def _boxes(table: Table) -> Array:
+    """Return centre, half extents and rotation (N, 15) of the rows."""
+    center, quat, size = (np.stack([table.numbers(role) for role in roles], 1)
+                          for roles in (BOXES_3D[:3], BOXES_3D[3:7], BOXES_3D[7:]))  # fmt: skip
+    bad = (size <= 0).any(1) | (np.abs(np.linalg.norm(quat, axis=1) - 1) > 0.01)
+    if bad.any():
+        row = int(bad.argmax())
+        raise ReobjError(f"{table.where(row)}: extents {size[row]} and quaternion {quat[row]}, "
+                         "expected extents above 0 and a quaternion of length 1")  # fmt: skip
+    turn = np.empty((0, 3, 3))
+    if len(quat):
+        turn = Rotation.from_quat(np.roll(quat, -1, 1)).as_matrix()
+    return np.hstack([center, size / 2, turn.reshape(-1, 9)])
+
+
+def _frame_times(poses: Poses, video: Video) -> tuple[IntArray, Array]:
+    """Return the frames with a pose and their times in s, ascending."""
+    frame = poses.frame[poses.known]
+    if video.times_s is not None:
+        return frame, video.times_s[frame]
+    return frame, poses.time_s[poses.known]
+
+
+def _projected(box: Array, time_s: Array, poses: Poses, video: Video) -> tuple[IntArray, Array]:
+    """Return the frames (N,), -1: none with a pose, and image bounds (N, 4), NaN: not visible."""
+    frames, times_s = _frame_times(poses, video)
+    nearest = _nearest(times_s, time_s)
+    frame = np.where(nearest >= 0, frames[nearest] if len(frames) else -1, -1)
+    xyxy = np.full((len(box), 4), np.nan)
+    img_from_world = poses.camera.K @ poses.cam_from_world[poses.known]  # (F, 3, 4)
+    solids = quadrics.Ellipsoids(box[:, :3], box[:, 3:6], box[:, 6:].reshape(-1, 3, 3))
+    for k in np.unique(nearest[nearest >= 0]):
+        rows = np.flatnonzero(nearest == k)
+        xyxy[rows] = quadrics.solid_boxes(solids[rows], "box", img_from_world[k : k + 1])[0]
+    size = (poses.camera.width, poses.camera.height)
+    xyxy = quadrics.clip_boxes(_distorted(xyxy, poses.camera), size)
+    return frame, xyxy * np.tile(np.divide(video.size, size), 2)
+
+
+def _nearest(times_s: Array, time_s: Array) -> IntArray:
+    """Return the rows of the nearest times (N,); -1 beyond half of the usual step."""
+    if not len(times_s):
+        return np.full(len(time_s), -1)
+    half = 0.5 * float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.5
+    after = np.searchsorted(times_s, time_s).clip(max=len(times_s) - 1)
+    pair = np.stack([(after - 1).clip(0), after], 1)  # (N, 2)
+    offset = np.abs(times_s[pair] - time_s[:, None])
+    nearest = np.take_along_axis(pair, offset.argmin(1)[:, None], 1)[:, 0]
+    return np.asarray(np.where(offset.min(1) <= half, nearest, -1), np.int64)
+
+
+def _distorted(xyxy: Array, camera: Camera) -> Array:
+    """Map bounds (N, 4) of a pinhole camera to those with the distortion of the camera.
+
+    By corners and middles of the sides, clipped to twice the image: distortions diverge beyond.
+    """
+    if camera.model in ("PINHOLE", "SIMPLE_PINHOLE"):
+        return xyxy
+    w = camera.width
+    h = camera.height
+    near = np.clip(xyxy, [-w / 2, -h / 2] * 2, [1.5 * w, 1.5 * h] * 2)
+    x = near[:, [0, 2, 0, 2]].mean(1)
+    y = near[:, [1, 3]].mean(1)
+    along_x = np.stack([near[:, 0], x, near[:, 2]], 1)[:, [0, 1, 2, 0, 2, 0, 1, 2]]
+    along_y = np.stack([near[:, 1], y, near[:, 3]], 1)[:, [0, 0, 0, 1, 1, 2, 2, 2]]
+    rays = np.stack([along_x, along_y, np.ones_like(along_x)], 2) @ np.linalg.inv(camera.K).T
+    rows = np.flatnonzero(np.isfinite(near).all(1))
+    found = np.full((len(near), 8, 2), np.nan)
+    if len(rows):
+        flat = rays[rows].reshape(-1, 3)
+        found[rows] = np.asarray(camera.to_pycolmap().img_from_cam(flat)).reshape(-1, 8, 2)
+    return np.hstack([found.min(1), found.max(1)])
