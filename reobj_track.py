@@ -1705,7 +1705,7 @@ def _place_by_objects(
     """Place the cameras by the objects of the recording, if its points match too few images.
 
     Returns:
-        result, cameras, COLMAP models; and the result with fitted objects, None if the cameras moved
+        result, cameras, COLMAP models; the result with fitted objects, None if the cameras moved
         or points placed them.
     """
     if result.boxes_3d is not None:
