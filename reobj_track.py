@@ -77,7 +77,14 @@ from reobj.appearance.reid import (
 )  # fmt: skip
 from reobj.appearance.sampling import SamplingLayout
 from reobj.cameras import Camera, Poses, checked_pose, viewing_rays
-from reobj.commands import SafeFormatter, make_parser, say, short_help, with_streams
+from reobj.commands import (
+    SafeFormatter,
+    apply_command,
+    make_parser,
+    say,
+    short_help,
+    with_streams,
+)
 from reobj.files import Progress, atomic, load_cached, load_npz, part_path, save_npz, wrapped
 from reobj.maps.corrections import corrected
 from reobj.maps.fusion import object_state
@@ -1810,7 +1817,8 @@ def _write(job: _Job, result: Result) -> Result:
     result.save(workspace.out, output.doubtful, write_more, stale)
     shown = (output.overlay, output.scene, output.doubtful)
     line = job.progress("write", job.video.expected)
-    failures = write_pictures(result, workspace.out, job.video, *shown, line)
+    command = apply_command(workspace.out)
+    failures = write_pictures(result, workspace.out, job.video, *shown, line, command=command)
     if failures:
         result = dataclasses.replace(result, warnings=[*result.warnings, *failures])
         result.write_objects(workspace.out / OutputFile.OBJECTS)

@@ -10,6 +10,7 @@ import io
 import logging
 import os
 import re
+import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -29,6 +30,14 @@ def program() -> str:
     if path.stem == "reobj-track":
         return path.stem
     return f"python {path}" if path.name == "reobj_track.py" else "python -m reobj_track"
+
+
+def apply_command(out: Path) -> str:
+    """Return the command that fits the objects of a folder again, from any working folder."""
+    name = program()
+    if name.endswith("reobj_track.py"):
+        name = f"python {shlex.quote(str(Path(sys.argv[0]).absolute()))}"
+    return f"{name} objects {shlex.quote(str(out.absolute()))}"
 
 
 class Parser(argparse.ArgumentParser):

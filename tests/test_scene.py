@@ -5,8 +5,11 @@ from __future__ import annotations
 import base64
 import dataclasses
 import json
+import os
 import re
 import shutil
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -145,7 +148,7 @@ def center_of(browser: Browser, number: int) -> tuple[float, float]:
 
 def test_a_click_on_an_object_opens_its_panel(browser: Browser, page: Path) -> None:
     browser.open(page)
-    assert browser.eval("!!gl && document.title") == "frames: 4 objects"
+    assert browser.eval("!!gl && document.title") == "a: 4 objects"
     for number, name in zip((1, 2, 3), NAMES, strict=False):
         browser.click(*center_of(browser, number))
         assert browser.eval("state.selected.id") == number
@@ -212,7 +215,40 @@ def test_the_slider_plays_the_cameras(browser: Browser, page: Path) -> None:
     moved = "new Promise(f => setInterval(() => state.step !== 5 && f(state.step), 20))"
     assert browser.eval(moved) == 6
     browser.eval("$('play').click()")
-    assert browser.eval("$('play').textContent") == "▶" and complaints(browser) == []
+    assert browser.eval("$('play').getAttribute('aria-label')") == "play"
+    assert complaints(browser) == []
+
+
+def test_play_and_pause_are_drawn(browser: Browser, page: Path) -> None:
+    browser.open(page)
+    drawn = "[$('play').innerText, $('play').querySelector('path').getAttribute('d')]"
+    before = browser.eval(drawn)
+    browser.eval("$('play').click()")
+    after = browser.eval(f"[...{drawn}, $('play').getAttribute('aria-label')]")
+    browser.eval("$('play').click()")
+    assert before[0] == after[0] == "" and before[1] != after[1] and after[2] == "pause"
+    assert browser.eval(drawn) == before
+
+
+def test_the_video_frame_is_moved_enlarged_and_closed(browser: Browser, page: Path) -> None:
+    browser.open(page)
+    browser.eval("goTo(3)")
+    browser.settle()
+    place = "(r => [r.x, r.y, r.width, r.height])($('frame').getBoundingClientRect())"
+    x, y, width, height = browser.eval(place)
+    view = browser.eval(VIEW)
+    browser.drag((x + 40, y + height - 20), (x - 60, y + height - 70), "left")
+    assert browser.eval(place) == pytest.approx([x - 100, y - 50, width, height])
+    assert browser.eval(VIEW) == view  # the 3D view has not been turned
+    browser.drag((x - 60, y + height - 70), (5, 5), "left")  # not beyond the view
+    inside = "(r => [r.x, r.y])($('view').getBoundingClientRect())"
+    assert browser.eval(place)[:2] == pytest.approx(browser.eval(inside), abs=1)
+    browser.eval("$('frame-size').click()")
+    assert browser.eval(place)[2] > 1.8 * width
+    browser.eval("$('frame-close').click(); goTo(4)")
+    assert browser.eval("[$('frame').offsetWidth, $('inset').checked]") == [0, False]
+    browser.eval("$('inset').click()")
+    assert browser.eval("$('frame').offsetWidth") > 0 and complaints(browser) == []
 
 
 def test_the_followed_camera_has_the_projection_of_the_video(browser: Browser, page: Path) -> None:
@@ -474,6 +510,44 @@ def test_the_list_has_names_and_sizes_and_a_search(browser: Browser, page: Path)
     assert "seen in frames 0" in browser.eval("$('legend').innerText")
 
 
+def test_a_search_dims_the_other_objects(browser: Browser, page: Path) -> None:
+    browser.open(page)
+    opacity = "(draw(), solid.map(o => o.group.parts.wire.material.opacity))"
+    labels = "[...$('labels').children].map(l => l.textContent)"
+    before = browser.eval(opacity)
+    browser.eval("$('search').value = 'suitcase'; $('search').oninput()")
+    after = browser.eval(opacity)
+    assert after[2] == before[2] and max(after[:2]) < 0.3 * min(before)
+    assert browser.eval(labels) == ["suitcase 3"] and browser.eval("$('none').hidden") is True
+    browser.eval("$('search').value = 'zebra'; $('search').oninput()")
+    assert browser.eval("$('none').innerText") == "no object matches"
+    assert max(browser.eval(opacity)) < 0.3 * min(before)
+    browser.eval("$('search').value = ''; $('search').oninput()")
+    assert browser.eval(opacity) == before and browser.eval("$('none').hidden") is True
+
+
+def test_labels_have_the_colours_of_their_objects(browser: Browser, page: Path) -> None:
+    """The text is black or white, with a contrast of 4.5 at least."""
+    browser.open(page)
+    labels = browser.eval("""[...$('labels').children].map(l => [l.textContent,
+        ...['backgroundColor', 'color'].map(k => getComputedStyle(l)[k].match(/\\d+/g)
+        .map(Number))])""")
+    for text, paper, ink in labels:
+        assert tuple(paper) == object_color(int(text.split()[-1]))[::-1]
+        assert ink in ([0, 0, 0], [255, 255, 255])
+    assert len(labels) >= 2
+
+    def luminance(color: list[int]) -> float:
+        linear = ((np.array(color) / 255 + 0.055) / 1.055) ** 2.4
+        return float(linear @ [0.2126, 0.7152, 0.0722])
+
+    for number in range(1, 40):
+        color = list(object_color(number)[::-1])
+        white = browser.eval(f"inkOn({color})") == "#fff"
+        light, low = luminance([255 * white] * 3), luminance(color)
+        assert (max(light, low) + 0.05) / (min(light, low) + 0.05) > 4.5
+
+
 def test_a_selected_object_keeps_its_colour(browser: Browser, page: Path) -> None:
     browser.open(page)
     ink = "[solid[0].group.parts.wire.material.color.getHex(), solid[0].group.parts.halo.visible]"
@@ -527,7 +601,8 @@ def test_corrections_made_in_the_viewer_are_applied(
             break
         time.sleep(0.05)
     assert json.loads(file.read_text()) == json.loads(browser.eval("editsFile()"))
-    assert "objects OUT --edits edits.json" in browser.eval("$('saved').innerText")
+    command = browser.eval("$('saved').querySelector('code').innerText")
+    assert command == f"python -m reobj_track objects {parted_folder} --edits edits.json"
     shown = browser.eval("objects.map(o => [o.id, o.class])")
     assert rt.main(["objects", str(out), "--edits", str(file)]) == 0
     assert [[o.id, o.class_name] for o in rt.Result.load(out).objects] == shown
@@ -544,6 +619,23 @@ def test_corrections_made_in_the_viewer_are_applied(
     before = browser.asked
     browser.open(out / "scene.html")  # unsaved corrections: the browser shows a dialog
     assert browser.asked == before + 1
+
+
+def test_the_command_for_corrections_runs(parted_folder: Path, tmp_path: Path) -> None:
+    """As the page shows it, in the folder of the downloads; the tool was called with a path."""
+    out = shutil.copytree(parted_folder, tmp_path / "an output")
+    tool = Path(rt.__file__)
+    call = [sys.executable, tool.name, "objects", str(out)]
+    subprocess.run(call, cwd=tool.parent, check=True, capture_output=True)
+    command = data_of(out / "scene.html")["command"]
+    assert command == f"python {tool} objects '{out}'"
+    before = (out / "objects.json").stat().st_mtime_ns
+    edits = '{"format": "reobj-edits", "version": 1, "edits": []}'
+    (tmp_path / "edits.json").write_text(edits)
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    subprocess.run(f"{command} --edits edits.json", shell=True, cwd=tmp_path, check=True,
+                   capture_output=True, env=os.environ | {"PATH": path})  # fmt: skip
+    assert (out / "objects.json").stat().st_mtime_ns > before
 
 
 def test_a_visit_is_split_at_the_slider(
@@ -609,6 +701,30 @@ def test_classes_can_be_hidden(browser: Browser, page: Path) -> None:
     browser.click(*at)
     assert browser.eval("state.selected") is None
     assert browser.eval("here[2].row.hidden") is True
+    click = "[...$('classes').querySelectorAll('button')].find(b => b.textContent === '{}').click()"
+    state = "(draw(), [here.map(o => o.row.hidden), solid.map(o => o.group.visible)])"
+    browser.eval(click.format("none"))
+    assert browser.eval(state) == [[True] * 4, [False] * 3]
+    assert browser.eval("$('none').innerText") == "all objects are hidden"
+    browser.eval(click.format("all"))
+    assert browser.eval(state) == [[False] * 4, [True] * 3]
+    checked = "[...$('classes').querySelectorAll('input')].every(i => i.checked)"
+    assert browser.eval(checked) is True
+
+
+def test_a_double_click_rotates_around_the_object(browser: Browser, page: Path) -> None:
+    """It is selected then, whether or not it was before."""
+    browser.open(page)
+    for number in (3, 3, 1):
+        browser.eval("VIEWS.reset(); draw()")
+        x, y = center_of(browser, number)
+        for count in (1, 2):
+            for kind in ("mousePressed", "mouseReleased"):
+                browser.mouse(kind, x, y, button="left", clickCount=count)
+        browser.settle()
+        assert browser.eval("state.selected?.id") == number
+        target = browser.eval("controls.target.toArray()")
+        np.testing.assert_allclose(target, browser.eval("state.selected.at"), atol=1e-9)
 
 
 def test_mouse_turns_zooms_and_pans(browser: Browser, page: Path) -> None:
@@ -647,6 +763,58 @@ def test_touch_gestures_on_a_phone_screen(browser: Browser, page: Path) -> None:
     assert complaints(browser) == []
 
 
+def test_menus_and_targets_fit_a_phone(browser: Browser, page: Path) -> None:
+    """Nothing extends beyond the screen; what a finger taps has 44 px at least."""
+    browser.open(page, 390, 844, phone=True)
+    browser.eval("goTo(3); $('show').open = true; $('classes').open = true")
+    targets = """[...document.querySelectorAll('button, select, summary, label, ' +
+        'input[type=range], input[type=search], input[type=text], .crops figure')].filter(e => e.offsetParent)
+        .map(e => [e.id || e.textContent, ...(r => [r.left, r.right, r.width, r.height])
+        (e.getBoundingClientRect())])"""
+    menu = "(r => [r.top, r.bottom])($('show').querySelector('div').getBoundingClientRect())"
+    view = "(r => [r.top, r.bottom])($('view').getBoundingClientRect())"
+    (top, bottom), (first, last) = browser.eval(menu), browser.eval(view)
+    assert first <= top < bottom <= last
+    found = browser.eval(targets)
+    browser.picture(SCREENSHOTS / "phone-menu.png")
+    browser.eval("$('show').open = false; select(here[1]); edit(edits.rename(here[1], 'box'))")
+    browser.eval("document.querySelector('#panel details').open = true")
+    found += browser.eval(targets)
+    browser.eval("[...document.querySelectorAll('#panel button')]"
+                 ".find(b => b.textContent.startsWith('Rename')).click()")  # fmt: skip
+    found += browser.eval(targets)
+    browser.eval("$('help').showModal()")
+    found += browser.eval(targets)
+    browser.picture(SCREENSHOTS / "phone-help.png")
+    assert len(found) > 60
+    for name, left, right, width, height in found:
+        assert left >= 0 and right <= 390, name
+        assert min(width, height) >= 43.9, name
+    browser.eval("saved = true")
+    assert complaints(browser) == []
+
+
+def test_help_says_what_fingers_do(browser: Browser, page: Path) -> None:
+    for phone, first in ((True, "Fingers"), (False, "Mouse")):
+        browser.open(page, 390 if phone else 1280, 844, phone=phone)
+        browser.eval("$('help-button').click()")
+        heads = browser.eval("[...document.querySelectorAll('#help h2')].map(h => h.innerText)")
+        assert heads[0] == first and set(heads) == {"Fingers", "Mouse", "Keys"}
+    text = browser.eval("$('help').innerText")
+    assert all(word in text for word in ("two fingers", "pinch", "tap an object", "tap twice"))
+
+
+def test_two_taps_rotate_around_the_object(browser: Browser, page: Path) -> None:
+    browser.open(page, 390, 844, phone=True)
+    at = center_of(browser, 3)
+    for _ in range(2):
+        browser.touch("touchStart", at)
+        browser.touch("touchEnd")
+    browser.wait("state.selected?.id === 3")
+    target = browser.eval("controls.target.toArray()")
+    np.testing.assert_allclose(target, browser.eval("state.selected.at"), atol=1e-9)
+
+
 def test_selecting_a_component_updates_everything(browser: Browser, parted_folder: Path) -> None:
     browser.open(parted_folder / "scene.html")
     rows = "[...document.querySelectorAll('.row b')].map(b => +b.textContent.split(' ').at(-1))"
@@ -655,7 +823,8 @@ def test_selecting_a_component_updates_everything(browser: Browser, parted_folde
         "cloud.geometry.attributes.position.count]"
     )
     assert browser.eval("[$('part').hidden, $('part').options.length]") == [False, 2]
-    assert browser.eval("document.title") == "frames: 6 objects in 2 components"
+    name = parted_folder.parent.name
+    assert browser.eval("document.title") == f"{name}: 6 objects in 2 components"
     assert browser.eval(rows) == [1, 2, 3]
     assert browser.eval(shown) == [[1, 2, 3], 40, 38, 39, 3]
     assert browser.eval("$('facts').textContent").startswith("cameras of 38 of 40 frames")
@@ -739,7 +908,7 @@ def changes_of_walk(objects: list[rt.Object]) -> Changes:
     shape = Shape("box", chair.half_axes, EIGHTH_TURN)
     lamp = Shape("cylinder", np.array([0.2, 0.2, 0.5]), np.array([1.0, 0, 0, 0]))
     return Changes(
-        "flat.map", "tuesday", "", 20, 24, sigma_m=0.01,
+        "flat.map", "tuesday", "", "points", 20, 24, sigma_m=0.01,
         stayed=(Change(2, second.class_name, second.center, second.center, 0.0, 0.02),),
         moved=(Change(1, "chair", chair.center + np.array([0, 1.0, 0]), chair.center, 1.0, 0.034,
                       "12 own points agree", (9,), shape),),
@@ -900,7 +1069,7 @@ def test_changes_are_shown_on_a_phone_and_without_webgl(
 
 def test_a_refused_map_is_named(browser: Browser, page: Path, tmp_path: Path) -> None:
     result = rt.Result.load(page.parent)
-    changes = Changes("flat.map", "tuesday", "3 of 24 frames agree with it", 3, 24)
+    changes = Changes("flat.map", "tuesday", "3 of 24 frames agree with it", "", 3, 24)
     video = rt.Video(page.parent.parent / "frames")
     refused = dataclasses.replace(result, changes=changes)
     write_scene(refused, Pictures(refused, video), tmp_path / "scene.html", video)
@@ -1081,7 +1250,7 @@ def test_sources_of_the_map_page_are_small(page: Path, changed_page: Path) -> No
 
 
 def test_same_input_gives_the_same_page(page: Path, tmp_path: Path) -> None:
-    assert write_page(tmp_path / "again").read_bytes() == page.read_bytes()
+    assert write_page(tmp_path / "a").read_bytes() == page.read_bytes()
 
 
 def test_names_are_escaped_in_the_data(page: Path) -> None:

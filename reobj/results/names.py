@@ -3,6 +3,30 @@
 from __future__ import annotations
 
 import enum
+from pathlib import Path
+
+from reobj.types import without_secrets
+
+GENERIC = frozenset({"color", "frames", "image", "images", "img", "rgb"})  # folders of recordings
+
+
+def recording_name(source: str) -> str:
+    """Return the name of a recording for titles: of its file or folder.
+
+    For a folder with a generic name, that of its parent; for a glob, that of its folder.
+
+    >>> recording_name("data/kitchen/images")
+    'kitchen'
+    >>> recording_name("data/kitchen/rgb/*.png")
+    'kitchen'
+    """
+    source = without_secrets(source)
+    path = Path(source) if "://" in source else Path(source).absolute()
+    names = [name for name in path.parts if not set(name) & set("*?[")]
+    specific = [name for name in names if name.lower() not in GENERIC]
+    if names and names[-1].lower() in GENERIC and specific:
+        return specific[-1]
+    return names[-1] if names else source
 
 
 class OutputFile(enum.StrEnum):

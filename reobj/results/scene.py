@@ -28,6 +28,7 @@ from reobj.files import Progress, atomic, base64_text, read_text, rounded, signi
 from reobj.poses.floor import NOISE
 from reobj.results.changes import EarlierSession
 from reobj.results.entries import Object, World, visit_gap
+from reobj.results.names import recording_name
 from reobj.results.origin import centred
 from reobj.results.overlay import Overlay, film_layers
 from reobj.results.report import sides
@@ -268,7 +269,12 @@ def page_text(served: dict[str, Any] | None = None) -> str:
 
 
 def write_scene(
-    result: Result, pictures: Pictures, path: Path, video: Video, doubtful: bool = False
+    result: Result,
+    pictures: Pictures,
+    path: Path,
+    video: Video,
+    doubtful: bool = False,
+    command: str = "",
 ) -> None:
     """Write scene.html: solids, cameras, points and pictures in one page that needs no network.
 
@@ -278,6 +284,7 @@ def write_scene(
 
     Args:
         doubtful: show low-confidence objects initially; a switch shows and hides them.
+        command: fits the objects again; the viewer shows it with the file of corrections.
     """
     steps = scene_steps(result)  # (S,)
     poses = result.poses
@@ -289,7 +296,8 @@ def write_scene(
     parts, origins = zip(*(centred(part) for part in result.parts()), strict=True)
     data = {
         "version": PAGE_VERSION,
-        "title": Path(str(video.source)).name,
+        "title": recording_name(str(video.source)),
+        "command": command,
         "warnings": result.warnings,
         "links": [
             link | {key: rounded(link[key], 2) for key in ("place_iou", "appearance_log_odds")}
@@ -548,6 +556,7 @@ def write_pictures(
     scene: bool = True,
     doubtful: bool = False,
     progress: Progress | None = None,
+    command: str = "",
 ) -> list[str]:
     """Write the overlay video and scene.html in one pass over the video.
 
@@ -559,6 +568,7 @@ def write_pictures(
         doubtful: include low-confidence objects in the overlay video; in the viewer, which always
             contains them, show them initially.
         progress: the line of the stage, whose steps are the frames.
+        command: fits the objects again; the viewer shows it with the file of corrections.
     Returns:
         messages about files that could not be written, with the option to omit them. With the
         environment variable REOBJ_RAISE, as in our tests, bugs are raised instead.
@@ -594,7 +604,7 @@ def write_pictures(
         if pictures is not None and "scene" not in faults.found:
             with faults.of("scene"):
                 page = dataclasses.replace(result, warnings=[*result.warnings, *faults.messages()])
-                write_scene(page, pictures, out / "scene.html", video, doubtful)
+                write_scene(page, pictures, out / "scene.html", video, doubtful, command=command)
         line.complete = complete
     return faults.messages()
 

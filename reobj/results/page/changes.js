@@ -71,14 +71,15 @@ function fillGhosts() {
 
 function drawGhosts(inside) {
   for (const g of ghosts) {
-    const visible = allowedGhost(g), chosen = g === state.ghost;
-    g.arrow.forEach((node) => { node.visible = visible; });
+    const visible = allowedGhost(g), chosen = g === state.ghost, found = isFound(g.object || g);
+    g.arrow.forEach((node) => { node.visible = visible && found; });
     if (!g.group) continue;
     const { wire, halo, faces, ellipsoid } = g.group.parts;
     g.group.visible = visible;
     ellipsoid.visible = halo.visible = false;
     wire.material.linewidth = chosen ? 4 : 2;
-    faces.material.opacity = inside ? 0.05 : 0.13;
+    wire.material.opacity = found ? 1 : FAINT;
+    faces.material.opacity = (inside ? 0.05 : 0.13) * (found ? 1 : FAINT);
   }
 }
 
@@ -117,7 +118,8 @@ function ghostRow(g) {
 function filterGhosts(words) {
   for (const g of ghosts.filter(absent)) {
     const text = `${nameOf(g)} ${kindText(g)}`.toLowerCase();
-    g.row.hidden = !allowedGhost(g) || !words.every((word) => text.includes(word));
+    g.found = words.every((word) => text.includes(word));
+    g.row.hidden = !allowedGhost(g) || !g.found;
   }
   markGhostRow();
 }

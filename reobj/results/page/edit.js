@@ -197,10 +197,10 @@ function save() {
   setTimeout(() => URL.revokeObjectURL(url), 10000);
   saved = true;
   $("saved").replaceChildren(el("h2", {}, "edits.json"),
-    el("p", {}, "The browser has put edits.json among your downloads. Apply it to the output "
-      + "folder (here OUT), which makes objects, solids and this page again:"),
-    el("p", {}, el("code", {}, "reobj-track objects OUT --edits edits.json")),
-    el("p", { className: "dim" }, "OUT keeps the corrections: later fits apply them again."),
+    el("p", {}, "The browser has saved edits.json among your downloads. Run this command in the folder of "
+      + "the downloads: it makes objects, shapes and this page again."),
+    el("p", {}, el("code", {}, `${S.command || "reobj-track objects OUT"} --edits edits.json`)),
+    el("p", { className: "dim" }, "The output folder keeps the corrections: later fits apply them again."),
     el("div", { className: "act" }, el("button", { className: "main",
       onclick: () => $("saved").close() }, "OK")));
   $("saved").showModal();

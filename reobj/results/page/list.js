@@ -33,10 +33,20 @@ function filterList() {
   const words = $("search").value.toLowerCase().split(/\s+/).filter(Boolean);
   for (const o of here) {
     const text = `${nameOf(o)} ${o.status} ${o.reason} ${kindText(changeOf(o))}`.toLowerCase();
-    o.row.hidden = !allowed(o) || !words.every((word) => text.includes(word));
+    o.found = words.every((word) => text.includes(word));
+    o.row.hidden = !allowed(o) || !o.found;
     o.row.classList.toggle("now", state.step >= 0 && seenAt(o, state.step));
   }
   filterGhosts(words);
+  $("none").textContent = words.length ? "no object matches" : "all objects are hidden";
+  $("none").hidden = ![...here, ...ghosts.filter(absent)].length
+    || [...$("rows").children].some((row) => !row.hidden);
+}
+
+function showClasses(names, on) {
+  names.forEach((name) => state.hidden[on ? "delete" : "add"](name));
+  fillList();
+  redraw();
 }
 
 function fillList() {
@@ -46,7 +56,8 @@ function fillList() {
   fillKinds(listed);
   const names = [...new Set(here.map((o) => o.class))].sort();
   $("classes").querySelector("summary").textContent = `classes (${names.length})`;
-  $("classes").querySelector("div").replaceChildren(...names.map((name) => {
+  const every = (text, on) => el("button", { onclick: () => showClasses(names, on) }, text);
+  $("classes").querySelector("div").replaceChildren(every("all", true), every("none", false), ...names.map((name) => {
     const box = el("input", { type: "checkbox", checked: !state.hidden.has(name), onchange: () => {
       state.hidden[box.checked ? "delete" : "add"](name);
       filterList();

@@ -85,7 +85,7 @@ $("help-button").onclick = () => $("help").showModal();
 $("play").onclick = play;
 $("slider").oninput = () => goTo(steps[+$("slider").value]);
 $("part").onchange = () => enter(+$("part").value);
-$("search").oninput = filterList;
+$("search").oninput = () => { filterList(); redraw(); };
 $("sort").onchange = fillList;
 for (const id of ["solids", "ellipsoids", "names", "points", "cameras", "grid", "boxes"]) {
   $(id).onchange = redraw;
@@ -95,18 +95,24 @@ $("doubtful").onchange = () => {
   filterList();
   redraw();
 };
-$("help").append(el("h2", {}, "Keys, mouse, fingers"),
-  el("p", {}, "Drag turns; right button, shift or two fingers move; wheel or pinch zooms. A click "
-    + "on an object selects it, a double click orbits it."),
-  el("dl", {}, ...KEYS.flatMap(([key, text]) => [el("dt", {}, el("kbd", {},
-    { ArrowLeft: "←", ArrowRight: "→", Escape: "Esc" }[key] || key)), el("dd", {}, text)])),
+const rowsOf = (rows) => el("dl", {}, ...rows.flatMap(([name, text]) =>
+  [el("dt", {}, name), el("dd", {}, text)]));
+const FINGERS = [el("h2", {}, "Fingers"), rowsOf([["drag", "rotate"], ["two fingers", "move"],
+  ["spread, pinch", "zoom"], ["tap an object", "select, deselect"], ["tap twice", "rotate around the object"],
+  ["Measure", "then tap two points"], ["video frame", "drag to move, + enlarges, × closes"]])];
+const MOUSE = [el("h2", {}, "Mouse"), rowsOf([["drag", "rotate"], ["right button, shift", "move"],
+  ["wheel", "zoom"], ["click an object", "select, deselect"], ["double click", "rotate around the object"]]),
+  el("h2", {}, "Keys"), rowsOf(KEYS.map(([key, text]) => [el("kbd", {},
+    { ArrowLeft: "←", ArrowRight: "→", Escape: "Esc" }[key] || key), text]))];
+const touch = matchMedia("(pointer: coarse)").matches;
+$("help").append(...(touch ? [...FINGERS, ...MOUSE] : [...MOUSE, ...FINGERS]),
   el("p", { className: "dim" }, "Sizes are width × depth × height, along the object's own axes "
     + "(height is the upright one), rounded as their standard deviation allows."),
   el("div", { className: "act" }, el("button", { className: "main",
     onclick: () => $("help").close() }, "Close")));
 
 // ---- A click: press and release at the same position ----
-let pressed = null;
+let pressed = null, clicked = [];                // objects under the last two clicks
 canvas.addEventListener("pointerdown", (e) => {
   $("show").open = false;
   pressed = pressed || !e.isPrimary ? null : { x: e.clientX, y: e.clientY };
@@ -118,10 +124,16 @@ canvas.addEventListener("pointerup", (e) => {
   if (!pressed || e.button !== 0) { pressed = null; return; }
   pressed = null;
   const { left, top } = canvas.getBoundingClientRect(), at = [e.clientX - left, e.clientY - top];
+  clicked = [clicked[1], pick(...at)];
   if (state.measuring) measureAt(...at); else choose(...at);
 });
-canvas.addEventListener("dblclick", () => lookAt(state.selected));
-addEventListener("resize", redraw);
+canvas.addEventListener("dblclick", () => {      // the panel, opened by the first click, moves the view
+  const [o] = clicked;
+  if (!o || state.measuring || state.merging) return;
+  if (o !== state.selected) select(o);
+  lookAt(o);
+});
+addEventListener("resize", () => { placeInset(); redraw(); });
 dark.addEventListener("change", () => {
   if (!renderer) return;
   fillScene();
@@ -144,5 +156,7 @@ if (S.why_flat || !prepare()) {
     + "when each object is seen; click one for its pictures."));
 }
 for (const id of ["follow", "ride", "measure"]) press(id, false);
+markPlay(false);
+enlarge(false);
 enter(0);
 if (job.running) watchJob(); else fillEdits();

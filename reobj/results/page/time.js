@@ -39,13 +39,18 @@ function goTo(step, image = null) {              // image: of the step, where it
 
 // ---- Play ----
 let playing = null;
+const PLAY = "M2 1l9 5-9 5z", PAUSE = "M2 1h3v10h-3zM7 1h3v10h-3z";
+function markPlay(on) {                          // drawn: fonts lack the sign of pause
+  $("play").querySelector("path").setAttribute("d", on ? PAUSE : PLAY);
+  $("play").setAttribute("aria-label", on ? "pause" : "play");
+}
 function onward(by = 1) {
   const list = state.ride && pictured().length ? pictured() : steps;
   const at = list.findLastIndex((step) => step <= state.step);
   goTo(list[(at + by + list.length) % list.length]);
 }
 function play() {
-  $("play").textContent = playing ? "▶" : "⏸";
+  markPlay(!playing);
   if (playing) { playing = clearInterval(playing); film.pause(); return; }
   if (state.ride && filmed && film.requestVideoFrameCallback) {
     playing = -1;                                // no timer
@@ -91,3 +96,34 @@ function setRide(on) {
   if (on) goTo(Math.max(state.step, steps[0]));
   redraw();
 }
+
+// ---- The video frame above the 3D view: dragged, enlarged, closed ----
+const inset = { right: 8, bottom: 8, from: null };
+function placeInset() {                          // inside the view
+  const frame = $("frame"), view = $("view");
+  const within = (x, room) => Math.max(0, Math.min(x, room));
+  inset.right = within(inset.right, view.clientWidth - frame.offsetWidth);
+  inset.bottom = within(inset.bottom, view.clientHeight - frame.offsetHeight);
+  frame.style.right = `${inset.right}px`;
+  frame.style.bottom = `${inset.bottom}px`;
+}
+function enlarge(on) {
+  $("frame").classList.toggle("large", on);
+  $("frame-size").textContent = on ? "−" : "+";
+  placeInset();
+}
+$("frame").onpointerdown = (e) => {
+  if (e.target.closest("button") || document.body.classList.contains("flat")) return;
+  $("frame").setPointerCapture(e.pointerId);
+  inset.from = { x: e.clientX + inset.right, y: e.clientY + inset.bottom };
+};
+$("frame").onpointermove = (e) => {
+  if (!inset.from) return;
+  inset.right = inset.from.x - e.clientX;
+  inset.bottom = inset.from.y - e.clientY;
+  placeInset();
+};
+$("frame").onpointerup = $("frame").onpointercancel = () => { inset.from = null; };
+$("frame-size").onclick = () => enlarge(!$("frame").classList.contains("large"));
+$("frame-close").onclick = () => $("inset").click();
+$("inset").onchange = () => $("frame").classList.toggle("closed", !$("inset").checked);

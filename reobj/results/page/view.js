@@ -268,6 +268,9 @@ function redraw() {
   requestAnimationFrame(() => { waiting = false; draw(); });
 }
 
+const FAINT = 0.15;                              // of objects that do not match the search
+const isFound = (o) => o.found !== false;
+
 function draw() {
   const [w, h] = [$("view").clientWidth, $("view").clientHeight];
   renderer.setPixelRatio(devicePixelRatio);
@@ -276,16 +279,17 @@ function draw() {
   for (const o of solid) {
     const { wire, halo, faces, ellipsoid } = o.group.parts, chosen = o === state.selected;
     const lit = chosen || state.step < 0 || o.then || seenAt(o, state.step);
+    const strength = isFound(o) || chosen ? 1 : FAINT;
     o.group.visible = visible.has(o);
     wire.visible = faces.visible = $("solids").checked;
     ellipsoid.visible = $("ellipsoids").checked || !$("solids").checked;
-    halo.visible = chosen || Boolean(markOf(o));
+    halo.visible = chosen || Boolean(markOf(o)) && isFound(o);
     halo.material.color.set(css(chosen ? "--halo" : `--${changeOf(o)?.kind}`) || "#000");
     halo.material.opacity = chosen ? 1 : 0.6;
-    wire.material.opacity = lit ? 1 : 0.35;
+    wire.material.opacity = (lit ? 1 : 0.35) * strength;
     wire.material.linewidth = chosen ? 2.4 : inside ? 2.4 : 1.8;
-    faces.material.opacity = lit && !inside ? 0.06 : 0.02;
-    ellipsoid.material.opacity = (lit ? 0.16 : 0.05) * (inside ? 0.6 : 1);
+    faces.material.opacity = (lit && !inside ? 0.06 : 0.02) * strength;
+    ellipsoid.material.opacity = (lit ? 0.16 : 0.05) * (inside ? 0.6 : 1) * strength;
   }
   drawGhosts(inside);
   cloud.visible = $("points").checked && !inside;
@@ -303,13 +307,17 @@ function draw() {
   placePicture(inside);
 }
 
+const inkOn = (color) => {                       // black or white: the larger contrast (WCAG)
+  const [r, g, b] = color.map((v) => ((v / 255 + 0.055) / 1.055) ** 2.4);
+  return 0.2126 * r + 0.7152 * g + 0.0722 * b > 0.179 ? "#000" : "#fff";
+};
 const LABEL_SHIFTS = [-26, -46, 26, 46, -66, 66];  // of changed objects, px: the arrow stays visible
 function drawLabels(cam) {                       // nearer labels win where two would overlap
   const taken = [];
   const first = (o) => 8 * (o === state.selected || o === state.ghost)
     + (o.kind || markOf(o) ? RANK.length - rankOf(o) : 0);
   const placed = [...shown(), ...absentHere()].map((o) => [o, project(o.at, cam)])
-    .filter(([, at]) => at).sort(([a, p], [b, q]) => first(b) - first(a) || p[2] - q[2]);
+    .filter(([o, at]) => at && (isFound(o) || first(o) >= 8)).sort(([a, p], [b, q]) => first(b) - first(a) || p[2] - q[2]);
   $("labels").replaceChildren();
   for (const [o, [x, y]] of $("names").checked ? placed : []) {
     if (cam === seat && !o.kind && !o.then && o !== state.selected && !seenAt(o, state.step)) continue;
@@ -321,7 +329,8 @@ function drawLabels(cam) {                       // nearer labels win where two 
     taken.push([x, at, w]);
     const chosen = o === state.selected || o === state.ghost ? "selected" : "";
     $("labels").append(el("span", { className: [chosen, mark && (o.kind || changeOf(o).kind)].join(" ").trim(),
-      style: `transform: translate(${x}px, ${at}px) translate(-50%, -50%)` }, text));
+      style: `transform: translate(${x}px, ${at}px) translate(-50%, -50%); ${o.kind ? "" : `background: ${rgb(o)}; `
+        + `color: ${inkOn(o.color)}`}` }, text));
   }
 }
 
