@@ -768,8 +768,8 @@ def test_menus_and_targets_fit_a_phone(browser: Browser, page: Path) -> None:
     browser.open(page, 390, 844, phone=True)
     browser.eval("goTo(3); $('show').open = true; $('classes').open = true")
     targets = """[...document.querySelectorAll('button, select, summary, label, ' +
-        'input[type=range], input[type=search], input[type=text], .crops figure')].filter(e => e.offsetParent)
-        .map(e => [e.id || e.textContent, ...(r => [r.left, r.right, r.width, r.height])
+        'input[type=range], input[type=search], input[type=text], .crops figure')]
+        .filter(e => e.offsetParent).map(e => [e.id || e.textContent, ...(r => [r.left, r.right, r.width, r.height])
         (e.getBoundingClientRect())])"""
     menu = "(r => [r.top, r.bottom])($('show').querySelector('div').getBoundingClientRect())"
     view = "(r => [r.top, r.bottom])($('view').getBoundingClientRect())"
