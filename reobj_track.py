@@ -270,6 +270,9 @@ class OutputConfig:
         "layers of the overlay video besides boxes: solids, ellipses, trails; none: no video",
     )
     scene: bool = option(True, "write the viewer, scene.html")
+    cloud: bool = option(
+        False, "dense coloured points in the viewer, from optical flow; about a minute longer"
+    )
     doubtful: bool = option(
         False, "include low-confidence objects in tracks.txt, overlay video and viewer"
     )
@@ -1818,7 +1821,9 @@ def _write(job: _Job, result: Result) -> Result:
     shown = (output.overlay, output.scene, output.doubtful)
     line = job.progress("write", job.video.expected)
     command = apply_command(workspace.out)
-    failures = write_pictures(result, workspace.out, job.video, *shown, line, command=command)
+    failures = write_pictures(
+        result, workspace.out, job.video, *shown, line, command=command, cloud=output.cloud
+    )
     if failures:
         result = dataclasses.replace(result, warnings=[*result.warnings, *failures])
         result.write_objects(workspace.out / OutputFile.OBJECTS)

@@ -1044,6 +1044,16 @@ def _(lab: Lab) -> None:
         assert (out / "scene.html").exists() == value
 
 
+@shows("output.cloud")
+def _(lab: Lab) -> None:
+    """Dense points: tests/test_cloud.py checks that the viewer has them."""
+    for value in (False, True):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(rt, "write_pictures", shown := Mock(return_value=[]))
+            lab.refit(value)
+        assert shown.call_args[1]["cloud"] == value
+
+
 @shows("output.doubtful")
 def _(lab: Lab) -> None:
     """All are below a confidence of 1.1: in the file and the viewer; in the overlay on request."""

@@ -27,6 +27,7 @@ from reobj.cameras import Camera, Poses, invert_rigid, place_of, undistort_boxes
 from reobj.files import Progress, atomic, base64_text, read_text, rounded, significant
 from reobj.poses.floor import NOISE
 from reobj.results.changes import EarlierSession
+from reobj.results.cloud import Cloud, DenseFrames
 from reobj.results.entries import Object, World, visit_gap
 from reobj.results.names import recording_name
 from reobj.results.origin import centred
@@ -52,6 +53,9 @@ if TYPE_CHECKING:
     from reobj.results.result import Result
 
 
+PAGE_MAX = 15_000_000  # bytes of a page with dense points
+CLOUD_MAX = 500_000  # dense points
+POINT_BYTES = 16  # of a dense point in the page: 12 as base64
 PAGE_VERSION = 1  # of the page's data: `serve` shows them in the page of this version
 
 
@@ -66,9 +70,12 @@ class Pictures:
         frames: [frame number, base64] of whole frames, undistorted.
         best: frame number of the best box of each object, by identity.
         time_s: of each frame that was read, by its number.
+        dense: frames for dense points; None: without.
     """
 
-    def __init__(self, result: Result, video: Video, max_crops: int = 480) -> None:
+    def __init__(
+        self, result: Result, video: Video, max_crops: int = 480, dense: bool = False
+    ) -> None:
         """Choose the crops, at most 8 of an object and `max_crops` of all, and 60 frames."""
         self.tracks = result.tracks
         self.scale = video.scale
@@ -97,6 +104,9 @@ class Pictures:
         self.camera = None if cameras is None else cameras.camera
         self.grid: npt.NDArray[np.float32] | None = None  # of undistorted pixels, made once
         self.time_s: dict[int, float] = {}
+        self.dense: DenseFrames | None = None
+        if dense and cameras is not None and cameras.known.any():
+            self.dense = DenseFrames(cameras)
 
     def take(self, frame: Frame) -> None:
         """Crop the wanted boxes of this frame, and keep the frame if it is one of `whole`."""
@@ -106,9 +116,14 @@ class Pictures:
             crop = _crop(frame.image, box * self.scale, 112)
             if crop:
                 self.crops[int(obj)].append((frame.index, _base64(crop)))
+        dense = self.dense is not None and frame.index in self.dense.wanted
+        if not dense and frame.index not in self.whole:
+            return
+        image = self._undistorted(shrunk(frame.image, 640))
         if frame.index in self.whole:
-            image = self._undistorted(shrunk(frame.image, 640))
             self.frames.append((frame.index, _base64(_jpeg(image))))
+        if self.dense is not None and dense:
+            self.dense.take(frame.index, image)
 
     def _undistorted(self, image: Image) -> Image:
         """Undistort a small picture, so that projected solids coincide with their objects."""
@@ -333,8 +348,35 @@ def write_scene(
         data["earlier"] = _earlier_sessions(result.earlier)
         for entry in data["objects"]:
             entry["best"] = pictures.best.get(entry["id"])
+    text = _page_of(data, None)
+    if pictures.dense is not None:
+        left = min(CLOUD_MAX, (PAGE_MAX - 1000 * len(origins) - len(text.encode())) // POINT_BYTES)
+        for k, origin in enumerate(origins):
+            cloud = pictures.dense.cloud(k)
+            if cloud is not None and left > 0:
+                data["parts"][k]["dense"] = _dense_points(cloud, origin, left)
+                left -= data["parts"][k]["dense"]["count"]
+        text = _page_of(data, None)
+        if not any("dense" in part for part in data["parts"]):
+            log.warning("no dense points: too few frames have a good baseline to others")
     with atomic(path) as part:
-        part.write_text(_page_of(data, None), encoding="utf-8")
+        part.write_text(text, encoding="utf-8")
+
+
+def _dense_points(cloud: Cloud, origin: Array, most: int) -> dict[str, Any]:
+    """Return dense points for the page, at most `most`: the most observed ones.
+
+    Positions are 16-bit integers from `low` in steps of `step` world units, then colours are three
+    bytes, then directions towards the cameras three signed bytes.
+    """
+    chosen = cloud.of_rows(np.arange(min(most, len(cloud))))
+    xyz = chosen.xyz - origin
+    low = xyz.min(0)
+    step = max(float(np.ptp(xyz, axis=0).max()) / 65535, np.finfo(float).tiny)
+    data = ((xyz - low) / step).round().clip(0, 65535).astype("<u2").tobytes()
+    data += chosen.rgb.tobytes() + (chosen.seen_from * 127).round().astype(np.int8).tobytes()
+    facts = {"count": len(chosen), "low": low.tolist(), "step": step, "voxel": chosen.voxel}
+    return facts | {"data": _base64(data)}
 
 
 def _page_of(data: dict[str, Any], served: dict[str, Any] | None) -> str:
@@ -557,6 +599,7 @@ def write_pictures(
     doubtful: bool = False,
     progress: Progress | None = None,
     command: str = "",
+    cloud: bool = False,
 ) -> list[str]:
     """Write the overlay video and scene.html in one pass over the video.
 
@@ -569,6 +612,7 @@ def write_pictures(
             contains them, show them initially.
         progress: the line of the stage, whose steps are the frames.
         command: fits the objects again; the viewer shows it with the file of corrections.
+        cloud: dense points in the viewer.
     Returns:
         messages about files that could not be written, with the option to omit them. With the
         environment variable REOBJ_RAISE, as in our tests, bugs are raised instead.
@@ -585,7 +629,7 @@ def write_pictures(
                 film = Overlay(shown, out / "overlay.mp4", video, overlay)
         if scene:
             with faults.of("scene"):
-                pictures = Pictures(result, video)
+                pictures = Pictures(result, video, dense=cloud and visible)
         found = (("overlay", film), ("scene", pictures))
         sinks = [(name, sink) for name, sink in found if sink and visible]
         try:

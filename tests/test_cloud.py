@@ -1,0 +1,167 @@
+"""Dense points of the viewer: flow between frames of known cameras, triangulated."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import json
+import logging
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from simulated import fitted
+
+import reobj.results.scene as scene
+import reobj_track as rt
+from reobj.results.cloud import Cloud, DenseFrames
+from reobj.results.scene import Pictures, write_pictures, write_scene
+
+WIDTH, HEIGHT, FOCAL, FRAMES = 320, 240, 250.0, 8
+DEPTH = 3.0  # of a wall, whose texture has 100 pixels a metre
+
+
+def wall() -> np.ndarray:
+    """The texture of the wall z = 3, from (-4, -4): left half reddish, right half bluish."""
+    rng = np.random.default_rng(0)
+    image = cv2.GaussianBlur(rng.uniform(0, 255, (800, 800, 3)), (0, 0), 2)
+    image = 60 + (image - image.mean()) * 5
+    image[:, :400, 2] += 90
+    image[:, 400:, 0] += 90
+    return image.clip(0, 255).astype(np.uint8)
+
+
+def poses_along_the_wall() -> rt.Poses:
+    """Cameras that look at the wall and walk along it, 8 cm a frame."""
+    cam_from_world = np.tile(np.eye(3, 4), (FRAMES, 1, 1))
+    cam_from_world[:, 0, 3] = -0.08 * (np.arange(FRAMES) - FRAMES / 2)
+    rng = np.random.default_rng(1)
+    points = np.column_stack([rng.uniform(-2, 2, (400, 2)), np.full(400, DEPTH)])
+    return rt.Poses(
+        camera=rt.Camera("PINHOLE", WIDTH, HEIGHT, (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)),
+        frame=np.arange(FRAMES),
+        time_s=np.arange(FRAMES) / 25,
+        cam_from_world=cam_from_world,
+        status=np.full(FRAMES, "supplied"),
+        source="user",
+        metric=True,
+        up_in_world=np.array([0, -1.0, 0]),
+        points=points,
+        colors=np.zeros((400, 3), np.uint8),
+    )
+
+
+def frames_of(poses: rt.Poses) -> list[np.ndarray]:
+    """The wall in each camera."""
+    plane = np.array([[0.01, 0, -4], [0, 0.01, -4], [0, 0, DEPTH], [0, 0, 1]])  # of its pixels
+    texture, frames = wall(), []
+    for pose in poses.cam_from_world:
+        img_from_wall = poses.camera.K @ pose @ plane
+        frames.append(cv2.warpPerspective(texture, img_from_wall, (WIDTH, HEIGHT)))
+    return frames
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of the frames."""
+    top = tmp_path_factory.mktemp("wall")
+    for i, image in enumerate(frames_of(poses_along_the_wall())):
+        cv2.imwrite(str(top / f"{i}.png"), image)
+    return top
+
+
+def result_of(poses: rt.Poses) -> rt.Result:
+    """A result with these cameras; its object does not matter."""
+    n = np.arange(FRAMES)
+    box = np.tile([100.0, 100, 150, 150], (FRAMES, 1))
+    tracks = rt.Tracks(n, n * 0 + 1, n * 0 + 1, box, n * 0 + 0.9, n * 0, n)
+    return dataclasses.replace(fitted(tracks, None, names=("chair",)), poses=poses)
+
+
+def test_points_lie_on_the_wall_in_its_colours() -> None:
+    poses = poses_along_the_wall()
+    frames = DenseFrames(poses)
+    for number, image in enumerate(frames_of(poses)):
+        if number in frames.wanted:
+            frames.take(number, image)
+    cloud = frames.cloud(0)
+    assert cloud is not None and len(cloud) > 20_000
+    assert np.percentile(np.abs(cloud.xyz[:, 2] - DEPTH), 95) < 0.03
+    np.testing.assert_allclose(np.linalg.norm(cloud.seen_from, axis=1), 1, atol=1e-4)
+    assert (cloud.seen_from[:, 2] < -0.7).all()  # towards the cameras
+    at = np.round((cloud.xyz[:, :2] + 4) * 100 - 0.5).astype(int)
+    true = cv2.GaussianBlur(wall(), (0, 0), 1)[at[:, 1], at[:, 0], ::-1].astype(float)
+    assert np.abs(cloud.rgb - true).mean() < 15
+    gap = np.abs(cloud.xyz - cloud.xyz.mean(0))
+    assert (gap < 4 * np.percentile(gap, 90)).all()
+
+
+def test_unrelated_frames_give_no_points() -> None:
+    poses = poses_along_the_wall()
+    frames = DenseFrames(poses)
+    rng = np.random.default_rng(2)
+    for number in frames.wanted:
+        noise = rng.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
+        frames.take(number, cv2.GaussianBlur(noise, (0, 0), 3))
+    cloud = frames.cloud(0)
+    assert cloud is None or len(cloud) < 500
+
+
+def test_the_page_has_the_points(folder: Path, tmp_path: Path) -> None:
+    poses = poses_along_the_wall()
+    result, video = result_of(poses), rt.Video(folder)
+    for cloud in (False, True):
+        out = tmp_path / str(cloud)
+        out.mkdir()
+        assert write_pictures(result, out, video, overlay="none", cloud=cloud) == []
+    text = [(tmp_path / name / "scene.html").read_text() for name in ("False", "True")]
+    parts = [json.loads(t.split('id="data">')[1].split("</script>")[0])["parts"] for t in text]
+    assert "dense" not in parts[0][0]
+    dense = parts[1][0]["dense"]
+    data, n = base64.b64decode(dense["data"]), dense["count"]
+    assert len(data) == 12 * n > 200_000
+    place = np.frombuffer(data[: 6 * n], "<u2").reshape(-1, 3) * dense["step"] + dense["low"]
+    place += parts[1][0]["origin"]
+    assert np.percentile(np.abs(place[:, 2] - DEPTH), 95) < 0.03
+    rgb = np.frombuffer(data[6 * n : 9 * n], np.uint8).reshape(-1, 3).astype(int)
+    left = place[:, 0] < 0
+    assert rgb[left, 0].mean() > rgb[left, 2].mean() + 40  # red
+    assert rgb[~left, 2].mean() > rgb[~left, 0].mean() + 40
+    assert (np.frombuffer(data[9 * n :], np.int8).reshape(-1, 3)[:, 2] < -80).all()
+
+
+def test_points_leave_the_page_below_its_limit(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The most observed points remain."""
+    result, video = result_of(poses_along_the_wall()), rt.Video(folder)
+    pictures = Pictures(result, video, dense=True)
+    for frame in video:
+        pictures.take(frame)
+    monkeypatch.setattr(scene, "PAGE_MAX", 1_000_000)
+    write_scene(result, pictures, tmp_path / "scene.html", video)
+    assert 900_000 < (tmp_path / "scene.html").stat().st_size <= 1_000_000
+
+
+def test_without_a_baseline_there_is_a_message(
+    folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    poses = poses_along_the_wall()
+    still = dataclasses.replace(poses, cam_from_world=np.tile(np.eye(3, 4), (FRAMES, 1, 1)))
+    with caplog.at_level(logging.WARNING):
+        write_pictures(result_of(still), tmp_path, rt.Video(folder), overlay="none", cloud=True)
+    assert "no dense points" in caplog.text
+    assert '"dense":{' not in (tmp_path / "scene.html").read_text()
+
+
+def test_points_are_quantised_within_their_step() -> None:
+    rng = np.random.default_rng(3)
+    xyz = rng.uniform(-3, 5, (50, 3))
+    towards = np.tile([0, 0, 1.0], (50, 1))
+    cloud = Cloud(xyz, rng.integers(0, 255, (50, 3)).astype(np.uint8), towards, 0.01)
+    dense = scene._dense_points(cloud, np.array([1.0, 2, 3]), 40)
+    data = base64.b64decode(dense["data"])
+    found = np.frombuffer(data[: 6 * 40], "<u2").reshape(-1, 3) * dense["step"] + dense["low"]
+    np.testing.assert_allclose(found, xyz[:40] - [1, 2, 3], atol=dense["step"])
+    assert dense["step"] < 8 / 60_000
