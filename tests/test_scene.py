@@ -28,6 +28,7 @@ import reobj_track as rt
 from reobj.cameras import invert_rigid
 from reobj.files import Progress, decimals
 from reobj.results.changes import Change, Changes, EarlierSession, Shape
+from reobj.results.cloud import Cloud
 from reobj.results.result import VideoInfo
 from reobj.results.scene import (
     Pictures,
@@ -727,6 +728,158 @@ def test_a_double_click_rotates_around_the_object(browser: Browser, page: Path) 
         np.testing.assert_allclose(target, browser.eval("state.selected.at"), atol=1e-9)
 
 
+def test_an_object_is_hidden_or_shown_alone(browser: Browser, page: Path) -> None:
+    browser.open(page)
+    button = "[...document.querySelectorAll('#panel button')].find(b => b.textContent === '{}')"
+    state = "(draw(), [here.map(o => o.row.hidden), solid.map(o => o.group.visible)])"
+    browser.eval(f"select(here[1]); {button.format('Hide')}.click()")
+    hidden = [[False, True, False, False], [True, False, True]]
+    assert browser.eval(state) == hidden and browser.eval("state.selected") is None
+    assert browser.eval("$('some').innerText") == "1 hidden object: show all"
+    browser.eval(f"select(here[2]); {button.format('Show only this')}.click()")
+    assert browser.eval(state) == [[True, True, False, True], [False, False, True]]
+    assert browser.eval("$('some').innerText") == "only suitcase 3 is shown: show all"
+    browser.eval("$('show-all').click()")
+    assert browser.eval(state) == [[False] * 4, [True] * 3]
+    assert browser.eval("$('some').hidden") is True and complaints(browser) == []
+
+
+def test_a_link_leads_to_the_view_and_the_object(browser: Browser, page: Path) -> None:
+    browser.open(page)
+    browser.drag((700, 300), (760, 320), "left")
+    browser.eval("goTo(7); select(here[1]); $('copy-link').click()")
+    browser.settle()
+    link, view = browser.eval("[location.href, " + VIEW + "]")
+    browser.open("about:blank")
+    browser.open(link)
+    np.testing.assert_allclose(browser.eval(VIEW), view, atol=1e-3)
+    assert browser.eval("[state.selected.id, frameOf(state.step)]") == [2, 7]
+    for bad in ("#eye=1,2&target=3", "#part=9&eye=1,2,3&target=0,0,0", "#eye=a,b,c&target=0,0,0",
+                "#part=0&eye=1,2,3&target=0,0,0&object=77&frame=-5"):  # fmt: skip
+        browser.open("about:blank")
+        browser.open(link.split("#")[0] + bad)
+        assert browser.eval("[state.selected, state.step]") == [None, -1]
+    assert browser.eval("orbit.position.toArray()") == pytest.approx([1, 2, 3])
+    assert complaints(browser) == []
+
+
+def test_a_picture_of_the_view_is_saved(browser: Browser, page: Path, tmp_path: Path) -> None:
+    """It has the pixels of the 3D view, its labels and the paper's colour."""
+    browser.open(page)
+    browser.send("Page.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
+    browser.eval("$('save-picture').click()")
+    file = tmp_path / "a.png"
+    for _ in range(100):
+        if file.exists() and (image := cv2.imread(str(file))) is not None:
+            break
+        time.sleep(0.05)
+    width, height = browser.eval("[$('view').clientWidth, $('view').clientHeight]")
+    assert image.shape[:2] == (height, width)
+    x, y = browser.eval("project(solid[2].at).slice(0, 2)")
+    label = image[int(y) - 8 : int(y) + 9, int(x) - 25 : int(x) + 26].reshape(-1, 3)
+    assert (np.abs(label.astype(int) - object_color(3)).max(1) < 3).mean() > 0.3
+    paper = [int(c) for c in browser.eval("css('--paper').match(/[0-9a-f]{2}/g).map(h => "
+                                          "parseInt(h, 16))")][::-1]  # fmt: skip
+    assert image[3, 3].tolist() == paper
+    shown = cv2.imdecode(
+        np.frombuffer(base64.b64decode(browser.send("Page.captureScreenshot")["data"]), np.uint8),
+        cv2.IMREAD_COLOR,
+    )
+    left, top = browser.eval("(r => [r.left, r.top])($('view').getBoundingClientRect())")
+    same = shown[int(top) : int(top) + height, int(left) : int(left) + width].astype(int)
+    assert (np.abs(same - image).max(-1)[60:] < 12).mean() > 0.97
+    assert complaints(browser) == []
+
+
+def test_units_can_be_switched(browser: Browser, page: Path) -> None:
+    """In the list, the panel, the scale bar and measured distances; by the sigma's decimals."""
+    browser.open(page)
+    browser.eval("select(here[0])")
+    (obj, *_) = data_of(page)["objects"]
+    browser.eval("""state.measured = [0, 2].map(i => ({ at: solid[i].at, object: solid[i] }));
+        redraw()""")
+    metres = browser.eval("distanceOf(state.measured)[0]")
+    for unit, per_metre in (("cm", 100), ("ft", 3.28084), ("m", 1)):
+        browser.eval(f"$('unit').value = '{unit}'; $('unit').onchange(); draw()")
+        size = np.array(obj["size_m"]) * per_metre
+        sigma = size * obj["size_rel_sigma"]
+        digits = decimals(sigma.min())
+        sides = [
+            f"{s:.{digits}f} ± {e:.{digits}f} {unit}" for s, e in zip(size, sigma, strict=True)
+        ]
+        text = browser.eval("$('panel').innerText")
+        assert all(side in text for side in sides)
+        row = browser.eval("here[0].row.innerText")
+        assert " \u00d7 ".join(f"{s:.{digits}f}" for s in size) + f" {unit}" in row
+        measured = browser.eval("document.querySelector('.measure text').textContent")
+        assert measured.endswith(f" {unit}")
+        assert float(measured.split()[0]) == pytest.approx(metres * per_metre, rel=0.05)
+        long, width = browser.eval("[$('bar').innerText, $('bar').querySelector('i').offsetWidth]")
+        reach = browser.eval("""orbit.position.distanceTo(controls.target)
+            * 2 * Math.tan(orbit.fov / 360 * Math.PI) / canvas.clientHeight""")
+        assert long.endswith(f" {unit}")
+        assert float(long.split()[0]) == pytest.approx(width * reach * per_metre, rel=0.03)
+    assert browser.eval("state.selected.id") == 1 and complaints(browser) == []
+
+
+def test_the_top_view_is_aligned_with_the_walls(
+    browser: Browser, page: Path, tmp_path: Path
+) -> None:
+    """Points of four walls, turned by 31 degrees."""
+    rng = np.random.default_rng(4)
+    along, across = rng.uniform(-3, 3, 2000), np.where(rng.random(2000) < 0.5, -2.0, 2.0)
+    first = rng.random(2000) < 0.6
+    xy = np.stack([np.where(first, along, 1.5 * across), np.where(first, across, along * 2 / 3)], 1)
+    angle = np.radians(31)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    xy = xy @ turn.T + rng.normal(scale=0.02, size=(2000, 2))
+    points = np.column_stack([xy, rng.uniform(0, 2.5, 2000)])
+    data = data_of(page)
+    data["parts"][0]["points"] = base64.b64encode(points.astype("<f4").tobytes()).decode()
+    data["parts"][0]["colors"] = base64.b64encode(bytes(6000)).decode()
+    (tmp_path / "a.html").write_text(scene._page_of(data, None))
+    browser.open(tmp_path / "a.html")
+    browser.press("1")
+    ends = [[0.0, 0.0, 1.0], [*turn[:, 0].tolist(), 1.0]]  # along a wall
+    a, b = (browser.eval(f"project(level.place({end})).slice(0, 2)") for end in ends)
+    off = np.degrees(np.arctan2(b[1] - a[1], b[0] - a[0])) % 90
+    assert min(off, 90 - off) < 1.5 and complaints(browser) == []
+
+
+def test_dense_points_are_drawn_from_their_front(
+    browser: Browser, page: Path, tmp_path: Path
+) -> None:
+    """A red wall that was seen from one side: it is visible from there only."""
+    x, z = (a.ravel() for a in np.meshgrid(np.linspace(-1.5, 1.5, 200), np.linspace(0, 2, 200)))
+    xyz = np.column_stack([x, np.full_like(x, 1.0), z])
+    rgb = np.tile(np.array([[220, 20, 20]], np.uint8), (len(x), 1))
+    wall = Cloud(xyz, rgb, np.tile([0, -1.0, 0], (len(x), 1)), 0.015)
+    data = data_of(page)
+    data["parts"][0]["dense"] = scene._dense_points(wall, np.zeros(3), 10**6)
+    (tmp_path / "a.html").write_text(scene._page_of(data, None))
+    browser.open(tmp_path / "a.html")
+    browser.eval("$('names').click(); $('solids').click(); $('ellipsoids').click()")
+
+    def red() -> float:
+        browser.settle()
+        jpeg = base64.b64decode(browser.send("Page.captureScreenshot")["data"])
+        image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+        return float((np.abs(image.astype(int) - [20, 20, 220]).max(-1) < 12).mean())
+
+    browser.eval("state.hidden = new Set(here.map(o => o.class)); VIEWS.front()")
+    look = "(b => {{ lookFrom(level.turn([0, {}, 0.3].map(v => v / Math.hypot(1, 0.3)))); }})()"
+    browser.eval(look.format(-1))
+    front = red()
+    browser.eval(look.format(1))
+    behind = red()
+    assert front > 0.03 and behind < 0.001
+    browser.eval(look.format(-1))
+    browser.eval("$('dense').click()")
+    assert red() < 0.001 and browser.eval("$('dense-label').hidden") is False
+    browser.open(page)
+    assert browser.eval("$('dense-label').hidden") is True and complaints(browser) == []
+
+
 def test_mouse_turns_zooms_and_pans(browser: Browser, page: Path) -> None:
     browser.open(page)
     start = browser.eval(VIEW)
@@ -769,8 +922,8 @@ def test_menus_and_targets_fit_a_phone(browser: Browser, page: Path) -> None:
     browser.eval("goTo(3); $('show').open = true; $('classes').open = true")
     targets = """[...document.querySelectorAll('button, select, summary, label, ' +
         'input[type=range], input[type=search], input[type=text], .crops figure')]
-        .filter(e => e.offsetParent).map(e => [e.id || e.textContent, ...(r => [r.left, r.right, r.width, r.height])
-        (e.getBoundingClientRect())])"""
+        .filter(e => e.offsetParent).map(e => [e.id || e.textContent,
+        ...(r => [r.left, r.right, r.width, r.height])(e.getBoundingClientRect())])"""
     menu = "(r => [r.top, r.bottom])($('show').querySelector('div').getBoundingClientRect())"
     view = "(r => [r.top, r.bottom])($('view').getBoundingClientRect())"
     (top, bottom), (first, last) = browser.eval(menu), browser.eval(view)

@@ -10,7 +10,7 @@ let ghosts = [];                                 // former places in the part: o
 const changeOf = (o) => CHANGES.get((o.ids || [o.id]).find((id) => CHANGES.has(id)));
 const rankOf = (o) => changeOf(o) ? RANK.indexOf(changeOf(o).kind) : RANK.length;
 const kindText = (c) => c ? c.kind.replace("_", " ") + (c.kind === "moved" && c.distance_m !== null
-  ? ` ${c.distance_m.toFixed(2)} m` : "") : "";
+  ? ` ${length(c.distance_m, true)}` : "") : "";
 const markOf = (o) => $("changes").checked && ["moved", "new"].includes(changeOf(o)?.kind)
   ? kindText(changeOf(o)) : "";
 const hiddenByKind = (c) => $("changes").checked && state.hiddenKinds.has(c?.kind);
@@ -21,7 +21,7 @@ const kindTag = (o) => $("changes").checked && changeOf(o) && changeOf(o).kind !
 function changeFacts(c) {                        // rows of the panel
   if (!c) return [];
   const text = c.kind === "moved" && c.distance_m !== null && c.sigma_m
-    ? `moved ${withSigma(c.distance_m, c.sigma_m, "m")}` : kindText(c);
+    ? `moved ${lengthWithSigma(c.distance_m, c.sigma_m, true)}` : kindText(c);
   return [[state.session ? "change" : "since the map", text], ...(c.evidence ? [["evidence", c.evidence]] : []),
     ...(c.candidates.length ? [["may also be", c.candidates.join(", ")]] : [])];
 }

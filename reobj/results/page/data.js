@@ -47,12 +47,24 @@ const withSigma = (value, sigma, unitName) => {
   const digits = decimals(sigma);
   return `${value.toFixed(digits)} ± ${sigma.toFixed(digits)} ${unitName}`;
 };
+const UNITS = { m: [1, 2], cm: [100, 0], ft: [3.28084, 1] };   // per metre, decimals without a sigma
+const unitOf = (metric) => metric ? state.unit : "units";
+const perUnit = (metric) => metric ? UNITS[state.unit][0] : 1;
+const length = (value, metric) => `${(value * perUnit(metric)).toFixed(metric ? UNITS[state.unit][1] : 2)} ${unitOf(metric)}`;
+const lengthWithSigma = (value, sigma, metric) =>
+  withSigma(value * perUnit(metric), sigma * perUnit(metric), unitOf(metric));
+function sidesOf(o) {                            // texts: value and, where known, sigma
+  if (!o.size_m || state.unit === "m") return o.sides;
+  const size = o.size_m.map((x) => x * perUnit(true)), sigma = o.size_rel_sigma?.map((s, i) => s * size[i]);
+  const digits = sigma && decimals(Math.min(...sigma));
+  return size.map((x, i) => sigma ? [x.toFixed(digits), sigma[i].toFixed(digits)] : [`${+x.toPrecision(3)}`]);
+}
 const sizeText = (o) => o.sides.length
-  ? `${o.sides.map(([side]) => side).join(" × ")} ${o.size_m ? "m" : "units"}` : "";
+  ? `${sidesOf(o).map(([side]) => side).join(" × ")} ${unitOf(o.size_m)}` : "";
 
 // ---- The selected component in its level frame: z up, 0 on the floor, metres if known ----
 const state = { part: -1, step: -1, seat: -1, asked: null, sought: null, session: null, selected: null, ghost: null, hidden: new Set(),
-  hiddenKinds: new Set(["not_seen"]), measured: [] };
+  hiddenKinds: new Set(["not_seen"]), measured: [], unit: "m", hiddenIds: new Set(), only: null };
 let objects = S.objects;                         // as the edits have them
 let here, solid, steps, cams, posed, level;      // of the part: objects, with a solid, steps, cameras
 
@@ -87,6 +99,7 @@ function pointsOf(part) {                        // level positions, colours
 const seenAt = (o, step) => o.seen.some((s, i) => i % 2 === 0 && s <= step
   && step <= o.seen[i + 1]);
 const counted = (o) => o.status !== "doubtful" && o.status !== "implausible";  // as in entries.py
-const allowed = (o) => !state.hidden.has(o.class) && !hiddenByKind(changeOf(o))
+const allowed = (o) => !state.hiddenIds.has(o.id) && (state.only === null || state.only === o.id)
+  && !state.hidden.has(o.class) && !hiddenByKind(changeOf(o))
   && ($("doubtful").checked || o.status !== "doubtful");
 const shown = () => solid.filter(allowed);

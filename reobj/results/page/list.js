@@ -43,6 +43,23 @@ function filterList() {
     || [...$("rows").children].some((row) => !row.hidden);
 }
 
+function showOnly(hide, only) {                  // ids that are hidden, or the only one that is shown
+  Object.assign(state, { hiddenIds: new Set(hide), only });
+  const count = state.hiddenIds.size, o = here.find(({ id }) => id === only);
+  $("some").hidden = !count && only === null;
+  $("some").querySelector("span").textContent = o ? `only ${nameOf(o)} is shown:`
+    : `${count} hidden object${count > 1 ? "s" : ""}:`;
+  filterList();
+  redraw();
+}
+const viewButtons = (o) => el("div", { className: "act" },
+  el("button", { title: "hide it in the list and in 3D", onclick: () => {
+    select(o);
+    showOnly([...state.hiddenIds, o.id], null);
+  } }, "Hide"), el("button", { onclick: () => showOnly([], state.only === o.id ? null : o.id) },
+    "Show only this"));
+$("show-all").onclick = () => showOnly([], null);
+
 function showClasses(names, on) {
   names.forEach((name) => state.hidden[on ? "delete" : "add"](name));
   fillList();
@@ -98,11 +115,11 @@ function evidence(link) {
 }
 
 function facts(o) {
-  const { scale } = S.parts[o.part], unitName = o.size_m ? "m" : "units";
+  const { scale } = S.parts[o.part], unitName = unitOf(o.size_m), sides = sidesOf(o);
   const rows = o.then ? [["recording", `${o.then.name}, ${dateOf(o.then)} UTC`], ["now", nowOf(o)]]
     : [["status", o.status.replace("_", " ") + (o.reason ? `: ${o.reason}` : "")]];
   ["width", "depth", "height"].forEach((name, i) => { if (o.sides.length) rows.push(
-    [name, `${o.sides[i].join(" ± ")} ${unitName}`
+    [name, `${sides[i].join(" ± ")} ${unitName}`
       + (o.size_rel_sigma ? ` (${percent(o.size_rel_sigma[i])})` : "")]); });
   if (o.sides.length) rows.push(
     ["scale", scale && scale.source !== "none" ? `from ${scale.source.replace("_", " ")}, ± `
@@ -143,6 +160,7 @@ function select(o) {
     el("h2", {}, el("i"), nameOf(o)), ...(o.then ? [] : [bar(o)]), ...beforeAfter(o.id, o),
     el("div", { className: "crops" }, ...o.crops.map(crop)),
     el("dl", {}, ...facts(o).flatMap(([k, v]) => [el("dt", {}, k), el("dd", {}, v)])),
+    ...(o.center ? [viewButtons(o)] : []),
     ...(o.then ? [] : [...editButtons(o), ...visitRows(o)]),
     ...(links.length ? [el("h3", {}, "Merges and splits"),
       el("ul", {}, ...links.map((l) => el("li", {}, evidence(l))))] : []));

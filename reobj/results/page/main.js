@@ -30,7 +30,10 @@ function enter(part) {                           // show one part of the cameras
   $("clock").textContent = "";
   $("frame").hidden = true;
   $("list").style.removeProperty("--now");
+  $("unit-label").hidden = !level.metres;
+  $("dense-label").hidden = !S.parts[part].dense;
   fillList();
+  showOnly([], null);
   if (renderer) { fillScene(); VIEWS.reset(); }
 }
 
@@ -87,7 +90,14 @@ $("slider").oninput = () => goTo(steps[+$("slider").value]);
 $("part").onchange = () => enter(+$("part").value);
 $("search").oninput = () => { filterList(); redraw(); };
 $("sort").onchange = fillList;
-for (const id of ["solids", "ellipsoids", "names", "points", "cameras", "grid", "boxes"]) {
+$("unit").onchange = () => {
+  state.unit = $("unit").value;
+  fillList();
+  const o = state.selected;
+  if (o) { select(o); select(o); }
+  redraw();
+};
+for (const id of ["solids", "ellipsoids", "names", "points", "dense", "cameras", "grid", "boxes"]) {
   $(id).onchange = redraw;
 }
 $("doubtful").onchange = () => {
@@ -148,6 +158,7 @@ $("part").hidden = S.parts.length < 2;
 startChanges();
 startSessions();
 $("doubtful").checked = S.doubtful;
+$("points").checked = !S.parts.some((part) => part.dense);   // the same surfaces
 $("doubtful-label").hidden = !S.objects.some((o) => o.status === "doubtful");
 objects = S.objects.map((o) => ({ ...o, ids: [o.id], sources: [o.id] }));
 if (S.why_flat || !prepare()) {
@@ -159,4 +170,5 @@ for (const id of ["follow", "ride", "measure"]) press(id, false);
 markPlay(false);
 enlarge(false);
 enter(0);
+openFragment();
 if (job.running) watchJob(); else fillEdits();

@@ -77,7 +77,7 @@ function drawMeasure(cam) {
     const [[x1, y1], [x2, y2]] = ends;
     group.append(svg("line", { class: "rule", x1, y1, x2, y2 }),
       svg("text", { x: (x1 + x2) / 2, y: (y1 + y2) / 2 - 8 },
-        withSigma(...distanceOf(state.measured), level.unit)));
+        lengthWithSigma(...distanceOf(state.measured), level.metres)));
   }
   group.append(...ends.map(([cx, cy]) => svg("circle", { class: "tip", cx, cy, r: 4 })));
   $("drawn").append(group);

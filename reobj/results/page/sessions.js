@@ -34,7 +34,7 @@ function nowOf(o) {                              // what this recording says of 
   const found = objects.find((x) => x.ids.includes(o.id)), { kind } = SINCE.get(o.id) || {};
   if (!found?.center || found.part !== state.part) return kind ? kind.replace("_", " ") : "not found";
   const way = add(found.center, o.center, -1), d = Math.hypot(...way) * level.size;
-  return `${d.toFixed(2)} ${level.unit} from here`;
+  return `${length(d, level.metres)} from here`;
 }
 
 // ---- Pictures of the map: of an object of another recording; before and after a change ----

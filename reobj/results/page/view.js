@@ -6,7 +6,7 @@ scene.add(root);
 const orbit = new THREE.PerspectiveCamera(50, 1, 0.01, 1000), seat = new THREE.PerspectiveCamera();
 seat.matrixAutoUpdate = false;
 orbit.up.set(0, 0, 1);
-let controls, room, cloud, wires, former, travel, now, floorGrid;
+let controls, room, cloud, dense, wires, former, travel, now, floorGrid;
 const dark = matchMedia("(prefers-color-scheme: dark)");
 const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
@@ -98,12 +98,36 @@ function cloudOf({ at, color }) {                // round points, about 2.5 pixe
     vertexShader: `attribute vec3 tint; uniform float size, reach, pixels; varying vec3 shade;
       void main() { shade = tint; gl_Position = projectionMatrix * modelViewMatrix
         * vec4(position, 1.);
-        gl_PointSize = pixels * clamp(size * reach / gl_Position.w, 1.6, 4.5); }`,
+        gl_PointSize = pixels * clamp(size * reach / gl_Position.w, .7 * size, 1.9 * size); }`,
     fragmentShader: `varying vec3 shade; void main() {
       if (length(gl_PointCoord - .5) > .5) discard; gl_FragColor = vec4(shade, 1.); }`,
   });
   const made = new THREE.Points(geometry, material);
   made.frustumCulled = false;
+  return made;
+}
+
+function denseOf({ count, low, step, voxel, data }) {   // points that are hidden from behind
+  const geometry = new THREE.BufferGeometry(), all = bytes(data);
+  const column = (Type, from, normalized) => new THREE.BufferAttribute(
+    new Type(all.buffer, from, 3 * count), 3, normalized);
+  geometry.setAttribute("position", column(Uint16Array, 0, false));
+  geometry.setAttribute("tint", column(Uint8Array, 6 * count, true));
+  geometry.setAttribute("seen", column(Int8Array, 9 * count, true));
+  const material = new THREE.ShaderMaterial({
+    uniforms: { size: { value: 1.5 * voxel * level.size }, focal: { value: 1 }, pixels: { value: 1 } },
+    vertexShader: `attribute vec3 tint, seen; uniform float size, focal, pixels; varying vec3 shade;
+      void main() { shade = tint; vec4 at = modelMatrix * vec4(position, 1.);
+        vec3 from = mat3(modelMatrix) * seen;
+        gl_Position = dot(from, cameraPosition - at.xyz) < 0. ? vec4(2., 2., 2., 1.)
+          : projectionMatrix * viewMatrix * at;
+        gl_PointSize = pixels * clamp(size * focal / gl_Position.w, 1.2, 14.); }`,
+    fragmentShader: `varying vec3 shade; void main() { gl_FragColor = vec4(shade, 1.); }`,
+  });
+  const made = new THREE.Points(geometry, material), size = step * level.size;
+  const at = level.place(low);
+  made.matrixAutoUpdate = made.frustumCulled = false;
+  made.matrix.set(...[0, 1, 2].flatMap((i) => [...times(level.rows[i], size), at[i]]), 0, 0, 0, 1);
   return made;
 }
 
@@ -166,10 +190,13 @@ function fillScene() {                           // everything of the part
   clear(root);
   const points = pointsOf(state.part);
   room = extent(points.at);
+  room.walls = alongWalls(points.at);
   cloud = cloudOf(points);
   [wires, former, travel, now] = [1, 2, 3, 4].map(() => new THREE.Group());
   floorGrid = gridOf();
   root.add(floorGrid, cloud, travel, now, wires, former);
+  dense = S.parts[state.part].dense ? denseOf(S.parts[state.part].dense) : null;
+  if (dense) root.add(dense);
   const ends = [], color = css("--path");
   cams.forEach((c, i) => { if (c && cams[i + 1]) ends.push(...c.at, ...cams[i + 1].at); });
   if (ends.length) travel.add(lines(ends, color, 2, 0.9));
@@ -184,6 +211,23 @@ function heading() {                             // level direction in which the
   const flat = [sum[0], sum[1], 0];
   if (Math.hypot(...flat) > 0.2 * posed.length) return unit(flat);
   return room.high[0] - room.low[0] > room.high[1] - room.low[1] ? [0, 1, 0] : [1, 0, 0];
+}
+
+function alongWalls(points) {                    // level direction of the walls: the yaw at which the
+  const at = [];                                 // points lie in the fewest bins along both axes (entropy)
+  for (let k = 0; k < points.length; k += 3 * Math.ceil(points.length / 12000)) at.push(points.subarray(k, k + 2));
+  if (at.length < 100) return null;
+  const width = room.radius / 40, entropy = (c, s) => {
+    const bins = new Map();
+    for (const [x, y] of at) { const bin = Math.round((c * x + s * y) / width);
+      bins.set(bin, (bins.get(bin) || 0) + 1); }
+    return [...bins.values()].reduce((sum, n) => sum - n * Math.log(n), 0);
+  };
+  const yaws = [...Array(90).keys()].map((deg) => { const c = Math.cos(deg * Math.PI / 180), s = Math.sin(deg * Math.PI / 180);
+    return [entropy(c, s) + entropy(-s, c), [c, s, 0]]; });
+  const [, axis] = yaws.reduce((a, b) => b[0] < a[0] ? b : a), h = heading();
+  const turned = [axis, [-axis[1], axis[0], 0]].flatMap((v) => [v, times(v, -1)]);
+  return turned.reduce((a, b) => dot(b, h) > dot(a, h) ? b : a);   // as the cameras look
 }
 
 function lookFrom(back) {                        // frame path, points and solids from a direction
@@ -207,9 +251,9 @@ function lookFrom(back) {                        // frame path, points and solid
   redraw();
 }
 
-const fromAbove = (deg) => { const a = deg * Math.PI / 180, h = heading();
+const fromAbove = (deg, h = heading()) => { const a = deg * Math.PI / 180;
   return [-h[0] * Math.cos(a), -h[1] * Math.cos(a), Math.sin(a)]; };
-const VIEWS = { reset: () => lookFrom(fromAbove(38)), top: () => lookFrom(fromAbove(89.9)),
+const VIEWS = { reset: () => lookFrom(fromAbove(38)), top: () => lookFrom(fromAbove(89.9, room.walls || heading())),
   front: () => lookFrom(fromAbove(3)) };
 
 function lookAt(o) {                             // turn about an object, from where one is
@@ -293,6 +337,12 @@ function draw() {
   }
   drawGhosts(inside);
   cloud.visible = $("points").checked && !inside;
+  if (dense) {
+    dense.visible = $("dense").checked && !inside;
+    dense.material.uniforms.pixels.value = devicePixelRatio;
+    dense.material.uniforms.focal.value = h / 2 / Math.tan(orbit.fov / 360 * Math.PI);
+  }
+  cloud.material.uniforms.size.value = Math.max(2.4, Math.min(w, h) / 270);   // of the screen
   cloud.material.uniforms.pixels.value = devicePixelRatio;
   cloud.material.uniforms.reach.value = orbit.position.distanceTo(controls.target);
   travel.visible = $("cameras").checked && !inside;
@@ -337,9 +387,9 @@ function drawLabels(cam) {                       // nearer labels win where two 
 function drawCorner() {                          // scale bar at the turning point; which way is up
   const reach = orbit.position.distanceTo(controls.target);
   const perPixel = 2 * reach * Math.tan(orbit.fov / 360 * Math.PI) / canvas.clientHeight;
-  const length = nice(140 * perPixel), bar = $("bar");
-  bar.querySelector("i").style.width = `${length / perPixel}px`;
-  bar.querySelector("span").textContent = `${+length.toPrecision(1)} ${level.unit}`;
+  const scale = perUnit(level.metres), long = nice(140 * perPixel * scale), bar = $("bar");
+  bar.querySelector("i").style.width = `${long / scale / perPixel}px`;
+  bar.querySelector("span").textContent = `${+long.toPrecision(1)} ${unitOf(level.metres)}`;
   const turned = (v) => { V.set(...v).transformDirection(orbit.matrixWorldInverse);
     return [22 * V.x, -22 * V.y]; };
   $("axes").replaceChildren(...[[[1, 0, 0], ""], [[0, 1, 0], ""], [[0, 0, 1], "up"]]
