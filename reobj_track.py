@@ -131,6 +131,7 @@ from reobj.results.checkpoint import Checkpoint
 from reobj.results.edits import kept_edits, read_edits
 from reobj.results.evaluation import evaluate, score_report
 from reobj.results.export import EXPORTS, Viewer, export
+from reobj.results.live import LivePage, open_viewer
 from reobj.results.names import OutputFile
 from reobj.results.overlay import film_layers
 from reobj.results.plausibility import implausible
@@ -1349,7 +1350,8 @@ def run(
         map: map of the room, in which objects keep their numbers over several recordings; it is
             made if it does not exist. map_frozen: do not change the file. They replace the
             options of config.map.
-        in_3d: False for 2D identities only. show: show progress in rerun's viewer.
+        in_3d: False for 2D identities only. show: show frames and identities live, in rerun's
+            viewer or, where rerun is missing, on a page of this machine.
     Returns:
         Result; if the reconstruction fails, it has a warning and no cameras and ellipsoids. With a
         map, `Result.changes` is what changed in the room.
@@ -1369,7 +1371,7 @@ def run(
         job = _Job(video, workspace, dataclasses.replace(config, map=config.map.absolute()))
         log.info("input: %r", video)
         log.debug("options that differ from the defaults: %s", changed_options(config))
-        viewer = Viewer(VideoInfo.of(video)) if show else None
+        viewer = open_viewer(VideoInfo.of(video)) if show else None
         in_3d = in_3d and config.poses.mode != "none"
         readings = _pose_readings(video, config.poses, detections) if in_3d else []
         if tracks:
@@ -1626,7 +1628,7 @@ def _reconstructed_cameras(
 
 
 def _track_video(
-    job: _Job, source: DetectionSource, poses: Poses | None, viewer: Viewer | None = None
+    job: _Job, source: DetectionSource, poses: Poses | None, viewer: Viewer | LivePage | None = None
 ) -> Result:
     """Track all frames, or load the tracks from the cache; live sources are not cached."""
     video = job.video
