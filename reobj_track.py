@@ -188,6 +188,7 @@ from reobj.types import (
     as_frame,
     cxcywh_from_xyxy,
     log,
+    log_message,
     one_line,
     option,
     rows_by,
@@ -1757,7 +1758,7 @@ def _finish(
     with job.timed("write"):
         result = _write(job, result)
     for warning in result.warnings:
-        log.warning(warning)
+        log_message(warning)
     return dataclasses.replace(result, seconds=job.seconds, step_seconds=job.step_seconds)
 
 
@@ -1855,7 +1856,7 @@ def _cmd_poses(args: argparse.Namespace) -> int:
     where = f"{workspace.out / 'poses.txt'}, {workspace.out / 'sparse'}"
     print(f"{poses.cameras_text}, {len(poses.points)} points; look at: {where}")
     for message in (*video.messages, *poses.messages, *components_message(poses)):
-        log.warning(message)
+        log_message(message)
     return 0
 
 
