@@ -83,7 +83,8 @@ def open_video(
     video = _frames_of(pose_file, path, size, poses.mode, config, detect or DetectConfig())
     video.messages.append(
         f"{NOTE_START}no images: {video.frame_count} frames of {size[0]}x{size[1]} from "
-        f"{poses.mode} and {path}; tracked by motion and cameras alone, without appearance and overlay video"
+        f"{poses.mode} and {path}; tracked by motion and cameras alone, without appearance and "
+        "overlay video"
     )
     return video
 
