@@ -663,7 +663,7 @@ class _Verdicts:
         if there:
             # rivals among map objects only: the displacement decided
             accepted = self.loss[-1, j] - self.loss[i, j] >= self.options.margin
-        else:  # looks and size alone gave three wrong numbers in eleven rendered pairs of recordings
+        else:  # looks and size alone gave three wrong numbers in eleven rendered pairs
             proven = bool(self.pairs.recognised()[i, j])
             accepted = proven and lead >= self.options.margin and self._distinguished(i, j)
         if not accepted:
