@@ -138,6 +138,7 @@ from reobj.results.checkpoint import Checkpoint
 from reobj.results.edits import kept_edits, read_edits
 from reobj.results.evaluation import evaluate, score_report
 from reobj.results.export import EXPORTS, Viewer, export
+from reobj.results.live import LivePage, open_viewer
 from reobj.results.names import OutputFile
 from reobj.results.overlay import film_layers
 from reobj.results.plausibility import implausible
@@ -194,6 +195,7 @@ from reobj.types import (
     as_frame,
     cxcywh_from_xyxy,
     log,
+    log_message,
     one_line,
     option,
     rows_by,
@@ -1359,7 +1361,8 @@ def run(
         map: map of the room, in which objects keep their numbers over several recordings; it is
             made if it does not exist. map_frozen: do not change the file. They replace the
             options of config.map.
-        in_3d: False for 2D identities only. show: show progress in rerun's viewer.
+        in_3d: False for 2D identities only. show: show frames and identities live, in rerun's
+            viewer or, where rerun is missing, on a page of this machine.
     Returns:
         Result; if the reconstruction fails, it has a warning and no cameras and ellipsoids. With a
         map, `Result.changes` is what changed in the room.
@@ -1379,7 +1382,7 @@ def run(
         job = _Job(video, workspace, dataclasses.replace(config, map=config.map.absolute()))
         log.info("input: %r", video)
         log.debug("options that differ from the defaults: %s", changed_options(config))
-        viewer = Viewer(VideoInfo.of(video)) if show else None
+        viewer = open_viewer(VideoInfo.of(video)) if show else None
         in_3d = in_3d and config.poses.mode != "none"
         readings = _pose_readings(video, config.poses, detections) if in_3d else []
         if tracks:
@@ -1636,7 +1639,7 @@ def _reconstructed_cameras(
 
 
 def _track_video(
-    job: _Job, source: DetectionSource, poses: Poses | None, viewer: Viewer | None = None
+    job: _Job, source: DetectionSource, poses: Poses | None, viewer: Viewer | LivePage | None = None
 ) -> Result:
     """Track all frames, or load the tracks from the cache; live sources are not cached."""
     video = job.video
@@ -1765,7 +1768,7 @@ def _finish(
     with job.timed("write"):
         result = _write(job, result)
     for warning in result.warnings:
-        log.warning(warning)
+        log_message(warning)
     return dataclasses.replace(result, seconds=job.seconds, step_seconds=job.step_seconds)
 
 
@@ -1866,7 +1869,7 @@ def _cmd_poses(args: argparse.Namespace) -> int:
     where = f"{workspace.out / 'poses.txt'}, {workspace.out / 'sparse'}"
     print(f"{poses.cameras_text}, {len(poses.points)} points; look at: {where}")
     for message in (*video.messages, *poses.messages, *components_message(poses)):
-        log.warning(message)
+        log_message(message)
     return 0
 
 

@@ -244,9 +244,8 @@ def _add_run(command: Any, name: str, text: str) -> None:
         text = "file of detections, used instead of the detector: MOT, KITTI, CSV, COCO JSON, "
         add("--detections", help=text + "folder of YOLO labels, CVAT, npz")
         _add_tracks(add)
-        add(
-            "--show", action="store_true", help="show progress live in rerun's viewer (needs rerun)"
-        )
+        text = "show frames and identities live: in rerun's viewer, without rerun on a page"
+        add("--show", action="store_true", help=text)
 
 
 def _add_map(command: Any, exports: Sequence[str]) -> None:

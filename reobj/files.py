@@ -425,7 +425,7 @@ class Progress:
         return f"{self.done}/{self.total} {percent}" if self.counted else percent.strip()
 
     def _write(self, text: str) -> None:
-        line = f"{self.stage:<10}{text}"
+        line = f"{self.stage:<9} {text}"
         # erases the rest of a longer line
         sys.stderr.write(f"\r{line}\x1b[K" if self._is_terminal else f"{line}\n")
         sys.stderr.flush()

@@ -18,7 +18,7 @@ import numpy as np
 
 import quadrics
 from reobj.files import atomic, did_you_mean, load_json, read_text, shortened
-from reobj.types import Array, ReobjError
+from reobj.types import NOTE_START, Array, ReobjError
 from reobj.words import canonical, synonyms
 
 C = TypeVar("C")
@@ -358,7 +358,8 @@ def priors_used(path: str, given: str, names: Sequence[str]) -> list[str]:
     unused = [f"--prior {word}: no object of this class has a shape" for word in of_words
               if word not in used]  # fmt: skip
     more = f"; and {len(texts) - PRIORS_SHOWN} more" * (len(texts) > PRIORS_SHOWN)
-    return [*(["; ".join(texts[:PRIORS_SHOWN]) + more] if texts else []), *unused]
+    shown = NOTE_START + "; ".join(texts[:PRIORS_SHOWN]) + more
+    return [shown, *unused] if texts else unused
 
 
 def _prior_text(prior: tuple[float, ...] | str) -> str:

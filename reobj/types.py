@@ -20,6 +20,15 @@ Image = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.float32]
 log = logging.getLogger("reobj_track")
 NOTE = 25  # level of a log line that is no warning, but is shown without --verbose
+NOTE_START = "note: "  # of a message of a result that is no warning
+
+
+def log_message(text: str) -> None:
+    """Log a message of a result as a note or a warning."""
+    if text.startswith(NOTE_START):
+        log.log(NOTE, "%s", text.removeprefix(NOTE_START))
+    else:
+        log.warning("%s", text)
 
 
 class ReobjError(ValueError):

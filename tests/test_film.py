@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import http.server
+import logging
 import os
 import queue
 import shutil
@@ -244,9 +245,13 @@ def test_a_video_that_cannot_be_written_is_an_error(tmp_path: Path, encoder: str
 
 
 def test_encoders_print_nothing(
-    tmp_path: Path, encoder: str, capfd: pytest.CaptureFixture[str]
+    tmp_path: Path,
+    encoder: str,
+    capfd: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """FFmpeg's C code prints a remark on the codec tag of VP8."""
+    monkeypatch.setattr(logging.getLogger("reobj_track"), "disabled", True)
     written(tmp_path / "a.mp4", pictures(3))
     print("still there", file=sys.stderr)
     assert capfd.readouterr() == ("", "still there\n")

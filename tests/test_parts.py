@@ -548,6 +548,7 @@ def ellipse_box(dual_c: np.ndarray) -> np.ndarray:
 def test_the_overlay_draws_each_component_in_its_frames(parted: rt.Result, tmp_path: Path) -> None:
     class Facts:
         config, fps, size = rt.InputConfig(), 30.0, SIZE
+        files: tuple[str, ...] = ()
 
     video: Any = Facts()
     overlay = Overlay(parted, tmp_path / "a.mp4", video, "ellipses")

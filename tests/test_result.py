@@ -67,7 +67,7 @@ def test_implausible_objects_keep_their_tracks_and_are_not_counted(
     assert first.id in found.tracks.track_id and [o.id for o in found.located] == [2, 3]
     lines = " ".join(found.summary().split())
     assert f"implausible, not counted: chair 1 ({why})" in lines
-    assert "distinct objects: 2 chair" in lines and "low confidence" not in lines
+    assert "2 objects: 2 chair" in lines and "low confidence" not in lines
     assert not any(line.split()[:1] == ["1"] for line in found.summary().splitlines())
     data = json.loads((tmp_path / "objects.json").read_text())
     data["objects"][0]["center"] = None

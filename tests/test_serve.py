@@ -456,7 +456,7 @@ def test_the_recording_plays_behind_the_shapes(browser: Browser, film_folder: Pa
         browser.eval("play()")
         seen = np.array(browser.eval("seen"))
         fits = np.abs(seen[:, 1] - 20 * seen[:, 0]) < 8
-        assert len(set(seen[:, 0])) > 3 and fits.mean() > 0.9  # a busy machine may miss a frame
+        assert len(set(seen[:, 0])) > 2 and fits.mean() > 0.8  # a busy machine may miss a frame
         assert browser.eval("[playing, film.paused]") == [None, True]
         assert own_complaints(browser) == []
 

@@ -149,9 +149,6 @@ class CompareOptions:
             largest, in nats. (Of pairs of objects of different classes, in three
             pairs of recordings and across them, none had a wrong motion.)
         margin: in nats, below which two explanations are equally probable (3: design).
-        looks_margin, size_margin: in nats, by which "moved" must exceed every other explanation if
-            its own points were not recognised: with appearance, and with size and class alone. (A
-            margin of 3 gave twice the share of wrong numbers in simulated rooms.)
         displacement_ratio: of two explanations that only the displacement distinguishes, the
             shorter one gives a number if the other one is longer by this factor.
         gone_log_odds: below which an object that was not detected is gone.
@@ -195,8 +192,6 @@ class CompareOptions:
     enough_inliers: int = 6
     inliers_limit: float = 15.0
     margin: float = 3.0
-    looks_margin: float = 4.0
-    size_margin: float = 6.0
     displacement_ratio: float = 2.0
     gone_log_odds: float = -3.0
 
@@ -668,22 +663,15 @@ class _Verdicts:
         if there:
             # rivals among map objects only: the displacement decided
             accepted = self.loss[-1, j] - self.loss[i, j] >= self.options.margin
-        else:
-            margin = self._moved_margin(i, j)
-            accepted = lead >= margin and self._distinguished(i, j)
+        else:  # looks and size alone gave three wrong numbers in eleven rendered pairs
+            proven = bool(self.pairs.recognised()[i, j])
+            accepted = proven and lead >= self.options.margin and self._distinguished(i, j)
         if not accepted:
             return None
         odds = min(lead, abs(float(self.stayed[i, j] - self.moved[i, j])))
         kind = "stayed" if there else "moved"
         rivals = self._candidates(j, besides=i)
         return Decision(kind, state.id, found.id, odds, rivals, self._evidence(i, j, there))
-
-    def _moved_margin(self, i: int, j: int) -> float:
-        """Return the lead in nats that a moved pair needs for its number."""
-        if self.pairs.recognised()[i, j]:
-            return self.options.margin
-        known = self.pairs.appearance[i, j] != 0
-        return self.options.looks_margin if known else self.options.size_margin
 
     def _distinguished(self, i: int, j: int) -> bool:
         """Return whether identity, or a much shorter displacement, excludes the best rival."""

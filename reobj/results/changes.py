@@ -133,7 +133,6 @@ class Changes:
     map_path: str
     session: str
     refused: str = ""
-    placed_by: str = ""
     localised_frames: int = 0
     tried_frames: int = 0
     components: Sequence[int] = (0,)
@@ -144,6 +143,7 @@ class Changes:
     new: Sequence[Change] = field(default_factory=tuple)
     not_seen: Sequence[Change] = field(default_factory=tuple)
     ambiguous: Sequence[Change] = field(default_factory=tuple)
+    placed_by: str = ""
 
     KINDS = ("stayed", "moved", "gone", "new", "not_seen", "ambiguous")
 

@@ -19,6 +19,7 @@ from reobj.results.names import OutputFile
 from reobj.types import (
     CLASS_NAME_MAX,
     COORDINATE_MAX,
+    NOTE_START,
     Array,
     BoolArray,
     IntArray,
@@ -219,7 +220,7 @@ def apply_edits(tracks: Tracks, class_names: tuple[str, ...], edits: Edits) -> E
     keep, messages = table.without_duplicates(str(edits.path))
     if (count := len(edits.edits)) > 0:
         corrections = f"{count} correction{'s' * (count != 1)}"
-        messages.append(f"{corrections} by hand applied ({OutputFile.EDITS})")
+        messages.append(f"{NOTE_START}{corrections} by hand applied ({OutputFile.EDITS})")
     edited = dataclasses.replace(tracks, track_id=table.identity, class_id=table.class_id)
     confirmed = table.confirmed & set(table.identity[keep].tolist())
     return Edited(edited, keep, tuple(table.names), confirmed, messages)

@@ -37,7 +37,7 @@ def summary(result: Result) -> str:
     if any(o.size_rel_sigma is not None for o in counted):
         lines.append("sigma: standard deviation of the least certain side")
     lines += ["", *_cameras(result)]
-    lines += _wrapped("seconds: " + ", ".join(_stage_time(result, s) for s in result.seconds))
+    lines.append("seconds: " + ", ".join(_stage_time(result, s) for s in result.seconds))
     return "\n".join(lines)
 
 

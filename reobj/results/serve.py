@@ -7,18 +7,14 @@ path of a file.
 
 from __future__ import annotations
 
-import hmac
-import http.cookies
 import json
 import os
 import re
-import secrets
 import subprocess
 import threading
 from collections.abc import Sequence
 from functools import partial
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, BinaryIO
 from urllib.parse import parse_qs, urlsplit
@@ -27,26 +23,19 @@ import cv2
 
 from reobj.files import atomic
 from reobj.results.edits import HEADER, read_edits
+from reobj.results.local_server import LocalHandler, LocalServer
 from reobj.results.names import OutputFile
 from reobj.results.scene import served_page
 from reobj.results.workspace import Workspace
 from reobj.sources.image_files import read_image
 from reobj.sources.video import Video, shrunk, source_fingerprint
-from reobj.types import ReobjError, log, one_line
+from reobj.types import ReobjError, one_line
 
-HOST = "127.0.0.1"
 EDITS_MAX = 16 << 20  # bytes of a file of corrections; 10,000 splits take 3 MB
 FRAME_PX = 1280  # longer side of the frames of an image folder
 CHUNK = 1 << 18  # bytes of the recording that are in memory
 PROGRESS_S = 0.5  # between two lines of progress of the worker
 VIDEO_TYPES = {".webm": "video/webm", ".mkv": "video/webm", ".ogv": "video/ogg"}  # else mp4
-HEADERS = {
-    "Cache-Control": "no-store",
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-    "Cross-Origin-Resource-Policy": "same-origin",
-    "Content-Security-Policy": "frame-ancestors 'none'",
-}
 
 
 class Recording:
@@ -225,7 +214,7 @@ class Corrections:
         line = ""
         for text in process.stderr:
             line = text.strip().replace(str(edits), OutputFile.EDITS) or line
-            if not line.startswith("warning:"):
+            if not line.startswith(("warning:", "note:")):
                 with self._lock:
                     self._text = line
         if process.wait() == 0:
@@ -238,18 +227,10 @@ def _no_edits() -> bytes:
     return json.dumps(HEADER | {"edits": []}).encode()
 
 
-class _Handler(BaseHTTPRequestHandler):
+class _Handler(LocalHandler):
     """Answer a request of the page; every other one is refused."""
 
     server: Server
-    protocol_version = "HTTP/1.1"
-    server_version = "reobj_track"
-    sys_version = ""
-    timeout = 60  # s, of a connection without a request
-
-    def log_message(self, text: str, *args: Any) -> None:
-        """Log requests with --debug, without the token."""
-        log.debug("serve: %s", (text % args).replace(self.server.token, "TOKEN"))
 
     def do_HEAD(self) -> None:
         self.do_GET()
@@ -301,37 +282,9 @@ class _Handler(BaseHTTPRequestHandler):
             return
         self._json(corrections.state())
 
-    # ---- Who asks --------------------------------------------------------------------------------
-
-    def _may_read(self) -> bool:
-        """Check the name of the server, which a foreign page cannot give, and the token."""
-        if self.headers.get("Host", "").lower() not in self.server.hosts:
-            self._refuse(HTTPStatus.FORBIDDEN, "unknown host")
-            return False
-        if not any(hmac.compare_digest(t, self.server.token.encode()) for t in self._tokens()):
-            self._refuse(HTTPStatus.FORBIDDEN, "no token: open the address that `serve` printed")
-            return False
-        return True
-
-    def _tokens(self) -> list[bytes]:
-        """Return the tokens of the address and of the cookie."""
-        found = parse_qs(urlsplit(self.path).query).get("token", [])
-        try:
-            cookies = http.cookies.SimpleCookie(self.headers.get("Cookie", ""))
-        except http.cookies.CookieError:
-            cookies = http.cookies.SimpleCookie()
-        if self.server.cookie in cookies:
-            found = [*found, cookies[self.server.cookie].value]
-        return [token.encode("utf-8", "replace") for token in found]
-
-    # ---- Answers ---------------------------------------------------------------------------------
-
     def _page(self) -> None:
         """Send the page; the token of the address moves to a cookie."""
-        cookie = f"{self.server.cookie}={self.server.token}; HttpOnly; SameSite=Lax; Path=/"
-        if urlsplit(self.path).query:
-            more = {"Location": "/", "Set-Cookie": cookie}
-            self._answer(HTTPStatus.SEE_OTHER, b"", "text/plain", more)
+        if self._token_moved():
             return
         try:
             page = self.server.page()
@@ -339,28 +292,6 @@ class _Handler(BaseHTTPRequestHandler):
             self._refuse(HTTPStatus.CONFLICT, str(error))
             return
         self._answer(HTTPStatus.OK, page.encode(), "text/html; charset=utf-8")
-
-    def _json(self, data: dict[str, Any]) -> None:
-        self._answer(HTTPStatus.OK, json.dumps(data).encode(), "application/json")
-
-    def _refuse(self, status: HTTPStatus, why: str) -> None:
-        self._answer(status, f"{one_line(why)}\n".encode(), "text/plain; charset=utf-8")
-
-    def _answer(
-        self, status: HTTPStatus, body: bytes, kind: str, more: dict[str, str] | None = None
-    ) -> None:
-        self._head(status, len(body), kind, more)
-        if self.command != "HEAD":
-            self.wfile.write(body)
-
-    def _head(
-        self, status: HTTPStatus, length: int, kind: str, more: dict[str, str] | None = None
-    ) -> None:
-        self.send_response(status)
-        headers = {"Content-Type": kind, "Content-Length": str(length)}
-        for name, value in (HEADERS | headers | (more or {})).items():
-            self.send_header(name, value)
-        self.end_headers()
 
     def _recording(self, path: Path) -> None:
         """Send the video file, or the range of it that is requested."""
@@ -419,37 +350,16 @@ def _range(text: str, size: int) -> tuple[int, int] | None:
     return (first, last) if first <= last else None
 
 
-class Server(ThreadingHTTPServer):
-    """The server of one output folder.
-
-    Attributes:
-        token: that every request must have. hosts, origins: names of this server.
-    """
-
-    daemon_threads = True
-    allow_reuse_address = os.name == "posix"  # elsewhere it lets two programs use one port
+class Server(LocalServer):
+    """The server of one output folder."""
 
     def __init__(self, out: Path, port: int, command: Sequence[str]) -> None:
         self.viewer = out / "scene.html"
         with Workspace.open(out) as workspace:
             self.recording = Recording(workspace)
         self.corrections = Corrections(out, command)
-        self.token = secrets.token_urlsafe(32)
         self.page()
-        try:
-            super().__init__((HOST, port), _Handler)
-        except (OSError, OverflowError) as error:
-            why = getattr(error, "strerror", None) or "0 to 65535 are possible"
-            raise ReobjError(f"--port {port}: {why}; give another one, or none") from error
-        number = self.server_address[1]
-        self.cookie = f"reobj_{number}"  # cookies do not distinguish ports
-        self.hosts = {f"{name}:{number}" for name in (HOST, "localhost")}
-        self.origins = {f"http://{host}" for host in self.hosts}
-
-    @property
-    def url(self) -> str:
-        """Address of the page with its token."""
-        return f"http://{HOST}:{self.server_address[1]}/?token={self.token}"
+        super().__init__(port, _Handler)
 
     def page(self) -> str:
         """Return the page.

@@ -88,7 +88,7 @@ def test_track(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 def test_run_without_images(tmp_path: Path) -> None:
     out, words = tmp_path / "out", ("--camera", (ROOM / "camera.txt").read_text())
     assert cli("run", "-o", out, *DETECTIONS, *POSES[:2], *words, *FEW) == 0
-    assert_right(out, idf1=0.94, warning="no images")
+    assert_right(out, idf1=0.94, warning="note: no images")
 
 
 PICTURES = range(0, 60, 10)  # frames of the clip that are the images 0000.jpg ... 0005.jpg

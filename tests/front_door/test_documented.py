@@ -247,7 +247,7 @@ def right_identities(desk: Path) -> None:
 
 
 def right_without_images(desk: Path) -> None:
-    assert_right(desk / "out", idf1=0.94, warning="no images")
+    assert_right(desk / "out", idf1=0.94, warning="note: no images")
 
 
 def detected(desk: Path, idf1: float = 0.45, share: float = 0.4) -> None:

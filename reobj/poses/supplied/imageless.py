@@ -33,7 +33,7 @@ from reobj.sources.detection_files import (
 from reobj.sources.image_files import TimeUnit, sorted_names
 from reobj.sources.imageless import ImagelessVideo
 from reobj.sources.video import InputConfig, Video
-from reobj.types import ReobjError
+from reobj.types import NOTE_START, ReobjError
 
 
 def open_video(
@@ -82,8 +82,9 @@ def open_video(
         )
     video = _frames_of(pose_file, path, size, poses.mode, config, detect or DetectConfig())
     video.messages.append(
-        f"no images: {video.frame_count} frames of {size[0]}x{size[1]} from {poses.mode} and "
-        f"{path}; tracked by motion and cameras alone, without appearance and overlay video"
+        f"{NOTE_START}no images: {video.frame_count} frames of {size[0]}x{size[1]} from "
+        f"{poses.mode} and {path}; tracked by motion and cameras alone, without appearance and "
+        "overlay video"
     )
     return video
 

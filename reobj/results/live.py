@@ -1,0 +1,156 @@
+"""Live view of a running `track`: rerun's viewer, or a page on 127.0.0.1 where rerun is missing."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+import webbrowser
+from collections.abc import Iterable, Iterator, Sequence
+from http import HTTPStatus
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import cv2
+
+from reobj.cameras import Poses
+from reobj.results.export import Viewer
+from reobj.results.local_server import LocalHandler, LocalServer
+from reobj.results.overlay import draw_tracks
+from reobj.results.result import Result, VideoInfo
+from reobj.sources.video import Video, shrunk
+from reobj.types import NOTE, Frame, ReobjError, Tracks, log
+
+EVERY_S = 0.1  # least time between two pictures of the page
+PICTURE_PX = 1280  # longer side
+PAGE = b"""<!doctype html><meta charset="utf-8"><title>reobj_track</title>
+<meta name="viewport" content="width=device-width">
+<style>body{margin:0;background:#111}img{display:block;margin:auto;max-width:100%;max-height:100vh}
+</style><img src="/pictures" alt="the latest frame with identities">"""
+
+
+def open_viewer(video: VideoInfo) -> Viewer | LivePage:
+    """Open the live view of `--show`."""
+    try:
+        return Viewer(video)
+    except ReobjError:  # rerun is missing
+        return LivePage()
+
+
+class LivePage:
+    """A page with the latest frame and its identities, while a video is tracked.
+
+    Attributes:
+        followed: the frames were shown while the video was tracked. url: of the page.
+    """
+
+    def __init__(self, open_browser: bool = True) -> None:
+        self.followed = False
+        self._server = _Server()
+        self.url = self._server.url
+        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+        log.log(NOTE, "live view: %s (in 3D with rerun: pip install rerun-sdk)", self.url)
+        if open_browser:
+            webbrowser.open(self.url)
+
+    def follow(
+        self, steps: Iterable[tuple[Frame, Tracks]], names: Sequence[str], video: Video,
+        poses: Poses | None,
+    ) -> Iterator[tuple[Frame, Tracks]]:  # fmt: skip
+        """Show and yield each frame of a running `track`; `poses` are not shown."""
+        self.followed = True
+        positions: dict[int, int] = {}
+        shown_s = -EVERY_S
+        for frame, tracks in steps:
+            if self._server.watchers and time.monotonic() - shown_s > EVERY_S:
+                shown_s = time.monotonic()
+                labels = {
+                    i: f"{i} {names[c] if 0 <= c < len(names) else 'object'}"
+                    for i, c in zip(tracks.track_id.tolist(), tracks.class_id.tolist(), strict=True)
+                }
+                image = shrunk(frame.image, PICTURE_PX).copy()
+                scale = image.shape[1] / frame.image.shape[1]
+                draw_tracks(image, tracks, labels, scale, positions)
+                self._server.put(cv2.imencode(".jpg", image)[1].tobytes())
+            yield frame, tracks
+
+    def show(self, result: Result, path: Path, images: bool) -> None:
+        """Show nothing more: scene.html has the result."""
+
+    def close(self) -> None:
+        """End the pictures and the server."""
+        self._server.put(b"")
+        self._server.shutdown()
+        self._server.server_close()
+
+
+class _Server(LocalServer):
+    """The server of the page.
+
+    Attributes:
+        watchers: number of browsers that show the pictures.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(0, _Handler)
+        self.watchers = 0
+        self._changed = threading.Condition()
+        self._number = 0
+        self._picture: bytes | None = None
+
+    def put(self, picture: bytes) -> None:
+        """Replace the picture, a JPEG; b"": there are no more."""
+        with self._changed:
+            self._picture = picture
+            self._number += 1
+            self._changed.notify_all()
+
+    def pictures(self) -> Iterator[bytes]:
+        """Yield the latest picture as soon as it is another one, until there are no more."""
+        seen = 0
+
+        def is_new() -> bool:
+            return self._number > seen
+
+        with self._changed:
+            self.watchers += 1
+        try:
+            while True:
+                with self._changed:
+                    self._changed.wait_for(is_new)
+                    seen = self._number
+                    picture = self._picture
+                if not picture:
+                    return
+                yield picture
+        finally:
+            with self._changed:
+                self.watchers -= 1
+
+
+class _Handler(LocalHandler):
+    """Send the page, and the pictures as one endless answer (multipart/x-mixed-replace)."""
+
+    server: _Server
+
+    def do_GET(self) -> None:
+        if not self._may_read():
+            return
+        path = urlsplit(self.path).path
+        if path == "/pictures":
+            with contextlib.suppress(OSError):  # the browser was closed
+                self._pictures()
+            self.close_connection = True
+        elif path != "/":
+            self._refuse(HTTPStatus.NOT_FOUND, "no such page")
+        elif not self._token_moved():
+            self._answer(HTTPStatus.OK, PAGE, "text/html; charset=utf-8")
+
+    def _pictures(self) -> None:
+        self.send_response(HTTPStatus.OK)
+        self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
+        self.send_header("Cache-Control", "no-store")
+        self.end_headers()
+        for picture in self.server.pictures():
+            head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(picture)}\r\n\r\n"
+            self.wfile.write(head.encode() + picture + b"\r\n")
