@@ -1061,7 +1061,7 @@ def changes_of_walk(objects: list[rt.Object]) -> Changes:
     shape = Shape("box", chair.half_axes, EIGHTH_TURN)
     lamp = Shape("cylinder", np.array([0.2, 0.2, 0.5]), np.array([1.0, 0, 0, 0]))
     return Changes(
-        "flat.map", "tuesday", "", "points", 20, 24, sigma_m=0.01,
+        "flat.map", "tuesday", "", 20, 24, sigma_m=0.01,
         stayed=(Change(2, second.class_name, second.center, second.center, 0.0, 0.02),),
         moved=(Change(1, "chair", chair.center + np.array([0, 1.0, 0]), chair.center, 1.0, 0.034,
                       "12 own points agree", (9,), shape),),
@@ -1222,7 +1222,7 @@ def test_changes_are_shown_on_a_phone_and_without_webgl(
 
 def test_a_refused_map_is_named(browser: Browser, page: Path, tmp_path: Path) -> None:
     result = rt.Result.load(page.parent)
-    changes = Changes("flat.map", "tuesday", "3 of 24 frames agree with it", "", 3, 24)
+    changes = Changes("flat.map", "tuesday", "3 of 24 frames agree with it", 3, 24)
     video = rt.Video(page.parent.parent / "frames")
     refused = dataclasses.replace(result, changes=changes)
     write_scene(refused, Pictures(refused, video), tmp_path / "scene.html", video)
