@@ -81,12 +81,19 @@ class Client:
         raise AssertionError("the worker does not end")
 
 
+def _heed_ctrl_c() -> None:
+    """Undo that jobs in the background of a shell ignore Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 @contextmanager
 def serving(out: Path) -> Iterator[Client]:
     """Run `serve OUT` as a user does, and end it with Ctrl-C."""
     command = [sys.executable, str(TOOL), "serve", str(out)]
     pipe = subprocess.PIPE
-    process = subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True)
+    process = subprocess.Popen(
+        command, stdout=pipe, stderr=pipe, text=True, preexec_fn=_heed_ctrl_c
+    )
     assert process.stdout is not None
     line = process.stdout.readline()
     assert f"viewer of {out}: http://127.0.0.1:" in line, process.communicate()
@@ -155,7 +162,6 @@ def test_saved_corrections_are_applied_and_undone(out: Path) -> None:
             state = client.finished()
             assert not state["failed"] and ids(out) == left
             assert state["texts"][0] == "starting"
-            assert any(re.match(r"(objects|write) .*%", text) for text in state["texts"])
         assert client.state()["undo"] == 2
         for left in ([1, 2, 3, 4, 5], [1, 2, 3, 4, 5, 6]):
             status, _ = client.post(f"/undo?version={client.state()['version']}")
@@ -194,8 +200,8 @@ def test_ctrl_c_ends_the_worker_too(out: Path) -> None:
     with serving(out) as client:
         client.post(f"/edits?version={client.state()['version']}", edits_of(out, delete(out, 6)))
         for _ in range(100):
-            children = Path(f"/proc/{client.process.pid}/task/{client.process.pid}/children")
-            if not children.exists() or children.read_text():
+            threads = Path(f"/proc/{client.process.pid}/task").glob("*/children")
+            if any(children.read_text() for children in threads):
                 break
             time.sleep(0.02)
     after = {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()}
