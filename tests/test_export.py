@@ -693,7 +693,7 @@ def test_show_reaches_the_viewer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     pytest.importorskip("rerun", reason="pip install .[viewer]")
     path = tmp_path / "live.rrd"
     viewer = partial(Viewer, start=lambda rec: rec.save(path))
-    monkeypatch.setattr(rt, "Viewer", viewer)
+    monkeypatch.setattr("reobj.results.live.Viewer", viewer)
     args = ("--detections", ROOM / "detections.npz", "--poses", ROOM / "poses.txt", "--camera",
             CAMERA, "--every", 5, "--stop", 30, "--show", *NO_PICTURES)  # fmt: skip
     for _ in range(2):

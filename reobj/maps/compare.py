@@ -27,7 +27,8 @@ class PointMotion:
     """Rigid motion of a map object, by its points recognised on an object of the recording.
 
     Attributes:
-        inliers: different points of the map object that follow it. images: that agree on it.
+        inliers: different points of the map object that follow it. images: that agree on it; 0:
+            the last run found it, and the images are not read again.
         new_from_old: (3, 4), in the world of the map; the identity: the points are where they were.
         shift: (3,) of the centre of the map object. cov: (3, 3) of the shift, without the
             uncertainty of the alignment of the recording.
@@ -741,6 +742,8 @@ class _Verdicts:
         own = ""
         if motion is not None:
             own = f", {motion.inliers} of its points recognised in {motion.images} images"
+            if not motion.images:
+                own = ", its points were recognised in the last run"
             if motion.inliers >= self.options.enough_inliers:
                 own += ", which give the displacement"
         place = f"{pairs.distance[i, j]:.2f} m from its place ({pairs.sigmas[i, j]:.1f} sigma)"

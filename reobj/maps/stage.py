@@ -451,6 +451,7 @@ def _as_placed_before(recording: Recording, before: Changes | None, room: RoomMa
         localised_frames=before.localised_frames,
         tried_frames=before.tried_frames,
         placed_by=before.placed_by,
+        moved=before.moved,
     )
 
 

@@ -14,7 +14,14 @@ from scipy.spatial import cKDTree
 
 import quadrics
 from reobj.cameras import Poses
-from reobj.maps.compare import CompareOptions, Decision, FoundObject, Visibility, compare
+from reobj.maps.compare import (
+    CompareOptions,
+    Decision,
+    FoundObject,
+    PointMotion,
+    Visibility,
+    compare,
+)
 from reobj.maps.fusion import ObjectState, object_state, scale_of
 from reobj.maps.motion import point_motions
 from reobj.maps.object_points import ObjectView
@@ -39,7 +46,7 @@ class Recording:
         views: features in boxes of its objects, in which the points of map objects are recognised.
         object_points: triangulated from the views, with the identities of the recording.
         pictures: JPEG of its objects, by identity; None: those that the map has are kept.
-        placed_by: as in `Changes`.
+        placed_by: as in `Changes`. moved: by its last run, if its images are not read again.
     """
 
     map_path: Path
@@ -55,6 +62,7 @@ class Recording:
     object_points: MapPoints = field(default_factory=MapPoints.empty)
     pictures: Mapping[int, bytes] | None = field(default_factory=dict)
     placed_by: str = ""
+    moved: Sequence[Change] = ()
 
 
 def add_recording(room: RoomMap, result: Result, recording: Recording) -> tuple[RoomMap, Result]:
@@ -219,9 +227,36 @@ def _with_motions(
     old = room.session_of(recording.fingerprint)
     points = room.points if old is None else room.points[room.points.session != old.number]
     motions = point_motions(points, states, found, recording.views, result.poses, room.up)
+    known = _known_motions(recording.moved, found, scale_of(room).value)
     return [
-        dataclasses.replace(o, motion_of=of_map) for o, of_map in zip(found, motions, strict=True)
+        dataclasses.replace(o, motion_of={**of_map, **known.get(o.id, {})})
+        for o, of_map in zip(found, motions, strict=True)
     ]
+
+
+def _known_motions(
+    moved: Sequence[Change], found: Sequence[FoundObject], metres_per_unit: float
+) -> dict[int, dict[int, PointMotion]]:
+    """Return the motions that the last run found, by identity and number of the map object.
+
+    Each belongs to the object of the recording that is nearest to its place, within its extent.
+    """
+    motions: dict[int, dict[int, PointMotion]] = {}
+    for change in moved:
+        if change.before is None or change.after is None or not found:
+            continue
+        after = change.after
+        nearest = min(found, key=lambda o: float(np.linalg.norm(o.center - after)))
+        if np.linalg.norm(nearest.center - after) > nearest.half_axes.max():
+            continue
+        shift = change.after - change.before
+        sigma = (change.sigma_m or 0.0) / metres_per_unit
+        motion = PointMotion(
+            CompareOptions().enough_inliers, 0, np.column_stack([np.eye(3), shift]), shift,
+            sigma**2 / 3 * np.eye(3),
+        )  # fmt: skip
+        motions.setdefault(nearest.id, {})[change.id] = motion
+    return motions
 
 
 def _array(values: Array | None, length: int) -> Array:
