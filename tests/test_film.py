@@ -151,9 +151,7 @@ def test_frame_rates_are_kept(tmp_path: Path, encoder: str, fps: float) -> None:
         writer.write(image)
     writer.close(True)
     found = cv2.VideoCapture(str(writer.path))
-    every = 1  # the encoder with the larger files takes at most 10 a second
-    if encoder == "vp8":
-        every = {30000 / 1001: 3, 12.0: 2, 1.0: 1}[fps]
+    every = 2 if encoder == "vp8" and fps > 15 else 1  # it has the larger files
     assert found.get(cv2.CAP_PROP_FRAME_COUNT) == 6 / every
     rel = 1e-5 if encoder == "vp8" else 1e-6  # whole ns
     assert found.get(cv2.CAP_PROP_FPS) == pytest.approx(fps / every, rel=rel)
@@ -182,7 +180,7 @@ def test_the_size_of_the_video_is_said(
     writer.close(True)
     (text,) = (record.getMessage() for record in caplog.records if "px" in record.getMessage())
     assert text.startswith(f"{writer.path.name}: {SIZE[0]} x {SIZE[1]} px")
-    assert ("pip install av" in text) == ("every 3. frame" in text) == (encoder == "vp8")
+    assert ("pip install av" in text) == ("every 2. frame" in text) == (encoder == "vp8")
 
 
 @pytest.mark.parametrize("size", [(321, 241), (1601, 901), (3840, 2160), (64, 48)])

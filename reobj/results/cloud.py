@@ -146,7 +146,8 @@ class DenseFrames:
 
     def _depth_map(self, row: int, other: int, rays: Array) -> Array:
         """Triangulate the flow from a frame to another one: depth (H, W); NaN: refused."""
-        image, target = self._image(row), self._image(other)
+        image = self._image(row)
+        target = self._image(other)
         assert image is not None and target is not None
         there, ok = _flow(image, target)
         pose, moved = self.poses.cam_from_world[[row, other]]
@@ -218,7 +219,9 @@ def _voxels(xyz: Array, rgb: npt.NDArray[np.uint8], seen_from: Array) -> Cloud:
     middle = np.median(xyz, 0)
     extent = np.percentile(np.abs(xyz - middle), 95, axis=0)
     near = (np.abs(xyz - middle) < 2 * extent).all(1)
-    xyz, rgb, seen_from = xyz[near], rgb[near], seen_from[near]
+    xyz = xyz[near]
+    rgb = rgb[near]
+    seen_from = seen_from[near]
     voxel = float(np.linalg.norm(extent)) / CELLS
     key = _cells(xyz, voxel)
     order = np.argsort(key, kind="stable")

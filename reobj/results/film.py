@@ -54,9 +54,9 @@ class FilmWriter:
         # absolute: FFmpeg reads a folder 12:30/ as a protocol
         self.part = self.path.with_name(f".part-{self.path.name}").absolute()
         # Longest side, px: HD plays everywhere. OpenCV's encoder needs 1.5 bits a pixel: at 720 px
-        # and 10 Hz 45 MB a minute.
+        # and 15 Hz 60 MB a minute.
         shrink = min(1.0, (720 if av is None else 1280) / max(size))
-        self.every = 1 if av else max(math.ceil(fps / 10 - 1e-3), 1)  # 30.0001 fps is 30
+        self.every = 1 if av else max(math.ceil(fps / 15 - 1e-3), 1)  # 30.0001 fps is 30
         self.repeat = math.ceil(1 / fps)  # at least 1 Hz: a frame in WebM lasts at most 4 s
         # 16 px are a block of the codecs; OpenCV's VP8 fails below
         width, height = (max(int(side * shrink) // 2 * 2, 16) for side in size)
