@@ -285,7 +285,7 @@ def test_a_recording_is_compared_with_the_points_of_the_other_sessions() -> None
     world = moved_world()
     room = dataclasses.replace(a_map([[observed(1, "new", true_shape())]]), points=world.points)
     result: Any = SimpleNamespace(poses=world.poses)
-    recording: Any = SimpleNamespace(views=tuple(world.views()), fingerprint="another")
+    recording: Any = SimpleNamespace(views=tuple(world.views()), fingerprint="another", moved=())
     found = _with_motions(world.found, world.states, result, room, recording)
     assert set(found[0].motion_of) == {1}
     recording.fingerprint = room.sessions[0].fingerprint

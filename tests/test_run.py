@@ -139,7 +139,8 @@ def test_same_input_same_bytes(clip: Path, detections: Path, tmp_path: Path) -> 
     for name in ("a", "b"):
         assert cli("track", clip, "-o", tmp_path / name, "--detections", detections) == 0
     for file in ("tracks.txt", "scene.html", overlay_in(tmp_path / "a"), "cache/last-tracks.npz"):
-        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes(), file
+        same = content(tmp_path / "a", file) == content(tmp_path / "b", file)
+        assert same, file
     objects = [
         json.loads((tmp_path / n / "objects.json").read_text())["objects"] for n in ("a", "b")
     ]
@@ -429,6 +430,11 @@ def test_a_function_detects_once_and_confident_people_are_masked(
     assert not [name for name in left if name.startswith(("detections", "boxes"))]
 
 
+def content(out: Path, file: str) -> bytes:
+    """A file of an output folder without the path of the folder, which the page shows."""
+    return (out / file).read_bytes().replace(str(out).encode(), b"OUT")
+
+
 def test_a_killed_run_leaves_nothing_broken(clip: Path, detections: Path, tmp_path: Path) -> None:
     """SIGKILL during tracking and while visualisations are written: the next run gives the
     result of an uninterrupted one.
@@ -453,7 +459,8 @@ def test_a_killed_run_leaves_nothing_broken(clip: Path, detections: Path, tmp_pa
         assert not (out / "scene.html").exists() and not list(out.glob("overlay.*"))
         assert cli(*args, "-o", out) == 0
         for file in ("tracks.txt", "scene.html", overlay_in(out), "cache/last-tracks.npz"):
-            assert (out / file).read_bytes() == (tmp_path / "good" / file).read_bytes(), file
+            same = content(out, file) == content(tmp_path / "good", file)
+            assert same, file
         assert not [p for p in out.rglob(".part-*")]
 
 
