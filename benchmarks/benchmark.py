@@ -413,7 +413,8 @@ def embedding_rows(source: str, frames: int) -> tuple[Array, IntArray]:
     from reobj.appearance.embedding import Backbone
 
     cv2.setNumThreads(1)
-    detector, embedder = rt.OnnxDetector("deimv2-femto", threads=1), rt.Embedder(threads=1)
+    detector = rt.OnnxDetector("deimv2-femto", threads=1)
+    embedder = rt.Embedder(threads=1)
     tracker, clock = rt.Tracker(embedder=embedder), Clock()
     clock.wrap(Backbone, "__call__", "map", lambda *_: 1)
     clock.wrap(Backbone, "embed", "head", lambda *_: 1)

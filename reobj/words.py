@@ -53,5 +53,5 @@ def merged(weights: Mapping[str, float]) -> dict[str, float]:
 
 
 def synonyms() -> dict[str, str]:
-    """Return the name that each synonym stands for."""
+    """Return the category of each synonym."""
     return dict(_table().aliases)

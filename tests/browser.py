@@ -34,7 +34,9 @@ class Browser:
         )
         os.close(theirs_in)
         os.close(theirs_out)
-        self.rest, self.number, self.session = b"", 0, ""
+        self.rest = b""
+        self.number = 0
+        self.session = ""
         self.errors: list[str] = []
         self.asked = 0  # number of unload dialogs of the page
         target = self.send("Target.createTarget", url="about:blank")["targetId"]

@@ -55,7 +55,8 @@ def poses_along_the_wall() -> rt.Poses:
 def frames_of(poses: rt.Poses) -> list[np.ndarray]:
     """The wall in each camera."""
     plane = np.array([[0.01, 0, -4], [0, 0.01, -4], [0, 0, DEPTH], [0, 0, 1]])  # of its pixels
-    texture, frames = wall(), []
+    texture = wall()
+    frames = []
     for pose in poses.cam_from_world:
         img_from_wall = poses.camera.K @ pose @ plane
         frames.append(cv2.warpPerspective(texture, img_from_wall, (WIDTH, HEIGHT)))
@@ -110,7 +111,8 @@ def test_unrelated_frames_give_no_points() -> None:
 
 def test_the_page_has_the_points(folder: Path, tmp_path: Path) -> None:
     poses = poses_along_the_wall()
-    result, video = result_of(poses), rt.Video(folder)
+    result = result_of(poses)
+    video = rt.Video(folder)
     for cloud in (False, True):
         out = tmp_path / str(cloud)
         out.mkdir()
@@ -119,7 +121,8 @@ def test_the_page_has_the_points(folder: Path, tmp_path: Path) -> None:
     parts = [json.loads(t.split('id="data">')[1].split("</script>")[0])["parts"] for t in text]
     assert "dense" not in parts[0][0]
     dense = parts[1][0]["dense"]
-    data, n = base64.b64decode(dense["data"]), dense["count"]
+    data = base64.b64decode(dense["data"])
+    n = dense["count"]
     assert len(data) == 12 * n > 200_000
     place = np.frombuffer(data[: 6 * n], "<u2").reshape(-1, 3) * dense["step"] + dense["low"]
     place += parts[1][0]["origin"]
@@ -135,7 +138,8 @@ def test_points_leave_the_page_below_its_limit(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The most observed points remain."""
-    result, video = result_of(poses_along_the_wall()), rt.Video(folder)
+    result = result_of(poses_along_the_wall())
+    video = rt.Video(folder)
     pictures = Pictures(result, video, dense=True)
     for frame in video:
         pictures.take(frame)

@@ -283,7 +283,8 @@ def test_no_address_is_a_path(out: Path) -> None:
     "fault", ["no folder", "no page", "link", "old page", "foreign", "port", "range"]
 )
 def test_bad_input_is_one_line(out: Path, tmp_path: Path, capsys: Any, fault: str) -> None:
-    page, words = out / "scene.html", ["serve", str(out)]
+    page = out / "scene.html"
+    words = ["serve", str(out)]
     if fault == "no folder":
         words[1] = str(tmp_path / "none")
     if fault == "no page":

@@ -403,8 +403,12 @@ def _least_squares(
         arm = moved - origin
         J = np.zeros((len(arm), 3, 7))
         x, y, z = arm.T
-        J[:, 0, 1], J[:, 0, 2], J[:, 1, 0] = z, -y, -z
-        J[:, 1, 2], J[:, 2, 0], J[:, 2, 1] = x, y, -x
+        J[:, 0, 1] = z
+        J[:, 0, 2] = -y
+        J[:, 1, 0] = -z
+        J[:, 1, 2] = x
+        J[:, 2, 0] = y
+        J[:, 2, 1] = -x
         J[:, :, 3:6] = np.eye(3)
         J[:, :, 6] = arm
         cov = of_map.cov + scale**2 * rotation @ found.cov @ rotation.T

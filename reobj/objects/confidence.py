@@ -14,7 +14,7 @@ from reobj.types import Array, BoolArray, IntArray, Tracks, rows_by
 # 1,202 objects of 48 runs of 10 rooms (benchmarks/RESULTS.md)
 CONFIDENCE = (-1.0, 1.5, 1.8, -1.5)
 FITTED_TO = "YOLOv8s, deimv2-femto, rendered rooms"
-FITTED_SCORES = (0.13, 0.87)  # lowest and highest median score of a recording of these
+FITTED_SCORES = (0.13, 0.87)  # lowest and highest median score of the recordings it was fitted to
 FAR_OFF = 1.0  # in log odds, beyond which a median is reported (chosen)
 USUAL_HIT_RATE = 0.75  # if it should be visible in no frame, as an always truncated table (mean)
 NO_SHAPE = -1.9  # instead of the intercept for identities without a 3D object (8 of 89 were real)

@@ -18,7 +18,7 @@ FLOOR = 0.05  # sigma common to all boxes, relative to the size, and in rad (cho
 def with_given_boxes(
     fits: quadrics.ObjectFits, boxes: Boxes3D | None, tracks: Tracks, group: IntArray
 ) -> quadrics.ObjectFits:
-    """Replace the shapes of objects that have boxes in 3D by the robust mean of these.
+    """Replace the shapes of objects that have boxes in 3D by the robust mean of their boxes.
 
     Args:
         tracks: N rows. group: (N,) object of each.
