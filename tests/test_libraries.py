@@ -124,11 +124,11 @@ def test_phrases_get_the_word_that_shares_most_tokens() -> None:
     phrases = ["machine", "red espresso machine", "toolbox red", "", "lamp"]
     image = {"boxes": np.arange(20.0).reshape(5, 4), "scores": np.arange(5.0),
              "text_labels": phrases}  # fmt: skip
-    found = libraries._with_words([image], list(WORDS))
+    found = libraries._with_words(image, list(WORDS))
     assert found["labels"].tolist() == [0, 0, 1]
     np.testing.assert_array_equal(found["scores"], [0, 1, 2])
-    none = libraries._with_words([image | {"boxes": np.empty((0, 4)), "scores": np.empty(0),
-                                           "text_labels": []}], list(WORDS))  # fmt: skip
+    none = libraries._with_words(image | {"boxes": np.empty((0, 4)), "scores": np.empty(0),
+                                          "text_labels": []}, list(WORDS))  # fmt: skip
     assert len(none["labels"]) == 0
 
 
@@ -217,11 +217,11 @@ def test_a_failure_of_a_library_is_one_line(
     """While it detects: the detector, the frame and the library's message; also while it opens."""
     calls = []
 
-    def detect(image: Any) -> Any:
-        calls.append(image)
+    def detect(images: list[Any]) -> Any:
+        calls.append(images)
         if len(calls) > 1:
             raise error
-        return np.empty((0, 6))
+        return [np.empty((0, 6))]
 
     def opens(options: libraries.LibraryOptions) -> libraries.LibraryDetector:
         if options.model == "broken":
