@@ -146,15 +146,16 @@ def test_a_fixed_batch_is_filled_up(tmp_path: Path, spied: type[Spy], caplog: An
 def test_a_model_of_one_image_gets_one(
     tmp_path: Path, spied: type[Spy], caplog: Any, shape: Any, each: bool, reason: str
 ) -> None:
-    """The user is warned who asked for more."""
+    """The user is warned who asked for more, or whose model says that it takes more."""
     detector = rt.OnnxDetector(grey_model(tmp_path, shape, each), rt.DetectConfig(batch=4))
     found = list(detector.detect([plain(40), plain(200)]))
     assert detector.batch == 1 and spied.batches[-2:] == [1, 1]
     assert found[0].score < found[1].score
     assert f"m.onnx: detect.batch=4 is not possible ({reason}): images are" in caplog.text
-    caplog.clear()
-    rt.OnnxDetector(grey_model(tmp_path, shape, each))
-    assert not caplog.text
+    for device, warned in (("cpu", False), ("cuda", shape[0] == "n")):
+        caplog.clear()
+        assert rt.OnnxDetector(grey_model(tmp_path, shape, each), device=device).batch == 1
+        assert ("detect.batch=8 is not possible" in caplog.text) == bool(caplog.text) == warned
 
 
 def test_images_of_different_input_sizes_are_not_joined(tmp_path: Path, spied: type[Spy]) -> None:
@@ -177,6 +178,18 @@ def test_the_tiles_of_an_image_are_a_batch(tmp_path: Path, spied: type[Spy]) -> 
     found = many(image)
     assert spied.batches == [1, 4, 4, 1]
     assert same(found, rt.OnnxDetector(path, rt.DetectConfig(tiles="2x2"))(image))
+
+
+def test_masks_of_a_batch_are_not_held_together(tmp_path: Path, monkeypatch: Any) -> None:
+    """Outputs are decoded one by one, as the detections are used."""
+    detector = rt.OnnxDetector(grey_model(tmp_path), rt.DetectConfig(batch=4))
+    decoded = []
+    decode = detector._decoded
+    monkeypatch.setattr(detector, "_decoded", lambda *a: decoded.append(1) or decode(*a))
+    steps = as_source(detector).look_at([rt.Frame(i, 0.0, plain(40)) for i in range(4)])
+    for count in (1, 2, 3, 4):
+        next(steps)
+        assert len(decoded) == count
 
 
 def test_a_batch_that_fails_names_its_size(tmp_path: Path, monkeypatch: Any) -> None:
@@ -217,12 +230,12 @@ def test_real_weights_in_batches(name: str, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 class Noted:
-    """A source in batches of four; it notes them, and how many frames were read by then."""
+    """A source in batches of two; it notes them, and how many frames were read by then."""
 
     def __init__(self) -> None:
         self.batches: list[list[int]] = []
         self.read: list[int] = []
-        self.source = rt.DetectionSource(self.one, detect_batch=self.several, batch=4)
+        self.source = rt.DetectionSource(self.one, detect_batch=self.several, batch=2)
 
     def one(self, frame: rt.Frame) -> rt.Detections:
         return rt.Detections.from_array([[9, 9, 50, 40 + frame.index, 0.9, 56]])
@@ -245,18 +258,21 @@ class Counted(rt.Video):
             yield frame
 
 
+FIVE = rt.InputConfig(stop=5)  # frames: the last batch is shorter
+
+
 def few_ahead(noted: Noted) -> bool:
     """Test that no more than the batch after the current one was read."""
     ends = np.cumsum([len(batch) for batch in noted.batches])
-    return bool((np.array(noted.read) <= ends + 4).all())
+    return bool((np.array(noted.read) <= ends + 2).all())
 
 
 def test_a_detection_of_all_frames_is_in_batches(clip: Path, tmp_path: Path) -> None:
     noted = Noted()
-    _, rows = detect_all(noted.source, Counted(clip), Workspace(tmp_path / "out"))
-    assert noted.batches == [[0, 1, 2, 3], [4, 5]] and few_ahead(noted)
-    assert rows.frame.tolist() == list(range(6))
-    assert rows.xyxy[:, 3].tolist() == [40 + i for i in range(6)]
+    _, rows = detect_all(noted.source, Counted(clip, FIVE), Workspace(tmp_path / "out"))
+    assert noted.batches == [[0, 1], [2, 3], [4]] and few_ahead(noted)
+    assert rows.frame.tolist() == list(range(5))
+    assert rows.xyxy[:, 3].tolist() == [40 + i for i in range(5)]
 
 
 @pytest.mark.parametrize("camera_motion", [True, False])
@@ -264,9 +280,11 @@ def test_tracking_is_in_batches(clip: Path, camera_motion: bool) -> None:
     """Each frame has the tracks of its detections, with and without motion estimated ahead."""
     noted = Noted()
     config = rt.TrackerConfig(camera_motion=camera_motion)
-    steps = list(rt.track(Counted(clip), noted.source, rt.Tracker(config)))
-    assert noted.batches == [[0, 1, 2, 3], [4, 5]] and few_ahead(noted)
-    plain_steps = list(rt.track(rt.Video(clip), rt.DetectionSource(noted.one), rt.Tracker(config)))
+    steps = list(rt.track(Counted(clip, FIVE), noted.source, rt.Tracker(config)))
+    assert noted.batches == [[0, 1], [2, 3], [4]] and few_ahead(noted)
+    plain_steps = list(
+        rt.track(rt.Video(clip, FIVE), rt.DetectionSource(noted.one), rt.Tracker(config))
+    )
     for (a, found), (b, expected) in zip(steps, plain_steps, strict=True):
         assert a.index == b.index and np.array_equal(found.xyxy, expected.xyxy)
         assert found.track_id.tolist() == expected.track_id.tolist()
