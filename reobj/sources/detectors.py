@@ -555,8 +555,9 @@ def _cache_key(config: DetectConfig, *source: str | int) -> str:
     The size of the batches is left out: it does not change the detections.
     """
     names = source_fingerprint(config.class_names) if config.class_names else ""
-    config = dataclasses.replace(config, batch=0)
-    return json.dumps([*source, dataclasses.asdict(config), names])
+    options = dataclasses.asdict(config)
+    del options["batch"]
+    return json.dumps([*source, options, names])
 
 
 def as_source(detector: Any, class_names: Sequence[str] = ()) -> DetectionSource:
