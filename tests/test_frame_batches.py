@@ -311,6 +311,15 @@ def test_a_function_gets_one_image_at_a_time(clip: Path) -> None:
         assert shapes == [(64, 96, 3)] * (frame.index + 1)
 
 
+def test_a_subclass_decides_what_a_call_returns(tmp_path: Path) -> None:
+    class Two(rt.OnnxDetector):
+        def __call__(self, image: Image) -> rt.Detections:
+            return super().__call__(image)[[0, 0]]
+
+    source = as_source(Two(grey_model(tmp_path), rt.DetectConfig(batch=4)))
+    assert len(source(rt.Frame(0, 0.0, plain(40)))) == 2 and source.always_looks
+
+
 def test_cached_frames_are_not_in_the_batch(tmp_path: Path) -> None:
     noted = Noted()
     cache = DetectionCache(tmp_path, (96, 64))

@@ -575,7 +575,7 @@ def as_source(detector: Any, class_names: Sequence[str] = ()) -> DetectionSource
     if isinstance(detector, RecordedDetections):
         return _recorded_source(detector)
     names = tuple(class_names) or _stated_names(detector)
-    if isinstance(detector, OnnxDetector):
+    if type(detector) is OnnxDetector:  # a subclass may change the result of a call
         source = _answer_source(detector.detect, names, bool(class_names))
         return dataclasses.replace(source, always_looks=True, batch=detector.batch)
     if isinstance(detector, LibraryDetector):
@@ -583,7 +583,8 @@ def as_source(detector: Any, class_names: Sequence[str] = ()) -> DetectionSource
     if not callable(detector):
         raise ReobjError(f"{detector!r:.80} is no detector: expected a function image -> detections"
                          "; a file is opened by read_detections(path, video)")  # fmt: skip
-    return _answer_source(lambda images: map(detector, images), names, bool(class_names))
+    source = _answer_source(lambda images: map(detector, images), names, bool(class_names))
+    return dataclasses.replace(source, always_looks=isinstance(detector, OnnxDetector))
 
 
 def _answer_source(
