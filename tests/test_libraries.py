@@ -64,7 +64,8 @@ def batches_are_like_single_frames(folder: Path, model: str, **config: Any) -> N
             np.abs(one.xyxy[:, None] - several.xyxy) < 0.1
         ).all(2)
         assert near.any(1).all()  # equal scores may change their order
-    assert found[0][0].score.tolist() != found[0][1].score.tolist()
+    first, second = (np.column_stack([one.xyxy, one.score]) for one in found[0][:2])
+    assert not np.array_equal(first, second)
 
 
 def opened(video: rt.Video, config: rt.DetectConfig) -> DetectionSource:
