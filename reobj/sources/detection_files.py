@@ -82,6 +82,11 @@ class DetectConfig:
     max_detections: int = option(
         0, "most detections per frame, by score (0: 100 of a model, all of a file)"
     )
+    batch: int = option(
+        0,
+        "frames that a network gets at once (0: 8 on cuda and tensorrt, else 1; a live source: 1); "
+        "lower: less memory of the device",
+    )
 
 
 def unnamed_class(class_id: int, count: int) -> str:
