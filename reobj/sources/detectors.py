@@ -303,14 +303,20 @@ class DetectionCache:
     Args:
         folder: for the cache alone. image_size: (w, h) of the frames and of their masks.
         file_frames: frames of a file; a kill loses a few seconds of work at most.
+        mask_bytes: of masks in memory, after which a file is written before it has its frames.
     """
 
     def __init__(
-        self, folder: str | Path, image_size: tuple[int, int], file_frames: int = 64
+        self,
+        folder: str | Path,
+        image_size: tuple[int, int],
+        file_frames: int = 64,
+        mask_bytes: int = 2**28,
     ) -> None:
         self.folder = Path(folder)
         self.image_size = image_size
         self._file_frames = file_frames
+        self._mask_bytes = mask_bytes
         self._stored: dict[int, RecordedDetections] = {}  # by frame
         self._pending: dict[int, Detections] = {}  # by frame, not on disk yet
         self._skipped: set[int] = set()  # frames of this run on which the detector was not run
@@ -344,7 +350,8 @@ class DetectionCache:
             self._skipped.add(index)
             return
         self._pending[index] = detections
-        if len(self._pending) >= self._file_frames:
+        masks = (d.masks.nbytes for d in self._pending.values() if d.masks is not None)
+        if len(self._pending) >= self._file_frames or sum(masks) >= self._mask_bytes:
             self.flush()
 
     def flush(self) -> None:
