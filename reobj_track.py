@@ -52,6 +52,7 @@ import webbrowser
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -87,6 +88,7 @@ from reobj.commands import (
 )
 from reobj.files import Progress, atomic, load_cached, load_npz, part_path, save_npz, wrapped
 from reobj.maps.corrections import corrected
+from reobj.maps.folder_map import FolderMap
 from reobj.maps.fusion import object_state
 from reobj.maps.known import class_ids, ellipsoid_map_of, embeddings_of
 from reobj.maps.listing import MAP_EXPORTS, export_map, listing
@@ -101,6 +103,7 @@ from reobj.maps.stage import (
     opened_map,
     place_objects,
     place_recording,
+    session_key,
 )
 from reobj.objects.confidence import scores_far_off
 from reobj.objects.config import ObjectsConfig
@@ -1883,8 +1886,19 @@ def _cmd_objects(args: argparse.Namespace) -> int:
     return 0
 
 
+def _folder_map(out: Path) -> FolderMap | None:
+    """Return the map of an output folder; None: there is none."""
+    config = _last_config(out).map
+    if not config.path:
+        return None
+    workspace = Workspace.open(out)
+    video, _ = workspace.video_or_frames(workspace.load_last())
+    return FolderMap(Path(config.path), session_key(video), config.frozen)
+
+
 def _cmd_serve(args: argparse.Namespace) -> int:
-    with Server(args.out, args.port, [sys.executable, __file__]) as server:
+    command = [sys.executable, __file__]
+    with Server(args.out, args.port, command, partial(_folder_map, args.out)) as server:
         print(f"viewer of {args.out}: {server.url}\nCtrl-C ends it", flush=True)
         if args.open:
             webbrowser.open(server.url)

@@ -386,13 +386,16 @@ def _page_of(data: dict[str, Any], served: dict[str, Any] | None) -> str:
     return head + text.replace("<", "\\u003c") + tail
 
 
-def served_page(path: Path, served: dict[str, Any]) -> str:
+def served_page(
+    path: Path, served: dict[str, Any], others: Sequence[EarlierSession] | None = None
+) -> str:
     """Return the page of a scene.html for `serve`: its data, in the page of this version.
 
     No script of the file is used.
 
     Args:
-        served: what the server offers to the page.
+        served: what the server offers to the page. others: recordings that the map has now, shown
+            instead of those of the file if its recording was placed in the map; None: no map.
     Raises:
         ReobjError: the file is not a viewer of this version.
     """
@@ -405,6 +408,9 @@ def served_page(path: Path, served: dict[str, Any]) -> str:
     if not isinstance(data, dict) or data.get("version") != PAGE_VERSION:
         advice = "`objects OUT` makes it again"
         raise ReobjError(f"{path}: not a viewer that this version wrote; {advice}")
+    changes = data.get("changes")
+    if others is not None and isinstance(changes, dict) and not changes.get("refused"):
+        data["earlier"] = _earlier_sessions(others)
     return _page_of(data, served)
 
 
