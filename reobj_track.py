@@ -276,7 +276,9 @@ class OutputConfig:
     )
     scene: bool = option(True, "write the viewer, scene.html")
     cloud: bool = option(
-        False, "dense coloured points in the viewer, from optical flow; about a minute longer"
+        False,
+        "dense coloured points in the viewer: from the maps of --depth, else from optical flow, "
+        "about a minute longer",
     )
     doubtful: bool = option(
         False, "include low-confidence objects in tracks.txt, overlay video and viewer"
@@ -1382,7 +1384,9 @@ def run(
     out = _default_out(source) if out is None else out
     with Workspace(out, overwrite) as workspace, opened_map(config.map) as room:
         workspace.bind(video, overwrite)
-        job = _Job(video, workspace, dataclasses.replace(config, map=config.map.absolute()))
+        poses_config = config.poses.absolute()
+        config = dataclasses.replace(config, map=config.map.absolute(), poses=poses_config)
+        job = _Job(video, workspace, config)
         log.info("input: %r", video)
         log.debug("options that differ from the defaults: %s", changed_options(config))
         viewer = open_viewer(VideoInfo.of(video)) if show else None
@@ -1449,7 +1453,9 @@ def refit(
         last = workspace.load_last()
         video, warnings = (workspace.video(), []) if tracks else workspace.video_or_frames(last)
         corrections = read_edits(edits) if edits else None
-        config = dataclasses.replace(as_config(_last_config(out), config), input=video.config)
+        config = as_config(_last_config(out), config)
+        poses_config = config.poses.absolute()
+        config = dataclasses.replace(config, input=video.config, poses=poses_config)
         _check_objects(config.objects)
         sizes = config.objects
         check_known_size(sizes.known_size, sizes.size_priors(), last.class_names)
@@ -1828,7 +1834,14 @@ def _write(job: _Job, result: Result) -> Result:
     line = job.progress("write", job.video.expected)
     command = apply_command(workspace.out)
     failures = write_pictures(
-        result, workspace.out, job.video, *shown, line, command=command, cloud=output.cloud
+        result,
+        workspace.out,
+        job.video,
+        *shown,
+        line,
+        command=command,
+        cloud=output.cloud,
+        depth=job.config.poses.depth,
     )
     if failures:
         result = dataclasses.replace(result, warnings=[*result.warnings, *failures])
