@@ -210,19 +210,6 @@ def test_what_other_maps_see_through_is_left_out(folder: Path, tmp_path: Path) -
     assert np.abs(place[:, 2] - place[:, 2].round()).max() < 0.01  # nor between, at the edge
 
 
-def test_pixels_at_edges_of_depth_are_left_out(folder: Path, tmp_path: Path) -> None:
-    """A sensor mixes both depths there; one map alone, so that no other contradicts it."""
-    depth = write_depth(tmp_path / "depth", spoiled=4)
-    for path in set(depth.iterdir()) - {depth / "4.depth.png"}:
-        path.unlink()
-    image = cv2.imread(str(depth / "4.depth.png"), cv2.IMREAD_UNCHANGED)
-    image[:, 78:80] = 2500
-    cv2.imwrite(str(depth / "4.depth.png"), image)
-    place, _ = dense_of(with_depth(folder, tmp_path / "out", depth, poses_along_the_wall()))
-    assert set(place[:, 2].round(1)) == {1.0, 2.0, 3.0}
-    assert np.abs(place[:, 2] - place[:, 2].round()).max() < 0.01
-
-
 def test_a_cloud_has_a_limit_that_larger_voxels_keep(monkeypatch: pytest.MonkeyPatch) -> None:
     """Everywhere fewer points, none cut off."""
     rng = np.random.default_rng(0)
