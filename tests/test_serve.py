@@ -26,6 +26,7 @@ from simulated import SIZE, tracks_of, unlinked, walk
 from test_scene import SCREENSHOTS, complaints
 
 import reobj_track as rt
+from reobj.maps.earlier import earlier_sessions
 from reobj.results.workspace import Workspace
 
 TOOL = Path(rt.__file__)
@@ -368,6 +369,25 @@ def test_all_recordings_of_the_map_are_browsed(browser: Browser, flat: Path) -> 
             browser.eval("$('session').value = 0; $('session').onchange()")
             assert browser.eval("here.map(o => o.id)") == numbers[number]
             assert own_complaints(browser) == []
+
+
+def test_a_loaded_result_has_the_recordings_of_the_map(flat: Path) -> None:
+    """So has the page that a notebook makes of it; a damaged file costs these only."""
+    (flat / "b/scene.html").unlink()
+    result = rt.Result.load(flat / "b")
+    room = rt.RoomMap.load(flat / "flat.map")
+    (session,) = result.earlier
+    (true,) = earlier_sessions(room, flat / "flat.map", room.session(2).fingerprint)
+    assert (session.name, session.date) == (true.name, true.date) == ("room.mp4 0-80", true.date)
+    assert session.changes is None and len(true.objects) > 3
+    for found, expected in zip(session.objects, true.objects, strict=True):
+        assert (found.id, found.class_name) == (expected.id, expected.class_name)
+        np.testing.assert_allclose(found.center, expected.center, rtol=1e-5)
+        np.testing.assert_allclose(found.size_m, expected.size_m, rtol=1e-5)
+    page = result._repr_html_()
+    assert "room.mp4 0-80" in page and "First recording of the map" in page
+    (flat / "b/cache/earlier.json").write_text('{"sessions": [{"name": 3}]}')
+    assert rt.Result.load(flat / "b").earlier == ()
 
 
 def test_a_folder_without_its_map_shows_the_page_of_its_fit(flat: Path) -> None:
