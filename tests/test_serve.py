@@ -326,6 +326,24 @@ def killed_during_undo(out: Path) -> Client:
     return client
 
 
+def test_undo_that_fails_or_is_ended_leaves_the_map(flat: Path) -> None:
+    """Another run writes into the folder; then Ctrl-C while the worker runs."""
+    out = flat / "b"
+    with serving(out) as client:
+        save(client, map_edits(flat))
+        saved = (flat / "flat.map").read_bytes()
+        with Workspace.open(out):
+            assert undo(client)[0] == 200
+            state = client.finished()
+        assert state["failed"] and "another run is writing" in state["text"] and state["undo"] == 1
+        assert (flat / "flat.map").read_bytes() == saved
+        assert undo(client)[0] == 200
+        while not workers_of(client):
+            time.sleep(0.02)
+        assert (flat / "flat.map").read_bytes() != saved
+    assert (flat / "flat.map").read_bytes() == saved and (out / "edits.json").is_file()
+
+
 def test_a_map_that_another_command_changed_is_left_alone(flat: Path) -> None:
     """Undo is refused in a line that names the map; map and folder stay as they are."""
     out = flat / "b"
