@@ -27,6 +27,9 @@ from test_scene import SCREENSHOTS, complaints
 
 import reobj_track as rt
 from reobj.maps.earlier import earlier_sessions
+from reobj.maps.folder_map import FolderMap
+from reobj.maps.stage import session_key
+from reobj.results.edits import read_edits
 from reobj.results.workspace import Workspace
 
 TOOL = Path(rt.__file__)
@@ -298,15 +301,19 @@ def test_undo_restores_the_map(flat: Path) -> None:
 def test_undo_that_was_killed_is_repeated(flat: Path) -> None:
     """Server and worker are killed once the map is restored: it is complete, and undo still works.
 
-    The same after a save: it was applied to the map, and the server did not learn of its end.
+    The save before it had no end either: the worker finished, but the server did not learn of it.
     """
     before = in_map(flat)
     out = flat / "b"
-    with serving(out) as client:
-        save(client, map_edits(flat))
-    digests = out / "cache/undo/1.digests"
-    digests.write_text("\n".join(digests.read_text().split()[:2]))  # as before the end of the save
-    client = killed_during_undo(out)
+    undo_file = out / "cache/undo/1.json"
+    edits = flat / "edits.json"
+    edits.write_bytes(map_edits(flat))
+    room = FolderMap(flat / "flat.map", session_key(Workspace(out).video()), False)
+    room.keep(undo_file.with_suffix(".map"), read_edits(edits))
+    undo_file.write_bytes(edits_of(out))
+    assert rt.main(["objects", str(out), "--edits", str(edits)]) == 0
+    assert in_map(flat)[1:] != before[1:]
+    kill_during_undo(out)
     assert in_map(flat)[1:] == before[1:] and (out / "edits.json").is_file()
     with serving(out) as client:
         assert client.state()["undo"] == 1
@@ -314,7 +321,7 @@ def test_undo_that_was_killed_is_repeated(flat: Path) -> None:
     assert in_map(flat) == before and not (out / "edits.json").exists()
 
 
-def killed_during_undo(out: Path) -> Client:
+def kill_during_undo(out: Path) -> None:
     """Begin to undo; kill server and worker as soon as the worker runs."""
     with pytest.raises(AssertionError), serving(out) as client:  # the server does not end well
         assert undo(client)[0] == 200
@@ -323,7 +330,6 @@ def killed_during_undo(out: Path) -> Client:
         client.process.kill()
         for worker in workers:
             os.kill(worker, signal.SIGKILL)
-    return client
 
 
 def test_undo_that_fails_or_is_ended_leaves_the_map(flat: Path) -> None:
