@@ -13,7 +13,7 @@ import numpy as np
 
 from reobj.files import atomic, load_json, numbers, rounded
 from reobj.results.entries import Object, decode
-from reobj.types import Array, ReobjError
+from reobj.types import Array, ReobjError, counted
 
 HEADER = {"format": "reobj-changes", "version": 1}
 
@@ -187,6 +187,8 @@ class Changes:
         """Summarise the changes in a line: "12 stayed, 1 moved (chair 6 by 0.56 m)"."""
         if self.refused:
             return f"map {self.map_path}: not placed; {self.refused}"
+        if self.new and not self.placed_by and len(self.of_objects()) == len(self.new):
+            return f"map {self.map_path}: made with {counted(len(self.new), 'object', 'objects')}"
         counts = []
         for kind in ("stayed", "moved", "gone", "new", "not_seen"):
             changes = getattr(self, kind)
