@@ -1130,6 +1130,21 @@ def changed_page(page: Path) -> Path:
     return out / "scene.html"
 
 
+def test_the_recording_that_made_the_map_has_no_new_objects(browser: Browser, page: Path) -> None:
+    """The header says that it made the map; nothing is marked."""
+    result = rt.Result.load(page.parent)
+    new = tuple(Change(o.id, o.class_name, None, np.zeros(3)) for o in result.objects)
+    changes = Changes("flat.map", "monday", new=new)
+    out = page.parent.parent / "first"
+    out.mkdir()
+    video = rt.Video(page.parent.parent / "frames")
+    write_pictures(dataclasses.replace(result, changes=changes), out, video, overlay="none")
+    browser.open(out / "scene.html")
+    assert browser.eval("$('since').textContent") == f"map flat.map: made with {len(new)} objects"
+    assert browser.eval("here.map(markOf).filter(Boolean)") == []
+    assert browser.eval("$('kinds').hidden")
+
+
 def test_an_arrow_leads_from_the_ghost_to_the_moved_object(
     browser: Browser, changed_page: Path
 ) -> None:

@@ -461,9 +461,7 @@ def load_map(path: Path) -> RoomMap:
         raise ReobjError(f"{path}: is a folder, but a map is a file")
     if not path.is_file():
         raise ReobjError(f"{path}: no such map; `run VIDEO -o OUT --map {path}` makes it")
-    with path.open("rb") as file:
-        if file.read(2) != b"PK":  # the first bytes of a zip file, which npz files are
-            raise ReobjError(f"{path}: {ANOTHER_FILE}")
+    _check_kind(path)
     try:
         arrays, facts = load_npz(path, sealed=True)
     except ReobjError:
@@ -479,6 +477,13 @@ def load_map(path: Path) -> RoomMap:
         fault = one_line(f"{missing}{error}")
         raise ReobjError(f"{path}: damaged ({fault}); use a copy of it") from error
     return room
+
+
+def _check_kind(path: Path) -> None:
+    """Refuse what is no zip file by its first bytes; npz files are."""
+    with path.open("rb") as file:
+        if file.read(2) != b"PK":
+            raise ReobjError(f"{path}: {ANOTHER_FILE}")
 
 
 def _check_header(path: Path, facts: dict[str, Any]) -> None:
@@ -587,8 +592,10 @@ def map_lock(path: Path) -> Iterator[None]:
     """Hold the lock of a map that is going to be written.
 
     Raises:
-        ReobjError: another run holds it.
+        ReobjError: another run holds it; or the file is no map, then no lock is made.
     """
+    if path.is_file():
+        _check_kind(path)
     try:
         with locked(path.with_name(f".{path.name}.lock"), named=path):
             yield

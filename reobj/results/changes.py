@@ -183,11 +183,16 @@ class Changes:
         }
         return facts | {kind: [c.to_json() for c in getattr(self, kind)] for kind in self.KINDS}
 
+    @property
+    def made_the_map(self) -> bool:
+        """True of the recording that made the map: that its objects are new is no change."""
+        return bool(self.new) and not self.placed_by and len(self.of_objects()) == len(self.new)
+
     def summary(self) -> str:
         """Summarise the changes in a line: "12 stayed, 1 moved (chair 6 by 0.56 m)"."""
         if self.refused:
             return f"map {self.map_path}: not placed; {self.refused}"
-        if self.new and not self.placed_by and len(self.of_objects()) == len(self.new):
+        if self.made_the_map:
             return f"map {self.map_path}: made with {counted(len(self.new), 'object', 'objects')}"
         counts = []
         for kind in ("stayed", "moved", "gone", "new", "not_seen"):
