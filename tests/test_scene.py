@@ -462,6 +462,12 @@ def test_implausible_objects_are_marked_and_not_counted(browser: Browser, page: 
     assert browser.eval("here[2].row.title") == "size is 7.2 sigma"
     dashed = "here.slice(0, 3).map(o => Boolean(o.group.parts.wire.material.dashed))"
     assert browser.eval(dashed) == [False, False, True]
+    filled = "[here[0], here[2]].map(o => o.group.parts).map(p => [p.faces, p.ellipsoid])"
+    filled = f"{filled}.map(p => p.map(x => x.visible))"
+    assert browser.eval(filled) == [[True, True], [False, False]]
+    browser.eval("select(here[2]); draw()")
+    assert browser.eval(filled)[1] == [True, True]
+    browser.eval("select(null)")
     assert browser.eval("room.radius") < 1.5 * before
     assert "suitcase 0" in browser.eval("$('classes').textContent")
 

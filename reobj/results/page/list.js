@@ -99,10 +99,11 @@ function fillList() {
   filterList();
 }
 
+const AND = new Intl.ListFormat("en-GB");        // 1, 2 and 3
 function evidence(link) {
   const numbers = [...new Set(link.tracklets)], noun = numbers.length > 1 ? "tracklets" : "tracklet";
   const owners = (t) => { const ids = objects.filter((o) => o.tracks.includes(t)).map((o) => o.id);
-    return `${ids.length > 1 ? "objects" : "object"} ${ids.join(" and ")}`; };
+    return `${ids.length > 1 ? "objects" : "object"} ${AND.format(ids.map(String))}`; };
   const names = `${noun} ${numbers.map((t) => `${t} (${owners(t)})`).join(", ")}`;
   if (link.place_iou === null) {
     return (link.kind === "split" ? `split: ${names} from the rest`

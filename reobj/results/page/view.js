@@ -326,8 +326,10 @@ function draw() {
     const lit = chosen || state.step < 0 || o.then || seenAt(o, state.step);
     const strength = isFound(o) || chosen ? 1 : FAINT;
     o.group.visible = visible.has(o);
-    wire.visible = faces.visible = $("solids").checked;
-    ellipsoid.visible = $("ellipsoids").checked || !$("solids").checked;
+    const filled = chosen || o.status !== "implausible";   // of 20 m it would cover the room
+    wire.visible = $("solids").checked;
+    faces.visible = filled && $("solids").checked;
+    ellipsoid.visible = filled && $("ellipsoids").checked || !$("solids").checked;
     halo.visible = chosen || Boolean(markOf(o)) && isFound(o);
     halo.material.color.set(css(chosen ? "--halo" : `--${changeOf(o)?.kind}`) || "#000");
     halo.material.opacity = chosen ? 1 : 0.6;
