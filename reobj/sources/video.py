@@ -493,6 +493,8 @@ class Video:
             kind = "video (damaged, or no video)"
             if self.is_live:
                 kind = "camera (is it connected?)" if is_camera else "stream (is it there?)"
+            elif not os.access(self.source, os.R_OK):
+                raise ReobjError(f"{self.source}: you may not read it; allow it (chmod u+r)")
             raise ReobjError(f"{self.source}: cannot be opened as a {kind}")
         return capture
 
