@@ -162,7 +162,7 @@ def lines(onnx: str, pt: str) -> list[Line]:
         Line("rfdetr:MODEL", f"--detector rfdetr:nano= {LOW}", RANDOM),
         Line(
             "torchvision:MODEL",
-            f"--detector torchvision:fasterrcnn_mobilenet_v3_large_320_fpn= {LOW}",
+            f"--detector torchvision:ssdlite320_mobilenet_v3_large= {LOW}",
             RANDOM,
         ),
         Line("hf:FOLDER", f"--detector hf:rt_detr {LOW}", f"RT-DETRv2. {RANDOM}", make_rt_detr),
