@@ -192,6 +192,18 @@ def test_a_missing_library_is_one_line_with_the_command(
         detect(video, "mine.pt")
 
 
+def test_a_missing_package_of_one_model_is_not_taken_for_the_library(
+    video: rt.Video, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def without_clip(_: libraries.LibraryOptions) -> libraries.LibraryDetector:
+        raise ModuleNotFoundError("No module named 'clip'", name="clip")
+
+    broken = libraries.Library(without_clip, "ultralytics", "yolo11n.pt", "yolov8s-worldv2.pt")
+    monkeypatch.setitem(libraries.LIBRARIES, "ultralytics", broken)
+    with pytest.raises(rt.ReobjError, match="'clip'; ultralytics needs it for this model"):
+        detect(video, "ultralytics:yolov8s-worldv2.pt", words="toolbox")
+
+
 @pytest.mark.parametrize("device", ["openvino", "coreml"])
 def test_a_device_of_onnxruntime_is_refused(video: rt.Video, device: str) -> None:
     with pytest.raises(rt.ReobjError, match=f"--device {device}: detectors of hf run on cpu, cuda"):

@@ -245,9 +245,11 @@ def library_detector(
     try:
         found = library.open(LibraryOptions(model, words, min_score, device))
     except ImportError as error:
-        raise ReobjError(
-            f"--detector {detector}: {error}; it needs: pip install {library.install}"
-        ) from error
+        remedy = f"it needs: pip install {library.install}"
+        missing = (error.name or "").partition(".")[0]
+        if missing not in ("", "torch", *library.install.split()):  # of one model alone, as CLIP
+            remedy = f"{name} needs it for this model; its documentation says how to install it"
+        raise ReobjError(f"--detector {detector}: {error}; {remedy}") from error
     except ReobjError:
         raise
     except Exception as error:  # no such file, no download, no such device, no model
