@@ -34,6 +34,7 @@ BOXER = (
     "time_ns,tx_world_object,ty_world_object,tz_world_object,qw_world_object,qx_world_object,"
     "qy_world_object,qz_world_object,scale_x,scale_y,scale_z,name,instance,sem_id,prob"
 )
+MOST_LINES = 30  # of the output of a command
 RANDOM = "Random weights: the boxes mean nothing."
 LOW = "--set detect.min_score=0.001"  # scores of random weights are low
 LOWEST = "--set detect.min_score=0.000001"
@@ -217,7 +218,10 @@ def result(line: Line, folder: Path) -> str:
     done = subprocess.run(shell, shell=True, cwd=folder, capture_output=True, text=True)
     errors = [row for row in done.stderr.splitlines() if row.startswith(("error:", "warning:"))]
     text = done.stdout.strip().partition("\nsigma:")[0].splitlines() + errors
-    text = [row.replace(str(folder), ".") for row in text if not row.startswith("look at:")]
+    text = [re.sub(r"\x1b\[\d*m", "", row.replace(str(folder), ".")) for row in text]
+    text = [row for row in text if not row.startswith("look at:")]
+    if len(text) > MOST_LINES:
+        text[MOST_LINES // 2 : -MOST_LINES // 2] = ["..."]
     end = f"{count(folder / out)}." if done.returncode == 0 else f"Exit code {done.returncode}."
     shown = "\n".join([f"$ {command}", *text])
     print(line.name, done.returncode, end, flush=True)
