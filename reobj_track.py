@@ -48,9 +48,8 @@ import re
 import sys
 import time
 import traceback
-import webbrowser
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -1377,12 +1376,16 @@ def run(
     video = open_video(source, config.input, config.poses, tracks or detections, config.detect)
     config = _with_input(config, video.config)
     out = _default_out(source) if out is None else out
-    with Workspace(out, overwrite) as workspace, opened_map(config.map) as room:
+    with (
+        Workspace(out, overwrite) as workspace,
+        opened_map(config.map) as room,
+        ExitStack() as opened,
+    ):
         workspace.bind(video, overwrite)
         job = _Job(video, workspace, dataclasses.replace(config, map=config.map.absolute()))
         log.info("input: %r", video)
         log.debug("options that differ from the defaults: %s", changed_options(config))
-        viewer = open_viewer(VideoInfo.of(video)) if show else None
+        viewer = open_viewer(VideoInfo.of(video), opened) if show else None
         in_3d = in_3d and config.poses.mode != "none"
         readings = _pose_readings(video, config.poses, detections) if in_3d else []
         if tracks:
@@ -1421,7 +1424,6 @@ def run(
         result = _finish(job, result, room, placed, fit=fitted is None)
         if viewer is not None:
             viewer.show(result.without_doubtful(), Path("rerun"), images=not viewer.followed)
-            viewer.close()
         return result
 
 
@@ -1887,7 +1889,7 @@ def _cmd_serve(args: argparse.Namespace) -> int:
     with Server(args.out, args.port, [sys.executable, __file__]) as server:
         print(f"viewer of {args.out}: {server.url}\nCtrl-C ends it", flush=True)
         if args.open:
-            webbrowser.open(server.url)
+            server.open_browser()
         try:
             server.serve_forever()
         except KeyboardInterrupt:

@@ -122,9 +122,8 @@ class Corrections:
             read_edits(new)
             before = self.out / OutputFile.EDITS
             old = before.read_bytes() if before.is_file() else _no_edits()
-        except ReobjError as error:
-            self._end(str(error))
-            raise
+        except (ReobjError, OSError) as error:
+            raise self._not_started(error) from error
         self._run(new, partial(self._push, old))
 
     def undo(self) -> None:
@@ -139,7 +138,11 @@ class Corrections:
             self._end("")
             raise ReobjError("nothing to undo")
         last = stack[-1]
-        self._run(self._temporary(last.read_bytes()), last.unlink)
+        try:
+            edits = self._temporary(last.read_bytes())
+        except (ReobjError, OSError) as error:
+            raise self._not_started(error) from error
+        self._run(edits, last.unlink)
 
     def stop(self) -> None:
         """End the worker; the result stays as it was."""
@@ -162,6 +165,12 @@ class Corrections:
             self._is_running = False
             self._failed = bool(fault)
             self._text = fault
+
+    def _not_started(self, error: Exception) -> ReobjError:
+        """End a job whose files cannot be read or written; return the error for the user."""
+        fault = one_line(str(error))
+        self._end(fault)
+        return ReobjError(fault)
 
     def _temporary(self, text: bytes) -> Path:
         """Write the file that the worker reads, and `_work` removes."""
@@ -202,7 +211,7 @@ class Corrections:
                 fault = self._follow(process, edits)
             if not fault:
                 done()
-        except OSError as error:
+        except (ReobjError, OSError) as error:
             fault = one_line(str(error))
         finally:
             edits.unlink(missing_ok=True)
