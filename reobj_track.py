@@ -1723,11 +1723,8 @@ def _place_by_objects(
         result, cameras, COLMAP models; the result with fitted objects, None if the cameras moved
         or points placed them.
     """
-    if result.boxes_3d is not None:
-        text = "the 3D boxes are used as 2D boxes only: the map has another world"
-        result = dataclasses.replace(result, boxes_3d=None, warnings=[*result.warnings, text])
     if not placed.unmatched:
-        return result, placed, models, None
+        return _without_moved_boxes(result, placed), placed, models, None
     poses = placed.poses
     with job.timed("objects"):
         fitted = _fit_objects(job, result)
@@ -1736,7 +1733,17 @@ def _place_by_objects(
         models = _moved_models(job, models, poses, placed)
     if placed.placement is not None and placed.placement.refused:
         return result, placed, models, fitted
-    return dataclasses.replace(result, poses=placed.poses), placed, models, None
+    moved = dataclasses.replace(result, poses=placed.poses)
+    return _without_moved_boxes(moved, placed), placed, models, None
+
+
+def _without_moved_boxes(result: Result, placed: Placed) -> Result:
+    """Leave out the boxes in 3D if the cameras were moved into the world of a map."""
+    placement = placed.placement
+    if result.boxes_3d is None or placement is None or placement.refused:
+        return result
+    text = "the 3D boxes are used as 2D boxes only: the map has another world"
+    return dataclasses.replace(result, boxes_3d=None, warnings=[*result.warnings, text])
 
 
 def _embedder_key(job: _Job) -> str:

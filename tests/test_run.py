@@ -873,7 +873,12 @@ def test_boxes_in_3d_of_another_program(tmp_path: Path, capsys: pytest.CaptureFi
             assert np.array(o.size) == pytest.approx(0.5, rel=0.03)
             assert np.isfinite(o.cov).all() and max(o.size_rel_sigma) < 0.07
     assert cli("export", out, "--to", "boxer", "-o", tmp_path / "again.csv") == 0
-    capsys.readouterr()
+    of_map = ("--map", tmp_path / "room.map", "-o", tmp_path / "mapped")
+    assert cli("run", frames, *of_map, *files, *cameras, *QUICK) == 0
+    assert "3D boxes" not in capsys.readouterr().err  # this recording made the map, in its world
+    for mapped in (rt.Result.load(tmp_path / "mapped"), rt.refit(tmp_path / "mapped")):
+        sizes = [np.array([o.size for o in r.located]) for r in (mapped, result)]
+        np.testing.assert_allclose(*sizes, rtol=1e-6)
     text = files[1].read_text()
     rows = text.splitlines()
     for name, changed, command, said in (
