@@ -200,6 +200,25 @@ def test_a_run_is_placed_by_its_objects(bare, tmp_path):
     )
 
 
+def test_classes_of_the_map_may_have_other_names(bare, tmp_path):
+    """A detector that writes "Chair" and "Dining_Table" made the map."""
+    path, moved = bare
+    room = rt.RoomMap.load(path)
+    objects = [
+        dataclasses.replace(o, observations=tuple(
+            dataclasses.replace(
+                seen, classes={k.title().replace(" ", "_"): v for k, v in seen.classes.items()})
+            for seen in o.observations))
+        for o in room.objects
+    ]  # fmt: skip
+    dataclasses.replace(room, objects=tuple(objects)).save(tmp_path / "titles.map")
+    result = rt.run(
+        ROOM / "room.mp4", tmp_path / "out", with_poses(6, moved), map=tmp_path / "titles.map",
+        detections=ROOM / "detections.npz", map_frozen=True,
+    )  # fmt: skip
+    assert result.changes.placed_by == "objects" and len(result.changes.stayed) >= 10
+
+
 def test_a_frozen_map_leaves_the_placement_to_the_output_folder(bare, tmp_path):
     """`objects OUT` knows by what the recording was placed, and how well."""
     path, moved = bare
