@@ -98,6 +98,40 @@ def test_points_lie_on_the_wall_in_its_colours() -> None:
     assert (gap < 4 * np.percentile(gap, 90)).all()
 
 
+def two_components() -> rt.Poses:
+    """The walk along the wall twice; the second component has a world of ten times the size."""
+    one = poses_along_the_wall()
+    large = one.cam_from_world.copy()
+    large[:, :, 3] *= 10
+    frame, point = np.indices((FRAMES, 400)).reshape(2, -1)
+    seen = np.column_stack([frame, point])
+    return dataclasses.replace(
+        one,
+        frame=np.arange(2 * FRAMES),
+        time_s=np.arange(2 * FRAMES) / 25,
+        cam_from_world=np.concatenate([one.cam_from_world, large]),
+        status=np.tile(one.status, 2),
+        points=np.concatenate([one.points, one.points * 10]),
+        colors=np.tile(one.colors, (2, 1)),
+        visibility=np.concatenate([seen, np.add(seen, (FRAMES, 400))]),
+        part=np.repeat([0, 1], FRAMES),
+    )
+
+
+def test_each_component_has_its_depths() -> None:
+    """The baseline is compared with the depth of the points of the same component."""
+    poses = two_components()
+    frames = DenseFrames(poses)
+    images = frames_of(poses_along_the_wall())
+    for number, image in enumerate([*images, *images]):
+        if number in frames.wanted:
+            frames.take(number, image)
+    for part, scale in enumerate((1, 10)):
+        cloud = frames.cloud(part)
+        assert cloud is not None and len(cloud) > 20_000
+        assert np.percentile(np.abs(cloud.xyz[:, 2] / scale - DEPTH), 95) < 0.03
+
+
 def test_unrelated_frames_give_no_points() -> None:
     poses = poses_along_the_wall()
     frames = DenseFrames(poses)
@@ -135,7 +169,10 @@ def test_the_page_has_the_points(folder: Path, tmp_path: Path) -> None:
 
 
 def test_points_leave_the_page_below_its_limit(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """The most observed points remain."""
     result = result_of(poses_along_the_wall())
@@ -146,6 +183,10 @@ def test_points_leave_the_page_below_its_limit(
     monkeypatch.setattr(scene, "PAGE_MAX", 1_000_000)
     write_scene(result, pictures, tmp_path / "scene.html", video)
     assert 900_000 < (tmp_path / "scene.html").stat().st_size <= 1_000_000
+    assert caplog.text == ""
+    monkeypatch.setattr(scene, "PAGE_MAX", 1000)
+    write_scene(result, pictures, tmp_path / "scene.html", video)
+    assert "no dense points: the page has 0." in caplog.text and "baseline" not in caplog.text
 
 
 def test_without_a_baseline_there_is_a_message(

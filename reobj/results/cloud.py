@@ -68,6 +68,7 @@ class DenseFrames:
         self.centers = -np.einsum(
             "nji,nj->ni", poses.cam_from_world[:, :, :3], poses.cam_from_world[:, :, 3]
         )  # (F, 3)
+        self.points = [poses.of_part(part).points for part in range(poses.part_count)]
         self.depth = {int(row): self._median_depth(row) for row in rows[even]}
         partners = [self._after(row, share) for row in self.depth for share in (0.1, 0.2)]
         self.rows = sorted({*self.depth, *(row for row in partners if row >= 0)})
@@ -76,7 +77,8 @@ class DenseFrames:
     def _median_depth(self, row: int) -> float:
         """Return the median depth of the sparse points in a frame; NaN: fewer than 20."""
         pose = self.poses.cam_from_world[row]
-        points = self.poses.points[:: len(self.poses.points) // 5000 + 1]
+        points = self.points[self.poses.part[row]]  # (N, 3), of the same world
+        points = points[:: len(points) // 5000 + 1]
         x = points @ pose[:, :3].T + pose[:, 3]
         x = x[x[:, 2] > 0]
         uv = x @ self.poses.camera.K.T / x[:, 2:]
