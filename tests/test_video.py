@@ -25,6 +25,7 @@ import numpy as np
 import pytest
 
 import reobj_track as rt
+from reobj.results.names import recording_name
 from reobj.sources import video as video_room
 from reobj.sources.image_files import Header, header_of, times_of_names
 from reobj.types import Image
@@ -883,3 +884,20 @@ def test_frames_have_the_times_of_their_names(tmp_path):
     found = [(frame.index, frame.time_s) for frame in video]
     np.testing.assert_allclose(found, [(1, START + 0.1), (3, START + 0.3)], atol=1e-6)
     assert video.fps == pytest.approx(10)
+
+
+def test_a_recording_is_named_by_its_file_or_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Brackets are part of a name where the file exists, else of a glob."""
+    kitchen = tmp_path / "kitchen [1]"
+    (kitchen / "rgb").mkdir(parents=True)
+    (kitchen / "clip [a].mp4").touch()
+    monkeypatch.chdir(kitchen / "rgb")
+    for source, name in (
+        (kitchen / "clip [a].mp4", "clip [a].mp4"), (kitchen, "kitchen [1]"),
+        (kitchen / "rgb", "kitchen [1]"), ("..", "kitchen [1]"), (".", "kitchen [1]"),
+        (tmp_path / "rgb" / "*.png", tmp_path.name), (0, "0"), ("http://u:p@host/a.mp4", "a.mp4"),
+        ("http://host/" + 300 * "x", 300 * "x"),
+    ):  # fmt: skip
+        assert recording_name(str(source)) == name
