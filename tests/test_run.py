@@ -928,6 +928,9 @@ def test_words_of_the_user_get_size_priors(
     for bad, said in (
         ("mixer=.2x.3m", "--prior 'mixer=.2x.3m': expected WORD=WIDTHxDEPTHxHEIGHT in m, cm"),
         ("mixer=suitcse", "no size prior of suitcse; did you mean suitcase?"),
+        ("Mixer=1x1x1m,mixer=2x2x2m", "--prior mixer: means the same as Mixer, give one of them"),
+        ("sofa=1x1x1m,couch=bed", "--prior couch: means the same as sofa, give one of them"),
+        ("vcr=tv,vcr=bed", "--prior vcr: is given twice"),
     ):
         other = tmp_path / "bad"
         assert cli("run", frames, "-o", other, *args, *QUICK, "--prior", bad) == 2
