@@ -18,7 +18,10 @@ import reobj_track as rt
 from reobj.results.cloud import Cloud, DenseFrames
 from reobj.results.scene import Pictures, write_pictures, write_scene
 
-WIDTH, HEIGHT, FOCAL, FRAMES = 320, 240, 250.0, 8
+WIDTH = 320
+HEIGHT = 240
+FOCAL = 250.0  # px
+FRAMES = 8
 DEPTH = 3.0  # of a wall, whose texture has 100 pixels a metre
 
 

@@ -128,7 +128,8 @@ def film_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         writer.write(image)
     writer.release()
     poses = walk(FILM, camera=LENS)
-    workspace, given = Workspace(top / "out"), unlinked(poses, tracks_of(poses))
+    workspace = Workspace(top / "out")
+    given = unlinked(poses, tracks_of(poses))
     workspace.bind(rt.Video(path))
     workspace.save_last(given, given.poses)
     assert rt.main(["objects", str(workspace.out), "--set", "output.overlay=none"]) == 0
@@ -266,7 +267,14 @@ def test_requests_without_the_token_are_refused(out: Path) -> None:
                             headers["Set-Cookie"])  # fmt: skip
         status, headers, page = client.ask("/", Cookie=headers["Set-Cookie"].split(";")[0])
         assert status == 200 and b'id="served">{"recording"' in page
-        assert headers["Cache-Control"] == "no-store" and client.token.encode() not in page
+        assert client.token.encode() not in page
+        for path in ("/", "/state", "/frame/1", "/none"):
+            headers = client.get(path)[1]
+            assert headers["Cache-Control"] == "no-store"
+            assert headers["X-Content-Type-Options"] == "nosniff"
+            assert headers["Referrer-Policy"] == "no-referrer"
+            assert headers["Cross-Origin-Resource-Policy"] == "same-origin"
+            assert headers["Content-Security-Policy"] == "frame-ancestors 'none'"
 
 
 def test_cookies_of_other_programs_do_not_matter(out: Path) -> None:
