@@ -7,6 +7,7 @@ path of a file.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -331,12 +332,10 @@ class _Handler(LocalHandler):
         """Send bytes of a file; the browser may end the connection when it has enough."""
         file.seek(first)
         left = last + 1 - first
-        try:
+        with contextlib.suppress(OSError):
             while left > 0 and (data := file.read(min(CHUNK, left))):
                 self.wfile.write(data)
                 left -= len(data)
-        except OSError:
-            self.close_connection = True
         if left > 0:
             self.close_connection = True
 
