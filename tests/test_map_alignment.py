@@ -15,6 +15,7 @@ from test_map_run import CAMERA, ROOM
 import reobj_track as rt
 from reobj.cameras import invert_rigid
 from reobj.maps.object_alignment import AlignmentOptions, align
+from reobj.maps.object_placement import place_by_objects
 from reobj.maps.placement import ComponentPlacement, Placement
 from reobj.maps.room_map import MapPoints
 
@@ -217,6 +218,27 @@ def test_classes_of_the_map_may_have_other_names(bare, tmp_path):
         detections=ROOM / "detections.npz", map_frozen=True,
     )  # fmt: skip
     assert result.changes.placed_by == "objects" and len(result.changes.stayed) >= 10
+
+
+def test_too_few_of_the_objects_in_view_are_refused(bare):
+    """The recording in its map: nearly all coincide; more than are in view are never there."""
+    path, _ = bare
+    result = rt.Result.load(path.parent / "a")
+    unmatched = (ComponentPlacement(None, (), 1, "no points", unmatched=True),)
+    by_points = Placement(result.poses, unmatched, "no points")
+
+    def placed(**options):
+        of = AlignmentOptions(**options)
+        return place_by_objects(rt.RoomMap.load(path), result, "", by_points, of)
+
+    found = placed()
+    assert found.refused == "" and found.by == "objects"
+    count = int(found.poses.messages[-1].split("in the map by ")[1].split()[0])
+    assert count >= 10
+    refused = placed(share=1.5).refused
+    assert refused.startswith(f"no points; by objects: {count} objects coincide with the map, of ")
+    in_view = int(refused.split("map, of ")[1].split()[0])
+    assert count <= in_view and f"in view; {int(np.ceil(1.5 * in_view))} of at least 8" in refused
 
 
 def test_a_frozen_map_leaves_the_placement_to_the_output_folder(bare, tmp_path):
