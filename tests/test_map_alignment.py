@@ -62,6 +62,38 @@ def test_without_a_known_scale_it_is_free():
     assert aligned.reason == "" and aligned.scale == pytest.approx(SCALE * 1.5, rel=0.05)
 
 
+def test_objects_of_another_size_do_not_coincide():
+    """Two of 14 have become three times as large; the others give the place."""
+    rng = np.random.default_rng(0)
+    room = simulated_room(rng, 14)
+    center, kind, size = in_session(room)
+    size[[4, 9]] += np.log(3)
+    aligned = align(
+        landmarks(rng, room, 0.1), landmarks(rng, (center, kind, size), 0.1), SCALE_SIGMA
+    )
+    assert aligned.reason == "" and len(aligned.pairs) >= 10
+    assert not {4, 9} & set(aligned.pairs[:, 0].tolist())
+
+
+def test_distances_beyond_the_covariances_enlarge_that_of_the_place():
+    """Both sides claim a sigma of 4 cm; in the second case the centres are off by 10 cm."""
+    sigmas = []
+    for error in (0.0, 0.1):
+        rng = np.random.default_rng(5)
+        room = simulated_room(rng, 16)
+        of_map = landmarks(rng, room, 0.0)
+        found = landmarks(rng, in_session(room), error)
+        claimed = np.tile(np.eye(3) * 0.04**2, (16, 1, 1))
+        aligned = align(
+            dataclasses.replace(of_map, cov=claimed),
+            dataclasses.replace(found, cov=claimed),
+            SCALE_SIGMA,
+        )
+        assert aligned.reason == "" and len(aligned.pairs) >= 12
+        sigmas.append(np.sqrt(np.diag(aligned.cov)[3:5].sum()))
+    assert sigmas[1] > 1.3 * sigmas[0]
+
+
 def test_errors_agree_with_the_covariance():
     squares = []
     for seed in range(20):
