@@ -872,6 +872,7 @@ def test_boxes_in_3d_of_another_program(tmp_path: Path, capsys: pytest.CaptureFi
             assert off.min() < 0.02 and o.support == "box" and o.status == "ok"
             assert np.array(o.size) == pytest.approx(0.5, rel=0.03)
             assert np.isfinite(o.cov).all() and max(o.size_rel_sigma) < 0.07
+    assert not refit.fits.prior_share.any()  # the usual size of the class is not used
     assert cli("export", out, "--to", "boxer", "-o", tmp_path / "again.csv") == 0
     of_map = ("--map", tmp_path / "room.map", "-o", tmp_path / "mapped")
     assert cli("run", frames, *of_map, *files, *cameras, *QUICK) == 0
