@@ -15,7 +15,7 @@ from simulated import fitted
 
 import reobj.results.scene as scene
 import reobj_track as rt
-from reobj.results.cloud import Cloud, DenseFrames
+from reobj.results.cloud import Cloud, DenseFrames, _voxels
 from reobj.results.scene import Pictures, write_pictures, write_scene
 
 WIDTH = 320
@@ -171,13 +171,27 @@ def test_the_page_has_the_points(folder: Path, tmp_path: Path) -> None:
     assert (np.frombuffer(data[9 * n :], np.int8).reshape(-1, 3)[:, 2] < -80).all()
 
 
+def test_the_most_observed_points_come_first() -> None:
+    """A wall, of which the right half was observed five times as often as the left one."""
+    y, z = np.meshgrid(np.linspace(-2, 2, 400), np.linspace(0, 2, 200))
+    wall = np.stack([np.zeros_like(y), y, z], -1).reshape(-1, 3)
+    rng = np.random.default_rng(0)
+    xyz = np.concatenate([wall, *[wall[wall[:, 1] > 0]] * 4])
+    xyz += rng.normal(0, 0.002, xyz.shape)
+    towards = np.tile([1.0, 0, 0], (len(xyz), 1))
+    cloud = _voxels(xyz, np.full((len(xyz), 3), 99, np.uint8), towards)
+    first = cloud.of_rows(np.arange(len(cloud) // 3))
+    assert (first.xyz[:, 1] > 0).mean() > 0.95
+    assert (cloud.xyz[:, 1] > 0).mean() < 0.8
+
+
 def test_points_leave_the_page_below_its_limit(
     folder: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """The most observed points remain."""
+    """Fewer points; without room for any, the message gives the size of the page."""
     result = result_of(poses_along_the_wall())
     video = rt.Video(folder)
     pictures = Pictures(result, video, dense=True)
