@@ -269,7 +269,7 @@ class _Handler(LocalHandler):
             self._refuse(HTTPStatus.FORBIDDEN, "from another page")
             return
         length = self.headers.get("Content-Length", "")
-        if not length.isdecimal() or int(length) > EDITS_MAX:
+        if not re.fullmatch(r"\d{1,9}", length) or int(length) > EDITS_MAX:
             self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"at most {EDITS_MAX >> 20} MB")
             return
         parts = urlsplit(self.path)
