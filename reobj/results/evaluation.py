@@ -360,7 +360,7 @@ def _missed(truth: LabelledBoxes, predicted: LabelledBoxes) -> dict[str, list[in
     name_of = dict(zip(scored.identity.tolist(), scored.name.tolist(), strict=True))
     missed: dict[str, list[int]] = {}
     for identity, match in identity_map(truth, predicted).items():
-        if match is None and identity in name_of:
+        if match is None:
             missed.setdefault(name_of[identity], []).append(identity)
     return dict(sorted(missed.items()))
 
