@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 import cv2
 
 from reobj.cameras import Poses
-from reobj.results.export import Viewer
+from reobj.results.export import Viewer, live_labels
 from reobj.results.local_server import LocalHandler, LocalServer
 from reobj.results.overlay import draw_tracks
 from reobj.results.result import Result, VideoInfo
@@ -66,10 +66,8 @@ class LivePage:
         for frame, tracks in steps:
             if self._server.watchers and time.monotonic() - shown_s > EVERY_S:
                 shown_s = time.monotonic()
-                labels = {
-                    i: f"{i} {names[c] if 0 <= c < len(names) else 'object'}"
-                    for i, c in zip(tracks.track_id.tolist(), tracks.class_id.tolist(), strict=True)
-                }
+                texts = live_labels(tracks, names)
+                labels = dict(zip(tracks.track_id.tolist(), texts, strict=True))
                 image = shrunk(frame.image, PICTURE_PX).copy()
                 scale = image.shape[1] / frame.image.shape[1]
                 draw_tracks(image, tracks, labels, scale, positions)
