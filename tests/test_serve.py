@@ -350,7 +350,18 @@ def test_no_address_is_a_path(out: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "fault", ["no folder", "no page", "link", "old page", "foreign", "port", "range"]
+    "fault",
+    [
+        "no folder",
+        "no page",
+        "link",
+        "old page",
+        "foreign",
+        "not a number",
+        "deep",
+        "port",
+        "range",
+    ],
 )
 def test_bad_input_is_one_line(out: Path, tmp_path: Path, capsys: Any, fault: str) -> None:
     page = out / "scene.html"
@@ -364,12 +375,18 @@ def test_bad_input_is_one_line(out: Path, tmp_path: Path, capsys: Any, fault: st
         page.symlink_to(tmp_path / "elsewhere.html")
     if fault == "old page":
         page.write_text(page.read_text().replace('"version":1,', "", 1))
+    if fault == "not a number":
+        page.write_text(page.read_text().replace('"version":1,', '"version":1,"x":NaN,', 1))
+    if fault == "deep":
+        deep = f'"version":1,"x":{"[" * 99999}{"]" * 99999},'
+        page.write_text(page.read_text().replace('"version":1,', deep, 1))
     if fault == "foreign":
         page.write_text("<script>alert(1)</script>")
     said = {
         "no folder": "no output folder of reobj_track", "no page": "make it with `objects",
         "link": "is a link out of the folder", "old page": "`objects OUT` makes it again",
         "foreign": "not a viewer that this version wrote", "port": "in use",
+        "not a number": "not a viewer", "deep": "not a viewer",
         "range": "0 to 65535 are possible",
     }  # fmt: skip
     if fault == "port":

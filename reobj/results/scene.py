@@ -417,13 +417,18 @@ def served_page(path: Path, served: dict[str, Any]) -> str:
     text = read_text(path)
     found = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)
     try:
-        data = json.loads(found[1]) if found else None
-    except ValueError:
+        data = json.loads(found[1], parse_constant=_no_number) if found else None
+    except (RecursionError, ValueError):
         data = None
     if not isinstance(data, dict) or data.get("version") != PAGE_VERSION:
         advice = "`objects OUT` makes it again"
         raise ReobjError(f"{path}: not a viewer that this version wrote; {advice}")
     return _page_of(data, served)
+
+
+def _no_number(text: str) -> None:
+    """Refuse NaN and Infinity, which the page's data never have."""
+    raise ValueError(text)
 
 
 def _is_file(video: Video) -> bool:
