@@ -51,6 +51,7 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +87,7 @@ from reobj.commands import (
 )
 from reobj.files import Progress, atomic, load_cached, load_npz, part_path, save_npz, wrapped
 from reobj.maps.corrections import corrected
+from reobj.maps.folder_map import FolderMap
 from reobj.maps.fusion import object_state
 from reobj.maps.known import class_ids, ellipsoid_map_of, embeddings_of
 from reobj.maps.listing import MAP_EXPORTS, export_map, listing
@@ -100,6 +102,7 @@ from reobj.maps.stage import (
     opened_map,
     place_objects,
     place_recording,
+    session_key,
 )
 from reobj.objects.confidence import scores_far_off
 from reobj.objects.config import ObjectsConfig
@@ -272,7 +275,9 @@ class OutputConfig:
     )
     scene: bool = option(True, "write the viewer, scene.html")
     cloud: bool = option(
-        False, "dense coloured points in the viewer, from optical flow; about a minute longer"
+        False,
+        "dense coloured points in the viewer: from the maps of --depth, else from optical flow, "
+        "about a minute longer",
     )
     doubtful: bool = option(
         False, "include low-confidence objects in tracks.txt, overlay video and viewer"
@@ -1382,7 +1387,9 @@ def run(
         ExitStack() as opened,
     ):
         workspace.bind(video, overwrite)
-        job = _Job(video, workspace, dataclasses.replace(config, map=config.map.absolute()))
+        poses_config = config.poses.absolute()
+        config = dataclasses.replace(config, map=config.map.absolute(), poses=poses_config)
+        job = _Job(video, workspace, config)
         log.info("input: %r", video)
         log.debug("options that differ from the defaults: %s", changed_options(config))
         viewer = open_viewer(VideoInfo.of(video), opened) if show else None
@@ -1448,7 +1455,9 @@ def refit(
         last = workspace.load_last()
         video, warnings = (workspace.video(), []) if tracks else workspace.video_or_frames(last)
         corrections = read_edits(edits) if edits else None
-        config = dataclasses.replace(as_config(_last_config(out), config), input=video.config)
+        config = as_config(_last_config(out), config)
+        poses_config = config.poses.absolute()
+        config = dataclasses.replace(config, input=video.config, poses=poses_config)
         _check_objects(config.objects)
         sizes = config.objects
         check_known_size(sizes.known_size, sizes.size_priors(), last.class_names)
@@ -1834,7 +1843,14 @@ def _write(job: _Job, result: Result) -> Result:
     line = job.progress("write", job.video.expected)
     command = apply_command(workspace.out)
     failures = write_pictures(
-        result, workspace.out, job.video, *shown, line, command=command, cloud=output.cloud
+        result,
+        workspace.out,
+        job.video,
+        *shown,
+        line,
+        command=command,
+        cloud=output.cloud,
+        depth=job.config.poses.depth,
     )
     if failures:
         result = dataclasses.replace(result, warnings=[*result.warnings, *failures])
@@ -1892,8 +1908,19 @@ def _cmd_objects(args: argparse.Namespace) -> int:
     return 0
 
 
+def _folder_map(out: Path) -> FolderMap | None:
+    """Return the map of an output folder; None: there is none."""
+    config = _last_config(out).map
+    if not config.path:
+        return None
+    workspace = Workspace.open(out)
+    video, _ = workspace.video_or_frames(workspace.load_last())
+    return FolderMap(Path(config.path), session_key(video), config.frozen)
+
+
 def _cmd_serve(args: argparse.Namespace) -> int:
-    with Server(args.out, args.port, [sys.executable, __file__]) as server:
+    command = [sys.executable, __file__]
+    with Server(args.out, args.port, command, partial(_folder_map, args.out)) as server:
         print(f"viewer of {args.out}: {server.url}\nCtrl-C ends it", flush=True)
         if args.open:
             server.open_browser()

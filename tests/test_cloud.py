@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 from simulated import fitted
 
+import reobj.results.cloud as cloud
 import reobj.results.scene as scene
 import reobj_track as rt
-from reobj.results.cloud import Cloud, DenseFrames, _voxels
+from reobj.results.cloud import Cloud, FlowFrames
 from reobj.results.scene import Pictures, write_pictures, write_scene
 
 WIDTH = 320
@@ -85,19 +86,19 @@ def result_of(poses: rt.Poses) -> rt.Result:
 
 def test_points_lie_on_the_wall_in_its_colours() -> None:
     poses = poses_along_the_wall()
-    frames = DenseFrames(poses)
+    frames = FlowFrames(poses)
     for number, image in enumerate(frames_of(poses)):
         if number in frames.wanted:
             frames.take(number, image)
-    cloud = frames.cloud(0)
-    assert cloud is not None and len(cloud) > 20_000
-    assert np.percentile(np.abs(cloud.xyz[:, 2] - DEPTH), 95) < 0.03
-    np.testing.assert_allclose(np.linalg.norm(cloud.seen_from, axis=1), 1, atol=1e-4)
-    assert (cloud.seen_from[:, 2] < -0.7).all()  # towards the cameras
-    at = np.round((cloud.xyz[:, :2] + 4) * 100 - 0.5).astype(int)
+    found = frames.cloud(0)
+    assert found is not None and len(found) > 20_000
+    assert np.percentile(np.abs(found.xyz[:, 2] - DEPTH), 95) < 0.03
+    np.testing.assert_allclose(np.linalg.norm(found.seen_from, axis=1), 1, atol=1e-4)
+    assert (found.seen_from[:, 2] < -0.7).all()  # towards the cameras
+    at = np.round((found.xyz[:, :2] + 4) * 100 - 0.5).astype(int)
     true = cv2.GaussianBlur(wall(), (0, 0), 1)[at[:, 1], at[:, 0], ::-1].astype(float)
-    assert np.abs(cloud.rgb - true).mean() < 15
-    gap = np.abs(cloud.xyz - cloud.xyz.mean(0))
+    assert np.abs(found.rgb - true).mean() < 15
+    gap = np.abs(found.xyz - found.xyz.mean(0))
     assert (gap < 4 * np.percentile(gap, 90)).all()
 
 
@@ -124,7 +125,7 @@ def two_components() -> rt.Poses:
 def test_each_component_has_its_depths() -> None:
     """The baseline is compared with the depth of the points of the same component."""
     poses = two_components()
-    frames = DenseFrames(poses)
+    frames = FlowFrames(poses)
     images = frames_of(poses_along_the_wall())
     for number, image in enumerate([*images, *images]):
         if number in frames.wanted:
@@ -137,23 +138,23 @@ def test_each_component_has_its_depths() -> None:
 
 def test_unrelated_frames_give_no_points() -> None:
     poses = poses_along_the_wall()
-    frames = DenseFrames(poses)
+    frames = FlowFrames(poses)
     rng = np.random.default_rng(2)
     for number in frames.wanted:
         noise = rng.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
         frames.take(number, cv2.GaussianBlur(noise, (0, 0), 3))
-    cloud = frames.cloud(0)
-    assert cloud is None or len(cloud) < 500
+    found = frames.cloud(0)
+    assert found is None or len(found) < 500
 
 
 def test_the_page_has_the_points(folder: Path, tmp_path: Path) -> None:
     poses = poses_along_the_wall()
     result = result_of(poses)
     video = rt.Video(folder)
-    for cloud in (False, True):
-        out = tmp_path / str(cloud)
+    for dense in (False, True):
+        out = tmp_path / str(dense)
         out.mkdir()
-        assert write_pictures(result, out, video, overlay="none", cloud=cloud) == []
+        assert write_pictures(result, out, video, overlay="none", cloud=dense) == []
     text = [(tmp_path / name / "scene.html").read_text() for name in ("False", "True")]
     parts = [json.loads(t.split('id="data">')[1].split("</script>")[0])["parts"] for t in text]
     assert "dense" not in parts[0][0]
@@ -179,10 +180,119 @@ def test_the_most_observed_points_come_first() -> None:
     xyz = np.concatenate([wall, *[wall[wall[:, 1] > 0]] * 4])
     xyz += rng.normal(0, 0.002, xyz.shape)
     towards = np.tile([1.0, 0, 0], (len(xyz), 1))
-    cloud = _voxels(xyz, np.full((len(xyz), 3), 99, np.uint8), towards)
-    first = cloud.of_rows(np.arange(len(cloud) // 3))
+    made = cloud._voxels(xyz, np.full((len(xyz), 3), 99, np.uint8), towards)
+    first = made.of_rows(np.arange(len(made) // 3))
     assert (first.xyz[:, 1] > 0).mean() > 0.95
-    assert (cloud.xyz[:, 1] > 0).mean() < 0.8
+    assert (made.xyz[:, 1] > 0).mean() < 0.8
+
+
+def write_depth(folder: Path, spoiled: int = -1) -> Path:
+    """Depth maps in mm, 160 x 120, of every second frame: of the wall.
+
+    Args:
+        spoiled: map with a patch at 1 m, where the others see through. The left half of the wall
+            is then at 2 m.
+    """
+    folder.mkdir()
+    width = WIDTH // 2
+    for i in range(0, FRAMES, 2):
+        depth = np.full((HEIGHT // 2, width), 1000 * DEPTH)
+        if spoiled >= 0:
+            center = 0.08 * (i - FRAMES / 2)
+            depth[:, (np.arange(width) + 0.5 - width / 2) / (FOCAL / 2) * 2 + center < 0] = 2000
+        if i == spoiled:
+            depth[60:90, 60:100] = 1000
+        depth[:10] = 0
+        cv2.imwrite(str(folder / f"{i}.depth.png"), depth.astype(np.uint16))
+    return folder
+
+
+def dense_of(page: Path) -> tuple[np.ndarray, np.ndarray]:
+    """The dense points of a page in world, and their colours."""
+    text = page.read_text().split('id="data">')[1].split("</script>")[0]
+    part = json.loads(text)["parts"][0]
+    dense = part["dense"]
+    n = dense["count"]
+    data = base64.b64decode(dense["data"])
+    place = np.frombuffer(data[: 6 * n], "<u2").reshape(-1, 3) * dense["step"] + dense["low"]
+    return place + part["origin"], np.frombuffer(data[6 * n : 9 * n], np.uint8).reshape(-1, 3)
+
+
+def with_depth(folder: Path, out: Path, depth: Path | str, poses: rt.Poses) -> Path:
+    """Write the page with dense points of depth maps."""
+    out.mkdir()
+    assert write_pictures(
+        result_of(poses), out, rt.Video(folder), overlay="none", cloud=True, depth=str(depth)
+    ) == []  # fmt: skip
+    return out / "scene.html"
+
+
+@pytest.mark.parametrize("metric", [True, False])
+def test_points_of_depth_maps(folder: Path, tmp_path: Path, metric: bool) -> None:
+    """Exactly on the wall, in its colours; also where a map gives the scale, .5 m a unit."""
+    poses = poses_along_the_wall()
+    metres = 1.0
+    if not metric:
+        metres = 0.5
+        cam_from_world = poses.cam_from_world.copy()
+        cam_from_world[:, :, 3] /= metres
+        poses = dataclasses.replace(
+            poses,
+            metric=False,
+            scale=(metres, 0.0),
+            cam_from_world=cam_from_world,
+            points=poses.points / metres,
+        )
+    page = with_depth(folder, tmp_path / "out", write_depth(tmp_path / "depth"), poses)
+    place, rgb = dense_of(page)
+    place *= metres
+    assert len(place) > 10_000 and np.abs(place[:, 2] - DEPTH).max() < 0.002
+    at = np.round((place[:, :2] + 4) * 100 - 0.5).astype(int)
+    true = cv2.GaussianBlur(wall(), (0, 0), 1)[at[:, 1], at[:, 0], ::-1].astype(float)
+    assert np.abs(rgb.astype(float) - true).mean() < 15
+    top = (10 / (HEIGHT / 2) - 0.5) * HEIGHT / FOCAL * DEPTH  # above it the maps are empty
+    assert place[:, 1].min() > top
+
+
+def test_what_other_maps_see_through_is_left_out(folder: Path, tmp_path: Path) -> None:
+    depth = write_depth(tmp_path / "depth", spoiled=4)
+    place, _ = dense_of(with_depth(folder, tmp_path / "out", depth, poses_along_the_wall()))
+    assert {2.0, 3.0} == set(place[:, 2].round(1)) and len(place) > 5000
+    assert np.abs(place[:, 2] - place[:, 2].round()).max() < 0.01  # nor between, at the edge
+
+
+def test_a_cloud_has_a_limit_that_larger_voxels_keep(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Everywhere fewer points, none cut off."""
+    rng = np.random.default_rng(0)
+    xyz = np.column_stack([rng.uniform(0, 4, (200_000, 2)), np.zeros(200_000)])
+    rgb = np.zeros((len(xyz), 3), np.uint8)
+    whole = cloud._voxels(xyz, rgb, xyz)
+    monkeypatch.setattr(cloud, "MOST", 3000)
+    few = cloud._voxels(xyz, rgb, xyz)
+    assert 2000 < len(few) <= 3000 < len(whole) and few.voxel > whole.voxel
+    for quarter in ((few.xyz[:, :2] < 2) == [a, b] for a in (True, False) for b in (True, False)):
+        assert quarter.all(1).mean() == pytest.approx(0.25, abs=0.02)
+
+
+@pytest.mark.parametrize("fault", ["no folder", "no scale", "not a map"])
+def test_without_usable_depth_maps_flow_makes_the_points(
+    folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, fault: str
+) -> None:
+    """One line says why."""
+    poses = poses_along_the_wall()
+    depth = write_depth(tmp_path / "depth")
+    if fault == "no scale":
+        poses = dataclasses.replace(poses, metric=False)
+    if fault == "not a map":
+        cv2.imwrite(str(depth / "2.depth.png"), np.zeros((120, 160), np.uint8))
+    given = tmp_path / "none" if fault == "no folder" else depth
+    with caplog.at_level(logging.WARNING):
+        place, _ = dense_of(with_depth(folder, tmp_path / "out", given, poses))
+    (message,) = [r.getMessage() for r in caplog.records]
+    said = {"no folder": "no such folder", "no scale": "scale of the cameras is unknown",
+            "not a map": "2.depth.png: not a depth map"}  # fmt: skip
+    assert said[fault] in message and "from optical flow, not from depth maps" in message
+    assert len(place) > 20_000
 
 
 def test_points_leave_the_page_below_its_limit(
@@ -194,7 +304,7 @@ def test_points_leave_the_page_below_its_limit(
     """Fewer points; without room for any, the message gives the size of the page."""
     result = result_of(poses_along_the_wall())
     video = rt.Video(folder)
-    pictures = Pictures(result, video, dense=True)
+    pictures = Pictures(result, video, dense=FlowFrames(result.poses))
     for frame in video:
         pictures.take(frame)
     monkeypatch.setattr(scene, "PAGE_MAX", 1_000_000)
@@ -221,8 +331,8 @@ def test_points_are_quantised_within_their_step() -> None:
     rng = np.random.default_rng(3)
     xyz = rng.uniform(-3, 5, (50, 3))
     towards = np.tile([0, 0, 1.0], (50, 1))
-    cloud = Cloud(xyz, rng.integers(0, 255, (50, 3)).astype(np.uint8), towards, 0.01)
-    dense = scene._dense_points(cloud, np.array([1.0, 2, 3]), 40)
+    points = Cloud(xyz, rng.integers(0, 255, (50, 3)).astype(np.uint8), towards, 0.01)
+    dense = scene._dense_points(points, np.array([1.0, 2, 3]), 40)
     data = base64.b64decode(dense["data"])
     found = np.frombuffer(data[: 6 * 40], "<u2").reshape(-1, 3) * dense["step"] + dense["low"]
     np.testing.assert_allclose(found, xyz[:40] - [1, 2, 3], atol=dense["step"])

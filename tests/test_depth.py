@@ -14,7 +14,7 @@ from pose_worlds import FakeVideo, motion, supplied
 import reobj_track as rt
 from reobj.cameras import invert_rigid, read_sparse_model, write_colmap
 from reobj.poses import stage
-from reobj.poses.supplied.depth import add_depth, depth_scale, find_depth_maps
+from reobj.poses.supplied.depth import add_depth, depth_scale, find_depth_maps, smooth_pixels
 from reobj.results.workspace import Workspace
 
 SIZE = (320, 240)
@@ -52,6 +52,18 @@ def write_maps(folder, cams, names, units=1000.0, camera=CAMERA, depth_from_colo
         depth[-20:, :30] = 65535
         cv2.imwrite(str(folder / name), depth.round().astype(np.uint16))
     return folder
+
+
+def test_pixels_at_edges_of_depth_are_not_used():
+    """A sensor mixes both depths there; a slope of 4 % a pixel is a surface, a hole none."""
+    depth = np.full((9, 30), 2, np.float32)
+    depth[:, 10] = 2.5
+    depth[:, 11:20] = 3
+    depth[:, 20:] = 3 * 1.04 ** np.arange(10)
+    depth[4, 15] = 0
+    ok = smooth_pixels(depth)
+    assert not ok[:, 9:12].any() and not ok[3:6, 14:17].any()
+    assert ok[:, :9].all() and ok[:, 18:].all() and ok[:3, 12:].all()
 
 
 @pytest.fixture

@@ -1050,8 +1050,9 @@ def _(lab: Lab) -> None:
     for value in (False, True):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(rt, "write_pictures", shown := Mock(return_value=[]))
-            lab.refit(value)
+            lab.refit(value, poses__depth="maps:5000")
         assert shown.call_args[1]["cloud"] == value
+        assert shown.call_args[1]["depth"] == str(Path("maps:5000").absolute())
 
 
 @shows("output.doubtful")

@@ -75,6 +75,11 @@ class PosesConfig:
     size_px: int = option(640, "longer side to which frames are shrunk for the reconstruction, px")
     seed: int = option(0, "random seed of the reconstruction")
 
+    def absolute(self) -> PosesConfig:
+        """Return the options with the absolute path of depth maps, to be found from any folder."""
+        depth = str(Path(self.depth).absolute()) if self.depth else ""
+        return dataclasses.replace(self, depth=depth)
+
 
 def estimate_poses(
     video: Any,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -11,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from reobj.files import atomic, load_json, numbers, rounded
+from reobj.files import atomic, base64_text, load_json, numbers, rounded
 from reobj.results.entries import Object, decode
 from reobj.types import Array, ReobjError
 
@@ -219,6 +220,45 @@ class EarlierSession:
     objects: Sequence[Object]
     changes: Changes | None = None
     pictures: Mapping[int, bytes] = field(default_factory=dict)
+
+
+def write_earlier(path: Path, sessions: Sequence[EarlierSession]) -> None:
+    """Write the other recordings of a map, for `read_earlier`."""
+    data = [
+        {
+            "name": session.name,
+            "date": session.date,
+            "objects": [o.to_json() for o in session.objects],
+            "changes": None if session.changes is None else session.changes.to_json(),
+            "pictures": {str(i): base64_text(np.frombuffer(jpeg, np.uint8), "u1")
+                         for i, jpeg in session.pictures.items()},
+        }
+        for session in sessions
+    ]  # fmt: skip
+    with atomic(path) as part:
+        part.write_text(json.dumps({"sessions": data}) + "\n")
+
+
+def read_earlier(path: Path) -> tuple[EarlierSession, ...]:
+    """Read what `write_earlier` wrote.
+
+    Raises:
+        ReobjError: damaged, or another kind of file.
+    """
+    data = load_json(path)
+    try:
+        return tuple(
+            EarlierSession(
+                str(entry["name"]),
+                str(entry["date"]),
+                decode(list[Object], entry["objects"]),
+                decode(Changes | None, entry["changes"]),
+                {int(i): base64.b64decode(text) for i, text in entry["pictures"].items()},
+            )
+            for entry in data["sessions"]
+        )
+    except (AttributeError, KeyError, TypeError, ValueError) as error:  # ReobjError is a ValueError
+        raise ReobjError(f"{path}: damaged ({error})") from error
 
 
 def _moved_text(change: Change) -> str:

@@ -1,13 +1,15 @@
-"""Dense coloured points for the viewer, from optical flow between frames with known cameras.
+"""Dense coloured points for the viewer, of frames with known cameras.
 
-For up to 60 frames, the flow (DIS: Kroeger et al., ECCV 2016) to three others is triangulated. A
-pixel becomes a point where flow there and back agree, the point projects onto both pixels, the rays
-have enough parallax, and two of the three depths agree. Points are then averaged in voxels.
+`FlowFrames`: for up to 60 frames, the flow (DIS: Kroeger et al., ECCV 2016) to three others is
+triangulated. A pixel becomes a point where flow there and back agree, the point projects onto both
+pixels, the rays have enough parallax, and two of the three depths agree. Points are then averaged
+in voxels. Points of depth maps: `depth_cloud`.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
@@ -26,7 +28,8 @@ PARALLAX_DEG = 1.5
 DEPTH_SHARE = 0.03  # by which two depths of a pixel may differ
 BASELINE = (0.03, 0.12, 0.35)  # least, best, greatest, as a share of the median depth
 ANGLE_DEG = 25.0  # between the optical axes of two frames
-CELLS = 300  # voxels over the radius of the room
+CELLS = 300  # voxels over the radius of the room; fewer where there would be too many points
+MOST = 500_000  # points of a cloud
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,27 +55,77 @@ class Cloud:
         return Cloud(self.xyz[rows], self.rgb[rows], self.seen_from[rows], self.voxel)
 
 
+Points = tuple[Array, npt.NDArray[np.uint8], Array]  # world, RGB, directions to the camera (N, 3)
+
+
 class DenseFrames:
     """Frames of a recording for a dense cloud, and the cloud of each component.
 
     Attributes:
-        wanted: numbers of the frames to keep. images: these, undistorted, by number.
+        rows: of the frames whose pixels become points. wanted: numbers of the frames to keep.
+        images: these, undistorted, by number. spacing: usual distance of the points of a frame,
+            world units; no voxel is smaller.
     """
 
-    def __init__(self, poses: Poses) -> None:
-        """Choose frames: `REFERENCES`, and after each the next two with a good baseline."""
+    REASON = ""  # why there may be no points
+    spacing = 0.0
+
+    def __init__(self, poses: Poses, rows: Iterable[int]) -> None:
         self.poses = poses
+        self.rows = list(rows)
+        self.wanted = {int(poses.frame[row]) for row in self.rows}
         self.images: dict[int, Image] = {}
-        rows = np.flatnonzero(poses.known)
-        even = np.linspace(0, len(rows) - 1, min(REFERENCES, len(rows))).round().astype(np.int64)
         self.centers = -np.einsum(
             "nji,nj->ni", poses.cam_from_world[:, :, :3], poses.cam_from_world[:, :, 3]
         )  # (F, 3)
+
+    def take(self, number: int, image: Image) -> None:
+        """Keep an undistorted frame."""
+        self.images[number] = shrunk(image, SIZE_PX)
+
+    def cloud(self, part: int) -> Cloud | None:
+        """Return the cloud of a component; None: no frame of it gives points."""
+        found = [
+            points
+            for row in self.rows
+            if self.poses.part[row] == part and (points := self._points(row)) is not None
+        ]
+        if not found:
+            return None
+        xyz, rgb, seen_from = (np.concatenate(column) for column in zip(*found, strict=True))
+        cloud = _voxels(xyz, rgb, seen_from, self.spacing) if len(xyz) else None
+        return cloud if cloud is not None and len(cloud) else None
+
+    def _points(self, row: int) -> Points | None:
+        """Return the points of a frame."""
+        raise NotImplementedError
+
+    def _image(self, row: int) -> Image | None:
+        return self.images.get(int(self.poses.frame[row]))
+
+    def _K(self, image: Image) -> Array:
+        return self.poses.camera.resized((image.shape[1], image.shape[0])).K
+
+
+def evenly(rows: IntArray) -> IntArray:
+    """Choose at most `REFERENCES` rows."""
+    even = np.linspace(0, len(rows) - 1, min(REFERENCES, len(rows))).round().astype(np.int64)
+    return np.asarray(rows[even])
+
+
+class FlowFrames(DenseFrames):
+    """Frames whose optical flow is triangulated."""
+
+    REASON = "too few frames have a good baseline to others"
+
+    def __init__(self, poses: Poses) -> None:
+        """Choose frames: `REFERENCES`, and after each the next two with a good baseline."""
+        super().__init__(poses, evenly(np.flatnonzero(poses.known)).tolist())
         self.points = [poses.of_part(part).points for part in range(poses.part_count)]
-        self.depth = {int(row): self._median_depth(row) for row in rows[even]}
-        partners = [self._after(row, share) for row in self.depth for share in (0.1, 0.2)]
-        self.rows = sorted({*self.depth, *(row for row in partners if row >= 0)})
-        self.wanted = {int(poses.frame[row]) for row in self.rows}
+        self.depth = {row: self._median_depth(row) for row in self.rows}
+        partners = [self._after(row, share) for row in self.rows for share in (0.1, 0.2)]
+        self.used = sorted({*self.rows, *(row for row in partners if row >= 0)})
+        self.wanted = {int(poses.frame[row]) for row in self.used}
 
     def _median_depth(self, row: int) -> float:
         """Return the median depth of the sparse points in a frame; NaN: fewer than 20."""
@@ -94,25 +147,9 @@ class DenseFrames:
         later = later[later > row]
         return int(later[0]) if len(later) else -1
 
-    def take(self, number: int, image: Image) -> None:
-        """Keep an undistorted frame."""
-        self.images[number] = shrunk(image, SIZE_PX)
-
-    def cloud(self, part: int) -> Cloud | None:
-        """Return the cloud of a component; None: no frame of it has others with a good baseline."""
-        found = [
-            points
-            for row in self.depth
-            if self.poses.part[row] == part and (points := self._points(row)) is not None
-        ]
-        if not found:
-            return None
-        xyz, rgb, seen_from = (np.concatenate(column) for column in zip(*found, strict=True))
-        return _voxels(xyz, rgb, seen_from) if len(xyz) else None
-
     def _neighbours(self, row: int) -> list[int]:
         """List up to three frames whose baseline and direction are best for flow."""
-        others = np.array([r for r in self.rows if r != row and self._image(r) is not None], int)
+        others = np.array([r for r in self.used if r != row and self._image(r) is not None], int)
         if not len(others) or not self.depth[row] > 0:
             return []
         least, best, greatest = BASELINE
@@ -124,11 +161,7 @@ class DenseFrames:
         cost = np.abs(np.log(base[good] / best)) + 4 * (1 - cos[good])
         return [int(r) for r in others[good][np.argsort(cost, kind="stable")[:3]]]
 
-    def _image(self, row: int) -> Image | None:
-        return self.images.get(int(self.poses.frame[row]))
-
-    def _points(self, row: int) -> tuple[Array, npt.NDArray[np.uint8], Array] | None:
-        """Return points of a frame: world (N, 3) float32, RGB (N, 3), directions to it (N, 3)."""
+    def _points(self, row: int) -> Points | None:
         image = self._image(row)
         others = self._neighbours(row)
         if image is None or len(others) < 2:
@@ -142,9 +175,6 @@ class DenseFrames:
         towards = self.centers[row] - xyz
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
         return xyz.astype(np.float32), image[ok][:, ::-1], towards.astype(np.float32)
-
-    def _K(self, image: Image) -> Array:
-        return self.poses.camera.resized((image.shape[1], image.shape[0])).K
 
     def _depth_map(self, row: int, other: int, rays: Array) -> Array:
         """Triangulate the flow from a frame to another one: depth (H, W); NaN: refused."""
@@ -216,16 +246,23 @@ def _agreed(depths: Array) -> Array:
     return np.where(agree >= 2, mean, np.inf)
 
 
-def _voxels(xyz: Array, rgb: npt.NDArray[np.uint8], seen_from: Array) -> Cloud:
-    """Average points in voxels; distant and isolated ones are left out, the most observed first."""
+def _voxels(xyz: Array, rgb: npt.NDArray[np.uint8], seen_from: Array, least: float = 0.0) -> Cloud:
+    """Average points in voxels; distant and isolated ones are left out, the most observed first.
+
+    Args:
+        least: side of a voxel.
+    """
     middle = np.median(xyz, 0)
     extent = np.percentile(np.abs(xyz - middle), 95, axis=0)
-    near = (np.abs(xyz - middle) < 2 * extent).all(1)
+    voxel = max(float(np.linalg.norm(extent)) / CELLS, least)
+    near = (np.abs(xyz - middle) <= 2 * np.maximum(extent, voxel)).all(1)  # a wall has no extent
     xyz = xyz[near]
     rgb = rgb[near]
     seen_from = seen_from[near]
-    voxel = float(np.linalg.norm(extent)) / CELLS
     key = _cells(xyz, voxel)
+    while (filled := len(np.unique(key))) > MOST:
+        voxel *= 1.01 * math.sqrt(filled / MOST)  # of a surface
+        key = _cells(xyz, voxel)
     order = np.argsort(key, kind="stable")
     start = np.flatnonzero(np.diff(key[order], prepend=-1))
     count = np.diff(start, append=len(key))
@@ -233,10 +270,10 @@ def _voxels(xyz: Array, rgb: npt.NDArray[np.uint8], seen_from: Array) -> Cloud:
         np.add.reduceat(values[order].astype(np.float32), start) / count[:, None]
         for values in (xyz, rgb, seen_from)
     ]
-    _, coarse, filled = np.unique(
+    _, coarse, near_by = np.unique(
         _cells(mean[0], 3 * voxel), return_inverse=True, return_counts=True
     )
-    rows = np.flatnonzero(filled[coarse] >= 4)  # of 27 voxels; a surface fills 9
+    rows = np.flatnonzero(near_by[coarse] >= 4)  # of 27 voxels; a surface fills 9
     rows = rows[np.argsort(-count[rows], kind="stable")]
     seen = mean[2] / np.maximum(np.linalg.norm(mean[2], axis=1, keepdims=True), 1e-6)
     cloud = Cloud(mean[0], mean[1].round().astype(np.uint8), seen, voxel)

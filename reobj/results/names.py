@@ -42,5 +42,6 @@ class OutputFile(enum.StrEnum):
     EDITS = "edits.json"
     CONFIG = "config.toml"  # options of the last run
     MODEL = "sparse"  # folder of a COLMAP model
+    EARLIER = "cache/earlier.json"  # other recordings of the map
     LAST_POSES = "cache/last-poses.npz"
     LAST_TRACKS = "cache/last-tracks.npz"  # before linking

@@ -48,7 +48,7 @@ class Result:
             taken from the cache.
         warnings: for the user. edits: manual corrections.
         changes: since the map that the recording was placed in; None: run without a map.
-        earlier: the other recordings in that map, in their order; for the viewer, not in the files.
+        earlier: the other recordings in that map, in their order; for the viewer.
         out: the folder that it was saved to or loaded from.
     """
 
@@ -190,7 +190,7 @@ class Result:
 
     @classmethod
     def load(cls, out: str | Path) -> Result:
-        """Read what `save` wrote; without the fits, the embeddings and the earlier recordings.
+        """Read what `save` wrote; without the fits and the embeddings.
 
         Boxes have the precision of tracks.txt, .01 px, and the class of their object (-1 if the
         object does not exist, as in a file that was edited by hand).

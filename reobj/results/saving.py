@@ -32,7 +32,13 @@ from reobj.files import (
     save_npz,
     staged,
 )
-from reobj.results.changes import read_changes, write_changes
+from reobj.results.changes import (
+    EarlierSession,
+    read_changes,
+    read_earlier,
+    write_changes,
+    write_earlier,
+)
 from reobj.results.edits import write_edits
 from reobj.results.entries import Object, VideoInfo, World, decode
 from reobj.results.names import OutputFile
@@ -40,7 +46,7 @@ from reobj.results.ply import write_ply
 from reobj.results.upright import component_of, upright_pose
 from reobj.sources.boxes_3d import Boxes3D
 from reobj.sources.tables import read_mot_rows
-from reobj.types import Embeddings, ReobjError, Tracks, printable, without_secrets
+from reobj.types import Embeddings, ReobjError, Tracks, log, printable, without_secrets
 
 if TYPE_CHECKING:
     from reobj.results.result import Result
@@ -48,6 +54,7 @@ if TYPE_CHECKING:
 HEADER = {"format": "reobj-objects", "version": 1}  # of objects.json
 STALE = (  # files that not every run writes; cameras.csv: before 0.2
     OutputFile.POSES, OutputFile.MESH, OutputFile.LAST_POSES, OutputFile.CHANGES,
+    OutputFile.EARLIER,
     "cameras.csv", "overlay.mp4", "overlay.webm", "scene.html",
 )  # fmt: skip
 
@@ -138,6 +145,8 @@ def save(
         write_edits(new, result.edits)
         if result.changes is not None:
             write_changes(new / OutputFile.CHANGES, result.changes)
+        if result.earlier:
+            write_earlier(new / OutputFile.EARLIER, result.earlier)
         if result.poses is not None:
             save_poses(new / OutputFile.LAST_POSES, result.poses)
             write_trajectories(new, result.poses)
@@ -180,8 +189,18 @@ def load(kind: type[Result], out: Path) -> Result:
         poses,
         warnings=entries.warnings,
         changes=read_changes(changes) if changes.is_file() else None,
+        earlier=_load_earlier(out / OutputFile.EARLIER),
         out=out,
     )
+
+
+def _load_earlier(path: Path) -> Sequence[EarlierSession]:
+    """Read the other recordings of the map; () if there are none, or with a warning if damaged."""
+    try:
+        return read_earlier(path) if path.is_file() else ()
+    except ReobjError as error:
+        log.warning("%s; the result is read without the other recordings of its map", error)
+        return ()
 
 
 def load_last_poses(out: Path) -> Poses | None:

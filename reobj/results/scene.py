@@ -27,7 +27,8 @@ from reobj.cameras import Camera, Poses, invert_rigid, place_of, undistort_boxes
 from reobj.files import Progress, atomic, base64_text, read_text, rounded, significant
 from reobj.poses.floor import NOISE
 from reobj.results.changes import EarlierSession
-from reobj.results.cloud import Cloud, DenseFrames
+from reobj.results.cloud import MOST, Cloud, DenseFrames
+from reobj.results.depth_cloud import dense_frames
 from reobj.results.entries import Object, World, visit_gap
 from reobj.results.names import recording_name
 from reobj.results.origin import centred
@@ -54,7 +55,6 @@ if TYPE_CHECKING:
 
 
 PAGE_MAX = 15_000_000  # bytes of a page with dense points
-CLOUD_MAX = 500_000  # dense points
 POINT_BYTES = 16  # of a dense point in the page: 12 as base64
 PAGE_VERSION = 1  # of the page's data: `serve` shows them in the page of this version
 
@@ -74,7 +74,11 @@ class Pictures:
     """
 
     def __init__(
-        self, result: Result, video: Video, max_crops: int = 480, dense: bool = False
+        self,
+        result: Result,
+        video: Video,
+        max_crops: int = 480,
+        dense: DenseFrames | None = None,
     ) -> None:
         """Choose the crops, at most 8 of an object and `max_crops` of all, and 60 frames."""
         self.tracks = result.tracks
@@ -104,9 +108,7 @@ class Pictures:
         self.camera = None if cameras is None else cameras.camera
         self.grid: npt.NDArray[np.float32] | None = None  # of undistorted pixels, made once
         self.time_s: dict[int, float] = {}
-        self.dense: DenseFrames | None = None
-        if dense and cameras is not None and cameras.known.any():
-            self.dense = DenseFrames(cameras)
+        self.dense = dense
 
     def take(self, frame: Frame) -> None:
         """Crop the wanted boxes of this frame, and keep the frame if it is one of `whole`."""
@@ -365,7 +367,7 @@ def _add_dense_points(
         parts: data of the components, completed in place. origins: (3,) of each, in its world.
             size: bytes of the page without dense points.
     """
-    left = min(CLOUD_MAX, (PAGE_MAX - 1000 * len(parts) - size) // POINT_BYTES)
+    left = min(MOST, (PAGE_MAX - 1000 * len(parts) - size) // POINT_BYTES)
     if left <= 0:
         limit = f"{size / 1e6:.1f} MB without them, {PAGE_MAX / 1e6:g} MB is the limit"
         log.warning("no dense points: the page has %s", limit)
@@ -378,7 +380,7 @@ def _add_dense_points(
             left -= parts[k]["dense"]["count"]
             found = True
     if not found:
-        log.warning("no dense points: too few frames have a good baseline to others")
+        log.warning("no dense points: %s", dense.REASON)
 
 
 def _dense_points(cloud: Cloud, origin: Array, most: int) -> dict[str, Any]:
@@ -404,13 +406,16 @@ def _page_of(data: dict[str, Any], served: dict[str, Any] | None) -> str:
     return head + text.replace("<", "\\u003c") + tail
 
 
-def served_page(path: Path, served: dict[str, Any]) -> str:
+def served_page(
+    path: Path, served: dict[str, Any], others: Sequence[EarlierSession] | None = None
+) -> str:
     """Return the page of a scene.html for `serve`: its data, in the page of this version.
 
     No script of the file is used.
 
     Args:
-        served: what the server offers to the page.
+        served: what the server offers to the page. others: recordings that the map has now, shown
+            instead of those of the file if its recording was placed in the map; None: no map.
     Raises:
         ReobjError: the file is not a viewer of this version.
     """
@@ -423,6 +428,9 @@ def served_page(path: Path, served: dict[str, Any]) -> str:
     if not isinstance(data, dict) or data.get("version") != PAGE_VERSION:
         advice = "`objects OUT` makes it again"
         raise ReobjError(f"{path}: not a viewer that this version wrote; {advice}")
+    changes = data.get("changes")
+    if others is not None and isinstance(changes, dict) and not changes.get("refused"):
+        data["earlier"] = _earlier_sessions(others)
     return _page_of(data, served)
 
 
@@ -623,6 +631,7 @@ def write_pictures(
     progress: Progress | None = None,
     command: str = "",
     cloud: bool = False,
+    depth: str = "",
 ) -> list[str]:
     """Write the overlay video and scene.html in one pass over the video.
 
@@ -635,7 +644,8 @@ def write_pictures(
             contains them, show them initially.
         progress: the line of the stage, whose steps are the frames.
         command: fits the objects again; the viewer shows it with the file of corrections.
-        cloud: dense points in the viewer.
+        cloud: dense points in the viewer. depth: folder of the depth maps that they are made from;
+            "": from optical flow.
     Returns:
         messages about files that could not be written, with the option to omit them. With the
         environment variable REOBJ_RAISE, as in our tests, bugs are raised instead.
@@ -652,7 +662,11 @@ def write_pictures(
                 film = Overlay(shown, out / "overlay.mp4", video, overlay)
         if scene:
             with faults.of("scene"):
-                pictures = Pictures(result, video, dense=cloud and visible)
+                poses = result.poses
+                dense = None
+                if cloud and visible and poses is not None and poses.known.any():
+                    dense = dense_frames(poses, video, depth)
+                pictures = Pictures(result, video, dense=dense)
         found = (("overlay", film), ("scene", pictures))
         sinks = [(name, sink) for name, sink in found if sink and visible]
         try:

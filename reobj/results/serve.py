@@ -13,28 +13,30 @@ import os
 import re
 import subprocess
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from http import HTTPStatus
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Protocol
 from urllib.parse import parse_qs, urlsplit
 
 import cv2
 
 from reobj.files import atomic
-from reobj.results.edits import HEADER, read_edits
+from reobj.results.changes import EarlierSession
+from reobj.results.edits import HEADER, Edits, read_edits
 from reobj.results.local_server import LocalHandler, LocalServer
 from reobj.results.names import OutputFile
 from reobj.results.scene import served_page
 from reobj.results.workspace import Workspace
 from reobj.sources.image_files import read_image
 from reobj.sources.video import Video, shrunk, source_fingerprint
-from reobj.types import ReobjError, one_line
+from reobj.types import ReobjError, log, one_line
 
 EDITS_MAX = 16 << 20  # bytes of a file of corrections; 10,000 splits take 3 MB
 FRAME_PX = 1280  # longer side of the frames of an image folder
 CHUNK = 1 << 18  # bytes of the recording that are in memory
+STOP_S = 20  # for the map to be put back after the worker was killed
 PROGRESS_S = 0.5  # between two lines of progress of the worker
 VIDEO_TYPES = {".webm": "video/webm", ".mkv": "video/webm", ".ogv": "video/ogg"}  # else mp4
 
@@ -70,24 +72,53 @@ class Recording:
         return cv2.imencode(".jpg", shrunk(image, FRAME_PX))[1].tobytes()
 
 
+class FolderMap(Protocol):
+    """The map of an output folder: what `reobj.maps.folder_map.FolderMap` does here.
+
+    Attributes:
+        frozen: corrections of the folder do not change it.
+    """
+
+    frozen: bool
+
+    def others(self) -> Sequence[EarlierSession]:
+        """Return the other recordings that the map has now."""
+
+    def keep(self, copy: Path, edits: Edits) -> None:
+        """Copy the map before corrections are applied."""
+
+    def applied(self, copy: Path) -> None:
+        """Note that the corrections after this copy were applied."""
+
+    def restore(self, copy: Path) -> Callable[[], None]:
+        """Replace the map by a copy; return a function that undoes it."""
+
+
 class Corrections:
     """Corrections of an output folder: one at a time in a child process, and what undoes them.
 
     Before corrections replace those of the folder, these are stored in OUT/cache/undo: 1.json, and
-    so on. Undo applies the last file and removes it.
+    so on, with the map that the folder belongs to, 1.map. Undo restores the last map, applies the
+    last file, and then removes both: if it is interrupted, it can be repeated.
 
     Args:
-        command: program and first arguments that run the tool.
+        command: program and first arguments that run the tool. find_map: returns the map of the
+            folder; None: it has none.
     """
 
-    def __init__(self, out: Path, command: Sequence[str]) -> None:
+    def __init__(
+        self, out: Path, command: Sequence[str], find_map: Callable[[], FolderMap | None]
+    ) -> None:
         self.out = out
         self.folder = out / "cache" / "undo"
         self._command = command
+        self._find_map = find_map
         self._lock = threading.Lock()
+        self._thread: threading.Thread | None = None
         self._process: subprocess.Popen[str] | None = None
         self._text = ""  # progress of the worker, or its error
         self._is_running = False
+        self._is_ending = False
         self._failed = False
 
     def state(self) -> dict[str, Any]:
@@ -120,38 +151,48 @@ class Corrections:
         self._start()
         try:
             new = self._temporary(text)
-            read_edits(new)
+            edits = read_edits(new)
             before = self.out / OutputFile.EDITS
             old = before.read_bytes() if before.is_file() else _no_edits()
+            room = self._changed_map()
+            entry = self._push(old, room, edits)
         except (ReobjError, OSError) as error:
             raise self._not_started(error) from error
-        self._run(new, partial(self._push, old))
+        copy = entry.with_suffix(".map")
+        done = _nothing if room is None else partial(room.applied, copy)
+        self._run(new, done, partial(self._drop, entry, room))
 
     def undo(self) -> None:
-        """Start to restore the corrections before the last ones.
+        """Start to restore the map and the corrections before the last ones.
 
         Raises:
-            ReobjError: there are none, or others are being applied.
+            ReobjError: there are none, others are being applied, or the map has changed since.
         """
         self._start()
         stack = self._stack()
         if not stack:
             self._end("")
             raise ReobjError("nothing to undo")
-        last = stack[-1]
+        entry = stack[-1]
+        copy = entry.with_suffix(".map")
+        put_back = _nothing
         try:
-            edits = self._temporary(last.read_bytes())
+            edits = self._temporary(entry.read_bytes())
+            room = self._changed_map()
+            if room is not None and copy.is_file():
+                put_back = room.restore(copy)
         except (ReobjError, OSError) as error:
             raise self._not_started(error) from error
-        self._run(edits, last.unlink)
+        self._run(edits, partial(_remove, entry), put_back)
 
     def stop(self) -> None:
-        """End the worker; the result stays as it was."""
+        """End the worker; the result and the map stay as they were."""
         with self._lock:
-            process = self._process
-        if process is not None and process.poll() is None:
-            process.kill()
-            process.wait()
+            self._is_ending = True
+            if self._process is not None:
+                self._process.kill()
+        if self._thread is not None:
+            self._thread.join(STOP_S)
 
     def _start(self) -> None:
         with self._lock:
@@ -173,6 +214,11 @@ class Corrections:
         self._end(fault)
         return ReobjError(fault)
 
+    def _changed_map(self) -> FolderMap | None:
+        """Return the map that corrections of the folder change."""
+        room = self._find_map()
+        return None if room is None or room.frozen else room
+
     def _temporary(self, text: bytes) -> Path:
         """Write the file that the worker reads, and `_work` removes."""
         path = self.out / "cache" / "new-edits.json"
@@ -180,22 +226,46 @@ class Corrections:
             part.write_bytes(text)
         return path
 
-    def _push(self, old: bytes) -> None:
-        """Store the corrections that were replaced."""
-        self.folder.mkdir(parents=True, exist_ok=True)
+    def _push(self, old: bytes, room: FolderMap | None, edits: Edits) -> Path:
+        """Store the corrections that are going to be replaced, and the map; return their file."""
         number = 1 + max((int(path.stem) for path in self._stack()), default=0)
-        with atomic(self.folder / f"{number}.json") as part:
+        entry = self.folder / f"{number}.json"
+        _remove(entry)
+        if room is not None:
+            room.keep(entry.with_suffix(".map"), edits)
+        with atomic(entry) as part:
             part.write_bytes(old)
+        return entry
 
-    def _run(self, edits: Path, done: Any) -> None:
-        """Start the worker; `done` is called after its success."""
-        threading.Thread(target=self._work, args=(edits, done), daemon=True).start()
+    def _drop(self, entry: Path, room: FolderMap | None) -> None:
+        """Restore the map after corrections that failed, and remove what would undo them."""
+        try:
+            if room is not None:
+                room.restore(entry.with_suffix(".map"))
+        finally:
+            _remove(entry)
 
-    def _work(self, edits: Path, done: Any) -> None:
+    def _run(self, edits: Path, done: Callable[[], None], failed: Callable[[], None]) -> None:
+        """Start the worker; `done` is called after its success, `failed` after an error."""
+        arguments = (edits, done, failed)
+        self._thread = threading.Thread(target=self._work, args=arguments, daemon=True)
+        self._thread.start()
+
+    def _work(self, edits: Path, done: Callable[[], None], failed: Callable[[], None]) -> None:
         """Apply a file of edits in a child process, as the command line does."""
+        fault = self._applied(edits)
+        try:
+            failed() if fault else done()
+        except (OSError, ReobjError) as error:
+            fault = fault or one_line(str(error))
+        finally:
+            edits.unlink(missing_ok=True)
+            self._end(fault)
+
+    def _applied(self, edits: Path) -> str:
+        """Run the child process; return its error, "" after a success."""
         command = [*self._command, "objects", str(self.out), "--edits", str(edits)]
         environment = os.environ | {"REOBJ_PROGRESS_S": str(PROGRESS_S)}
-        fault = "the worker could not be started"
         try:
             with subprocess.Popen(
                 command,
@@ -209,14 +279,11 @@ class Corrections:
             ) as process:
                 with self._lock:
                     self._process = process
-                fault = self._follow(process, edits)
-            if not fault:
-                done()
-        except (ReobjError, OSError) as error:
-            fault = one_line(str(error))
-        finally:
-            edits.unlink(missing_ok=True)
-            self._end(fault)
+                    if self._is_ending:
+                        process.kill()
+                return self._follow(process, edits)
+        except OSError as error:
+            return f"the worker could not be started: {one_line(str(error))}"
 
     def _follow(self, process: subprocess.Popen[str], edits: Path) -> str:
         """Show the progress of the worker; return its error, "" after a success."""
@@ -230,6 +297,16 @@ class Corrections:
         if process.wait() == 0:
             return ""
         return line.removeprefix("error: ") or f"the worker ended with {process.returncode}"
+
+
+def _nothing() -> None:
+    """Do nothing, where there is no map."""
+
+
+def _remove(entry: Path) -> None:
+    """Remove stored corrections with their map: what is left without the first one is unused."""
+    for suffix in (".json", ".map", ".digests"):
+        entry.with_suffix(suffix).unlink(missing_ok=True)
 
 
 def _no_edits() -> bytes:
@@ -359,13 +436,20 @@ def _range(text: str, size: int) -> tuple[int, int] | None:
 
 
 class Server(LocalServer):
-    """The server of one output folder."""
+    """The server of one output folder; for the arguments see `Corrections`."""
 
-    def __init__(self, out: Path, port: int, command: Sequence[str]) -> None:
+    def __init__(
+        self,
+        out: Path,
+        port: int,
+        command: Sequence[str],
+        find_map: Callable[[], FolderMap | None],
+    ) -> None:
         self.viewer = out / "scene.html"
+        self._find_map = find_map
         with Workspace.open(out) as workspace:
             self.recording = Recording(workspace)
-        self.corrections = Corrections(out, command)
+        self.corrections = Corrections(out, command, find_map)
         self.page()
         super().__init__(port, _Handler)
 
@@ -385,4 +469,13 @@ class Server(LocalServer):
             "frames": bool(self.recording.images),
             "state": self.corrections.state(),
         }
-        return served_page(path, served)
+        return served_page(path, served, self._others())
+
+    def _others(self) -> Sequence[EarlierSession] | None:
+        """Return the other recordings of the folder's map; None: those of the page are shown."""
+        try:
+            room = self._find_map()
+            return None if room is None else room.others()
+        except ReobjError as error:
+            log.warning("%s; the page has the recordings of its last fit", error)
+            return None

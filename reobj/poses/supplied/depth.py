@@ -217,6 +217,12 @@ def _camera_of(path: Path, content: Any, depth: Any, size: tuple[int, int]) -> t
 # ---- Scale and points ----------------------------------------------------------------------------
 
 
+def depth_maps_of(video: Any, poses: Poses, text: str) -> DepthMaps:
+    """Find the depth maps of the frames of a video; for arguments and errors `find_depth_maps`."""
+    names = [video.name(int(frame)) for frame in poses.frame] if video.names else ()
+    return find_depth_maps(text, poses, names)
+
+
 def add_depth(poses: Poses, text: str, video: Any) -> Poses:
     """Add points from depth maps to poses, and make these metric if they were not.
 
@@ -225,8 +231,7 @@ def add_depth(poses: Poses, text: str, video: Any) -> Poses:
     Returns:
         the poses with more points; unchanged, with a message, where the scale is not observable.
     """
-    names = [video.name(int(frame)) for frame in poses.frame] if video.names else ()
-    maps = find_depth_maps(text, poses, names)
+    maps = depth_maps_of(video, poses, text)
     if not poses.metric:
         scale = depth_scale(poses, maps)
         if isinstance(scale, str):
@@ -300,7 +305,7 @@ def _log_ratio(poses: Poses, maps: DepthMaps, visible: VisiblePoints, row: int) 
     log_scale = 0.0
     for offset in (0 * shift, shift, shift):  # the shift between the cameras needs the scale
         in_depth = np.exp(log_scale) * in_color @ rotation.T + offset
-        measured = _look_up(depth, K, in_depth)
+        measured = look_up_depth(depth, K, in_depth)
         good = (measured > 0) & (in_depth[:, 2] > 0)
         if good.sum() < least:
             return None
@@ -308,8 +313,8 @@ def _log_ratio(poses: Poses, maps: DepthMaps, visible: VisiblePoints, row: int) 
     return log_scale
 
 
-def _look_up(depth: Floats, K: Array, in_depth: Array) -> Array:
-    """Return the map's depth at points (N, 3) of its camera, 0 where there is none."""
+def look_up_depth(depth: Floats, K: Array, in_depth: Array) -> Array:
+    """Return the depth (N,) of a map at points (N, 3) of its camera, 0 where there is none."""
     xyw = in_depth @ K.T
     with np.errstate(divide="ignore", invalid="ignore"):
         xy = xyw[:, :2] / xyw[:, 2:]  # (N, 2)
@@ -339,6 +344,20 @@ def _scaled(poses: Poses, scale: Array, sigma: Array, used: int) -> Poses:
 
 AGREE = 0.04  # relative difference of equal depths (chosen: noise and pose errors) ...
 AGREE_M = 0.03  # ... and at least
+
+
+def compared(measured: Array, depth: Array) -> tuple[BoolArray, BoolArray]:
+    """Compare the depth of points with a map that they are in.
+
+    Args:
+        measured: (N,) by the map, m; 0: nothing. depth: (N,) of the points, m.
+    Returns:
+        (N,) whether the map has a surface there, and whether it sees through the point.
+    """
+    limit = np.maximum(AGREE * depth, AGREE_M)
+    return (measured > 0) & (np.abs(measured - depth) <= limit), measured > depth + limit
+
+
 # Fraction of the views of points in other maps that see through the point; beyond it maps and poses
 # contradict. Measured: redkitchen .14; its depths made 20 % shorter or longer .36, .40.
 MAX_CONTRADICTED = 0.3
@@ -351,7 +370,7 @@ def _with_points(poses: Poses, maps: DepthMaps, video: Any) -> Poses:
         return _with_message(poses, "no frame with a depth map has a pose")
     depth_maps = {row: maps.read(row) for row in rows}
     depth_from_world = {
-        row: _compose(maps.depth_from_color, poses.cam_from_world[row]) for row in rows
+        row: composed(maps.depth_from_color, poses.cam_from_world[row]) for row in rows
     }
     map_points = []
     map_depths = []
@@ -373,11 +392,10 @@ def _with_points(poses: Poses, maps: DepthMaps, video: Any) -> Poses:
         same = np.flatnonzero(poses.part[origin] == poses.part[row])
         pose = depth_from_world[row]
         in_depth = points[same] @ pose[:, :3].T + pose[:, 3]
-        measured = _look_up(*depth_maps[row], in_depth)
-        limit = np.maximum(AGREE * in_depth[:, 2], AGREE_M)
-        agrees = (measured > 0) & (np.abs(measured - in_depth[:, 2]) <= limit)
+        measured = look_up_depth(*depth_maps[row], in_depth)
+        agrees, through = compared(measured, in_depth[:, 2])
         observations.append(np.column_stack([np.full(agrees.sum(), row), same[agrees]]))
-        seen_through[same[measured > in_depth[:, 2] + limit]] += 1
+        seen_through[same[through]] += 1
     visibility = np.concatenate(observations)
     views = np.bincount(visibility[:, 1], minlength=len(points))
     confirmed = int((views - 1).clip(0).sum())
@@ -407,21 +425,26 @@ def _with_message(poses: Poses, reason: str) -> Poses:
     return dataclasses.replace(poses, messages=(*poses.messages, text))
 
 
-def _compose(c_from_b: Array, b_from_a: Array) -> Array:
+def composed(c_from_b: Array, b_from_a: Array) -> Array:
     """Chain rigid transforms (3, 4)."""
     return np.column_stack(
         [c_from_b[:, :3] @ b_from_a[:, :3], c_from_b[:, :3] @ b_from_a[:, 3] + c_from_b[:, 3]]
     )
 
 
+def smooth_pixels(depth: Floats) -> BoolArray:
+    """Find the pixels of a map (h, w) whose neighbours have nearly its depth: not at edges."""
+    low, high = (f(depth, np.ones((3, 3), np.uint8)) for f in (cv2.erode, cv2.dilate))
+    smooth: BoolArray = (low > 0) & (high - low <= 2 * 0.05 * depth)  # 5 % from pixel to pixel
+    return smooth
+
+
 def _grid_points(depth: Floats, K: Array) -> Array:
     """Return points (N, 3) of a coarse grid of a map, 80 across, in its camera; none at edges."""
     step = max(1, max(depth.shape) // 80)
-    low, high = (f(depth, np.ones((3, 3), np.uint8)) for f in (cv2.erode, cv2.dilate))
-    smooth = (low > 0) & (high - low <= 2 * 0.05 * depth)  # 5 % from pixel to pixel
     chosen = np.zeros(depth.shape, bool)
     chosen[step // 2 :: step, step // 2 :: step] = True
-    y, x = np.nonzero(chosen & smooth)
+    y, x = np.nonzero(chosen & smooth_pixels(depth))
     rays = np.column_stack([x + 0.5, y + 0.5, np.ones(len(x))]) @ np.linalg.inv(K).T  # (N, 3)
     return np.asarray(rays * depth[y, x][:, None], np.float64)
 
