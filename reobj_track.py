@@ -165,7 +165,7 @@ from reobj.sources.detectors import (
 )
 from reobj.sources.looked import Intervals
 from reobj.sources.recorded import write_detections_npz
-from reobj.sources.video import InputConfig, Video
+from reobj.sources.video import InputConfig, Video, in_batches
 from reobj.sources.weights import list_models, model_path
 from reobj.state import restore_state, state_arrays
 from reobj.tracking.assignment import Pairs, ambiguous_pairs, assign, touching
@@ -1326,11 +1326,12 @@ def track(
     cameras = CameraInputs(poses, video.scale)
     looked = True if source.always_looks else None
     ahead = tracker.config.camera_motion and video.has_images and not video.is_live
-    for frame in tracker.state.camera_motion.ahead(video) if ahead else video:
-        tracks = tracker.update(
-            source.look(frame), frame.image, looked=looked, **cameras(frame.index)
-        )
-        yield frame, dataclasses.replace(tracks, frame=np.full(len(tracks), frame.index))
+    batch = 1 if video.is_live else source.batch
+    motion = tracker.state.camera_motion
+    for frames in motion.ahead(video, batch) if ahead else in_batches(video, batch):
+        for frame, found in zip(frames, source.look_at(frames), strict=True):
+            tracks = tracker.update(found, frame.image, looked=looked, **cameras(frame.index))
+            yield frame, dataclasses.replace(tracks, frame=np.full(len(tracks), frame.index))
 
 
 # ---- The whole chain ---------------------------------------------------------------------------

@@ -199,7 +199,7 @@ def make_parser(
     add("out", type=Path, help="output folder of an earlier `run`")
     add("--port", type=int, default=0, help="port of 127.0.0.1 (default: a free one)")
     add("--open", action="store_true", help="open the page in the browser")
-    text = "compare with ground truth: HOTA, IDF1, MOTA, O3D ..."
+    text = "compare with ground truth: HOTA, IDF1, MOTA, O3D"
     add = command("eval", text, "out --gt gt.txt")
     add("out", type=Path, help="output folder of an earlier `run`, or a tracks.txt")
     add("--gt", type=Path, required=True,

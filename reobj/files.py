@@ -63,9 +63,11 @@ def _folder(path: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def writing(path: Path) -> Iterator[None]:
+def writing(path: Path, named: Path | None = None) -> Iterator[None]:
     """Convert disk errors of the block that writes `path` to errors that say what to do.
 
+    Args:
+        named: in the errors, instead of `path`.
     Raises:
         ReobjError: for the errors listed here. Others, and those of files in other folders, pass.
     """
@@ -80,32 +82,35 @@ def writing(path: Path) -> Iterator[None]:
         errno.ENOTDIR: "a file stands where a folder should be: move it away",
         errno.EISDIR: "a folder stands where a file should be: move it away",
         errno.EIO: "disk I/O error: check the disk",
+        errno.ENOENT: "this folder takes no files (as /proc): choose another one",
     }
     try:
         yield
     except OSError as error:
         full = re.search(r"\d+ requested and \d+ written", str(error))  # numpy's, without an errno
         number = errno.ENOSPC if full else error.errno
-        named = Path(os.fsdecode(error.filename or path))
-        beside = named.is_relative_to(path.parent) or path.is_relative_to(named)
-        if number not in advice_of or not beside:
+        at = Path(os.fsdecode(error.filename or path.parent / "?"))
+        above = path.is_relative_to(at)
+        beside = at.is_relative_to(path.parent) and number != errno.ENOENT  # else an input
+        if number not in advice_of or not (above or beside):
             raise
         why = os.strerror(number)
         advice = advice_of[number]
-        shown = Path(*(name for name in path.parts if name != PART_RESULTS))
+        shown = Path(*(name for name in (named or path).parts if name != PART_RESULTS))
         raise ReobjError(f"{shown}: cannot be written ({why}); {advice}, then run again") from error
 
 
 @contextlib.contextmanager
-def locked(path: Path, wait_s: float = 0.0) -> Iterator[None]:
+def locked(path: Path, wait_s: float = 0.0, named: Path | None = None) -> Iterator[None]:
     """Hold the lock of a file; the system releases it when the process ends, even if killed.
 
     Args:
-        wait_s: longest time to wait for another process that holds it.
+        wait_s: longest time to wait for another process that holds it. named: by disk errors,
+            instead of the lock: the file beside it that will be written.
     Raises:
         LockedError: another process, or this one, still holds it.
     """
-    with writing(path):
+    with writing(path, named):
         path.parent.mkdir(parents=True, exist_ok=True)
         file = open(path, "ab")
     with file:
@@ -225,6 +230,8 @@ def read_text(path: Path, most: int | None = None, errors: str = "strict") -> st
 
     most: largest number of characters; default: as MEMORY_MAX allows. errors: as in `open`.
     """
+    if path.is_dir():
+        raise ReobjError(f"{path}: is a folder, expected a text file")
     most = most or MEMORY_MAX // 8  # of up to 4 bytes each, held twice while they are split
     try:
         with path.open(encoding="utf-8-sig", errors=errors) as file:
@@ -493,6 +500,15 @@ def shortened(items: Sequence[Any]) -> str:
     '1, 2, 3, 4, 5, ...'
     """
     return ", ".join(map(str, items[:5])) + (", ..." if len(items) > 5 else "")
+
+
+def last_name(path: Path) -> str:
+    """Return the name of a file or folder for messages, also of "." and "..".
+
+    >>> last_name(Path("boxes.csv")), last_name(Path("data/labels/."))
+    ('boxes.csv', 'labels')
+    """
+    return os.path.basename(os.path.abspath(path))
 
 
 def cut(text: str, most: int) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import cv2
 import numpy as np
@@ -46,9 +46,16 @@ def test_a_known_motion_is_recovered(size_hw: tuple[int, int], truth: np.ndarray
     np.testing.assert_array_equal(motion.parallax(corners[:, :2]), np.zeros((4, 2)))  # not deep
 
 
+def one_by_one(batches: Iterator[list[Frame]], sizes: list[int]) -> Iterator[Frame]:
+    for batch in batches:
+        sizes.append(len(batch))
+        yield from batch
+
+
+@pytest.mark.parametrize("batch", [1, 4])
 @pytest.mark.parametrize(("foreign", "computed_here"), [(9, 0), (3, 4)])
 def test_estimating_ahead_changes_nothing(
-    monkeypatch: pytest.MonkeyPatch, foreign: int, computed_here: int
+    monkeypatch: pytest.MonkeyPatch, foreign: int, computed_here: int, batch: int
 ) -> None:
     """The motion is computed ahead of its request, and again after an unexpected image."""
     rng, here = np.random.default_rng(2), []
@@ -65,10 +72,12 @@ def test_estimating_ahead_changes_nothing(
             plain(wide[:, 400:])
         plain(frame.image)
     monkeypatch.setattr(camera_motion, "_step", estimated)
-    for i, frame in enumerate(ahead.ahead(frames)):
+    batches = list[int]()
+    for i, frame in enumerate(one_by_one(ahead.ahead(frames, batch), batches)):
         if i == foreign:
             ahead(wide[:, 400:])
         motion = ahead(frame.image)
+    assert batches == {1: [1] * 6, 4: [4, 2]}[batch]
     assert sum(here) == computed_here and len(here) == len(frames) + computed_here
     np.testing.assert_array_equal(ahead.corners, plain.corners)
     np.testing.assert_array_equal(ahead.residual_flow, plain.residual_flow)

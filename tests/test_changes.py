@@ -82,6 +82,10 @@ def test_the_summary_counts_the_changes() -> None:
         "1 not seen, 1 ambiguous among identical objects"
     )
     assert Changes("a.map", "b").summary() == "map a.map: 0 stayed"
+    first = Changes("a.map", "b", new=room_changes().new)
+    assert first.summary() == "map a.map: made with 1 object"
+    later = dataclasses.replace(first, placed_by="points")
+    assert later.summary() == "map a.map: 0 stayed, 1 new (cup 12)"
     unscaled = Change(6, "chair", np.zeros(3), np.ones(3))
     assert Changes("a.map", "b", moved=(unscaled,)).summary().endswith("1 moved (chair 6)")
     refused = Changes("a.map", "b", "3 of 40 frames agree")

@@ -264,6 +264,20 @@ def test_a_photo_whose_matches_are_not_in_the_model_is_left_out():
     assert found.tolist() == [1, 2, 3, 4, 6, 7, 8, 9, 10, 11, 12]
 
 
+@pytest.mark.parametrize("one_is_tied, found", [(False, [(1, 7), (7, 13)]), (True, [(1, 13)])])
+def test_photos_are_separated_where_no_strong_pair_across_is_in_the_model(one_is_tied, found):
+    """Two halves with 200 common points far from the seam; the pairs across have many more."""
+    scene = Scene(points=10_000)
+    scene.untie(6, 200)
+    pairs = replace(scene.pairs(across=True), is_path=False)
+    if one_is_tied:  # of images 5 and 7, the matches that are points of the model
+        row = pairs.image_ids.tolist().index([5, 7])
+        pairs.inliers[row] = scene.pairs().inliers[row]
+        assert len(pairs.inliers[row]) >= MIN_MATCHES
+    arrays = read_arrays(scene.model())
+    assert [ids.tolist() for ids in consistent_groups(arrays, pairs)] == numbers(*found)
+
+
 def keyframes_dropped(scene, model, dropped):
     """Remove images from a model, as if a mapper could not register them."""
     for image in dropped:

@@ -562,6 +562,17 @@ def test_cache_survives_a_kill_between_flushes(tmp_path: Path, masks: bool) -> N
     assert_same(DetectionCache(tmp_path / "c", (32, 24)).get(298), some(298, masks))
 
 
+def test_masks_are_written_before_they_fill_the_memory(tmp_path: Path) -> None:
+    cache = DetectionCache(tmp_path, (32, 24), mask_bytes=5 * 32 * 24)
+    files = []
+    for index in (1, 2, 3):  # of as many masks each
+        cache.put(index, some(index, masks=True))
+        files.append(len(list(tmp_path.glob("chunk_*.npz"))))
+    assert files == [0, 0, 1]
+    for index in (1, 2, 3):
+        assert_same(DetectionCache(tmp_path, (32, 24)).get(index), some(index, masks=True))
+
+
 def test_damaged_cache_files_are_detected_again(tmp_path: Path, caplog: Any) -> None:
     cache = DetectionCache(tmp_path, (32, 24))
     for index in (1, 2, 3):

@@ -125,6 +125,10 @@ def check_detector(folder: Path) -> None:
     assert chair["class"] == "chair" and chair["frames_seen"] == 4
 
 
+def check_example(folder: Path) -> None:
+    assert len(objects(folder / "out")) > 25 and (folder / "out/scene.html").is_file()
+
+
 def check_training(folder: Path) -> None:
     assert (folder / "trained/reobj.onnx").is_file() and objects(folder / "out")
 
@@ -150,6 +154,7 @@ def check_map(folder: Path) -> None:
 
 Step = Callable[[Path], None]
 PAGES: dict[str, tuple[Step, Step]] = {
+    "first_hour": (nothing, check_example),
     "phone_video": (nothing, check_phone),
     "scannet_scene": (scannet, check_scannet),
     "ar_poses": (arkit, check_ar),

@@ -80,7 +80,9 @@ def test_text_with_and_without_byte_order_mark(tmp_path: Path) -> None:
         path.write_bytes(data)
         assert files.read_text(path) == "größer"
     path.write_bytes("größer".encode("latin-1"))
-    for bad in (path, tmp_path, tmp_path / "none"):
+    with pytest.raises(rt.ReobjError, match=f"^{tmp_path}: is a folder, expected a text file"):
+        files.read_text(tmp_path)
+    for bad in (path, tmp_path / "none"):
         with pytest.raises(rt.ReobjError, match=f"^{bad}: cannot be read as text"):
             files.read_text(bad)
 

@@ -6,6 +6,7 @@ what is tested. `pip install ultralytics rfdetr torchvision transformers` to run
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -42,33 +43,70 @@ def detect(video: rt.Video, model: str, **config: Any) -> tuple[Detections, Dete
     return found, source
 
 
+def batches_are_like_single_frames(folder: Path, model: str, **config: Any) -> None:
+    """Three different photos, two at a time, against one at a time."""
+    folder.mkdir()
+    rng = np.random.default_rng(1)
+    for i in range(3):
+        image = cv2.resize(rng.integers(0, 255, (9 + 9 * i, 12, 3), dtype=np.uint8), (320, 240))
+        cv2.imwrite(str(folder / f"{i}.png"), image)
+    video = rt.Video(folder)
+    found = []
+    for batch in (1, 2):
+        source = opened(video, rt.DetectConfig(model=model, batch=batch, **config))
+        assert source.batch == batch
+        frames = list(video)
+        found.append([*source.look_at(frames[:batch]), *source.look_at(frames[batch:])])
+    for one, several in zip(*found, strict=True):
+        assert one is not None and several is not None and len(one) == len(several) > 0
+        np.testing.assert_allclose(one.score, several.score, atol=1e-4)
+        near = np.isclose(one.score[:, None], several.score, atol=1e-4) & (
+            np.abs(one.xyxy[:, None] - several.xyxy) < 0.1
+        ).all(2)
+        assert near.any(1).all()  # equal scores may change their order
+    first, second = (np.column_stack([one.xyxy, one.score]) for one in found[0][:2])
+    assert not np.array_equal(first, second)
+
+
+def opened(video: rt.Video, config: rt.DetectConfig) -> DetectionSource:
+    """Open a detector whose random weights are the same each time."""
+    if torch := sys.modules.get("torch"):
+        torch.manual_seed(0)
+    return open_detections(video, config)
+
+
 # ---- Each library ------------------------------------------------------------------------------
 
 
-def test_ultralytics(video: rt.Video) -> None:
+def test_ultralytics(video: rt.Video, tmp_path: Path) -> None:
     pytest.importorskip("ultralytics")
     found, source = detect(video, "ultralytics:yolo11n-seg.yaml", min_score=1e-6)
     assert len(found) > 0 and found.masks is not None
     assert found.masks.shape == (len(found), 240, 320)
     assert len(source.class_names) == 80 and source.key
+    model = "ultralytics:yolo11n-seg.yaml"
+    batches_are_like_single_frames(tmp_path / "three", model, min_score=1e-6)
     with pytest.raises(rt.ReobjError, match=r"--words: ultralytics:yolo11n.yaml has fixed classes"):
         detect(video, "ultralytics:yolo11n.yaml", words="toolbox")
 
 
-def test_rfdetr(video: rt.Video) -> None:
+def test_rfdetr(video: rt.Video, tmp_path: Path) -> None:
     pytest.importorskip("rfdetr")
     found, source = detect(video, "rfdetr:nano=", min_score=0.01)
     assert len(found) > 10 and source.class_names[0] == "person" and source.key
+    batches_are_like_single_frames(tmp_path / "three", "rfdetr:nano=", min_score=0.01)
     with pytest.raises(rt.ReobjError, match=r"rfdetr:huge: no such model; there are base, .*nano"):
         detect(video, "rfdetr:huge")
 
 
-def test_torchvision(video: rt.Video) -> None:
+def test_torchvision(video: rt.Video, tmp_path: Path) -> None:
     pytest.importorskip("torchvision")
     found, source = detect(video, "torchvision:maskrcnn_resnet50_fpn=", min_score=0.001)
     assert len(found) > 10 and found.masks is not None
     assert found.masks.shape == (len(found), 240, 320)
     assert source.class_names[1] == "person" and found.class_id.min() > 0  # 0: background
+    model = "torchvision:fasterrcnn_resnet50_fpn="
+    batches_are_like_single_frames(tmp_path / "three", model, min_score=0.001)
 
 
 def test_transformers(video: rt.Video, tmp_path: Path) -> None:
@@ -91,6 +129,7 @@ def test_transformers(video: rt.Video, tmp_path: Path) -> None:
     assert np.ptp(found.xyxy[:, ::2]) > 50  # px of the photo, not of the network or 0..1
     plants, _ = detect(video, f"hf:{folder}", min_score=0.001, classes="plant")
     assert set(plants.class_id) <= {1}
+    batches_are_like_single_frames(tmp_path / "three", f"hf:{folder}", min_score=0.001)
 
 
 def test_transformers_with_words(video: rt.Video, tmp_path: Path) -> None:
@@ -115,6 +154,9 @@ def test_transformers_with_words(video: rt.Video, tmp_path: Path) -> None:
     tf.Owlv2Processor(images, tokenizer).save_pretrained(folder)
     _, source = detect(video, f"hf:{folder}", min_score=0.001, words=", ".join(WORDS))
     assert tuple(source.class_names) == WORDS
+    words = ", ".join(WORDS)
+    model = f"hf:{folder}"
+    batches_are_like_single_frames(tmp_path / "three", model, min_score=0.001, words=words)
 
 
 # ---- What needs no library ---------------------------------------------------------------------
@@ -124,18 +166,18 @@ def test_phrases_get_the_word_that_shares_most_tokens() -> None:
     phrases = ["machine", "red espresso machine", "toolbox red", "", "lamp"]
     image = {"boxes": np.arange(20.0).reshape(5, 4), "scores": np.arange(5.0),
              "text_labels": phrases}  # fmt: skip
-    found = libraries._with_words([image], list(WORDS))
+    found = libraries._with_words(image, list(WORDS))
     assert found["labels"].tolist() == [0, 0, 1]
     np.testing.assert_array_equal(found["scores"], [0, 1, 2])
-    none = libraries._with_words([image | {"boxes": np.empty((0, 4)), "scores": np.empty(0),
-                                           "text_labels": []}], list(WORDS))  # fmt: skip
+    none = libraries._with_words(image | {"boxes": np.empty((0, 4)), "scores": np.empty(0),
+                                          "text_labels": []}, list(WORDS))  # fmt: skip
     assert len(none["labels"]) == 0
 
 
 def test_a_missing_library_is_one_line_with_the_command(
     video: rt.Video, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "ultralytics", None)
+    monkeypatch.setitem(sys.modules, "ultralytics", None)
     with pytest.raises(rt.ReobjError, match=r"--detector mine\.pt: .* pip install ultralytics$"):
         detect(video, "mine.pt")
 
@@ -198,6 +240,39 @@ def test_a_library_without_a_file_is_one_line(
         detect(video, "no.pt")
 
 
+def test_a_library_gets_batches(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """Each answer is checked and filtered as that of its frame; a failure names the batch."""
+    calls: list[int] = []
+
+    def run(images: list[Any]) -> Any:
+        calls.append(len(images))
+        if len(calls) == fails_at:
+            raise RuntimeError("CUDA out of memory.")
+        return [[[-5, 5, 20 + image[0, 0, 0], 40, 0.9, 0]] for image in images]
+
+    stub = libraries.Library(lambda options: libraries.LibraryDetector(run, ("cup",)), "", "")
+    monkeypatch.setitem(libraries.LIBRARIES, "ultralytics", stub)
+    monkeypatch.setattr(libraries.importlib.metadata, "version", lambda name: "1")
+    images = tmp_path / "five"
+    images.mkdir()
+    for i in range(5):
+        cv2.imwrite(str(images / f"{i}.png"), np.full((48, 64, 3), i, np.uint8))
+    words = ["track", str(images), "-o", str(tmp_path / "out"), "--detector", "ultralytics:m"]
+    words += ["--embed", "none", "--set", "detect.batch=2", "--set", "output.overlay=none"]
+    fails_at = 2
+    assert rt.main(words) == 2
+    line = capsys.readouterr().err.strip().splitlines()[-1]
+    text = "ultralytics:m failed on 2 images at once (detect.batch): CUDA out of memory."
+    assert line == f"error: frame 2: --detector {text}"
+    fails_at = 0
+    assert rt.main(words) == 0
+    assert calls == [2, 2, 2, 1]  # the first two frames are in the cache
+    rows = (tmp_path / "out/tracks.txt").read_text().splitlines()
+    assert len(rows) == 5 and all(row.split(",")[2] == "0.00" for row in rows)
+
+
 @pytest.mark.parametrize(
     ("error", "said"),
     [
@@ -217,11 +292,11 @@ def test_a_failure_of_a_library_is_one_line(
     """While it detects: the detector, the frame and the library's message; also while it opens."""
     calls = []
 
-    def detect(image: Any) -> Any:
-        calls.append(image)
+    def detect(images: list[Any]) -> Any:
+        calls.append(images)
         if len(calls) > 1:
             raise error
-        return np.empty((0, 6))
+        return [np.empty((0, 6))]
 
     def opens(options: libraries.LibraryOptions) -> libraries.LibraryDetector:
         if options.model == "broken":

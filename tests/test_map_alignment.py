@@ -143,11 +143,11 @@ def test_few_objects_or_vague_ones_are_refused():
     seven = tuple(values[:7] for values in room)
     of_map = landmarks(rng, room, 0.02)
     reason = align(of_map, landmarks(rng, in_session(seven), 0.02), SCALE_SIGMA).reason
-    assert reason.startswith("7 objects of the recording and 12 of the map are located within")
+    assert reason.startswith("7 of the objects of the recording and 12 of those of the map are ")
     found = landmarks(rng, in_session(room), 0.02)
     vague = dataclasses.replace(found, cov=np.tile(np.eye(3), (12, 1, 1)))
     reason = align(of_map, vague, SCALE_SIGMA).reason
-    assert reason.startswith("0 objects of the recording and 12 of the map are located within")
+    assert reason.startswith("0 of the objects of the recording and 12 of those of the map are ")
 
 
 def test_looks_distinguish_equal_places():

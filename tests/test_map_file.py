@@ -168,9 +168,14 @@ def test_missing_file_and_folder(tmp_path: Path) -> None:
     assert "is a folder, but a map is a file" in refusal(tmp_path)
 
 
-@pytest.mark.parametrize("content", [b"", b"solid", b"PK\x03\x04", b"\x00" * 2000])
+@pytest.mark.parametrize("content", [b"", b"solid", b"\x00" * 2000])
 def test_files_of_another_kind(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "a.map").write_bytes(content)
+    assert "not a map of reobj_track; another file was given" in refusal(tmp_path / "a.map")
+
+
+def test_the_beginning_of_a_map(tmp_path: Path) -> None:
+    (tmp_path / "a.map").write_bytes(b"PK\x03\x04")
     assert "damaged, or no npz file" in refusal(tmp_path / "a.map")
 
 

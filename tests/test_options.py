@@ -46,7 +46,7 @@ from reobj.options import (
 from reobj.results.workspace import Workspace
 from reobj.sources.imageless import ImagelessVideo
 from reobj.sources.video import LiveTimes
-from reobj.sources.weights import own_models
+from reobj.sources.weights import frames_at_once, own_models
 
 CHAIR = 56
 CAMERA_TEXT = "300,300,160,120"
@@ -526,6 +526,35 @@ def _(lab: Lab) -> None:
     lab.patch.setattr(Session, "SIDE", 128)
     assert [len(by_network(lab, value)[0]) for value in (3, 120, 0)] == [3, 120, 100]
     assert [len(by_file(lab, value)[0]) for value in (3, 120, 0)] == [3, 120, 140]  # 0: all
+
+
+@shows("detect.batch")
+def _(lab: Lab) -> None:
+    """The most images of a run of the network; 0: by the device."""
+    sizes: list[int] = []
+
+    class Batched(Session):
+        def get_inputs(self) -> list[Any]:
+            (image,) = super().get_inputs()
+            image.shape[0] = "n"
+            return [image]
+
+        def run(self, _: Any, feeds: dict[str, Any]) -> list[np.ndarray]:
+            sizes.append(len(feeds["images"]))
+            return [np.repeat(self.table, sizes[-1], 0)]
+
+    lab.patch.setattr(detectors, "onnx_session", Batched)
+    model = lab.path / "model.onnx"
+    model.touch()
+    for device, value, batch in (
+        ("cpu", 0, 1), ("cpu", 4, 4), ("cuda", 0, 8), ("cuda", 2, 2), ("tensorrt", 0, 8),
+        ("coreml", 0, 1),
+    ):  # fmt: skip
+        detector = rt.OnnxDetector(model, lab.config(value).detect, device=device)
+        sizes.clear()
+        found = list(detector.detect([np.full((64, 64, 3), 128, np.uint8)] * 9))
+        assert len(found) == 9 and max(sizes) == batch and sum(sizes) == 9
+    assert [frames_at_once(0, device) for device in ("cpu", "mps", "cuda:1")] == [1, 1, 8]
 
 
 # ---- embed, threads, device, offline: settings of the networks of a run ----

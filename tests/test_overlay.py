@@ -692,6 +692,18 @@ def changed(chairs: rt.Result, support: str = "box") -> rt.Result:
     return dataclasses.replace(chairs, changes=changes)
 
 
+def test_the_recording_that_made_the_map_has_no_new_objects(
+    chairs: rt.Result, tmp_path: Path
+) -> None:
+    """All of them are: they keep the colours of their identities."""
+    new = tuple(Change(o.id, "chair", None, o.center) for o in chairs.objects)
+    result = dataclasses.replace(chairs, changes=Changes("flat.map", "monday", new=new))
+    overlay = Overlay(result, tmp_path / "o.mp4", rt.Video(frames(tmp_path / "f", 1, SIZE)))
+    overlay.close(False)
+    assert overlay.labels == {1: "1 chair", 2: "2 chair", 3: "3 chair"} and overlay.marks == {}
+    assert [kind for kind, _ in overlay.legend] == ["box", "solid", "thin"]
+
+
 def near(image: np.ndarray, color: tuple[int, int, int], spread: int = 70) -> np.ndarray:
     """Pixels of about a colour: the video is compressed."""
     return (np.abs(image.astype(int) - color) <= spread).all(-1)

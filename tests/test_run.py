@@ -15,7 +15,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -271,16 +271,18 @@ class CountingDetector:
     calls = 0
     stop_at = -1
     class_names = rt.COCO_NAMES
+    batch = 1
 
     def __init__(self, *args: object) -> None: ...
 
-    def __call__(self, image: np.ndarray) -> rt.Detections:
+    def detect(self, images: list[np.ndarray]) -> Iterator[rt.Detections]:
         cls = type(self)
-        if cls.calls == cls.stop_at:
-            cls.stop_at = -1
-            raise KeyboardInterrupt
-        cls.calls += 1
-        return rt.Detections.from_array([[100, 60, 140, 110, 0.9, 56]])
+        for _ in images:
+            if cls.calls == cls.stop_at:
+                cls.stop_at = -1
+                raise KeyboardInterrupt
+            cls.calls += 1
+            yield rt.Detections.from_array([[100, 60, 140, 110, 0.9, 56]])
 
 
 @pytest.fixture

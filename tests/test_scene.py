@@ -187,9 +187,7 @@ def test_merges_and_splits_are_listed(browser: Browser, page: Path) -> None:
     browser.eval("select(objects[0])")
     text = browser.eval("$('panel').innerText")
     assert "tracklets 1 (object 1), 3 (object 3): overlap in 3D 0.2" in text
-    assert (
-        "undone: one solid" in text and "parts of tracklets 1 (object 1) are at different" in text
-    )
+    assert "undone: one solid" in text and "parts of tracklet 1 (object 1) are at different" in text
     assert "undefined" not in text and "NaN" not in text
     browser.eval("select(objects[1])")
     assert "overlap in 3D 0.12, log odds of the appearance 1.99" in browser.eval(
@@ -405,6 +403,54 @@ def test_doubtful_objects_are_shown_on_request(browser: Browser, page: Path) -> 
     browser.eval("S.objects[2].status = 'ok'; replay()")
 
 
+def test_the_title_counts_one_object_in_the_singular(browser: Browser, page: Path) -> None:
+    status = re.compile(r'"status":"\w+"')
+    alone = page.with_name("alone.html")
+    doubtful = status.sub('"status":"doubtful"', page.read_text())
+    alone.write_text(status.sub('"status":"ok"', doubtful, count=1))
+    browser.open(alone)
+    assert browser.eval("document.title").endswith(": 1 object")
+
+
+@pytest.mark.parametrize(("width", "height"), [(1280, 800), (390, 844)])
+def test_the_first_view_is_below_the_buttons(
+    browser: Browser, page: Path, width: int, height: int
+) -> None:
+    """Points and solids too: nothing is under them until the user moves the view."""
+    browser.open(page, width, height, phone=width < 700)
+    below = "$('tools').offsetTop + $('tools').offsetHeight"
+    for view in ("reset", "top", "front"):
+        browser.eval(f"VIEWS.{view}(); draw()")
+        tops = "room.anchors.map(a => project(a)[1])"
+        assert browser.eval(f"Math.min(...{tops}) >= {below}"), view
+        assert browser.eval(f"Math.max(...{tops}) <= canvas.clientHeight"), view
+
+
+def test_a_finger_ends_merging_without_a_merge(browser: Browser, page: Path) -> None:
+    """A phone has no Esc; the hint is as wide as its text, up to the width of the view."""
+    browser.open(page, 390, 844, phone=True)
+    browser.eval("select(here[0])")
+    merge = "[...document.querySelectorAll('#panel button')].find(b => /^Merge/.test(b.innerText))"
+    browser.eval(f"{merge}.click()")
+    said = browser.eval("$('hint').textContent")
+    assert said.startswith("tap the object") and "Esc" not in said
+    assert browser.eval("$('hint').offsetWidth > 0.8 * $('view').offsetWidth")
+    browser.eval(f"{merge}.click()")
+    assert browser.eval("[state.merging, $('hint').hidden, pending.length]") == [None, True, 0]
+
+
+def test_corrections_leave_room_for_the_list_on_a_phone(browser: Browser, page: Path) -> None:
+    """Of several that are applied, each with a button, the latest is in view, the others scroll."""
+    browser.open(page, 390, 844, phone=True)
+    for name in ("armchair", "stool", "bench", "seat"):
+        browser.eval(f"S.edits.push(edits.rename(objects[0], '{name}'))")
+    browser.eval("fillEdits()")
+    assert browser.eval("$('edits').offsetHeight") < 140
+    shown = "(o => o.getBoundingClientRect().bottom >= o.lastChild.getBoundingClientRect().bottom)"
+    assert browser.eval(f"{shown}($('edits').querySelector('ol'))")
+    assert browser.eval("$('list').offsetHeight") > 120
+
+
 def test_implausible_objects_are_marked_and_not_counted(browser: Browser, page: Path) -> None:
     """Dashed and dim, with the reason; neither hidden nor part of the initial view."""
     browser.open(page)
@@ -417,6 +463,12 @@ def test_implausible_objects_are_marked_and_not_counted(browser: Browser, page: 
     assert browser.eval("here[2].row.title") == "size is 7.2 sigma"
     dashed = "here.slice(0, 3).map(o => Boolean(o.group.parts.wire.material.dashed))"
     assert browser.eval(dashed) == [False, False, True]
+    filled = "[here[0], here[2]].map(o => o.group.parts).map(p => [p.faces, p.ellipsoid])"
+    filled = f"{filled}.map(p => p.map(x => x.visible))"
+    assert browser.eval(filled) == [[True, True], [False, False]]
+    browser.eval("select(here[2]); draw()")
+    assert browser.eval(filled)[1] == [True, True]
+    browser.eval("select(null)")
     assert browser.eval("room.radius") < 1.5 * before
     assert "suitcase 0" in browser.eval("$('classes').textContent")
 
@@ -1086,6 +1138,21 @@ def changed_page(page: Path) -> Path:
     video = rt.Video(page.parent.parent / "frames")
     write_pictures(dataclasses.replace(result, changes=changes), out, video, overlay="none")
     return out / "scene.html"
+
+
+def test_the_recording_that_made_the_map_has_no_new_objects(browser: Browser, page: Path) -> None:
+    """The header says that it made the map; nothing is marked."""
+    result = rt.Result.load(page.parent)
+    new = tuple(Change(o.id, o.class_name, None, np.zeros(3)) for o in result.objects)
+    changes = Changes("flat.map", "monday", new=new)
+    out = page.parent.parent / "first"
+    out.mkdir()
+    video = rt.Video(page.parent.parent / "frames")
+    write_pictures(dataclasses.replace(result, changes=changes), out, video, overlay="none")
+    browser.open(out / "scene.html")
+    assert browser.eval("$('since').textContent") == f"map flat.map: made with {len(new)} objects"
+    assert browser.eval("here.map(markOf).filter(Boolean)") == []
+    assert browser.eval("$('kinds').hidden")
 
 
 def test_an_arrow_leads_from_the_ghost_to_the_moved_object(

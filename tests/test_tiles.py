@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -73,6 +75,10 @@ def picture(*boxes: tuple[int, int, int, int]) -> Image:
     return image
 
 
+def in_tiles(detect: Any, image: Image) -> rt.Detections:
+    return detect_in_tiles(lambda images: map(detect, images), image, (2, 2))
+
+
 WHERE = (
     (20, 20, 60, 60),  # in one tile
     (300, 220, 340, 260),  # in the middle: in all four
@@ -85,7 +91,7 @@ WHERE = (
 def test_every_object_is_detected_once_and_complete(masks: bool) -> None:
     sizes, detect = painter(masks=masks)
     image = picture(*WHERE)
-    found = detect_in_tiles(detect, image, (2, 2))
+    found = in_tiles(detect, image)
     order = np.argsort(found.class_id)
     np.testing.assert_allclose(found.xyxy[order], WHERE)
     assert found.class_id[order].tolist() == [1, 2, 3, 4]
@@ -102,13 +108,13 @@ def test_small_objects_are_detected_in_tiles_only() -> None:
     _, detect = painter(min_px=0.1)
     image = picture(*WHERE)
     assert sorted(detect(image).class_id.tolist()) == [3]
-    found = detect_in_tiles(detect, image, (2, 2))
+    found = in_tiles(detect, image)
     assert sorted(found.class_id.tolist()) == [1, 2, 3, 4]
 
 
 def test_no_detections() -> None:
     for masks in (False, True):
-        found = detect_in_tiles(painter(masks=masks)[1], picture(), (2, 2))
+        found = in_tiles(painter(masks=masks)[1], picture())
         assert len(found) == 0 and found.xyxy.shape == (0, 4)
 
 

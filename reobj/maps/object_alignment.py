@@ -141,8 +141,8 @@ def align(
     none = ObjectAlignment(np.empty((0, 2), np.int64))
     if min(len(rows), len(map_rows)) < options.common:
         reason = (
-            f"{len(rows)} objects of the recording and {len(map_rows)} of the map are located "
-            f"within {options.elsewhere_m:g} m, {options.common} of each are needed"
+            f"{len(rows)} of the objects of the recording and {len(map_rows)} of those of the map "
+            f"are located within {options.elsewhere_m:g} m, {options.common} of each are needed"
         )
         return dataclasses.replace(none, reason=reason)
     scale_sigma = float(np.hypot(scale_sigma, options.scale_floor))

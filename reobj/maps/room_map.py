@@ -452,12 +452,16 @@ def _without_arrays(record: Any, arrays: Sequence[str]) -> dict[str, Any]:
     return {k: dataclasses.asdict(v) if isinstance(v, Camera) else v for k, v in kept.items()}
 
 
+ANOTHER_FILE = "not a map of reobj_track; another file was given"
+
+
 def load_map(path: Path) -> RoomMap:
     """Read a map; for the errors see `RoomMap.load`."""
     if path.is_dir():
         raise ReobjError(f"{path}: is a folder, but a map is a file")
     if not path.is_file():
         raise ReobjError(f"{path}: no such map; `run VIDEO -o OUT --map {path}` makes it")
+    _check_kind(path)
     try:
         arrays, facts = load_npz(path, sealed=True)
     except ReobjError:
@@ -475,10 +479,17 @@ def load_map(path: Path) -> RoomMap:
     return room
 
 
+def _check_kind(path: Path) -> None:
+    """Refuse what is no zip file by its first bytes; npz files are."""
+    with path.open("rb") as file:
+        if file.read(2) != b"PK":
+            raise ReobjError(f"{path}: {ANOTHER_FILE}")
+
+
 def _check_header(path: Path, facts: dict[str, Any]) -> None:
     """Refuse other files and other versions."""
     if facts.get("format") != HEADER["format"]:
-        raise ReobjError(f"{path}: not a map of reobj_track; another file was given")
+        raise ReobjError(f"{path}: {ANOTHER_FILE}")
     if facts.get("version") != HEADER["version"]:
         raise ReobjError(
             f"{path}: a map of format {facts.get('version')}, this version reads "
@@ -581,10 +592,12 @@ def map_lock(path: Path) -> Iterator[None]:
     """Hold the lock of a map that is going to be written.
 
     Raises:
-        ReobjError: another run holds it.
+        ReobjError: another run holds it; or the file is no map, then no lock is made.
     """
+    if path.is_file():
+        _check_kind(path)
     try:
-        with locked(path.with_name(f".{path.name}.lock")):
+        with locked(path.with_name(f".{path.name}.lock"), named=path):
             yield
     except LockedError:
         what = "another run is updating this map"

@@ -33,6 +33,7 @@ from reobj.maps.room_map import RoomMap, Session, map_lock
 from reobj.maps.single_frames import locate_frames, locate_rest
 from reobj.maps.update import Recording, add_recording
 from reobj.results.changes import Changes
+from reobj.results.names import recording_name
 from reobj.results.result import Result
 from reobj.results.scene import best_pictures
 from reobj.sources.video import Video, content_fingerprint, files_of
@@ -154,16 +155,17 @@ def place_recording(
     features = tuple(image_features(poses, video, rows, options, line))
     if not room.sessions:
         return Placed(dataclasses.replace(poses, map_id=room.map_id), features, None)
+    points = room.points
     with progress("map", 0) as line:
         if poses.known.any():
-            placement = place(poses, features, room.points, options, line.step)
-            if placement.refused:
-                features = _denser(features, poses, video, options, progress)
-                every = dataclasses.replace(options, images=len(features))
-                placement = place(poses, features, room.points, every, line.step)
+            placement = place(poses, features, points, options, line.step)
         else:
-            points = room.points
             placement = locate_frames(poses, features, points, camera, options, report=line.step)
+    if placement.refused and poses.known.any():
+        features = _denser(features, poses, video, options, progress)
+        every = dataclasses.replace(options, images=len(features))
+        with progress("map", 0) as line:
+            placement = place(poses, features, points, every, line.step)
     if not placement.refused and placement.poses.source == "map":
         placement = _all_frames(placement, video, progress)
     return _placed(room, poses, features, placement)
@@ -377,8 +379,8 @@ def _refusal(opened: OpenMap, poses: Poses | None, video: Video, placed: Placed 
 
 
 def session_name(video: Video) -> str:
-    """Name a recording by its file, and by the part of it that is read."""
-    name = Path(str(video.source)).name or str(video.source)
+    """Name a recording as its viewer does, and by the part of it that is read."""
+    name = recording_name(str(video.source))
     part = video.config
     return f"{name} {part.start}-{part.stop or ''}" if part.start or part.stop else name
 

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.spatial.transform import Rotation
 
 from reobj.cameras import import_pycolmap
@@ -48,6 +48,9 @@ class ConsistencyOptions:
     Attributes:
         tied: fraction of the matches of two consecutive images that must be one point of the model
             (measured: right .38-.98, wrong 0).
+        strongest: pairs with the most matches across a cut of photos; the cut is made if none is
+            tied (measured: right models have one among the first three; one of 10 photos with the
+            wrong one of two poses has none among the first ten).
         bridge: points, and matches of one pair of images, that connect two groups (COLMAP registers
             one image from 30 on).
         group: images; fewer with a weak connection are left to be located by PnP.
@@ -57,6 +60,7 @@ class ConsistencyOptions:
     """
 
     tied: float = 0.1
+    strongest: int = 5
     bridge: int = MIN_MATCHES
     group: int = 3
     reobserved: float = 0.03
@@ -79,10 +83,14 @@ def consistent_groups(
     if pairs.is_path:
         todo = _runs_of_tied_neighbours(arrays, pairs, explained, options.tied)
     else:
-        todo = [_tied_photos(arrays, pairs, explained, options.tied)]
+        todo = [np.arange(len(arrays.ids))]
     while todo:
         rows = todo.pop()
-        side = _weak_cut(arrays, rows, pairs, explained, options)
+        side = None if pairs.is_path else _untied_cut(arrays, rows, pairs, explained, options)
+        if side is None and not pairs.is_path:
+            rows = _tied_photos(arrays, rows, pairs, explained, options.tied)
+        if side is None:
+            side = _weak_cut(arrays, rows, pairs, explained, options)
         if side is None:
             groups.append(arrays.ids[rows])
             continue
@@ -159,8 +167,61 @@ def _runs_of_tied_neighbours(
     return [run for run in np.split(rows, starts) if len(run)]
 
 
+def _pairs_among(
+    arrays: ModelArrays, rows: IntArray, pairs: MatchedPairs
+) -> tuple[IntArray, IntArray]:
+    """Find the pairs of images `rows` (R,) with enough matches.
+
+    Returns:
+        their rows in `pairs` (E,), and the two images of each, numbers in `rows` (E, 2).
+    """
+    ids = arrays.ids[rows]
+    inside = np.flatnonzero(pairs.enough & np.isin(pairs.image_ids, ids).all(1))
+    return inside, np.searchsorted(ids, pairs.image_ids[inside])
+
+
+def _untied_cut(
+    arrays: ModelArrays,
+    rows: IntArray,
+    pairs: MatchedPairs,
+    explained: IntArray,
+    options: ConsistencyOptions,
+) -> BoolArray | None:
+    """Find a cut of photos across which the pairs with the most matches are not in the model.
+
+    Candidates are the edges of the spanning tree of most matches, which takes the place of the path
+    of a video: each is the pair with the most matches across its cut. A photo that sees the others
+    by points on one plane alone has two possible poses (Necker reversal); where the mapper takes
+    the wrong one, the next photos are added to it, and their matches with all others contradict it.
+
+    Args:
+        rows: (R,) of the photos, ascending. explained: (P,) matches of each pair.
+    Returns:
+        (R,) True on one side of `rows`, None if there is no such cut.
+    """
+    inside, ends = _pairs_among(arrays, rows, pairs)
+    matches = pairs.matches[inside]
+    shape = (len(rows), len(rows))
+    tree = minimum_spanning_tree(sparse.csr_matrix((1 / matches, ends.T), shape)).tocsr()
+    edges = np.flatnonzero(np.asarray(tree[ends[:, 0], ends[:, 1]]).ravel())
+    tied = _tied(arrays, pairs, explained, inside[edges], options.tied)
+    for edge in edges[~tied]:
+        rest = tree.copy()
+        rest[ends[edge, 0], ends[edge, 1]] = 0
+        rest.eliminate_zeros()
+        component = connected_components(rest, directed=False)[1]
+        side = component == component[ends[edge, 0]]
+        if min(side.sum(), (~side).sum()) < options.group:
+            continue
+        across = np.flatnonzero(side[ends[:, 0]] != side[ends[:, 1]])
+        strongest = across[np.argsort(-matches[across], kind="stable")[: options.strongest]]
+        if not _tied(arrays, pairs, explained, inside[strongest], options.tied).any():
+            return np.asarray(side)
+    return None
+
+
 def _tied_photos(
-    arrays: ModelArrays, pairs: MatchedPairs, explained: IntArray, least: float
+    arrays: ModelArrays, rows: IntArray, pairs: MatchedPairs, explained: IntArray, least: float
 ) -> IntArray:
     """Leave out photos whose matches with the most similar photos are not points of the model.
 
@@ -170,20 +231,20 @@ def _tied_photos(
     matches.
 
     Args:
+        rows: (R,) of the photos, ascending. explained: (P,) matches of each pair.
         least: `ConsistencyOptions.tied`.
     Returns:
-        rows (n,) of the photos, ascending.
+        those of `rows` that stay, (n,).
     """
-    enough = np.flatnonzero(pairs.enough & np.isin(pairs.image_ids, arrays.ids).all(1))
-    pair = np.repeat(enough, 2)  # (2 E,) each pair belongs to two images
-    image = np.searchsorted(arrays.ids, pairs.image_ids[enough]).ravel()
+    inside, ends = _pairs_among(arrays, rows, pairs)
+    pair = np.repeat(inside, 2)  # (2 E,) each pair belongs to two images
+    image = ends.ravel()
     order = np.lexsort((-pairs.matches[pair], image))
     rank = np.arange(len(order)) - np.searchsorted(image[order], image[order])
     nearest = order[rank < 2]
-    rows = np.unique(pair[nearest])
-    tied = np.isin(pair[nearest], rows[_tied(arrays, pairs, explained, rows, least)])
-    untied = np.setdiff1d(image[nearest], image[nearest[tied]])
-    return np.setdiff1d(np.arange(len(arrays.ids)), untied)
+    judged = np.unique(pair[nearest])
+    tied = np.isin(pair[nearest], judged[_tied(arrays, pairs, explained, judged, least)])
+    return np.delete(rows, np.setdiff1d(image[nearest], image[nearest[tied]]))
 
 
 def _tied(

@@ -14,7 +14,7 @@ import numpy as np
 
 from reobj.files import atomic, base64_text, load_json, numbers, rounded
 from reobj.results.entries import Object, decode
-from reobj.types import Array, ReobjError
+from reobj.types import Array, ReobjError, counted
 
 HEADER = {"format": "reobj-changes", "version": 1}
 
@@ -184,10 +184,17 @@ class Changes:
         }
         return facts | {kind: [c.to_json() for c in getattr(self, kind)] for kind in self.KINDS}
 
+    @property
+    def made_the_map(self) -> bool:
+        """True of the recording that made the map: that its objects are new is no change."""
+        return bool(self.new) and not self.placed_by and len(self.of_objects()) == len(self.new)
+
     def summary(self) -> str:
         """Summarise the changes in a line: "12 stayed, 1 moved (chair 6 by 0.56 m)"."""
         if self.refused:
             return f"map {self.map_path}: not placed; {self.refused}"
+        if self.made_the_map:
+            return f"map {self.map_path}: made with {counted(len(self.new), 'object', 'objects')}"
         counts = []
         for kind in ("stayed", "moved", "gone", "new", "not_seen"):
             changes = getattr(self, kind)

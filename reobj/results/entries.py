@@ -110,19 +110,22 @@ class Object:
 
 
 VISIT_GAP_S = 2.0  # between two visits of an object; a detector misses objects for shorter times
+VISIT_GAP_SHARE = 1 / 3  # of the recording, at most: 2 s are 60 photos without times (chosen)
 
 
 def visit_gap(frame: IntArray, fps: float) -> float:
     """Return the longest gap within a visit, in frames of the source.
 
-    VISIT_GAP_S, or the usual distance of two frames with detections if that is longer.
+    VISIT_GAP_S, of a short recording VISIT_GAP_SHARE of its frames, or the usual distance of two
+    frames with detections if that is longer.
 
     Args:
         frame: (N,) of all detections. fps: of the source, Hz.
     """
-    steps = np.diff(np.unique(frame))
-    usual = float(np.median(steps)) if len(steps) else 1.0
-    return max(VISIT_GAP_S * fps, usual)
+    frames = np.unique(frame)
+    usual = float(np.median(np.diff(frames))) if len(frames) > 1 else 1.0
+    most = VISIT_GAP_SHARE * float(np.ptp(frames) + 1) if len(frames) else 1.0
+    return max(min(VISIT_GAP_S * fps, most), usual)
 
 
 def visits_of(frame: IntArray, gap: float) -> list[list[int]]:

@@ -331,10 +331,10 @@ def score_report(scores: dict[str, Any]) -> str:
     lines = [score_table(matched), *_missed_text(scores["missed"])]
     ranks = scores["ranks"]
     rates = [f"{k.replace('rank', 'Rank-')} {v:.3f}" for k, v in ranks.items() if k != "queries"]
-    if ranks:
-        lines.append(f"returns by appearance alone, {ranks['queries']:.0f} queries: "
-                     + (", ".join(rates) or "no returns"))  # fmt: skip
-    else:
+    if rates:
+        queries = f"{ranks['queries']:.0f} queries"
+        lines.append(f"returns by appearance alone, {queries}: {', '.join(rates)}")
+    elif not ranks:
         lines.append("Rank-k: no embeddings (an output folder of `run` or `track` has them)")
     if "objects" in scores:
         numbers = {k: v for k, v in scores["objects"].items() if isinstance(v, int | float)}

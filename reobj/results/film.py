@@ -117,7 +117,7 @@ class FilmWriter:
         width, height = self.size
         text = f"{self.path.name}: {width} x {height} px"
         if self.every > 1:
-            text += f", every {self.every}. frame"
+            text += f", 1 frame in {self.every}"
         if isinstance(self.sink, _VP8):
             text += "; with PyAV (pip install av): up to 1280 px, all frames, a third of the bytes"
         log.log(NOTE if isinstance(self.sink, _VP8) else logging.INFO, text)

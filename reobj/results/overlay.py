@@ -693,7 +693,8 @@ class Overlay:
 
 def _changes_of(result: Result) -> dict[int, tuple[str, Change]]:
     """Map the number of each object to its change since the map; {} without a map."""
-    return {} if result.changes is None else result.changes.of_objects()
+    changes = result.changes
+    return {} if changes is None or changes.made_the_map else changes.of_objects()
 
 
 def _located_by_part(result: Result) -> list[tuple[Result, list[int]]]:

@@ -344,8 +344,9 @@ def write_scene(
             for k, (part, origin) in enumerate(zip(parts, origins, strict=True))
         ],
     }
-    if result.changes is not None:
-        data["changes"] = result.changes.to_json() | {"summary": result.changes.summary()}
+    if (changes := result.changes) is not None:
+        marked = dataclasses.replace(changes, new=()) if changes.made_the_map else changes
+        data["changes"] = marked.to_json() | {"summary": changes.summary()}
     if result.earlier:
         data["earlier"] = _earlier_sessions(result.earlier)
         for entry in data["objects"]:

@@ -16,7 +16,7 @@ from reobj.results.checkpoint import Checkpoint, TrackedFrames
 from reobj.results.result import Result, VideoInfo
 from reobj.results.workspace import Workspace
 from reobj.sources.detectors import DetectionCache, DetectionSource
-from reobj.sources.video import Video, one_ahead
+from reobj.sources.video import Video, in_batches, one_ahead
 from reobj.types import Array, Detections, Embeddings, Frame, IntArray, ReobjError, Tracks
 
 
@@ -63,11 +63,12 @@ def detect_all(
     steps = []
     try:
         with progress("detect", video.expected) as line:
-            for frame in one_ahead(iter(video)):  # a thread decodes the next frame meanwhile
-                detected = source(frame)
-                frames += [frame.index] * len(detected)
-                steps.append((detected.xyxy / video.scale, detected.score, detected.class_id))
-                line.step()
+            for batch in one_ahead(in_batches(video, source.batch)):  # a thread decodes the next
+                for frame, found in zip(batch, source.look_at(batch), strict=True):
+                    detected = Detections.empty() if found is None else found
+                    frames += [frame.index] * len(detected)
+                    steps.append((detected.xyxy / video.scale, detected.score, detected.class_id))
+                    line.step()
     finally:
         source.flush()
     rows = Tracks.empty()

@@ -24,7 +24,7 @@ from reobj.files import load_json, read_lines, shortened
 from reobj.results.result import Result
 from reobj.sources.cvat import read_cvat
 from reobj.sources.tables import read_mot_rows
-from reobj.types import CLASS_MAX, Array, BoolArray, IntArray, ReobjError
+from reobj.types import CLASS_MAX, Array, BoolArray, IntArray, ReobjError, counted
 from reobj.words import among, canonical
 
 
@@ -181,7 +181,12 @@ def _read_mot(
         notes.append("the truth has one class without a name: classes do not count")
         return labelled(rows, "", np.where(flagged, Role.ABSENT, hidden * Role.IGNORED))
     notes.append("class numbers of the truth are those of the detector (COCO's), from 0")
-    return labelled(rows, _names_of(number, None, class_names), (flagged | hidden) * Role.IGNORED)
+    unnamed = number < 0
+    if unnamed.any():
+        boxes = counted(int(unnamed.sum()), "true box", "true boxes")
+        notes.append(f"{boxes} without a class (below 0) do not count, nor do boxes on them")
+    names = np.where(unnamed, "", _names_of(number, None, class_names))
+    return labelled(rows, names, (flagged | hidden | unnamed) * Role.IGNORED)
 
 
 def _from_one(rows: Array, path: Path, notes: list[str]) -> Array:

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import hashlib
 import json
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -85,6 +86,7 @@ class Workspace:
         if foreign and (out / OutputFile.MODEL).exists():
             raise ReobjError(f"{out}: a sparse/ of its own would be lost; choose another -o")
         self._held = contextlib.ExitStack()
+        self._is_new = not out.exists()
         with writing(self.cache):
             self.cache.mkdir(parents=True, exist_ok=True)
 
@@ -97,8 +99,14 @@ class Workspace:
             raise ReobjError(f"{self.out}: {what}; wait for it, or choose another -o") from None
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Release the lock; a new folder without any result is removed after an error."""
         self._held.close()
+        if kind is None or not self._is_new:
+            return
+        names = {path.name for path in self.out.rglob("*") if path.is_file()}
+        if names <= {"lock", self._source_file.name}:
+            shutil.rmtree(self.out, ignore_errors=True)
 
     @staticmethod
     def open(out: str | Path) -> Workspace:

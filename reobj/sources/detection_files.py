@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from reobj.cameras import Poses
-from reobj.files import did_you_mean, load_json, shortened
+from reobj.files import did_you_mean, last_name, load_json, shortened
 from reobj.sources import coco, tables
 from reobj.sources.boxes_3d import has_boxes_3d, read_boxes_3d
 from reobj.sources.class_names import check_length, load_class_names
@@ -81,6 +81,11 @@ class DetectConfig:
     )
     max_detections: int = option(
         0, "most detections per frame, by score (0: 100 of a model, all of a file)"
+    )
+    batch: int = option(
+        0,
+        "frames that a network gets at once (0: 8 on cuda and tensorrt, else 1; a live source: 1); "
+        "lower: less memory of the device",
     )
 
 
@@ -251,7 +256,7 @@ def _check(
     rows = np.flatnonzero(keep)
     rows = rows[np.lexsort((rows, -recorded.score[rows], recorded.frame[rows]))]  # best first
     recorded.select(_best_per_frame(recorded, rows, path, config.max_detections))
-    recorded.messages[:] = [f"{path.name}: {text}" for text in recorded.messages]
+    recorded.messages[:] = [f"{last_name(path)}: {text}" for text in recorded.messages]
 
 
 def _check_rows(recorded: RecordedDetections, path: Path) -> None:
@@ -426,8 +431,9 @@ def read_tracks(
         names = tuple(known_names) if unnamed else names
         if unnamed:
             without = (tracks.class_id < 0).sum()
-            text = f"{path.name}: no classes: {len(tracks) - without} boxes get the class of the "
-            recorded.messages.append(f"{text}earlier object that they show, {without} are `object`")
+            given = f"{len(tracks) - without} boxes get the class of the earlier object"
+            text = f"no classes: {given} that they show, {without} are `object`"
+            recorded.messages.append(f"{last_name(path)}: {text}")
     return tracks, names, recorded.messages
 
 
@@ -438,11 +444,13 @@ def _check_identities(recorded: RecordedDetections, path: Path) -> None:
         raise ReobjError(f"{path}: no box has an identity; expected a file of tracks")
     if not identified.all():
         count = (~identified).sum()
-        text = f"{path.name}: {count} of {len(recorded)} boxes without an identity left out"
+        text = f"{last_name(path)}: {count} of {len(recorded)} boxes without an identity left out"
         recorded.messages.append(text)
         recorded.select(np.flatnonzero(identified))
     if recorded.identity.min() == 0:
-        recorded.messages.append(f"{path.name}: identities count from 0: 1 is added to all of them")
+        recorded.messages.append(
+            f"{last_name(path)}: identities count from 0: 1 is added to all of them"
+        )
         recorded.identity = recorded.identity + 1
 
 

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import itertools
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,8 @@ from reobj.sources.detection_files import (
     unnamed_class,
 )
 from reobj.sources.libraries import (
+    LibraryDetector,
+    at_once,
     fixed_classes,
     is_function,
     library_detector,
@@ -45,8 +48,14 @@ from reobj.sources.onnx_layouts import (
 )
 from reobj.sources.recorded import NORMALISED_MAX, RecordedDetections, pack_detections, read_npz
 from reobj.sources.tiles import detect_in_tiles, parse_tiles
-from reobj.sources.video import Video, source_fingerprint
-from reobj.sources.weights import WEIGHTS, known_weights, model_path, onnx_session
+from reobj.sources.video import Video, in_batches, source_fingerprint
+from reobj.sources.weights import (
+    WEIGHTS,
+    frames_at_once,
+    known_weights,
+    model_path,
+    onnx_session,
+)
 from reobj.types import (
     COCO_NAMES,
     Array,
@@ -76,6 +85,7 @@ class OnnxDetector:
         device: cpu, cuda, coreml, ... (`onnx_session`).
     Attributes:
         class_names: names by class id. layout: name of the inferred layout. path: of the file.
+        batch: most images that `detect` gives the network at once.
     Raises:
         ReobjError: no such file, or an unknown layout.
     """
@@ -99,6 +109,8 @@ class OnnxDetector:
         _, shape, kind = self._inputs[0]
         if kind != "tensor(float)" or len(shape) not in (3, 4) or shape[-3] != 3:
             raise self._refusal(f"input is {kind} {shape}, expected an image (1, 3, H, W)")
+        axis = shape[0] if len(shape) == 4 else 1
+        self._fixed = axis if isinstance(axis, int) else 0  # images of every run; 0: any number
         trial = self._trial_run()
         accepting = [layout for layout in LAYOUTS if layout.accepts(trial)]
         if not accepting:
@@ -115,24 +127,37 @@ class OnnxDetector:
             raise ReobjError(f"{text}: {fault}{weights.fallback}")
         wanted = self.config.classes
         self._allowed = class_filter(wanted, self.class_names) if wanted else None
+        self.batch = self._accepted(frames_at_once(self.config.batch, device), trial)
 
     def __call__(self, image: Image) -> Detections:
         """Detect the objects in one BGR image (H, W, 3); best first, boxes clipped to the image."""
-        image = as_frame(image)
-        if self._grid == (1, 1):
-            return self._detect(image)
-        return detect_in_tiles(self._detect, image, self._grid)[: self._most]
+        return next(self.detect([image]))
 
-    def _detect(self, image: Image) -> Detections:
-        """Run the network once, on the whole image."""
-        size = self._input_size(image.shape[1], image.shape[0])
-        canvas, geometry = fit_image(image, size, self._layout.fit)
-        feeds = self._feeds(canvas, geometry.image_size, self._layout)
-        try:
-            outputs = self._session.run(None, feeds)
-        except Exception as error:  # no memory on the device, a shape that the network refuses
-            reason = str(error).partition("\n")[0]
-            raise ReobjError(f"{self.path} failed: {reason}") from error
+    def detect(self, images: Sequence[Image]) -> Iterator[Detections]:
+        """Detect the objects in each of several images, as one call for each would."""
+        images = [as_frame(image) for image in images]
+        if self._grid == (1, 1):
+            yield from self._detect(images)
+            return
+        for image in images:
+            yield detect_in_tiles(self._detect, image, self._grid)[: self._most]
+
+    def _detect(self, images: list[Image]) -> Iterator[Detections]:
+        """Run the network on whole images, together if they have the same input size."""
+        for size, group in itertools.groupby(images, lambda a: self._input_size(*a.shape[1::-1])):
+            for batch in in_batches(group, self.batch):
+                fitted = [fit_image(image, size, self._layout.fit) for image in batch]
+                try:
+                    each = self._run(fitted, self._layout)
+                except Exception as error:  # no memory on the device, a shape that is refused
+                    reason = str(error).partition("\n")[0]
+                    text = f"{self.path} failed{at_once(len(batch))}: {reason}"
+                    raise ReobjError(text) from error
+                for outputs, (_, geometry) in zip(each, fitted, strict=True):
+                    yield self._decoded(outputs, geometry)
+
+    def _decoded(self, outputs: list[Any], geometry: Geometry) -> Detections:
+        """Decode and select the detections of one image."""
         decoded = self._layout.decode(outputs, geometry)
         boxes = np.clip(decoded.xyxy, 0, np.tile(geometry.image_size, 2))
         label = decoded.class_id - self._layout.first
@@ -151,7 +176,7 @@ class OnnxDetector:
         """Find why the outputs of a trial run are not those of layout `expected`; "": they are."""
         if not self.layout.startswith(expected):
             return f"its layout is {self.layout}"
-        identity = Geometry(trial.size, trial.size, (1.0, 1.0), (0, 0))
+        _, identity = self._grey()
         decoded = self._layout.decode(trial.outputs, identity)
         score = decoded.score
         if not np.isfinite(decoded.xyxy).all() or not ((score >= 0) & (score <= 1)).all():
@@ -184,25 +209,62 @@ class OnnxDetector:
         w, h = (a if isinstance(a, int) else b for a, b in zip(fixed, scaled, strict=True))
         return w, h
 
-    def _feeds(self, canvas: Image, image_size: tuple[int, int], layout: Layout) -> dict[str, Any]:
-        """Make the model's inputs from a fitted BGR image: the image, and its size if required."""
+    def _run(self, fitted: list[tuple[Image, Geometry]], layout: Layout) -> list[list[Any]]:
+        """Run the model on fitted BGR images; return the outputs of each, with a batch axis of 1.
+
+        A fixed batch is filled up with the last image.
+        """
+        count = len(fitted)
+        fitted = fitted + fitted[-1:] * (self._fixed - count)
         name, shape, _ = self._inputs[0]
         mean, std = np.array([layout.mean, layout.std], np.float32)
-        blob = (canvas[..., ::-1] if layout.rgb else canvas).astype(np.float32)
-        blob = np.ascontiguousarray(((blob - mean) / std).transpose(2, 0, 1))  # (3, H, W)
-        feeds = {name: blob[None] if len(shape) == 4 else blob}
-        return feeds | {other: np.array([image_size]) for other, _, _ in self._inputs[1:]}
+        canvases = np.stack([canvas for canvas, _ in fitted])
+        blob = (canvases[..., ::-1] if layout.rgb else canvases).astype(np.float32)
+        blob = np.ascontiguousarray(((blob - mean) / std).transpose(0, 3, 1, 2))  # (B, 3, H, W)
+        sizes = np.array([geometry.image_size for _, geometry in fitted])
+        feeds = {name: blob if len(shape) == 4 else blob[0]}
+        feeds |= {other: sizes for other, _, _ in self._inputs[1:]}
+        outputs = [np.asarray(output) for output in self._session.run(None, feeds)]
+        if len(fitted) == 1:
+            return [outputs]  # some have no batch axis
+        return [[output[i : i + 1] for output in outputs] for i in range(count)]
+
+    def _grey(self) -> tuple[Image, Geometry]:
+        """Make a square image in the grey of the borders of fitted images, for trial runs."""
+        size = self._input_size(1, 1)
+        grey = np.full((size[1], size[0], 3), 114, np.uint8)
+        return grey, Geometry(size, size, (1.0, 1.0), (0, 0))
 
     def _trial_run(self) -> Trial:
         """Run the model on a grey image to get the shapes of its outputs."""
-        size = self._input_size(1, 1)  # of a square image
-        grey = np.full((size[1], size[0], 3), 114, np.uint8)  # as the borders of fitted images
+        grey, geometry = self._grey()
         try:
-            outputs = self._session.run(None, self._feeds(grey, size, LAYOUTS[0]))
+            (outputs,) = self._run([(grey, geometry)], LAYOUTS[0])
         except Exception as error:
             reason = f"a trial run with {self._inputs} failed: {str(error).splitlines()[0]}"
             raise self._refusal(reason) from error
-        return Trial([np.asarray(output) for output in outputs], len(self._inputs), size)
+        return Trial(outputs, len(self._inputs), geometry.input_size)
+
+    def _accepted(self, wanted: int, trial: Trial) -> int:
+        """Return how many images the model takes at once: `wanted`, or its fixed number, or 1.
+
+        Exports exist whose batch axis is dynamic only by name.
+        """
+        if wanted == 1 or self._fixed > 1:
+            return max(self._fixed, 1)
+        reason = "its batch axis is 1"
+        if not self._fixed:
+            try:
+                *_, last = self._run([self._grey()] * wanted, self._layout)
+                if [a.shape for a in last] == [a.shape for a in trial.outputs]:
+                    return wanted
+                reason = "its outputs have no batch axis"
+            except Exception as error:
+                reason = str(error).partition("\n")[0]
+        if self.config.batch or not self._fixed:
+            log.warning("%s: detect.batch=%d is not possible (%s): images are given one at a time",
+                        self.path, wanted, reason)  # fmt: skip
+        return 1
 
     def _names(self, count: int) -> tuple[str, ...]:
         """Name `count` classes (0: unknown) by option, metadata of the model, COCO, or numbers."""
@@ -241,14 +303,20 @@ class DetectionCache:
     Args:
         folder: for the cache alone. image_size: (w, h) of the frames and of their masks.
         file_frames: frames of a file; a kill loses a few seconds of work at most.
+        mask_bytes: of masks in memory, after which a file is written before it has its frames.
     """
 
     def __init__(
-        self, folder: str | Path, image_size: tuple[int, int], file_frames: int = 64
+        self,
+        folder: str | Path,
+        image_size: tuple[int, int],
+        file_frames: int = 64,
+        mask_bytes: int = 2**28,
     ) -> None:
         self.folder = Path(folder)
         self.image_size = image_size
         self._file_frames = file_frames
+        self._mask_bytes = mask_bytes
         self._stored: dict[int, RecordedDetections] = {}  # by frame
         self._pending: dict[int, Detections] = {}  # by frame, not on disk yet
         self._skipped: set[int] = set()  # frames of this run on which the detector was not run
@@ -282,7 +350,8 @@ class DetectionCache:
             self._skipped.add(index)
             return
         self._pending[index] = detections
-        if len(self._pending) >= self._file_frames:
+        masks = (d.masks.nbytes for d in self._pending.values() if d.masks is not None)
+        if len(self._pending) >= self._file_frames or sum(masks) >= self._mask_bytes:
             self.flush()
 
     def flush(self) -> None:
@@ -313,6 +382,8 @@ class DetectionSource:
         recorded: detections of a file, all available in advance.
         always_looks: zero detections mean an empty frame, and only None a frame on which the
             detector was not run.
+        detect_batch: `detect` for several frames, whose detections it yields in order; None:
+            `detect` is called for each. batch: most frames that it should be given.
     """
 
     detect: Callable[[Frame], Detections | None]
@@ -323,6 +394,8 @@ class DetectionSource:
     cache: DetectionCache | None = None
     recorded: RecordedDetections | None = None
     always_looks: bool = False
+    detect_batch: Callable[[Sequence[Frame]], Iterator[Detections | None]] | None = None
+    batch: int = 1
 
     def __post_init__(self) -> None:
         if not isinstance(self.class_names, Vocabulary):
@@ -335,12 +408,21 @@ class DetectionSource:
 
     def look(self, frame: Frame) -> Detections | None:
         """Return the detections of a frame, cached if possible; None: the detector was not run."""
-        if self.cache is not None and frame.index in self.cache:
-            return self.cache.get(frame.index)
-        detections = self.detect(frame)
-        if self.cache is not None:
-            self.cache.put(frame.index, detections)
-        return detections
+        return next(self.look_at([frame]))
+
+    def look_at(self, frames: Sequence[Frame]) -> Iterator[Detections | None]:
+        """Yield `look` of several frames; those that are not cached are detected together."""
+        cache = self.cache
+        new = [frame for frame in frames if cache is None or frame.index not in cache]
+        found = map(self.detect, new) if self.detect_batch is None else self.detect_batch(new)
+        for frame in frames:
+            if cache is not None and frame.index in cache:
+                yield cache.get(frame.index)
+                continue
+            detections = next(found)
+            if cache is not None:
+                cache.put(frame.index, detections)
+            yield detections
 
     def cached(self, folder: str | Path, image_size: tuple[int, int]) -> DetectionSource:
         """Return the source with a cache in `folder`, if it is slow and has a key.
@@ -387,7 +469,8 @@ def open_detections(
             opened, version = library_detector(config.model, words, config.min_score, device)
             key = _cache_key(config, version, _file_key(config.model), device)
             source = _filtered(as_source(opened), config)
-            return dataclasses.replace(source, key=key, slow=True, always_looks=True)
+            batch = frames_at_once(config.batch, device)
+            return dataclasses.replace(source, key=key, slow=True, always_looks=True, batch=batch)
         if words:
             raise fixed_classes(config.model)
         if is_function(config.model):
@@ -418,10 +501,7 @@ def _filtered(
     wanted = config.classes
     allowed = class_filter(wanted, source.class_names) if wanted and not is_open else None
 
-    def detect(frame: Frame) -> Detections | None:
-        found = source.detect(frame)
-        if found is None:
-            return None
+    def select(frame: Frame, found: Detections) -> Detections:
         boxes = np.clip(found.xyxy, 0, np.tile(frame.image.shape[1::-1], 2))
         use = (found.score >= config.min_score) & (boxes[:, 2:] > boxes[:, :2]).all(1)
         if allowed is not None:
@@ -432,7 +512,18 @@ def _filtered(
         rows = rows[best_rows(found.score[rows])][: config.max_detections or None]
         return dataclasses.replace(found, xyxy=boxes)[rows]
 
-    return dataclasses.replace(source, detect=detect)
+    def detect(frames: Sequence[Frame]) -> Iterator[Detections | None]:
+        for frame, found in zip(frames, source.look_at(frames), strict=True):
+            yield None if found is None else select(frame, found)
+
+    return dataclasses.replace(source, detect=_of_one(detect), detect_batch=detect)
+
+
+def _of_one(
+    detect: Callable[[Sequence[Frame]], Iterator[Detections | None]],
+) -> Callable[[Frame], Detections | None]:
+    """Make a function of one frame from one of several frames."""
+    return lambda frame: next(detect([frame]))
 
 
 def _file_key(model: str) -> str:
@@ -466,9 +557,14 @@ def with_detector(config: DetectConfig, detections: Any) -> tuple[DetectConfig, 
 
 
 def _cache_key(config: DetectConfig, *source: str | int) -> str:
-    """Make a cache key from the identity of a source, the options and the class names' file."""
+    """Make a cache key from the identity of a source, the options and the class names' file.
+
+    The size of the batches is left out: it does not change the detections.
+    """
     names = source_fingerprint(config.class_names) if config.class_names else ""
-    return json.dumps([*source, dataclasses.asdict(config), names])
+    options = dataclasses.asdict(config)
+    del options["batch"]
+    return json.dumps([*source, options, names])
 
 
 def as_source(detector: Any, class_names: Sequence[str] = ()) -> DetectionSource:
@@ -485,30 +581,52 @@ def as_source(detector: Any, class_names: Sequence[str] = ()) -> DetectionSource
         return detector
     if isinstance(detector, RecordedDetections):
         return _recorded_source(detector)
+    names = tuple(class_names) or _stated_names(detector)
+    if type(detector) is OnnxDetector:  # a subclass may change the result of a call
+        source = _answer_source(detector.detect, names, bool(class_names))
+        return dataclasses.replace(source, always_looks=True, batch=detector.batch)
+    if isinstance(detector, LibraryDetector):
+        return _answer_source(detector.detect, names, bool(class_names))
     if not callable(detector):
         raise ReobjError(f"{detector!r:.80} is no detector: expected a function image -> detections"
                          "; a file is opened by read_detections(path, video)")  # fmt: skip
-    stated_names = tuple(class_names) or _stated_names(detector)
-    names = Vocabulary(stated_names or COCO_NAMES)
-    silent = bool(stated_names)
+    source = _answer_source(lambda images: map(detector, images), names, bool(class_names))
+    return dataclasses.replace(source, always_looks=isinstance(detector, OnnxDetector))
+
+
+def _answer_source(
+    answer: Callable[[list[Image]], Iterator[Any]], class_names: Sequence[str], numbered: bool
+) -> DetectionSource:
+    """Make a source from the answers of a detector, which are checked.
+
+    Args:
+        answer: BGR images -> what the detector returns for each. class_names: () if it states none.
+        numbered: labels of the detector are ignored, as its class numbers have names.
+    """
+    names = Vocabulary(class_names or COCO_NAMES)
+    silent = bool(class_names)
     for name in names:
         check_length(name, "class names of the detector")
 
-    def detect(frame: Frame) -> Detections | None:
+    def detect(frames: Sequence[Frame]) -> Iterator[Detections | None]:
+        answers = answer([frame.image for frame in frames])
+        return (checked(frame, answers) for frame in frames)
+
+    def checked(frame: Frame, answers: Iterator[Any]) -> Detections | None:
         nonlocal silent
         try:
-            answer = detector(frame.image)
-            if answer is None:
+            found = next(answers)
+            if found is None:
                 return None
-            labels = None if class_names else text_labels(answer)
+            labels = None if numbered else text_labels(found)
             kinds = None if labels is None else np.array(names.numbers(labels), np.int64)
-            detections = as_detections(answer, kinds)
+            detections = as_detections(found, kinds)
         except ReobjError as error:
             raise ReobjError(f"frame {frame.index}: {error}") from error
         if len(detections) and detections.class_id.max() >= len(names):
             text = unnamed_class(int(detections.class_id.max()), len(names))
             raise ReobjError(f"frame {frame.index}: {text}")
-        if isinstance(answer, Mapping) and kinds is None and not silent and len(detections):
+        if isinstance(found, Mapping) and kinds is None and not silent and len(detections):
             log.warning(
                 "the detector has no class names: its numbers are read as COCO's 80 classes, from "
                 "0; torchvision and DETR count 91 from 1: give the names (detect.class_names, or "
@@ -517,7 +635,7 @@ def as_source(detector: Any, class_names: Sequence[str] = ()) -> DetectionSource
             silent = True  # one warning is enough
         return detections
 
-    return DetectionSource(detect, names, always_looks=isinstance(detector, OnnxDetector))
+    return DetectionSource(_of_one(detect), names, detect_batch=detect)
 
 
 def _recorded_source(recorded: RecordedDetections) -> DetectionSource:

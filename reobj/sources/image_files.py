@@ -74,7 +74,7 @@ def list_images(source: str) -> ImageList:
     ]
     if not files:
         folders = sorted(p.name for p in paths if p.is_dir())[:9]
-        more = [f"its folders are {', '.join(folders)}"] if folders and path.is_dir() else []
+        more = [f"its folders: {', '.join(folders)}"] if folders and path.is_dir() else []
         fault = f"no images there (looked for {' '.join(IMAGE_SUFFIXES)})"
         raise ReobjError("; ".join([f"{source}: {fault}", *messages, *more]))
     headers = {p: header(p) for p in files}

@@ -10,7 +10,7 @@ import dataclasses
 import importlib
 import importlib.metadata
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,6 @@ from typing import Any
 import numpy as np
 
 from reobj.types import Image, ReobjError
-
-Detect = Callable[[Image], Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,26 +40,33 @@ class LibraryDetector:
     """Detector of another library.
 
     Attributes:
-        detect: BGR image (H, W, 3) uint8 -> detections as `reobj.types.as_detections` accepts them.
+        run: BGR images (H, W, 3) uint8 -> of each, detections as `reobj.types.as_detections`
+            accepts them.
         class_names: by class id. name: on the command line.
     """
 
-    detect: Detect
+    run: Callable[[list[Image]], Iterable[Any]]
     class_names: tuple[str, ...]
     name: str = ""
 
-    def __call__(self, image: Image) -> Any:
-        """Detect the objects in an image.
+    def detect(self, images: list[Image]) -> Iterator[Any]:
+        """Detect the objects in each of several images, all at once.
 
         Raises:
             ReobjError: the library failed; with its message.
         """
         try:
-            return self.detect(image)
+            yield from self.run(images)
         except ReobjError:
             raise
         except Exception as error:  # libraries raise any kind
-            raise ReobjError(f"--detector {self.name} failed: {_message(error)}") from error
+            text = f"--detector {self.name} failed{at_once(len(images))}: {_message(error)}"
+            raise ReobjError(text) from error
+
+
+def at_once(count: int) -> str:
+    """Return the part of a message about a network's failure that names the size of the batch."""
+    return f" on {count} images at once (detect.batch)" if count > 1 else ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,12 +93,12 @@ def _ultralytics(options: LibraryOptions) -> LibraryDetector:
             raise fixed_classes(f"ultralytics:{options.model}")
         model.set_classes(list(options.words))
 
-    def detect(image: Image) -> Any:
+    def run(images: list[Image]) -> Any:
         return model.predict(
-            image, conf=options.min_score, device=options.device, retina_masks=True, verbose=False
-        )[0]
+            images, conf=options.min_score, device=options.device, retina_masks=True, verbose=False
+        )
 
-    return LibraryDetector(detect, _by_id(model.names))
+    return LibraryDetector(run, _by_id(model.names))
 
 
 def _rfdetr(options: LibraryOptions) -> LibraryDetector:
@@ -107,11 +112,13 @@ def _rfdetr(options: LibraryOptions) -> LibraryDetector:
     given = {"pretrain_weights": weights or None} if "=" in options.model else {}
     model = getattr(rfdetr, classes[wanted])(device=options.device, **given)
 
-    def detect(image: Image) -> Any:
-        found = model.predict(image[..., ::-1].copy(), threshold=options.min_score)
-        return found[np.array([bool(name) for name in found.data["class_name"]], bool)]
+    def run(images: list[Image]) -> Iterator[Any]:
+        rgb = [image[..., ::-1].copy() for image in images]
+        answer = model.predict(rgb, threshold=options.min_score)
+        for found in answer if isinstance(answer, list) else [answer]:  # of one image: no list
+            yield found[np.array([bool(name) for name in found.data["class_name"]], bool)]
 
-    return LibraryDetector(detect, tuple(map(str, model.class_names)))
+    return LibraryDetector(run, tuple(map(str, model.class_names)))
 
 
 def _torchvision(options: LibraryOptions) -> LibraryDetector:
@@ -131,14 +138,15 @@ def _torchvision(options: LibraryOptions) -> LibraryDetector:
         model = get_model(name, weights=trained)
     model = model.to(options.device).eval()
 
-    def detect(image: Image) -> dict[str, Any]:
-        tensor = torch.from_numpy(image[..., ::-1].copy()).permute(2, 0, 1).float() / 255
+    def run(images: list[Image]) -> Iterator[dict[str, Any]]:
+        rgb = torch.from_numpy(np.stack(images)[..., ::-1].copy()).to(options.device)
         with torch.inference_mode():
-            found = model([tensor.to(options.device)])[0]
-        keep = (found["scores"] >= options.min_score) & (found["labels"] > 0)  # 0: background
-        return {key: value[keep].cpu() for key, value in found.items()}
+            answers = model(list(rgb.permute(0, 3, 1, 2).float() / 255))
+        for found in answers:
+            keep = (found["scores"] >= options.min_score) & (found["labels"] > 0)  # 0: background
+            yield {key: value[keep].cpu() for key, value in found.items()}
 
-    return LibraryDetector(detect, tuple(trained.meta["categories"]))
+    return LibraryDetector(run, tuple(trained.meta["categories"]))
 
 
 def _transformers(options: LibraryOptions) -> LibraryDetector:
@@ -156,32 +164,32 @@ def _transformers(options: LibraryOptions) -> LibraryDetector:
         raise ReobjError(f"hf:{options.model}: {str(error).splitlines()[0]}{advice}") from error
     model = model.to(options.device).eval()
 
-    def detect(image: Image) -> Any:
-        rgb = image[..., ::-1].copy()
-        text = {"text": [words], "padding": True, "truncation": True} if words else {}
+    def run(images: list[Image]) -> Any:
+        count = len(images)
+        rgb = [image[..., ::-1].copy() for image in images]
+        text = {"text": [words] * count, "padding": True, "truncation": True} if words else {}
         inputs = processor(images=rgb, return_tensors="pt", **text).to(options.device)
         with torch.inference_mode():
             outputs = model(**inputs)
-        asked: dict[str, Any] = {"threshold": options.min_score, "target_sizes": [rgb.shape[:2]]}
+        sizes = [image.shape[:2] for image in rgb]
+        asked: dict[str, Any] = {"threshold": options.min_score, "target_sizes": sizes}
         if not words:
-            return processor.post_process_object_detection(outputs, **asked)[0]
+            return processor.post_process_object_detection(outputs, **asked)
         if "input_ids" in inputs and type(processor).__name__.startswith("GroundingDino"):
             asked |= {"input_ids": inputs["input_ids"], "text_threshold": options.min_score}
         else:
-            asked["text_labels"] = [words]
-        return _with_words(
-            processor.post_process_grounded_object_detection(outputs, **asked), words
-        )
+            asked["text_labels"] = [words] * count
+        answers = processor.post_process_grounded_object_detection(outputs, **asked)
+        return (_with_words(found, words) for found in answers)
 
-    return LibraryDetector(detect, options.words or _by_id(model.config.id2label))
+    return LibraryDetector(run, options.words or _by_id(model.config.id2label))
 
 
-def _with_words(found: Any, words: list[str]) -> dict[str, Any]:
+def _with_words(image: Any, words: list[str]) -> dict[str, Any]:
     """Number detections of one image by the word that shares most tokens with their phrase.
 
     Grounding DINO returns phrases, which may lack tokens of a word or join several words.
     """
-    (image,) = found
     phrases = [set(str(text).lower().split()) for text in image["text_labels"]]
     tokens = [set(word.lower().split()) for word in words]
     shared = np.array([[len(p & t) / len(t) for t in tokens] for p in phrases])

@@ -8,7 +8,7 @@ gives the same boxes (a test compares), but lacks masks and depends on numba, ll
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -76,19 +76,21 @@ def weighted_box_fusion(
 
 
 def detect_in_tiles(
-    detect: Callable[[Image], Detections], image: Image, grid: tuple[int, int]
+    detect: Callable[[list[Image]], Iterable[Detections]], image: Image, grid: tuple[int, int]
 ) -> Detections:
     """Detect in the whole image and in its tiles, and fuse the boxes; best first.
+
+    detect: images -> the detections of each.
 
     Boxes cut by an edge of their tile are dropped: the object is complete in the whole image or in
     the next tile. The mask of fused boxes is that of the best one.
     """
     height, width = image.shape[:2]
     tiles = np.vstack([[0, 0, width, height], tile_boxes((width, height), grid)])  # (V, 4)
+    parts = [np.ascontiguousarray(image[y1:y2, x1:x2]) for x1, y1, x2, y2 in tiles.tolist()]
     per_tile = []
-    for tile in tiles:
+    for tile, detections in zip(tiles, detect(parts), strict=True):
         x1, y1, x2, y2 = tile.tolist()
-        detections = detect(np.ascontiguousarray(image[y1:y2, x1:x2]))
         xyxy = detections.xyxy
         inside = np.array([x1 > 0, y1 > 0, x2 < width, y2 < height])  # edges inside the image
         margin = 0.01 * np.array([x2 - x1, y2 - y1])  # boxes nearer to an edge count as cut

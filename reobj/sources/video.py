@@ -11,6 +11,7 @@ import dataclasses
 import functools
 import glob
 import hashlib
+import itertools
 import json
 import math
 import os
@@ -18,7 +19,7 @@ import queue
 import re
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -492,6 +493,8 @@ class Video:
             kind = "video (damaged, or no video)"
             if self.is_live:
                 kind = "camera (is it connected?)" if is_camera else "stream (is it there?)"
+            elif not os.access(self.source, os.R_OK):
+                raise ReobjError(f"{self.source}: you may not read it; allow it (chmod u+r)")
             raise ReobjError(f"{self.source}: cannot be opened as a {kind}")
         return capture
 
@@ -605,6 +608,13 @@ def files_of(source: Any) -> list[Path]:
 
 
 Item = TypeVar("Item")
+
+
+def in_batches(items: Iterable[Item], size: int) -> Iterator[list[Item]]:
+    """Group items into lists of `size`; the last one may be shorter."""
+    left = iter(items)
+    while batch := list(itertools.islice(left, size)):
+        yield batch
 
 
 def one_ahead(items: Iterator[Item]) -> Iterator[Item]:

@@ -283,6 +283,15 @@ def _download(weights: Weights, part: Path, most: int = 100_000_000) -> None:
                 raise ConnectionError(f"connection cut after {done} of {size} bytes")
 
 
+def frames_at_once(asked: int, device: str) -> int:
+    """Return how many frames a network gets at once; asked: by the user, 0: by device.
+
+    On two CPU cores batches are slower. On an H100 4 images at once took 25 to 62 % of the time of
+    single ones, and 16 took 15 to 54 % (benchmarks/RESULTS.md); 8 need half the memory of 16.
+    """
+    return asked or (8 if device.partition(":")[0] in ("cuda", "tensorrt") else 1)
+
+
 def onnx_session(path: Path, threads: int = 0, device: str = "cpu") -> Any:
     """Make an onnxruntime session on a device (threads 0: all cores).
 

@@ -6,13 +6,13 @@ residual motion near a point of a deep scene. Neither poses nor depth are needed
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from reobj.sources.video import Video, one_ahead, shrunk
+from reobj.sources.video import in_batches, one_ahead, shrunk
 from reobj.types import Array, Floats, Frame, Image
 
 FLOW_SIZE_PX = 320  # px, longer side of the image in which corners are followed: for speed
@@ -39,23 +39,22 @@ class CameraMotion:
         self.gray: Image | None = None
         self.corners: Floats | None = None
         self.residual_flow = np.empty((0, 4))
-        self._ahead: _Step | None = None  # precomputed by `ahead` for the next image
+        self._ahead: list[_Step] = []  # precomputed by `ahead` for the next images
 
     def __call__(self, image: Image) -> Array:
         """Estimate new_from_old (3, 3) between the previous image and this one (H, W, 3) BGR.
 
         In pixels of `image`; the identity for a first image and after a change of size.
         """
-        step = self._ahead
-        if step is None or step.image is not image or step.old is not self.gray:
-            step = _step(self.gray, self.corners, image)
+        known = (s for s in self._ahead if s.image is image and s.old is self.gray)
+        step = next(known, None) or _step(self.gray, self.corners, image)
         self.gray = step.gray
         self.corners = step.corners
         self.residual_flow = step.residual_flow
         return step.new_from_old
 
-    def ahead(self, video: Video) -> Iterator[Frame]:
-        """Iterate over a recorded video; a thread estimates the motion of the next frame meanwhile.
+    def ahead(self, frames: Iterable[Frame], batch: int) -> Iterator[list[Frame]]:
+        """Group frames; a thread reads the next group and estimates its motion meanwhile.
 
         The state changes only when the motion of a frame is requested.
         """
@@ -63,14 +62,15 @@ class CameraMotion:
         def steps() -> Iterator[tuple[Frame, _Step]]:
             gray = self.gray
             corners = self.corners
-            for frame in video:
+            for frame in frames:
                 step = _step(gray, corners, frame.image)
                 gray = step.gray
                 corners = step.corners
                 yield frame, step
 
-        for frame, self._ahead in one_ahead(steps()):
-            yield frame
+        for several in one_ahead(in_batches(steps(), batch)):
+            self._ahead = [step for _, step in several]
+            yield [frame for frame, _ in several]
 
     def parallax(self, xy: Array, nearest: int = 5) -> Array:
         """Estimate the parallax at points of the old image: their residual motion.

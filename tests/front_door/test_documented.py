@@ -98,6 +98,12 @@ ELSEWHERE = {
     "python reobj_track.py map flat.map --delete 7": "test_map_command.py",
     "python reobj_track.py map flat.map --export csv -o flat.csv": "test_map_command.py",
 }  # fmt: skip
+FIRST_HOUR = ROOT / "docs" / "tutorials" / "first_hour.md"
+ELSEWHERE |= {
+    c: "below: parsed, or repeated as a mistake; the recordings are those of others"
+    for c in commands_of(FIRST_HOUR)
+    if c.startswith("python reobj_track.py ") and DOCUMENTED[c] == page_name(FIRST_HOUR)
+}
 
 
 def benchmark_of(command: str) -> str | None:
@@ -494,6 +500,56 @@ def test_documented_command(
     if shown.says:
         assert shown.says in said.err and len(said.err.strip().splitlines()) == 1
     shown.check(desk)
+
+
+# ---- A first hour: recordings of others ----
+
+
+def said_in_the_first_hour() -> list[tuple[str, str]]:
+    """Commands of the page, with the error below each; "": it has results."""
+    lines = FIRST_HOUR.read_text().splitlines()
+    pairs = zip(lines, [*lines[1:], ""], strict=True)
+    return [(a, b * b.startswith("error: ")) for a, b in pairs if a.startswith(TOOL)]
+
+
+def test_commands_of_the_first_hour_are_valid() -> None:
+    commands = [c for c, error in said_in_the_first_hour() if not error]
+    assert len(commands) >= 10
+    for command in commands:
+        assert rt._parser().parse_args(shlex.split(command)[2:]).func is not None, command
+
+
+def run_in_process(words: list[str]) -> object:
+    """The exit code, also of invalid arguments."""
+    try:
+        return cli(*words)
+    except SystemExit as ended:
+        return ended.code
+
+
+def test_mistakes_of_the_first_hour(desk: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each has the message that the page shows, and leaves nothing behind."""
+    weights("deimv2-femto")
+    recording(desk)
+    for name in ("apple.mp4", "monday.mp4"):
+        (desk / name).symlink_to(ROOM / "room.mp4")
+    shutil.copy(ROOM / "gt_mot.txt", desk / "livingroom_gt.txt")
+    matrices = np.tile(np.eye(4).ravel(), (240, 1))
+    np.savetxt(desk / "monday_poses.txt", matrices)
+    (desk / "poses.txt").unlink()
+    (desk / "livingroom").mkdir()
+    before = sorted(desk.iterdir())
+    mistakes = [(c, error) for c, error in said_in_the_first_hour() if error]
+    assert len(mistakes) >= 10
+    for command, error in mistakes:
+        capsys.readouterr()
+        done = run_in_process(shlex.split(command)[2:])
+        said = capsys.readouterr()
+        program = re.sub(
+            r"\(see .*?(?= run --help| --help)", "(see python reobj_track.py", said.err
+        )
+        assert (done, said.out, program) == (2, "", f"{error}\n"), command
+        assert sorted(desk.iterdir()) == before, command
 
 
 # ---- Python outside the tutorials ----

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -223,6 +224,8 @@ def test_another_room_is_refused(
     said = capsys.readouterr()
     why = "this is not the room of flat.map, or nothing in view matches it"
     assert " ".join(said.out.split()).count(why) == 1 and said.err.count(why) == 1
+    whole, steps = re.search(r"\bmap ([\d.]+) \((.*?)\)", said.out).groups()
+    assert sum(map(float, re.findall(r"[\d.]+", steps))) <= float(whole) + 0.2  # rounded
     assert (desk / "flat.map").read_bytes() == before
     changes = read_changes(desk / "other" / "changes.json")
     assert why in changes.refused and changes.tried_frames == 10

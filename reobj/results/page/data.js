@@ -7,6 +7,7 @@ const floats = (b64) => new Float32Array(bytes(b64).buffer);
 const picture = (b64) => `data:image/jpeg;base64,${b64}`;
 const figure = (data, alt, text, more = {}) => el("figure", more, el("img", { src: picture(data), alt }),
   text);
+const several = (count, noun) => `${count} ${noun}${count === 1 ? "" : "s"}`;
 const percent = (x) => `${Math.round(100 * x)} %`;
 const rgb = (o) => `rgb(${o.color})`;
 

@@ -125,7 +125,7 @@ function edit(made) {
   pending.push(made);
   saved = false;
   replay();
-  hint(both ? `both are seen in ${both} frames at once: are they one object? (u: undo)` : "");
+  hint(both ? `both are seen in ${both} frames at once: are they one object? Undo takes it back` : "");
 }
 function undo() {
   if (!pending.pop()) return;
@@ -137,7 +137,7 @@ function undo() {
 const said = (e) => ({
   merge: () => `merge ${e.object.id} with ${e.with.id}`,
   split: () => e.frames ? `split frames ${e.frames.join("–")} off ${e.object.id}`
-    : `split ${e.visits.length} tracklet${e.visits.length > 1 ? "s" : ""} off ${e.object.id}`,
+    : `split ${several(e.visits.length, "tracklet")} off ${e.object.id}`,
   rename: () => `rename ${e.object.id} to ${e.class}`,
   delete: () => `delete ${e.object.id}`,
 })[e.do]();
@@ -161,6 +161,7 @@ function fillEdits() {
       onclick: () => send("undo", "") }, "Undo the last save")] : []),
     el("button", { id: "save", className: "main", disabled: !changed || job.running, onclick: save },
       SERVED ? "Save" : "Save edits.json"));
+  bar.querySelector("ol").scrollTop = 1e6;       // the latest one
 }
 
 const editsFile = () => JSON.stringify({ format: "reobj-edits", version: 1, map: S.map,
@@ -228,8 +229,9 @@ function editButtons(o) {
   form.hidden = true;
   act.append(
     el("button", { title: "it is the same as another object", onclick: () => {
-      state.merging = o;
-      hint(`click the object that is the same as ${o.class} ${o.id} (Esc: none)`);
+      state.merging = state.merging ? null : o;    // a second time: none
+      hint(state.merging ? `${touch ? "tap" : "click"} the object that is the same as ${nameOf(o)}; `
+        + `none: ${touch ? "" : "Esc, or "}“Merge with” again` : "");
     } }, "Merge with …"),
     el("button", { onclick: () => { form.hidden = false; form.querySelector("input").select(); } },
       "Rename …"),

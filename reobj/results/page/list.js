@@ -48,7 +48,7 @@ function showOnly(hide, only) {                  // ids that are hidden, or the 
   const count = state.hiddenIds.size, o = here.find(({ id }) => id === only);
   $("some").hidden = !count && only === null;
   $("some").querySelector("span").textContent = o ? `only ${nameOf(o)} is shown:`
-    : `${count} hidden object${count > 1 ? "s" : ""}:`;
+    : `${several(count, "hidden object")}:`;
   filterList();
   redraw();
 }
@@ -89,8 +89,8 @@ function fillList() {
     el("span", {}, el("b", {}, "| "), "now"), el("span", {}, `${ends[1]}`));
   const doubtful = here.filter((o) => o.status === "doubtful").length;
   $("notes").replaceChildren(
-    ...(doubtful ? [el("p", { className: "dim" }, `${doubtful} doubtful object`
-      + `${doubtful > 1 ? "s" : ""}, more likely absent than present: `, el("button", { onclick: () => {
+    ...(doubtful ? [el("p", { className: "dim" }, `${several(doubtful, "doubtful object")}, `
+      + "more likely absent than present: ", el("button", { onclick: () => {
         $("doubtful").checked = !$("doubtful").checked;
         $("doubtful").onchange();
       } }, "show or hide"))] : []),
@@ -99,18 +99,20 @@ function fillList() {
   filterList();
 }
 
+const AND = new Intl.ListFormat("en-GB");        // 1, 2 and 3
 function evidence(link) {
-  const owners = (t) => objects.filter((o) => o.tracks.includes(t)).map((o) => o.id)
-    .join(" and ");
-  const names = [...new Set(link.tracklets)].map((t) => `${t} (object ${owners(t)})`).join(", ");
+  const numbers = [...new Set(link.tracklets)], noun = numbers.length > 1 ? "tracklets" : "tracklet";
+  const owners = (t) => { const ids = objects.filter((o) => o.tracks.includes(t)).map((o) => o.id);
+    return `${ids.length > 1 ? "objects" : "object"} ${AND.format(ids.map(String))}`; };
+  const names = `${noun} ${numbers.map((t) => `${t} (${owners(t)})`).join(", ")}`;
   if (link.place_iou === null) {
     return (link.kind === "split" ? `split: ${names} from the rest`
-      : `merge of tracklets ${names}`) + ` by appearance alone (log odds ${link.appearance_log_odds})`;
+      : `merge of ${names}`) + ` by appearance alone (log odds ${link.appearance_log_odds})`;
   }
   if (link.kind === "split") {
-    return `split: parts of tracklets ${names} are at different 3D positions (overlap ${link.place_iou})`;
+    return `split: parts of ${names} are at different 3D positions (overlap ${link.place_iou})`;
   }
-  return `merge of tracklets ${names}: overlap in 3D ${link.place_iou}, log odds of the appearance ${link.appearance_log_odds}`
+  return `merge of ${names}: overlap in 3D ${link.place_iou}, log odds of the appearance ${link.appearance_log_odds}`
     + (link.kept ? "" : "; undone: one solid does not fit the boxes of both");
 }
 

@@ -4,7 +4,7 @@ function setMeasure(on) {
   state.measured = [];
   press("measure", on);
   document.body.classList.toggle("measuring", on);
-  hint(on ? "click two points on solids or sparse points" : "");
+  hint(on ? `${touch ? "tap" : "click"} two points on shapes or sparse points` : "");
   redraw();
 }
 
@@ -62,7 +62,7 @@ function placeUnder(x, y) {                      // the nearest of solids and po
 
 function measureAt(x, y) {
   const place = placeUnder(x, y);
-  if (!place) { hint("nothing there: click on a solid or a point"); return; }
+  if (!place) { hint(`nothing there: ${touch ? "tap" : "click"} a shape or a point`); return; }
   state.measured = state.measured.length === 1 ? [state.measured[0], place] : [place];
   hint(state.measured.length === 1 ? "and the other end" : "");
   redraw();

@@ -230,8 +230,9 @@ function alongWalls(points) {                    // level direction of the walls
   return turned.reduce((a, b) => dot(b, h) > dot(a, h) ? b : a);   // as the cameras look
 }
 
-function lookFrom(back) {                        // frame path, points and solids from a direction
-  const aspect = canvas.clientWidth / Math.max(canvas.clientHeight, 1);
+function lookFrom(back) {                        // frame path, points and solids below the buttons
+  const height = Math.max(canvas.clientHeight, 1), aspect = canvas.clientWidth / height;
+  const hidden = Math.min($("tools").offsetTop + $("tools").offsetHeight, height / 2) / height;
   const tan = Math.tan(orbit.fov / 360 * Math.PI), side = unit(cross([0, 0, 1], back));
   const top = cross(back, side);
   let target = room.middle, distance = 2.5 * room.radius;
@@ -241,8 +242,8 @@ function lookFrom(back) {                        // frame path, points and solid
       return [dot(off, side) / depth / aspect, dot(off, top) / depth]; });
     const [x, y] = [0, 1].map((i) => [0, 1].map((k) => quantile(seen.map((s) => s[i]), k)));
     target = add(add(target, side, (x[0] + x[1]) / 2 * distance * tan * aspect),
-      top, (y[0] + y[1]) / 2 * distance * tan);
-    distance *= Math.sqrt(Math.max(x[1] - x[0], y[1] - y[0]) / 2 / 0.9);
+      top, ((y[0] + y[1]) / 2 + hidden) * distance * tan);
+    distance *= Math.sqrt(Math.max(x[1] - x[0], (y[1] - y[0]) / (1 - hidden)) / 2 / 0.9);
   }
   setRide(false);
   controls.target.set(...target);
@@ -325,8 +326,10 @@ function draw() {
     const lit = chosen || state.step < 0 || o.then || seenAt(o, state.step);
     const strength = isFound(o) || chosen ? 1 : FAINT;
     o.group.visible = visible.has(o);
-    wire.visible = faces.visible = $("solids").checked;
-    ellipsoid.visible = $("ellipsoids").checked || !$("solids").checked;
+    const filled = chosen || o.status !== "implausible";   // of 20 m it would cover the room
+    wire.visible = $("solids").checked;
+    faces.visible = filled && $("solids").checked;
+    ellipsoid.visible = filled && $("ellipsoids").checked || !$("solids").checked;
     halo.visible = chosen || Boolean(markOf(o)) && isFound(o);
     halo.material.color.set(css(chosen ? "--halo" : `--${changeOf(o)?.kind}`) || "#000");
     halo.material.opacity = chosen ? 1 : 0.6;

@@ -1,0 +1,124 @@
+"""Mistakes of a first hour, and their messages; what a newcomer's recordings showed."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import reobj_track as rt
+from front_door.room import ROOM, cli
+
+CLIP = ROOM / "room.mp4"
+
+
+def refusal(capsys: pytest.CaptureFixture[str], *command: object) -> str:
+    """The line of a command that ends with exit code 2."""
+    capsys.readouterr()
+    assert cli(*command) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.startswith("error: ") and said.err.count("\n") == 1
+    return said.err
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc is a folder of Linux")
+def test_folders_that_take_no_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    boxes = ("--detections", ROOM / "detections.npz")
+    text = refusal(capsys, "run", CLIP, "-o", "/proc/out", *boxes)
+    assert text.startswith("error: /proc/out/cache: cannot be written (No such file")
+    assert "this folder takes no files" in text
+    text = refusal(capsys, "run", CLIP, "-o", tmp_path / "out", *boxes, "--map", "/proc/flat.map")
+    assert text.startswith("error: /proc/flat.map: cannot be written (No such file")
+
+
+def test_a_refused_run_leaves_no_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """But what was in the folder stays."""
+    for option in ("--detector=fsat", "--detections=none.json", f"--map={CLIP}", "--poses=a.txt"):
+        refusal(capsys, "run", CLIP, "-o", tmp_path / "out", option)
+        assert not (tmp_path / "out").exists(), option
+    (tmp_path / "out" / "cache").mkdir(parents=True)
+    refusal(capsys, "run", CLIP, "-o", tmp_path / "out", "--detector", "fsat")
+    assert (tmp_path / "out" / "cache").is_dir()
+
+
+def test_a_video_is_no_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = refusal(capsys, "run", CLIP, "-o", tmp_path / "out", "--map", CLIP)
+    assert text == f"error: {CLIP}: not a map of reobj_track; another file was given\n"
+
+
+@pytest.mark.skipif(os.name == "nt" or os.geteuid() == 0, reason="root may read everything")
+def test_a_video_that_may_not_be_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    video = Path(shutil.copy(CLIP, tmp_path / "room.mp4"))
+    video.chmod(0)
+    text = refusal(capsys, "run", video, "-o", tmp_path / "out")
+    assert text == f"error: {video}: you may not read it; allow it (chmod u+r)\n"
+
+
+def test_labels_in_the_working_folder_have_a_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "room_labels").mkdir()
+    monkeypatch.chdir(tmp_path / "room_labels")
+    for i in range(1, 241):
+        Path(f"room_{i}.txt").write_text("56 0.5 0.5 0.2 0.2\n")
+    messages = rt.read_detections(".", rt.Video(CLIP)).messages
+    assert messages and all(text.startswith("room_labels: ") for text in messages)
+
+
+def photos(folder: Path, count: int) -> Path:
+    """Photos of a wall without texture: their cameras cannot be reconstructed."""
+    folder.mkdir(parents=True)
+    for i in range(count):
+        cv2.imwrite(str(folder / f"{i:03d}.jpg"), np.full((240, 320, 3), 90 + i, np.uint8))
+    return folder
+
+
+def test_photos_have_visits(tmp_path: Path) -> None:
+    """13 photos without times count as 30 a second, and 2 s would be all of them."""
+    folder = photos(tmp_path / "flat" / "images", 13)
+    rows = [f"{i + 1},1,{100 + i},50,60,90,.9,56" for i in (0, 1, 2, 9, 10, 11, 12)]
+    rows += [f"{i + 1},2,{20 + i},150,40,60,.9,58" for i in range(13)]
+    (tmp_path / "gt.txt").write_text("\n".join(rows) + "\n")
+    assert cli("track", folder, "-o", tmp_path / "out", "--tracks", tmp_path / "gt.txt") == 0
+    first, second = rt.Result.load(tmp_path / "out").objects
+    assert first.visits == [[0, 2], [9, 12]] and second.visits == [[0, 12]]
+
+
+def test_a_recording_in_a_map_has_the_name_of_its_viewer(tmp_path: Path) -> None:
+    folder = photos(tmp_path / "flat" / "images", 8)
+    (tmp_path / "gt.txt").write_text("".join(f"{i},1,99,50,60,90,.9,56\n" for i in range(1, 9)))
+    more = ("--tracks", tmp_path / "gt.txt", "--map", tmp_path / "a.map")
+    assert cli("run", folder, "-o", tmp_path / "out", *more) == 0
+    changes = rt.Result.load(tmp_path / "out").changes
+    assert changes is not None and changes.session == "flat"
+
+
+def test_true_boxes_without_a_class_do_not_count(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Class -1 in a truth with classes: areas that are not annotated."""
+    folder = photos(tmp_path / "images", 8)
+    chairs = [f"{f},1,{100 + f},50,60,90" for f in range(1, 9)]
+    areas = [f"{f},2,200,20,100,200" for f in range(1, 9)]
+    (tmp_path / "det.txt").write_text("\n".join(f"{r},.9,56" for r in chairs + areas) + "\n")
+    truth = [f"{row},1,56,1" for row in chairs] + [f"{row},1,-1,1" for row in areas]
+    (tmp_path / "gt.txt").write_text("\n".join(truth) + "\n")
+    out = tmp_path / "out"
+    assert cli("track", folder, "-o", out, "--tracks", tmp_path / "det.txt") == 0
+    capsys.readouterr()
+    assert cli("eval", out, "--gt", tmp_path / "gt.txt") == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert re.search(r"all 100\.0 100\.0 100\.0", said) and "not found" not in said
+    assert "note: 8 true boxes without a class (below 0) do not count, nor do boxes on them" in said
+
+
+def test_a_folder_as_truth(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "res.txt").write_text("1,1,10,10,50,50,1,-1,-1,-1\n")
+    text = refusal(capsys, "eval", tmp_path / "res.txt", "--gt", tmp_path)
+    assert text == f"error: {tmp_path}: is a folder, expected a text file\n"
