@@ -531,6 +531,8 @@ def load_priors(
         fault = "a category has a missing or invalid field"
         table = _with_more(table, aliases, more or {})
         rows = [_prior_row(entry) for entry in table.values()]
+    except QuadricsError:
+        raise
     except (AttributeError, LookupError, TypeError, ValueError, RecursionError) as error:
         raise QuadricsError(f"{path}: {fault} ({error}); see docs/quadrics.md") from error
     columns: list[Any] = [np.array(column) for column in zip(*rows, strict=True)]

@@ -48,9 +48,8 @@ import re
 import sys
 import time
 import traceback
-import webbrowser
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -1383,14 +1382,18 @@ def run(
     video = open_video(source, config.input, config.poses, tracks or detections, config.detect)
     config = _with_input(config, video.config)
     out = _default_out(source) if out is None else out
-    with Workspace(out, overwrite) as workspace, opened_map(config.map) as room:
+    with (
+        Workspace(out, overwrite) as workspace,
+        opened_map(config.map) as room,
+        ExitStack() as opened,
+    ):
         workspace.bind(video, overwrite)
         poses_config = config.poses.absolute()
         config = dataclasses.replace(config, map=config.map.absolute(), poses=poses_config)
         job = _Job(video, workspace, config)
         log.info("input: %r", video)
         log.debug("options that differ from the defaults: %s", changed_options(config))
-        viewer = open_viewer(VideoInfo.of(video)) if show else None
+        viewer = open_viewer(VideoInfo.of(video), opened) if show else None
         in_3d = in_3d and config.poses.mode != "none"
         readings = _pose_readings(video, config.poses, detections) if in_3d else []
         if tracks:
@@ -1429,7 +1432,6 @@ def run(
         result = _finish(job, result, room, placed, fit=fitted is None)
         if viewer is not None:
             viewer.show(result.without_doubtful(), Path("rerun"), images=not viewer.followed)
-            viewer.close()
         return result
 
 
@@ -1731,11 +1733,8 @@ def _place_by_objects(
         result, cameras, COLMAP models; the result with fitted objects, None if the cameras moved
         or points placed them.
     """
-    if result.boxes_3d is not None:
-        text = "the 3D boxes are used as 2D boxes only: the map has another world"
-        result = dataclasses.replace(result, boxes_3d=None, warnings=[*result.warnings, text])
     if not placed.unmatched:
-        return result, placed, models, None
+        return _without_moved_boxes(result, placed), placed, models, None
     poses = placed.poses
     with job.timed("objects"):
         fitted = _fit_objects(job, result)
@@ -1744,7 +1743,17 @@ def _place_by_objects(
         models = _moved_models(job, models, poses, placed)
     if placed.placement is not None and placed.placement.refused:
         return result, placed, models, fitted
-    return dataclasses.replace(result, poses=placed.poses), placed, models, None
+    moved = dataclasses.replace(result, poses=placed.poses)
+    return _without_moved_boxes(moved, placed), placed, models, None
+
+
+def _without_moved_boxes(result: Result, placed: Placed) -> Result:
+    """Leave out the boxes in 3D if the cameras were moved into the world of a map."""
+    placement = placed.placement
+    if result.boxes_3d is None or placement is None or placement.refused:
+        return result
+    text = "the 3D boxes are used as 2D boxes only: the map has another world"
+    return dataclasses.replace(result, boxes_3d=None, warnings=[*result.warnings, text])
 
 
 def _embedder_key(job: _Job) -> str:
@@ -1915,7 +1924,7 @@ def _cmd_serve(args: argparse.Namespace) -> int:
     with Server(args.out, args.port, command, partial(_folder_map, args.out)) as server:
         print(f"viewer of {args.out}: {server.url}\nCtrl-C ends it", flush=True)
         if args.open:
-            webbrowser.open(server.url)
+            server.open_browser()
         try:
             server.serve_forever()
         except KeyboardInterrupt:

@@ -36,7 +36,7 @@ WIDTH = 800  # px of a picture
 
 def best_frame(result: rt.Result) -> int:
     """Return the position of the frame in the video that shows most listed objects."""
-    listed = [o.id for o in result.objects if o.status != "doubtful"]
+    listed = [o.id for o in result.objects if o.counted]
     rows = np.isin(result.tracks.track_id, listed)
     frames = np.unique(result.tracks.frame)
     shown = np.searchsorted(frames, result.tracks.frame[rows])

@@ -3,7 +3,7 @@
 
     python benchmarks/map_alignment.py [--rooms 100]
 
-Rooms of 5 x 4 m with 8, 12 or 20 objects of eight classes (a third are chairs). Between map and
+Rooms of 5 x 4 m with 9, 12 or 20 objects of eight classes (a third are chairs). Between map and
 recording a quarter of them changes: half of these are gone, half elsewhere. Centres have a sigma of
 10 or 20 cm on both sides, sizes 10 %, the scale 7 %, gravity 1.7 deg; yaw and shift are arbitrary,
 and there are no looks. `another` is another room of the same kind, `mirrored` the room x -> -x.

@@ -11,6 +11,7 @@ import logging
 import os
 import re
 import shlex
+import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -34,10 +35,12 @@ def program() -> str:
 
 def apply_command(out: Path) -> str:
     """Return the command that fits the objects of a folder again, from any working folder."""
-    name = program()
-    if name.endswith("reobj_track.py"):
-        name = f"python {shlex.quote(str(Path(sys.argv[0]).absolute()))}"
-    return f"{name} objects {shlex.quote(str(out.absolute()))}"
+    path = Path(sys.argv[0])
+    words = ["python", str(path.absolute())] if path.name == "reobj_track.py" else program().split()
+    words += ["objects", str(out.absolute())]
+    if sys.platform == "win32":  # cmd.exe takes double quotes only
+        return subprocess.list2cmdline(words)
+    return shlex.join(words)
 
 
 class Parser(argparse.ArgumentParser):

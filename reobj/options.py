@@ -276,12 +276,14 @@ def load_size_priors(path: str, given: str = "") -> quadrics.Priors:
     plain = quadrics.load_priors(path or None)
     plain = dataclasses.replace(plain, aliases=_with_synonyms(plain))
     entries = dict[str, dict[str, Any] | str]()
+    word_of = dict[str, str]()
     for word, prior in parse_priors(given).items():
-        name, like = (_category(plain, text) for text in (word, str(prior)))
-        if isinstance(prior, str) and not like:
-            close = did_you_mean(prior, plain.names) or ", expected a size, such as .35x.30x.40m"
-            raise ReobjError(f"--prior {word}={prior}: no size prior of {prior}{close}")
-        entries[name or word] = like if isinstance(prior, str) else _entry(prior)
+        name = _category(plain, word) or canonical(word)
+        if name in entries:
+            same = f"means the same as {word_of[name]}, give one of them"
+            raise ReobjError(f"--prior {word}: {same}")
+        word_of[name] = word
+        entries[name] = _like(plain, word, prior) if isinstance(prior, str) else _entry(prior)
     if not entries:
         return plain
     return dataclasses.replace(quadrics.load_priors(path or None, entries), aliases=plain.aliases)
@@ -291,6 +293,15 @@ def _category(priors: quadrics.Priors, word: str) -> str:
     """Return the category of priors that a word means; "": none."""
     row = priors.index([word])[0]
     return priors.names[row] if row >= 0 else ""
+
+
+def _like(priors: quadrics.Priors, word: str, category: str) -> str:
+    """Return the category that a word is like, as the priors name it."""
+    like = _category(priors, category)
+    if not like:
+        close = did_you_mean(category, priors.names) or ", expected a size, such as .35x.30x.40m"
+        raise ReobjError(f"--prior {word}={category}: no size prior of {category}{close}")
+    return like
 
 
 def _entry(size_m: tuple[float, ...]) -> dict[str, Any]:
@@ -325,6 +336,8 @@ def parse_priors(text: str) -> dict[str, tuple[float, ...] | str]:
         in_range = all(LENGTHS_M[0] <= side <= LENGTHS_M[1] for side in sides)
         if not word or not (size or value[:1].isalpha()) or not in_range:
             raise _no_prior(item)
+        if word in found:
+            raise ReobjError(f"--prior {word}: is given twice")
         found[word] = sides or value
     return found
 

@@ -25,7 +25,8 @@ class Browser:
     """One page of a headless Chromium."""
 
     def __init__(self, profile: Path) -> None:
-        (theirs_in, self.out), (self.inp, theirs_out) = os.pipe(), os.pipe()
+        theirs_in, self.out = os.pipe()
+        self.inp, theirs_out = os.pipe()
         command = f'exec "$0" {FLAGS} --user-data-dir="$1" 3<&{theirs_in} 4>&{theirs_out}'
         self.process = subprocess.Popen(
             ["bash", "-c", command, str(CHROMIUM), str(profile)],
@@ -67,7 +68,8 @@ class Browser:
             self.rest += chunk
         text, self.rest = self.rest.split(b"\0", 1)
         message = json.loads(text)
-        kind, about = message.get("method"), message.get("params", {})
+        kind = message.get("method")
+        about = message.get("params", {})
         if kind == "Runtime.exceptionThrown":
             self.errors.append(json.dumps(about))
         if kind == "Runtime.consoleAPICalled" and about["type"] in ("error", "warning", "assert"):

@@ -19,7 +19,10 @@ import reobj_track as rt
 from reobj.results.cloud import Cloud, FlowFrames
 from reobj.results.scene import Pictures, write_pictures, write_scene
 
-WIDTH, HEIGHT, FOCAL, FRAMES = 320, 240, 250.0, 8
+WIDTH = 320
+HEIGHT = 240
+FOCAL = 250.0  # px
+FRAMES = 8
 DEPTH = 3.0  # of a wall, whose texture has 100 pixels a metre
 
 
@@ -99,6 +102,40 @@ def test_points_lie_on_the_wall_in_its_colours() -> None:
     assert (gap < 4 * np.percentile(gap, 90)).all()
 
 
+def two_components() -> rt.Poses:
+    """The walk along the wall twice; the second component has a world of ten times the size."""
+    one = poses_along_the_wall()
+    large = one.cam_from_world.copy()
+    large[:, :, 3] *= 10
+    frame, point = np.indices((FRAMES, 400)).reshape(2, -1)
+    seen = np.column_stack([frame, point])
+    return dataclasses.replace(
+        one,
+        frame=np.arange(2 * FRAMES),
+        time_s=np.arange(2 * FRAMES) / 25,
+        cam_from_world=np.concatenate([one.cam_from_world, large]),
+        status=np.tile(one.status, 2),
+        points=np.concatenate([one.points, one.points * 10]),
+        colors=np.tile(one.colors, (2, 1)),
+        visibility=np.concatenate([seen, np.add(seen, (FRAMES, 400))]),
+        part=np.repeat([0, 1], FRAMES),
+    )
+
+
+def test_each_component_has_its_depths() -> None:
+    """The baseline is compared with the depth of the points of the same component."""
+    poses = two_components()
+    frames = FlowFrames(poses)
+    images = frames_of(poses_along_the_wall())
+    for number, image in enumerate([*images, *images]):
+        if number in frames.wanted:
+            frames.take(number, image)
+    for part, scale in enumerate((1, 10)):
+        cloud = frames.cloud(part)
+        assert cloud is not None and len(cloud) > 20_000
+        assert np.percentile(np.abs(cloud.xyz[:, 2] / scale - DEPTH), 95) < 0.03
+
+
 def test_unrelated_frames_give_no_points() -> None:
     poses = poses_along_the_wall()
     frames = FlowFrames(poses)
@@ -133,6 +170,20 @@ def test_the_page_has_the_points(folder: Path, tmp_path: Path) -> None:
     assert rgb[left, 0].mean() > rgb[left, 2].mean() + 40  # red
     assert rgb[~left, 2].mean() > rgb[~left, 0].mean() + 40
     assert (np.frombuffer(data[9 * n :], np.int8).reshape(-1, 3)[:, 2] < -80).all()
+
+
+def test_the_most_observed_points_come_first() -> None:
+    """A wall, of which the right half was observed five times as often as the left one."""
+    y, z = np.meshgrid(np.linspace(-2, 2, 400), np.linspace(0, 2, 200))
+    wall = np.stack([np.zeros_like(y), y, z], -1).reshape(-1, 3)
+    rng = np.random.default_rng(0)
+    xyz = np.concatenate([wall, *[wall[wall[:, 1] > 0]] * 4])
+    xyz += rng.normal(0, 0.002, xyz.shape)
+    towards = np.tile([1.0, 0, 0], (len(xyz), 1))
+    made = cloud._voxels(xyz, np.full((len(xyz), 3), 99, np.uint8), towards)
+    first = made.of_rows(np.arange(len(made) // 3))
+    assert (first.xyz[:, 1] > 0).mean() > 0.95
+    assert (made.xyz[:, 1] > 0).mean() < 0.8
 
 
 def write_depth(folder: Path, spoiled: int = -1) -> Path:
@@ -245,9 +296,12 @@ def test_without_usable_depth_maps_flow_makes_the_points(
 
 
 def test_points_leave_the_page_below_its_limit(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """The most observed points remain."""
+    """Fewer points; without room for any, the message gives the size of the page."""
     result = result_of(poses_along_the_wall())
     video = rt.Video(folder)
     pictures = Pictures(result, video, dense=FlowFrames(result.poses))
@@ -256,6 +310,10 @@ def test_points_leave_the_page_below_its_limit(
     monkeypatch.setattr(scene, "PAGE_MAX", 1_000_000)
     write_scene(result, pictures, tmp_path / "scene.html", video)
     assert 900_000 < (tmp_path / "scene.html").stat().st_size <= 1_000_000
+    assert caplog.text == ""
+    monkeypatch.setattr(scene, "PAGE_MAX", 1000)
+    write_scene(result, pictures, tmp_path / "scene.html", video)
+    assert "no dense points: the page has 0." in caplog.text and "baseline" not in caplog.text
 
 
 def test_without_a_baseline_there_is_a_message(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import re
@@ -13,11 +14,14 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
+from simulated import chair_solids, walk
 
 import reobj_track as rt
 from reobj.results.export_labels import BOXER_HEADER
 from reobj.results.truth import read_truth
 from reobj.sources import coco, cvat, recorded, tables
+from reobj.sources.boxes_3d import read_boxes_3d
 from reobj.sources.recorded import RecordedDetections
 
 SHARED = Path(os.environ.get("REOBJ_SHARED", Path(__file__).resolve().parents[2] / "shared"))
@@ -638,3 +642,62 @@ def test_classes_take_synonyms_that_occur(tmp_path: Path, video: rt.Video) -> No
     (tmp_path / "d.csv").write_text(text + CSV.splitlines()[1].replace("56", "couch") + "\n")
     found = rt.read_detections(tmp_path / "d.csv", video, rt.DetectConfig(classes="sofa"))
     assert {found.class_names[k] for k in found.class_id} == {"sofa"}
+
+
+# ---- Boxes in 3D ----
+
+
+def boxer_rows(poses: rt.Poses, late_s: float = 0.0) -> str:
+    """The chairs of `chair_solids` in each frame, as Boxer writes them."""
+    lines = [BOXER_HEADER]
+    solids = chair_solids()
+    xyzw = Rotation.from_matrix(solids.world_from_obj).as_quat()
+    for time_s in poses.time_s:
+        for center, half, quat in zip(
+            solids.center_in_world, solids.half_axes, np.roll(xyzw, 1, 1), strict=True
+        ):
+            numbers = ",".join(f"{v:.9g}" for v in (*center, *quat, *(2 * half)))
+            lines.append(f"{round((time_s + late_s) * 1e9)},{numbers},chair,-1,0,0.8")
+    return "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize("model", ["PINHOLE", "SIMPLE_RADIAL"])
+def test_boxes_in_3d_are_projected_through_the_lens(tmp_path: Path, model: str) -> None:
+    """Images of half the camera's size; of several readings the one that sees most boxes."""
+    parameters = {"PINHOLE": (520.0, 520, 320, 240), "SIMPLE_RADIAL": (520.0, 320, 240, -0.15)}
+    camera = rt.Camera(model, 640, 480, parameters[model])
+    poses = walk(5, camera=camera)
+    for i in range(5):
+        cv2.imwrite(str(tmp_path / f"{i}.png"), np.zeros((240, 320, 3), np.uint8))
+    video = rt.Video(tmp_path)
+    (tmp_path / "b.csv").write_text(boxer_rows(poses))
+    away = poses.cam_from_world.copy()
+    away[:, :, 3] += [40.0, 0, 0]
+    other = dataclasses.replace(poses, cam_from_world=away)
+    found, reading = read_boxes_3d(tmp_path / "b.csv", video, [other, poses])
+    assert reading == 1 and found.frame.tolist() == np.repeat(range(5), 3).tolist()
+    solids = chair_solids()
+    signs = np.stack(np.meshgrid(*[[-1, 1]] * 3), -1).reshape(-1, 3)
+    corners = np.einsum("oij,pj->opi", solids.world_from_obj * solids.half_axes[:, None], signs)
+    corners = corners + solids.center_in_world[:, None]  # (O, 8, 3)
+    pose = poses.cam_from_world[found.frame]
+    in_cam = np.einsum("nij,npj->npi", pose[:, :, :3], np.tile(corners, (5, 1, 1)))
+    in_cam = in_cam + pose[:, None, :, 3]
+    xy = np.asarray(camera.to_pycolmap().img_from_cam(in_cam.reshape(-1, 3))).reshape(15, 8, 2) / 2
+    true = np.hstack([xy.min(1), xy.max(1)]).clip(0, [320, 240, 320, 240])
+    assert np.abs(found.xyxy - true).max() < (0.01 if model == "PINHOLE" else 3)
+
+
+def test_boxes_in_3d_belong_to_the_nearest_frame(tmp_path: Path) -> None:
+    """Within half the usual distance of two frames, 33 ms."""
+    poses = walk(5)
+    for i in range(5):
+        cv2.imwrite(str(tmp_path / f"{i}.png"), np.zeros((480, 640, 3), np.uint8))
+    for late_s, frames in ((0.015, [0, 1, 2, 3, 4]), (0.018, [1, 2, 3, 4])):
+        (tmp_path / "b.csv").write_text(boxer_rows(poses, late_s))
+        found, _ = read_boxes_3d(tmp_path / "b.csv", rt.Video(tmp_path), [poses])
+        assert np.unique(found.frame).tolist() == frames
+        left_out = 3 * (5 - len(frames))
+        assert found.messages == [
+            f"{left_out} boxes at times without a frame with a pose left out"
+        ] * bool(left_out)

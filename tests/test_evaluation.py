@@ -264,6 +264,9 @@ def test_the_report_omits_classes_without_detections() -> None:
     assert not any(line.startswith("clock") for line in lines) and max(map(len, lines)) <= 100
     nothing = score_report({"tracks": {"all": zero}, "ranks": {}, "missed": {}}).splitlines()
     assert nothing[1].startswith("all ")
+    bad = zero | {"MOTA": -12.3456, "IDSW": 12345, "Frag": 104729, "ids_per_object": 10.26}
+    cells = score_report({"tracks": {"all": bad}, "ranks": {}, "missed": {}}).splitlines()[1]
+    assert cells.split()[7:] == ["-1234.6", "12345", "104729", "10.26"]
 
 
 def test_eval_ranks_the_embeddings_of_the_folder(tmp_path: Path) -> None:

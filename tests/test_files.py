@@ -487,6 +487,18 @@ def test_a_long_stage_leaves_plain_lines_in_a_log(
     ]
 
 
+def test_serve_gets_a_line_each_half_second(
+    clock: list[float], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By a variable of the environment of its worker."""
+    monkeypatch.setenv("REOBJ_PROGRESS_S", "0.5")
+    with files.Progress("objects", 100) as progress:
+        for _ in range(20):
+            clock[0] += 0.25
+            progress.step(5)
+    assert len(capsys.readouterr().err.splitlines()) >= 5  # of a stage of 5 s
+
+
 def test_without_stderr_progress_is_only_measured(
     clock: list[float], monkeypatch: pytest.MonkeyPatch
 ) -> None:

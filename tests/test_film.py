@@ -22,7 +22,9 @@ from reobj.results.film import FilmWriter, import_av
 from reobj.results.overlay import film_fps
 
 ROOT = Path(__file__).resolve().parent.parent
-SIZE, FRAMES, FPS = (320, 240), 30, 10.0
+SIZE = (320, 240)
+FRAMES = 30
+FPS = 10.0
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 FLAGS = (
     "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-sync "

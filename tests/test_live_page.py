@@ -41,6 +41,7 @@ def test_the_page_shows_frames_with_identities(
     monkeypatch.setitem(sys.modules, "rerun", None)
     monkeypatch.setattr("reobj.results.live.EVERY_S", 0.0)
     got: list[bytes] = []
+    headers: dict[str, str] = {}
     threads: list[threading.Thread] = []
     watching = threading.Event()
 
@@ -49,6 +50,7 @@ def test_the_page_shows_frames_with_identities(
         page = client.open(url, timeout=20).read()
         assert b'src="/pictures"' in page
         stream = client.open(url.split("?")[0] + "pictures", timeout=20)
+        headers.update(stream.headers)
         watching.set()
         got.append(stream.read())
 
@@ -66,12 +68,38 @@ def test_the_page_shows_frames_with_identities(
     threads[0].join(20)
     parts = re.findall(rb"Content-Length: (\d+)\r\n\r\n", got[0])
     assert 1 <= len(parts) <= COUNT
+    assert headers["Cross-Origin-Resource-Policy"] == "same-origin"  # no other page shows them
+    assert headers["Connection"] == "close" and "Content-Length" not in headers
     last = got[0].rsplit(b"\r\n\r\n", 1)[1][: int(parts[-1])]
     image = cv2.imdecode(np.frombuffer(last, np.uint8), cv2.IMREAD_COLOR)
     assert image.shape == (240, 320, 3)
     drawn = np.abs(image.astype(int) - 127).max(2) > 60
     y, x = np.nonzero(drawn)
     np.testing.assert_allclose([x.min(), x.max(), y.max()], [60, 200, 180], atol=4)
+
+
+def test_the_page_ends_with_a_run_that_fails(
+    video: rt.Video, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its port is closed, so that the browser does not wait for pictures."""
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    urls: list[str] = []
+    opened = threading.Event()
+
+    def open_browser(url: str) -> None:
+        urls.append(url)
+        opened.set()
+
+    monkeypatch.setattr("webbrowser.open", open_browser)
+
+    def fails(image: np.ndarray) -> np.ndarray:
+        assert opened.wait(20) and browser().open(urls[0], timeout=20).status == 200
+        raise rt.ReobjError("no detector")
+
+    with pytest.raises(rt.ReobjError, match="no detector"):
+        rt.run(video, tmp_path / "out", in_3d=False, detector=fails, show=True)
+    with pytest.raises(urllib.error.URLError, match="refused"):
+        browser().open(urls[0], timeout=20)
 
 
 def test_a_request_without_token_is_refused() -> None:

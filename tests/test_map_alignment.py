@@ -15,6 +15,7 @@ from test_map_run import CAMERA, ROOM
 import reobj_track as rt
 from reobj.cameras import invert_rigid
 from reobj.maps.object_alignment import AlignmentOptions, align
+from reobj.maps.object_placement import place_by_objects
 from reobj.maps.placement import ComponentPlacement, Placement
 from reobj.maps.room_map import MapPoints
 
@@ -59,6 +60,38 @@ def test_without_a_known_scale_it_is_free():
     found = landmarks(rng, (center / 1.5, kind, size - np.log(1.5)), 0.05)
     aligned = align(landmarks(rng, room, 0.1), found, np.inf)
     assert aligned.reason == "" and aligned.scale == pytest.approx(SCALE * 1.5, rel=0.05)
+
+
+def test_objects_of_another_size_do_not_coincide():
+    """Two of 14 have become three times as large; the others give the place."""
+    rng = np.random.default_rng(0)
+    room = simulated_room(rng, 14)
+    center, kind, size = in_session(room)
+    size[[4, 9]] += np.log(3)
+    aligned = align(
+        landmarks(rng, room, 0.1), landmarks(rng, (center, kind, size), 0.1), SCALE_SIGMA
+    )
+    assert aligned.reason == "" and len(aligned.pairs) >= 10
+    assert not {4, 9} & set(aligned.pairs[:, 0].tolist())
+
+
+def test_distances_beyond_the_covariances_enlarge_that_of_the_place():
+    """Both sides claim a sigma of 4 cm; in the second case the centres are off by 10 cm."""
+    sigmas = []
+    for error in (0.0, 0.1):
+        rng = np.random.default_rng(5)
+        room = simulated_room(rng, 16)
+        of_map = landmarks(rng, room, 0.0)
+        found = landmarks(rng, in_session(room), error)
+        claimed = np.tile(np.eye(3) * 0.04**2, (16, 1, 1))
+        aligned = align(
+            dataclasses.replace(of_map, cov=claimed),
+            dataclasses.replace(found, cov=claimed),
+            SCALE_SIGMA,
+        )
+        assert aligned.reason == "" and len(aligned.pairs) >= 12
+        sigmas.append(np.sqrt(np.diag(aligned.cov)[3:5].sum()))
+    assert sigmas[1] > 1.3 * sigmas[0]
 
 
 def test_errors_agree_with_the_covariance():
@@ -198,6 +231,46 @@ def test_a_run_is_placed_by_its_objects(bare, tmp_path):
     assert again.placed_by == "objects" and again.sigma_m == pytest.approx(
         changes.sigma_m, rel=0.01
     )
+
+
+def test_classes_of_the_map_may_have_other_names(bare, tmp_path):
+    """A detector that writes "Chair" and "Dining_Table" made the map."""
+    path, moved = bare
+    room = rt.RoomMap.load(path)
+    objects = [
+        dataclasses.replace(o, observations=tuple(
+            dataclasses.replace(
+                seen, classes={k.title().replace(" ", "_"): v for k, v in seen.classes.items()})
+            for seen in o.observations))
+        for o in room.objects
+    ]  # fmt: skip
+    dataclasses.replace(room, objects=tuple(objects)).save(tmp_path / "titles.map")
+    result = rt.run(
+        ROOM / "room.mp4", tmp_path / "out", with_poses(6, moved), map=tmp_path / "titles.map",
+        detections=ROOM / "detections.npz", map_frozen=True,
+    )  # fmt: skip
+    assert result.changes.placed_by == "objects" and len(result.changes.stayed) >= 10
+
+
+def test_too_few_of_the_objects_in_view_are_refused(bare):
+    """The recording in its map: nearly all coincide; more than are in view are never there."""
+    path, _ = bare
+    result = rt.Result.load(path.parent / "a")
+    unmatched = (ComponentPlacement(None, (), 1, "no points", unmatched=True),)
+    by_points = Placement(result.poses, unmatched, "no points")
+
+    def placed(**options):
+        of = AlignmentOptions(**options)
+        return place_by_objects(rt.RoomMap.load(path), result, "", by_points, of)
+
+    found = placed()
+    assert found.refused == "" and found.by == "objects"
+    count = int(found.poses.messages[-1].split("in the map by ")[1].split()[0])
+    assert count >= 10
+    refused = placed(share=1.5).refused
+    assert refused.startswith(f"no points; by objects: {count} objects coincide with the map, of ")
+    in_view = int(refused.split("map, of ")[1].split()[0])
+    assert count <= in_view and f"in view; {int(np.ceil(1.5 * in_view))} of at least 8" in refused
 
 
 def test_a_frozen_map_leaves_the_placement_to_the_output_folder(bare, tmp_path):

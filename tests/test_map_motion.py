@@ -164,6 +164,17 @@ def moved_world() -> World:
     return world
 
 
+@pytest.mark.parametrize(("name", "compared"), [("sofa", 0), ("couch", 0), ("lamp", 1)])
+def test_an_object_in_its_place_needs_no_points(name: str, compared: int) -> None:
+    """Unless it has another class; a synonym is the same class."""
+    world = World()
+    points, code = world.add("sofa", LAMP)
+    world.put(points, code, LAMP, np.eye(3))
+    world.find(name, LAMP, off=0.0)
+    (motions,) = world.motions()
+    assert len(motions) == compared
+
+
 def test_points_of_a_moved_object_give_its_motion_and_those_of_another_that_it_stayed() -> None:
     radio, lamp = moved_world().motions()
     assert set(radio) == {1} and set(lamp) == {2}

@@ -114,7 +114,11 @@ def test_a_moved_object_keeps_its_number(monday):
     tuesday = moved_by(seen([0, 1, 2], numbers=[3, 1, 2]), 3, MOVE)
     _, result = add_recording(monday, tuesday, recording("tuesday"))
     assert not result.changes.moved and 4 in {o.id for o in result.objects}  # looks are not enough
-    again = recording("tuesday", moved=recognised(tuesday, 1, 3))
+    (move,) = recognised(tuesday, 1, 3)
+    elsewhere = dataclasses.replace(move, after=np.add(move.after, (0, 1, 0)))  # nothing is there
+    _, result = add_recording(monday, tuesday, recording("tuesday", moved=(elsewhere,)))
+    assert not result.changes.moved
+    again = recording("tuesday", moved=(move,))
     room, result = add_recording(monday, tuesday, again)
     (change,) = result.changes.moved
     assert change.id == 1 and change.distance_m == pytest.approx(np.hypot(0.6, 0.4), abs=0.03)

@@ -310,7 +310,7 @@ def test_labels_never_cover_each_other() -> None:
         assert overlap.max() == 0 and len(shown) >= min(count, 8)
 
 
-def test_labels_never_cover_small_objects() -> None:
+def test_labels_never_cover_small_objects(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cups side by side: labels lie around the group, with lines to their cups."""
     boxes = np.array([[x, y, x + 24, y + 24] for y in (90, 118) for x in (100, 128, 156)])
     sizes = np.array([[60, 17]] * 6)
@@ -323,11 +323,17 @@ def test_labels_never_cover_small_objects() -> None:
     image = grey(320, 240)
     ids = np.arange(6)
     rows = rt.Tracks(ids * 0, ids, ids, boxes.astype(float), np.ones(6), ids * 0, ids * 0)
-    draw_tracks(image, rows, dict.fromkeys(range(6), "1234567"), 1.0)  # labels of about 60 px
-    outside = np.ones((240, 320), bool)
-    outside[80:152, 90:190] = False  # the boxes and labels beside them
-    colored = (np.abs(image.astype(int) - object_color(int(away[0]))) < 40).all(2)
-    assert (colored & outside).any()
+    texts = dict.fromkeys(range(6), "1234567")  # labels of about 60 px
+    draw_tracks(image, rows, texts, 1.0)
+    plain = grey(320, 240)
+    monkeypatch.setattr("reobj.results.overlay._draw_leader", lambda *_: None)
+    draw_tracks(plain, rows, texts, 1.0)
+    y, x = np.nonzero((image != plain).any(2))  # the lines
+    line = np.column_stack([x, y])
+    gap = np.maximum(boxes[:, None, :2] - line, line - boxes[:, None, 2:]).max(2).min(1)  # (6,)
+    number = int(gap.argmin())
+    assert gap[number] <= 1 and len(line) > 10
+    assert (np.abs(image[y, x].astype(int) - object_color(number)) < 40).all(1).any()
 
 
 def test_a_label_keeps_its_position_while_it_is_free() -> None:

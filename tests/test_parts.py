@@ -524,6 +524,9 @@ def test_the_summary_has_a_line_for_each_component(parted: rt.Result) -> None:
     assert ["measured" in line for line in lines[groups[1] + 1 : groups[1] + 4]] == [True] * 3
     assert groups[1] - groups[0] == 4
     assert not [line for line in lines if line.startswith("scale")]
+    mixed = dataclasses.replace(parted, objects=sorted(parted.objects, key=lambda o: o.id % 3))
+    lines = mixed.summary().splitlines()
+    assert [k for k, line in enumerate(lines) if line in ("component 0", "component 1")] == groups
 
 
 def test_a_component_without_scale_is_not_reported_in_metres(parted: rt.Result) -> None:

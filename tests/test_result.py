@@ -312,7 +312,8 @@ def test_the_summary_fits_the_terminal(chairs: rt.Result) -> None:
     result = copy_of(chairs, out=None)
     result = dataclasses.replace(result, objects=[
         dataclasses.replace(chairs.objects[0], id=i, class_name=f"dining table {i % 40}",
-                            status="prior_dominated", reason=reason)
+                            status="prior_dominated",
+                            reason=reason if i < 120 else f"parallax of .3 deg; {reason}")
         for i in range(1, 121)
     ])  # fmt: skip
     lines = result.summary().splitlines()
@@ -320,7 +321,8 @@ def test_the_summary_fits_the_terminal(chairs: rt.Result) -> None:
     assert sum(reason in line for line in lines) == 1
     first = next(k for k, line in enumerate(lines) if reason in line)
     assert lines[first].startswith(f"{reason}: 1, 2, 3,")
-    assert any(line.endswith(" 120") for line in lines[first:])
+    assert any(line.endswith(" 119, 120") for line in lines[first:])
+    assert "parallax of .3 deg: 120" in lines
 
 
 # ---- The schema ----

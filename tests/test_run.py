@@ -874,8 +874,14 @@ def test_boxes_in_3d_of_another_program(tmp_path: Path, capsys: pytest.CaptureFi
             assert off.min() < 0.02 and o.support == "box" and o.status == "ok"
             assert np.array(o.size) == pytest.approx(0.5, rel=0.03)
             assert np.isfinite(o.cov).all() and max(o.size_rel_sigma) < 0.07
+    assert not refit.fits.prior_share.any()  # the usual size of the class is not used
     assert cli("export", out, "--to", "boxer", "-o", tmp_path / "again.csv") == 0
-    capsys.readouterr()
+    of_map = ("--map", tmp_path / "room.map", "-o", tmp_path / "mapped")
+    assert cli("run", frames, *of_map, *files, *cameras, *QUICK) == 0
+    assert "3D boxes" not in capsys.readouterr().err  # this recording made the map, in its world
+    for mapped in (rt.Result.load(tmp_path / "mapped"), rt.refit(tmp_path / "mapped")):
+        sizes = [np.array([o.size for o in r.located]) for r in (mapped, result)]
+        np.testing.assert_allclose(*sizes, rtol=1e-6)
     text = files[1].read_text()
     rows = text.splitlines()
     for name, changed, command, said in (
@@ -925,6 +931,9 @@ def test_words_of_the_user_get_size_priors(
     for bad, said in (
         ("mixer=.2x.3m", "--prior 'mixer=.2x.3m': expected WORD=WIDTHxDEPTHxHEIGHT in m, cm"),
         ("mixer=suitcse", "no size prior of suitcse; did you mean suitcase?"),
+        ("Mixer=1x1x1m,mixer=2x2x2m", "--prior mixer: means the same as Mixer, give one of them"),
+        ("sofa=1x1x1m,couch=bed", "--prior couch: means the same as sofa, give one of them"),
+        ("vcr=tv,vcr=bed", "--prior vcr: is given twice"),
     ):
         other = tmp_path / "bad"
         assert cli("run", frames, "-o", other, *args, *QUICK, "--prior", bad) == 2

@@ -125,7 +125,8 @@ class Facts:
     """Replaces a video of which only the metadata are used."""
 
     config, fps, scale, source, is_live = rt.InputConfig(), 30.0, 1.0, "a.mp4", False
-    files, has_images = (), True
+    files = ()
+    has_images = True
     size = (WIDTH, HEIGHT)
 
 
@@ -597,7 +598,8 @@ def test_labels_have_the_colours_of_their_objects(browser: Browser, page: Path) 
     for number in range(1, 40):
         color = list(object_color(number)[::-1])
         white = browser.eval(f"inkOn({color})") == "#fff"
-        light, low = luminance([255 * white] * 3), luminance(color)
+        light = luminance([255 * white] * 3)
+        low = luminance(color)
         assert (max(light, low) + 0.05) / (min(light, low) + 0.05) > 4.5
 
 
@@ -879,7 +881,8 @@ def test_the_top_view_is_aligned_with_the_walls(
 ) -> None:
     """Points of four walls, turned by 31 degrees."""
     rng = np.random.default_rng(4)
-    along, across = rng.uniform(-3, 3, 2000), np.where(rng.random(2000) < 0.5, -2.0, 2.0)
+    along = rng.uniform(-3, 3, 2000)
+    across = np.where(rng.random(2000) < 0.5, -2.0, 2.0)
     first = rng.random(2000) < 0.6
     xy = np.stack([np.where(first, along, 1.5 * across), np.where(first, across, along * 2 / 3)], 1)
     angle = np.radians(31)
@@ -978,7 +981,8 @@ def test_menus_and_targets_fit_a_phone(browser: Browser, page: Path) -> None:
         ...(r => [r.left, r.right, r.width, r.height])(e.getBoundingClientRect())])"""
     menu = "(r => [r.top, r.bottom])($('show').querySelector('div').getBoundingClientRect())"
     view = "(r => [r.top, r.bottom])($('view').getBoundingClientRect())"
-    (top, bottom), (first, last) = browser.eval(menu), browser.eval(view)
+    top, bottom = browser.eval(menu)
+    first, last = browser.eval(view)
     assert first <= top < bottom <= last
     found = browser.eval(targets)
     browser.picture(SCREENSHOTS / "phone-menu.png")

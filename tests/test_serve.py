@@ -9,6 +9,8 @@ import os
 import re
 import shutil
 import signal
+import socket
+import struct
 import subprocess
 import sys
 import time
@@ -102,13 +104,14 @@ def _heed_ctrl_c() -> None:
 
 
 @contextmanager
-def serving(out: Path) -> Iterator[Client]:
+def serving(out: Path, *words: str, **environment: str) -> Iterator[Client]:
     """Run `serve OUT` as a user does, and end it with Ctrl-C."""
-    command = [sys.executable, str(TOOL), "serve", str(out)]
+    command = [sys.executable, str(TOOL), "serve", str(out), *words]
     pipe = subprocess.PIPE
     process = subprocess.Popen(
-        command, stdout=pipe, stderr=pipe, text=True, preexec_fn=_heed_ctrl_c
-    )
+        command, stdout=pipe, stderr=pipe, text=True, preexec_fn=_heed_ctrl_c,
+        env=os.environ | environment,
+    )  # fmt: skip
     assert process.stdout is not None
     line = process.stdout.readline()
     assert f"viewer of {out}: http://127.0.0.1:" in line, process.communicate()
@@ -139,7 +142,8 @@ def film_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         writer.write(image)
     writer.release()
     poses = walk(FILM, camera=LENS)
-    workspace, given = Workspace(top / "out"), unlinked(poses, tracks_of(poses))
+    workspace = Workspace(top / "out")
+    given = unlinked(poses, tracks_of(poses))
     workspace.bind(rt.Video(path))
     workspace.save_last(given, given.poses)
     assert rt.main(["objects", str(workspace.out), "--set", "output.overlay=none"]) == 0
@@ -210,6 +214,25 @@ def test_corrections_that_fail_change_nothing(out: Path) -> None:
         assert not client.finished()["failed"] and ids(out) == [1, 2, 3, 4, 5]
 
 
+def test_a_file_that_cannot_be_written_does_not_block_later_corrections(out: Path) -> None:
+    """One line for the user; the next save works."""
+    obstacle = out / "cache/new-edits.json"
+    with serving(out) as client:
+        path = f"/edits?version={client.state()['version']}"
+        obstacle.mkdir()
+        status, answer = client.post(path, edits_of(out, delete(out, 6)))
+        assert status == 409 and "new-edits.json" in answer and "\n" not in answer
+        assert client.state()["failed"] and not client.state()["running"]
+        obstacle.rmdir()
+        assert client.post(path, edits_of(out, delete(out, 6)))[0] == 200
+        assert not client.finished()["failed"] and ids(out) == [1, 2, 3, 4, 5]
+        obstacle.mkdir()
+        assert client.post(f"/undo?version={client.state()['version']}")[0] == 409
+        obstacle.rmdir()
+        assert client.post(f"/undo?version={client.state()['version']}")[0] == 200
+        assert not client.finished()["failed"] and ids(out) == [1, 2, 3, 4, 5, 6]
+
+
 def test_ctrl_c_ends_the_worker_too(out: Path) -> None:
     before = {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()}
     with serving(out) as client:
@@ -220,6 +243,21 @@ def test_ctrl_c_ends_the_worker_too(out: Path) -> None:
     assert after == before
     with Workspace.open(out):  # no process holds its lock
         pass
+
+
+def test_open_does_not_wait_for_a_browser_in_the_terminal(out: Path, tmp_path: Path) -> None:
+    """Such a browser (lynx, w3m) shows the page before `webbrowser.open` returns."""
+    script = tmp_path / "browser.py"
+    fetch = "urllib.request.urlopen(sys.argv[1], timeout=60).status"
+    script.write_text(f"import sys, urllib.request\nprint({fetch}, file=open('status', 'w'))\n")
+    command = f"sh -c 'cd {tmp_path} && {sys.executable} browser.py %s > said 2>&1'"
+    with serving(out, "--open", BROWSER=command):
+        said = tmp_path / "said"
+        for _ in range(200):
+            if said.exists() and said.read_text().endswith("\n"):
+                break
+            time.sleep(0.1)
+    assert said.read_text().endswith("HTTP Error 403: Forbidden\n")  # it keeps no cookie
 
 
 # ---- Corrections of a recording with a map ----
@@ -440,7 +478,38 @@ def test_requests_without_the_token_are_refused(out: Path) -> None:
                             headers["Set-Cookie"])  # fmt: skip
         status, headers, page = client.ask("/", Cookie=headers["Set-Cookie"].split(";")[0])
         assert status == 200 and b'id="served">{"recording"' in page
-        assert headers["Cache-Control"] == "no-store" and client.token.encode() not in page
+        assert client.token.encode() not in page
+        for path in ("/", "/state", "/frame/1", "/none"):
+            headers = client.get(path)[1]
+            assert headers["Cache-Control"] == "no-store"
+            assert headers["X-Content-Type-Options"] == "nosniff"
+            assert headers["Referrer-Policy"] == "no-referrer"
+            assert headers["Cross-Origin-Resource-Policy"] == "same-origin"
+            assert headers["Content-Security-Policy"] == "frame-ancestors 'none'"
+
+
+def test_cookies_of_other_programs_do_not_matter(out: Path) -> None:
+    """Cookies do not distinguish ports: the browser sends those of all programs on 127.0.0.1."""
+    with serving(out) as client:
+        mine = f"reobj_{client.port}={client.token}"
+        for other in ('layout={"a": [1, 2]}', "user@host=1", "flag", "a=b c", "x=\u00e9", "k[0]="):
+            assert client.ask("/state", Cookie=f"{other}; {mine}")[0] == 200, other
+            assert client.ask("/state", Cookie=f"{mine};{other}")[0] == 200, other
+            assert client.ask("/state", Cookie=other)[0] == 403
+
+
+def test_a_broken_request_leaves_no_traceback(out: Path) -> None:
+    """A browser that closes the connection early, and an address that is none."""
+    with serving(out) as client:
+        assert client.get("http://[")[0] == 400
+        request = f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{client.port}\r\n"
+        request += f"Cookie: reobj_{client.port}={client.token}\r\n\r\n"
+        for _ in range(5):
+            with socket.create_connection(("127.0.0.1", client.port)) as connection:
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+                connection.sendall(request.encode())
+                connection.recv(100)  # the answer has begun; the page is larger than the buffers
+        assert client.get("/state")[0] == 200
 
 
 def test_other_hosts_and_origins_are_refused(out: Path) -> None:
@@ -464,8 +533,8 @@ def test_other_hosts_and_origins_are_refused(out: Path) -> None:
         assert client.ask(path, "POST", body, Cookie=cookie)[0] == 403  # without an origin
         assert client.ask(path, "POST", body, Origin=client.origin)[0] == 403  # without the token
         assert client.post("/", body)[0] == 404
-        status, _ = client.post(path, b"", Content_Length=str(1 << 40))
-        assert status == 413
+        for length in (str(1 << 40), "9" * 5000, "-1", "1e3", ""):
+            assert client.post(path, b"", Content_Length=length)[0] == 413
         assert client.ask(path, "PUT", body, Cookie=cookie)[0] == 501
         assert ids(out) == [1, 2, 3, 4, 5, 6] and not client.state()["running"]
 
@@ -492,7 +561,18 @@ def test_no_address_is_a_path(out: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "fault", ["no folder", "no page", "link", "old page", "foreign", "port", "range"]
+    "fault",
+    [
+        "no folder",
+        "no page",
+        "link",
+        "old page",
+        "foreign",
+        "not a number",
+        "deep",
+        "port",
+        "range",
+    ],
 )
 def test_bad_input_is_one_line(out: Path, tmp_path: Path, capsys: Any, fault: str) -> None:
     page = out / "scene.html"
@@ -506,12 +586,18 @@ def test_bad_input_is_one_line(out: Path, tmp_path: Path, capsys: Any, fault: st
         page.symlink_to(tmp_path / "elsewhere.html")
     if fault == "old page":
         page.write_text(page.read_text().replace('"version":1,', "", 1))
+    if fault == "not a number":
+        page.write_text(page.read_text().replace('"version":1,', '"version":1,"x":NaN,', 1))
+    if fault == "deep":
+        deep = f'"version":1,"x":{"[" * 99999}{"]" * 99999},'
+        page.write_text(page.read_text().replace('"version":1,', deep, 1))
     if fault == "foreign":
         page.write_text("<script>alert(1)</script>")
     said = {
         "no folder": "no output folder of reobj_track", "no page": "make it with `objects",
         "link": "is a link out of the folder", "old page": "`objects OUT` makes it again",
         "foreign": "not a viewer that this version wrote", "port": "in use",
+        "not a number": "not a viewer", "deep": "not a viewer",
         "range": "0 to 65535 are possible",
     }  # fmt: skip
     if fault == "port":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from simulated import CAMERA, SIZE, walk
 import quadrics
 import reobj_track as rt
 from reobj.cameras import quat_wxyz_from_matrix
+from reobj.maps.known import class_ids
 from reobj.types import Embeddings
 
 NAMES = ("chair", "cup", "book", "bottle")
@@ -192,3 +194,12 @@ def test_a_map_is_given_before_the_first_frame():
     tracker.start_from(scene.room(), NAMES)
     tracker.start_from(rt.RoomMap())
     assert tracker.state.next_number == 1 and not len(tracker.state.numbers)
+
+
+def test_classes_of_a_map_are_those_of_the_detector() -> None:
+    """By name, else by a synonym; a less likely class where the detector lacks the first one."""
+    names = ("chair", "couch", "tv", "monitor")
+    classes = [("Sofa", {"sofa": 2.0}), ("monitor", {"monitor": 1.0}), ("screen", {"screen": 1.0}),
+               ("lamp", {"lamp": 5.0, "chair": 1.0}), ("lamp", {"lamp": 1.0})]  # fmt: skip
+    states = [SimpleNamespace(class_name=name, classes=of) for name, of in classes]
+    assert class_ids(states, names).tolist() == [1, 3, 2, 0, -1]

@@ -25,6 +25,8 @@ import numpy as np
 import pytest
 
 import reobj_track as rt
+from reobj.maps.stage import session_key
+from reobj.results.names import recording_name
 from reobj.sources import video as video_room
 from reobj.sources.image_files import Header, header_of, times_of_names
 from reobj.types import Image
@@ -395,7 +397,10 @@ def test_a_file_with_glob_characters_in_its_name(tmp_path: Path) -> None:
 
 def test_copies_have_the_same_content_fingerprint(movie: Path, tmp_path: Path) -> None:
     """Whatever their folder and times; of another content of the same size it differs."""
-    fingerprint = video_room.content_fingerprint
+
+    def fingerprint(source: Path | str | int) -> str:
+        return video_room.content_fingerprint(video_room.files_of(source))
+
     for name in ("one", "other"):
         (tmp_path / name).mkdir()
         for k in range(20):
@@ -406,6 +411,23 @@ def test_copies_have_the_same_content_fingerprint(movie: Path, tmp_path: Path) -
     (tmp_path / "other" / "03.png").write_bytes(bytes([3]) * 9_999 + b"x")
     assert fingerprint(tmp_path / "other") != first
     assert fingerprint("rtsp://camera/1") == fingerprint(0) == ""
+
+
+def test_a_map_knows_a_recording_by_its_images(tmp_path: Path) -> None:
+    """Not by other files of their folder, such as .DS_Store and poses."""
+    keys = set()
+    for name in ("scan[1]", "copy"):
+        (tmp_path / name).mkdir()
+        for k in range(3):
+            cv2.imwrite(str(tmp_path / name / f"{k}.png"), np.full((48, 64, 3), k, np.uint8))
+        keys.add(session_key(rt.Video(tmp_path / name)))
+        keys.add(session_key(rt.Video(tmp_path / name / "*.png")))
+    (tmp_path / "copy" / ".DS_Store").write_text("x")
+    (tmp_path / "copy" / "poses.txt").write_text("0 0 0 0 0 0 0 1")
+    keys.add(session_key(rt.Video(tmp_path / "copy")))
+    assert len(keys) == 1
+    cv2.imwrite(str(tmp_path / "copy" / "3.png"), np.full((48, 64, 3), 3, np.uint8))
+    assert session_key(rt.Video(tmp_path / "copy")) not in keys
 
 
 def test_fingerprints_of_urls_are_unique_without_secrets() -> None:
@@ -883,3 +905,20 @@ def test_frames_have_the_times_of_their_names(tmp_path):
     found = [(frame.index, frame.time_s) for frame in video]
     np.testing.assert_allclose(found, [(1, START + 0.1), (3, START + 0.3)], atol=1e-6)
     assert video.fps == pytest.approx(10)
+
+
+def test_a_recording_is_named_by_its_file_or_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Brackets are part of a name where the file exists, else of a glob."""
+    kitchen = tmp_path / "kitchen [1]"
+    (kitchen / "rgb").mkdir(parents=True)
+    (kitchen / "clip [a].mp4").touch()
+    monkeypatch.chdir(kitchen / "rgb")
+    for source, name in (
+        (kitchen / "clip [a].mp4", "clip [a].mp4"), (kitchen, "kitchen [1]"),
+        (kitchen / "rgb", "kitchen [1]"), ("..", "kitchen [1]"), (".", "kitchen [1]"),
+        (tmp_path / "rgb" / "*.png", tmp_path.name), (0, "0"), ("http://u:p@host/a.mp4", "a.mp4"),
+        ("http://host/" + 300 * "x", 300 * "x"),
+    ):  # fmt: skip
+        assert recording_name(str(source)) == name

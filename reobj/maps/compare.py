@@ -276,10 +276,9 @@ class _Pairs:
         self.found = found
         self.visibility = visibility
         self.options = options
-        of_all = [o.classes for o in states] + [o.classes for o in found]
-        self.names = sorted({canonical(name) for classes in of_all for name in classes} | {""})
-        self.of_map = _class_shares(states, self.names)  # (N, C)
-        self.of_found = _class_shares(found, self.names)  # (M, C)
+        self.names = class_names_of([*states, *found])
+        self.of_map = class_shares(states, self.names)  # (N, C)
+        self.of_found = class_shares(found, self.names)  # (M, C)
         fates = np.array([options.fate(name) for name in self.names])  # (C, 3)
         self.fate = self.of_map @ fates
         self.fate[[not s.present for s in states]] = options.absent_fate
@@ -478,8 +477,17 @@ class _Pairs:
         return np.asarray(np.log(real * stay * self.missed / away))
 
 
-def _class_shares(objects: Sequence[ObjectState | FoundObject], names: list[str]) -> Array:
-    """Return the class distributions (K, C); an object without classes has the class ""."""
+def class_names_of(objects: Sequence[ObjectState | FoundObject]) -> list[str]:
+    """Return the canonical names (C) of the classes of objects, and "" first."""
+    return sorted({canonical(name) for o in objects for name in o.classes} | {""})
+
+
+def class_shares(objects: Sequence[ObjectState | FoundObject], names: list[str]) -> Array:
+    """Return the class distributions (K, C); an object without classes has the class "".
+
+    Args:
+        names: of `class_names_of`.
+    """
     of_objects = [merged(o.classes) for o in objects]
     weights = np.array([[classes.get(n, 0.0) for n in names] for classes in of_objects])
     weights = weights.reshape(len(objects), len(names))

@@ -167,7 +167,7 @@ def align(
 
 
 def _certain(objects: Landmarks, options: AlignmentOptions) -> IntArray:
-    """Return the rows of the objects whose position is certain enough to tell places apart."""
+    """Return the rows of the objects whose position is certain enough to distinguish places."""
     sigma = np.sqrt(np.trace(objects.cov, axis1=1, axis2=2) / 3)
     order = np.argsort(sigma, kind="stable")[: options.most]  # NaN: last
     return np.sort(order[sigma[order] < options.elsewhere_m])

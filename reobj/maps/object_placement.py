@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import quadrics
-from reobj.maps.compare import FoundObject
+from reobj.maps.compare import FoundObject, class_names_of, class_shares
 from reobj.maps.fusion import ObjectState, object_state, scale_of
 from reobj.maps.object_alignment import AlignmentOptions, Landmarks, ObjectAlignment, align
 from reobj.maps.placement import ComponentPlacement, Placement, Similarity, joined
@@ -51,7 +51,7 @@ def place_by_objects(
     turn = _upright(room.up)
     found_turn = _upright(result.world.up_in_world)
     both: list[ObjectState | FoundObject] = [*states, *found]
-    names = sorted({name for o in both for name in o.classes})
+    names = class_names_of(both)
     width = max((len(o.foreground) for o in both), default=0)
     aligned = align(
         _landmarks(states, turn, scale.value, names, width, same_embedder),
@@ -127,28 +127,26 @@ def _landmarks(
     objects: Sequence[ObjectState | FoundObject],
     turn: Array,
     unit: float,
-    names: Sequence[str],
+    names: list[str],
     width: int,
     embedded: Sequence[bool],
 ) -> Landmarks:
     """Return objects in upright axes and metres.
 
     Args:
-        turn: (3, 3) to these axes. unit: metres. names: classes. width: elements of an embedding.
-        embedded: its embedding can be compared.
+        turn: (3, 3) to these axes. unit: metres. names: of `class_names_of`. width: elements of an
+            embedding. embedded: whether the embedding of each object can be compared.
     """
     looks = np.full((len(objects), width), np.nan, np.float32)
     for k, o in enumerate(objects):
         if embedded[k] and len(o.foreground) == width:
             looks[k] = o.foreground
-    weight = np.array([[o.classes.get(name, 0.0) for name in names] for o in objects])
-    weight = weight.reshape(len(objects), len(names))
     cov = np.array([o.cov[:3, :3] for o in objects]).reshape(-1, 3, 3)
     half_axes = np.array([o.half_axes for o in objects]).reshape(-1, 3)
     return Landmarks(
         np.array([o.center for o in objects]).reshape(-1, 3) @ turn.T * unit,
         turn @ cov @ turn.T * unit**2,
-        weight / weight.sum(1, keepdims=True).clip(1e-9),
+        class_shares(objects, names),
         np.log(half_axes * unit).mean(1),
         np.array([o.cov[3:6, 3:6].sum() / 9 for o in objects]),
         looks,

@@ -36,7 +36,7 @@ from reobj.results.changes import Changes
 from reobj.results.names import recording_name
 from reobj.results.result import Result
 from reobj.results.scene import best_pictures
-from reobj.sources.video import Video, content_fingerprint
+from reobj.sources.video import Video, content_fingerprint, files_of
 from reobj.types import ReobjError, option
 
 
@@ -387,7 +387,8 @@ def session_name(video: Video) -> str:
 
 def session_key(video: Video) -> str:
     """Identify a recording: the content of its files, and the part of it that is read."""
-    content = content_fingerprint(video.source) or video.fingerprint
+    files = video.files or files_of(video.source)
+    content = content_fingerprint(files) or video.fingerprint
     return f"{content} {video.config.start}-{video.config.stop}"
 
 

@@ -121,6 +121,7 @@ class FlowFrames(DenseFrames):
     def __init__(self, poses: Poses) -> None:
         """Choose frames: `REFERENCES`, and after each the next two with a good baseline."""
         super().__init__(poses, evenly(np.flatnonzero(poses.known)).tolist())
+        self.points = [poses.of_part(part).points for part in range(poses.part_count)]
         self.depth = {row: self._median_depth(row) for row in self.rows}
         partners = [self._after(row, share) for row in self.rows for share in (0.1, 0.2)]
         self.used = sorted({*self.rows, *(row for row in partners if row >= 0)})
@@ -129,7 +130,8 @@ class FlowFrames(DenseFrames):
     def _median_depth(self, row: int) -> float:
         """Return the median depth of the sparse points in a frame; NaN: fewer than 20."""
         pose = self.poses.cam_from_world[row]
-        points = self.poses.points[:: len(self.poses.points) // 5000 + 1]
+        points = self.points[self.poses.part[row]]  # (N, 3), of the same world
+        points = points[:: len(points) // 5000 + 1]
         x = points @ pose[:, :3].T + pose[:, 3]
         x = x[x[:, 2] > 0]
         uv = x @ self.poses.camera.K.T / x[:, 2:]

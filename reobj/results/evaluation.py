@@ -311,16 +311,16 @@ COLUMNS = {
     "Frag": "interruptions of a tracked object",
     "IDs": "identities of the result per true object",
 }
-COUNTS = ("IDSW", "Frag", "IDs")
 
 
 def score_table(scores: dict[str, dict[str, float]]) -> str:
     """Format one line for each name, rates in per cent."""
     lines = [f"{'':<14}" + "".join(f"{c:>6}" for c in COLUMNS)]
     for name, score in scores.items():
-        values = score | {"IDs": score["ids_per_object"]}
-        cells = [f"{values[c]:6.4g}" if c in COUNTS else f"{100 * values[c]:6.1f}" for c in COLUMNS]
-        lines.append(f"{name[:14]:<14}" + "".join(cells))
+        counts = {key: f"{score[key]:.0f}" for key in ("IDSW", "Frag")}
+        counts["IDs"] = f"{score['ids_per_object']:.4g}"
+        cells = [counts.get(c) or f"{100 * score[c]:.1f}" for c in COLUMNS]
+        lines.append(f"{name[:14]:<14}" + "".join(f" {cell:>5}" for cell in cells))
     return "\n".join(lines)
 
 
@@ -360,7 +360,7 @@ def _missed(truth: LabelledBoxes, predicted: LabelledBoxes) -> dict[str, list[in
     name_of = dict(zip(scored.identity.tolist(), scored.name.tolist(), strict=True))
     missed: dict[str, list[int]] = {}
     for identity, match in identity_map(truth, predicted).items():
-        if match is None and identity in name_of:
+        if match is None:
             missed.setdefault(name_of[identity], []).append(identity)
     return dict(sorted(missed.items()))
 

@@ -309,6 +309,14 @@ def _nerf_camera(camera: Camera, path: Path) -> dict[str, Any]:
 # ---- rerun -------------------------------------------------------------------------------------
 
 
+def live_labels(tracks: Tracks, names: Sequence[str]) -> list[str]:
+    """Return identity and class of each row, as text."""
+    return [
+        f"{i} {names[c] if 0 <= c < len(names) else 'object'}"
+        for i, c in zip(tracks.track_id.tolist(), tracks.class_id.tolist(), strict=True)
+    ]
+
+
 class Viewer:
     """A rerun recording: to a file, or live to its viewer while a video is tracked.
 
@@ -354,10 +362,7 @@ class Viewer:
             cloud = self.rr.Points3D(poses.points, colors=poses.colors)
             self.rec.log("world/points", cloud, static=True)
         for frame, tracks in steps:
-            labels = [
-                f"{i} {names[c] if 0 <= c < len(names) else 'object'}"
-                for i, c in zip(tracks.track_id.tolist(), tracks.class_id.tolist(), strict=True)
-            ]
+            labels = live_labels(tracks, names)
             native = dataclasses.replace(tracks, xyxy=tracks.xyxy / video.scale)
             self._frame(frame.index, poses, pose_of.get(frame.index), 1.0, native, labels)
             self._image(frame.image)

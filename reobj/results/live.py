@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-import webbrowser
 from collections.abc import Iterable, Iterator, Sequence
 from http import HTTPStatus
 from pathlib import Path
@@ -14,7 +13,7 @@ from urllib.parse import urlsplit
 import cv2
 
 from reobj.cameras import Poses
-from reobj.results.export import Viewer
+from reobj.results.export import Viewer, live_labels
 from reobj.results.local_server import LocalHandler, LocalServer
 from reobj.results.overlay import draw_tracks
 from reobj.results.result import Result, VideoInfo
@@ -29,12 +28,15 @@ PAGE = b"""<!doctype html><meta charset="utf-8"><title>reobj_track</title>
 </style><img src="/pictures" alt="the latest frame with identities">"""
 
 
-def open_viewer(video: VideoInfo) -> Viewer | LivePage:
-    """Open the live view of `--show`."""
+def open_viewer(video: VideoInfo, stack: contextlib.ExitStack) -> Viewer | LivePage:
+    """Open the live view of `--show`; the end of the stack closes it."""
+    viewer: Viewer | LivePage
     try:
-        return Viewer(video)
+        viewer = Viewer(video)
     except ReobjError:  # rerun is missing
-        return LivePage()
+        viewer = LivePage()
+    stack.callback(viewer.close)
+    return viewer
 
 
 class LivePage:
@@ -51,7 +53,7 @@ class LivePage:
         threading.Thread(target=self._server.serve_forever, daemon=True).start()
         log.log(NOTE, "live view: %s (in 3D with rerun: pip install rerun-sdk)", self.url)
         if open_browser:
-            webbrowser.open(self.url)
+            self._server.open_browser()
 
     def follow(
         self, steps: Iterable[tuple[Frame, Tracks]], names: Sequence[str], video: Video,
@@ -64,10 +66,8 @@ class LivePage:
         for frame, tracks in steps:
             if self._server.watchers and time.monotonic() - shown_s > EVERY_S:
                 shown_s = time.monotonic()
-                labels = {
-                    i: f"{i} {names[c] if 0 <= c < len(names) else 'object'}"
-                    for i, c in zip(tracks.track_id.tolist(), tracks.class_id.tolist(), strict=True)
-                }
+                texts = live_labels(tracks, names)
+                labels = dict(zip(tracks.track_id.tolist(), texts, strict=True))
                 image = shrunk(frame.image, PICTURE_PX).copy()
                 scale = image.shape[1] / frame.image.shape[1]
                 draw_tracks(image, tracks, labels, scale, positions)
@@ -147,10 +147,7 @@ class _Handler(LocalHandler):
             self._answer(HTTPStatus.OK, PAGE, "text/html; charset=utf-8")
 
     def _pictures(self) -> None:
-        self.send_response(HTTPStatus.OK)
-        self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
-        self.send_header("Cache-Control", "no-store")
-        self.end_headers()
+        self._head(HTTPStatus.OK, None, "multipart/x-mixed-replace; boundary=frame")
         for picture in self.server.pictures():
             head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(picture)}\r\n\r\n"
             self.wfile.write(head.encode() + picture + b"\r\n")

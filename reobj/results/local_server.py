@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import hmac
-import http.cookies
 import json
 import os
 import secrets
+import sys
+import threading
+import webbrowser
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -35,10 +37,15 @@ class LocalHandler(BaseHTTPRequestHandler):
 
     def log_message(self, text: str, *args: Any) -> None:
         """Log requests with --debug, without the token."""
-        log.debug("serve: %s", (text % args).replace(self.server.token, "TOKEN"))
+        log.debug("serve: %s", one_line((text % args).replace(self.server.token, "TOKEN")))
 
     def _may_read(self) -> bool:
-        """Check the name of the server, which a foreign page cannot give, and the token."""
+        """Check the address, the host, which a page of another server cannot give, the token."""
+        try:
+            urlsplit(self.path)
+        except ValueError:  # such as http://[
+            self._refuse(HTTPStatus.BAD_REQUEST, "no address")
+            return False
         if self.headers.get("Host", "").lower() not in self.server.hosts:
             self._refuse(HTTPStatus.FORBIDDEN, "unknown host")
             return False
@@ -50,12 +57,11 @@ class LocalHandler(BaseHTTPRequestHandler):
     def _tokens(self) -> list[bytes]:
         """Return the tokens of the address and of the cookie."""
         found = parse_qs(urlsplit(self.path).query).get("token", [])
-        try:
-            cookies = http.cookies.SimpleCookie(self.headers.get("Cookie", ""))
-        except http.cookies.CookieError:
-            cookies = http.cookies.SimpleCookie()
-        if self.server.cookie in cookies:
-            found = [*found, cookies[self.server.cookie].value]
+        # SimpleCookie reads none if another program on 127.0.0.1 has set one that it cannot read
+        for cookie in self.headers.get("Cookie", "").split(";"):
+            name, _, value = cookie.strip().partition("=")
+            if name == self.server.cookie:
+                found.append(value)
         return [token.encode("utf-8", "replace") for token in found]
 
     def _token_moved(self) -> bool:
@@ -81,10 +87,12 @@ class LocalHandler(BaseHTTPRequestHandler):
             self.wfile.write(body)
 
     def _head(
-        self, status: HTTPStatus, length: int, kind: str, more: dict[str, str] | None = None
+        self, status: HTTPStatus, length: int | None, kind: str, more: dict[str, str] | None = None
     ) -> None:
+        """Send the head of an answer of `length` bytes; None: until the connection is closed."""
         self.send_response(status)
-        headers = {"Content-Type": kind, "Content-Length": str(length)}
+        end = {"Connection": "close"} if length is None else {"Content-Length": str(length)}
+        headers = {"Content-Type": kind} | end
         for name, value in (HEADERS | headers | (more or {})).items():
             self.send_header(name, value)
         self.end_headers()
@@ -112,7 +120,19 @@ class LocalServer(ThreadingHTTPServer):
         self.hosts = {f"{name}:{number}" for name in (HOST, "localhost")}
         self.origins = {f"http://{host}" for host in self.hosts}
 
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Log a connection that the browser closed with --debug; print other errors."""
+        error = sys.exception()
+        if isinstance(error, ConnectionError):
+            log.debug("serve: %s", error)
+        else:
+            super().handle_error(request, client_address)
+
     @property
     def url(self) -> str:
         """Address of the page with its token."""
         return f"http://{HOST}:{self.server_address[1]}/?token={self.token}"
+
+    def open_browser(self) -> None:
+        """Open the page in the browser; in a thread, as one in the terminal returns at its end."""
+        threading.Thread(target=webbrowser.open, args=(self.url,), daemon=True).start()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import os
 from pathlib import Path
 
 from reobj.types import without_secrets
@@ -21,8 +22,9 @@ def recording_name(source: str) -> str:
     'kitchen'
     """
     source = without_secrets(source)
-    path = Path(source) if "://" in source else Path(source).absolute()
-    names = [name for name in path.parts if not set(name) & set("*?[")]
+    path = Path(source) if "://" in source else Path(os.path.abspath(source))
+    is_glob = not os.path.exists(path)
+    names = [name for name in path.parts if not (is_glob and set(name) & set("*?["))]
     specific = [name for name in names if name.lower() not in GENERIC]
     if names and names[-1].lower() in GENERIC and specific:
         return specific[-1]

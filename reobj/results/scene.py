@@ -353,17 +353,35 @@ def write_scene(
             entry["best"] = pictures.best.get(entry["id"])
     text = _page_of(data, None)
     if pictures.dense is not None:
-        left = min(MOST, (PAGE_MAX - 1000 * len(origins) - len(text.encode())) // POINT_BYTES)
-        for k, origin in enumerate(origins):
-            cloud = pictures.dense.cloud(k)
-            if cloud is not None and left > 0:
-                data["parts"][k]["dense"] = _dense_points(cloud, origin, left)
-                left -= data["parts"][k]["dense"]["count"]
+        _add_dense_points(data["parts"], pictures.dense, origins, len(text.encode()))
         text = _page_of(data, None)
-        if not any("dense" in part for part in data["parts"]):
-            log.warning("no dense points: %s", pictures.dense.REASON)
     with atomic(path) as part:
         part.write_text(text, encoding="utf-8")
+
+
+def _add_dense_points(
+    parts: list[dict[str, Any]], dense: DenseFrames, origins: Sequence[Array], size: int
+) -> None:
+    """Add dense points to the components of a page, as many as its limit leaves room for.
+
+    Args:
+        parts: data of the components, completed in place. origins: (3,) of each, in its world.
+            size: bytes of the page without dense points.
+    """
+    left = min(MOST, (PAGE_MAX - 1000 * len(parts) - size) // POINT_BYTES)
+    if left <= 0:
+        limit = f"{size / 1e6:.1f} MB without them, {PAGE_MAX / 1e6:g} MB is the limit"
+        log.warning("no dense points: the page has %s", limit)
+        return
+    found = False
+    for k, origin in enumerate(origins):
+        cloud = dense.cloud(k) if left > 0 else None
+        if cloud is not None:
+            parts[k]["dense"] = _dense_points(cloud, origin, left)
+            left -= parts[k]["dense"]["count"]
+            found = True
+    if not found:
+        log.warning("no dense points: %s", dense.REASON)
 
 
 def _dense_points(cloud: Cloud, origin: Array, most: int) -> dict[str, Any]:
@@ -405,8 +423,8 @@ def served_page(
     text = read_text(path)
     found = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)
     try:
-        data = json.loads(found[1]) if found else None
-    except ValueError:
+        data = json.loads(found[1], parse_constant=_no_number) if found else None
+    except (RecursionError, ValueError):
         data = None
     if not isinstance(data, dict) or data.get("version") != PAGE_VERSION:
         advice = "`objects OUT` makes it again"
@@ -415,6 +433,11 @@ def served_page(
     if others is not None and isinstance(changes, dict) and not changes.get("refused"):
         data["earlier"] = _earlier_sessions(others)
     return _page_of(data, served)
+
+
+def _no_number(text: str) -> None:
+    """Refuse NaN and Infinity, which the page's data never have."""
+    raise ValueError(text)
 
 
 def _is_file(video: Video) -> bool:

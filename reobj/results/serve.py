@@ -7,6 +7,7 @@ path of a file.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -155,9 +156,8 @@ class Corrections:
             old = before.read_bytes() if before.is_file() else _no_edits()
             room = self._changed_map()
             entry = self._push(old, room, edits)
-        except ReobjError as error:
-            self._end(str(error))
-            raise
+        except (ReobjError, OSError) as error:
+            raise self._not_started(error) from error
         copy = entry.with_suffix(".map")
         done = _nothing if room is None else partial(room.applied, copy)
         self._run(new, done, partial(self._drop, entry, room))
@@ -177,13 +177,13 @@ class Corrections:
         copy = entry.with_suffix(".map")
         put_back = _nothing
         try:
+            edits = self._temporary(entry.read_bytes())
             room = self._changed_map()
             if room is not None and copy.is_file():
                 put_back = room.restore(copy)
-        except ReobjError as error:
-            self._end(str(error))
-            raise
-        self._run(self._temporary(entry.read_bytes()), partial(_remove, entry), put_back)
+        except (ReobjError, OSError) as error:
+            raise self._not_started(error) from error
+        self._run(edits, partial(_remove, entry), put_back)
 
     def stop(self) -> None:
         """End the worker; the result and the map stay as they were."""
@@ -207,6 +207,12 @@ class Corrections:
             self._is_running = False
             self._failed = bool(fault)
             self._text = fault
+
+    def _not_started(self, error: Exception) -> ReobjError:
+        """End a job whose files cannot be read or written; return the error for the user."""
+        fault = one_line(str(error))
+        self._end(fault)
+        return ReobjError(fault)
 
     def _changed_map(self) -> FolderMap | None:
         """Return the map that corrections of the folder change."""
@@ -340,7 +346,7 @@ class _Handler(LocalHandler):
             self._refuse(HTTPStatus.FORBIDDEN, "from another page")
             return
         length = self.headers.get("Content-Length", "")
-        if not length.isdecimal() or int(length) > EDITS_MAX:
+        if not re.fullmatch(r"\d{1,9}", length) or int(length) > EDITS_MAX:
             self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"at most {EDITS_MAX >> 20} MB")
             return
         parts = urlsplit(self.path)
@@ -403,12 +409,10 @@ class _Handler(LocalHandler):
         """Send bytes of a file; the browser may end the connection when it has enough."""
         file.seek(first)
         left = last + 1 - first
-        try:
+        with contextlib.suppress(OSError):
             while left > 0 and (data := file.read(min(CHUNK, left))):
                 self.wfile.write(data)
                 left -= len(data)
-        except OSError:
-            self.close_connection = True
         if left > 0:
             self.close_connection = True
 

@@ -25,8 +25,6 @@ from reobj.sources.tables import BOXES_3D, Table, read_cells, seconds, text_clas
 from reobj.sources.video import Video
 from reobj.types import Array, IntArray, ReobjError, Tracks
 
-COLUMNS_3D = 15  # of a row of `RecordedDetections.boxes_3d`: centre, half extents, rotation
-
 
 @dataclass(frozen=True, slots=True)
 class Boxes3D:

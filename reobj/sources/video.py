@@ -570,15 +570,15 @@ def source_fingerprint(source: Any) -> str:
         rounds = 100_000  # .05 s, once per run and per guess of a password
         digest = hashlib.pbkdf2_hmac("sha256", text.encode(), public.encode(), rounds)
         return public if public == text else f"{public} {digest.hex()[:16]}"
-    files = _files_of(source)
+    files = files_of(source)
     if not files:
         return text
     facts = [(p.name, p.stat().st_size, p.stat().st_mtime_ns) for p in files]
     return hashlib.sha256(json.dumps(facts).encode()).hexdigest()[:16]
 
 
-def content_fingerprint(source: Any, most: int = 8, piece: int = 4096) -> str:
-    """Hash names, sizes and some content of a file, a folder's files or a glob's matches.
+def content_fingerprint(files: Sequence[Path], most: int = 8, piece: int = 4096) -> str:
+    """Hash names, sizes and some content of files.
 
     Copies in another folder have the same one, whatever their times.
 
@@ -587,7 +587,6 @@ def content_fingerprint(source: Any, most: int = 8, piece: int = 4096) -> str:
     Returns:
         16 hex digits; "" without files.
     """
-    files = _files_of(source)
     if not files:
         return ""
     digest = hashlib.sha256(json.dumps([(p.name, p.stat().st_size) for p in files]).encode())
@@ -599,7 +598,7 @@ def content_fingerprint(source: Any, most: int = 8, piece: int = 4096) -> str:
     return digest.hexdigest()[:16]
 
 
-def _files_of(source: Any) -> list[Path]:
+def files_of(source: Any) -> list[Path]:
     """List a file, a folder's files or a glob's matches, sorted; [] of a camera or URL."""
     path = Path(str(source))
     if path.is_file():  # first: the name may contain glob characters, det[1].txt

@@ -43,6 +43,7 @@ from front_door.room import (
     true_centres,
     true_objects,
 )
+from reobj.commands import apply_command
 
 SHORT = range(0, 120, 3)  # frames of the `room` fixture
 FILES = {
@@ -460,3 +461,16 @@ def test_a_reader_that_stops_early_is_no_error() -> None:
     command = f"{sys.executable} {ROOT / 'reobj_track.py'} --options | head -n 1"
     done = subprocess.run(command, shell=True, capture_output=True, text=True, check=False)
     assert done.stderr == "" and done.stdout
+
+
+@pytest.mark.parametrize(("platform", "quote"), [("linux", "'"), ("darwin", "'"), ("win32", '"')])
+def test_the_command_for_corrections_is_quoted_as_the_shell_wants(
+    monkeypatch: pytest.MonkeyPatch, platform: str, quote: str
+) -> None:
+    """PowerShell and cmd.exe on Windows: only double quotes are quotes in both."""
+    monkeypatch.setattr("sys.platform", platform)
+    monkeypatch.setattr("sys.argv", ["/my tools/reobj_track.py"])
+    expected = f"python {quote}/my tools/reobj_track.py{quote} objects {quote}/a b/out{quote}"
+    assert apply_command(Path("/a b/out")) == expected
+    monkeypatch.setattr("sys.argv", ["/bin/reobj-track"])
+    assert apply_command(Path("/out")) == "reobj-track objects /out"

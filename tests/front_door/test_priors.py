@@ -124,6 +124,12 @@ def test_one_table_of_synonyms() -> None:
     assert class_filter("monitor", ["tv", "monitor"]).tolist() == [1]
 
 
+def test_a_word_like_no_category_is_named() -> None:
+    """Not the file of the priors, which is valid."""
+    with pytest.raises(q.QuadricsError, match=r"^nonsense: no such category"):
+        q.load_priors(more={"mixer": "nonsense"})
+
+
 def test_a_file_of_priors_takes_the_synonyms_of_its_words(tmp_path: Path) -> None:
     """Its "sofa" is the prior of "couch" too; a word of the user replaces it."""
     path = tmp_path / "p.json"

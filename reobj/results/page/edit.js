@@ -20,7 +20,7 @@ const edits = {
   delete: (o) => ({ do: "delete", object: refOf(o) }),
 };
 
-// ---- Objects after the edits; `objects OUT --edits` fits their solids again ----
+// ---- Objects after the edits; `objects OUT --edits` fits their shapes again ----
 function stepsOf(visits) {                       // first, last, first, last ... position seen
   const runs = [];
   S.steps.frame.forEach((frame, step) => {
@@ -49,7 +49,7 @@ const hue = (id) => {                            // `object_color` in types.py
 };
 const sure = (o) => o.status !== "doubtful" ? {} : { status: o.center ? "ok" : "tracked", reason: "" };
 const NO_SOLID = { center: null, half_axes: null, size: null, size_m: null, sides: [],
-  status: "tracked", reason: SERVED ? "its solid is fitted by Save" : "its solid is fitted by objects OUT --edits" };
+  status: "tracked", reason: SERVED ? "its shape is fitted by Save" : "its shape is fitted by objects OUT --edits" };
 
 const APPLY = {
   merge(list, { object, with: other }) {

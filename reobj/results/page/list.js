@@ -1,7 +1,7 @@
 // The list of objects and the panel of the chosen one.
 const nameOf = (o) => `${o.class} ${o.id}`;
 const NOTE = { ok: "", prior_dominated: "", rejected: "no solid", doubtful: "doubtful",
-  implausible: "implausible size",   tracked: "in 2D only" };
+  implausible: "implausible size", tracked: "in 2D only" };
 
 function bar(o) {                                // when the object was seen, over the part's frames
   const first = S.steps.frame[steps[0]], span = S.steps.frame[steps.at(-1)] - first + 1;
