@@ -387,7 +387,7 @@ def test_unread_images_are_counted(tmp_path: Path) -> None:
         rt.Video(phone)
     with pytest.raises(rt.ReobjError, match=r"\.HEIC files are not read; convert it"):
         rt.Video(phone / "IMG_0010.HEIC")
-    with pytest.raises(rt.ReobjError, match=r"no images there .* its folders are phone"):
+    with pytest.raises(rt.ReobjError, match=r"no images there .* its folders: phone"):
         rt.Video(tmp_path)
 
 
