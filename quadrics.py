@@ -2415,12 +2415,14 @@ def _status(
     rejections = _rejection_reasons(fit, posterior.size_sigma, seen, growth, limits)
     for b, rejection in enumerate(rejections):
         doubt = []
+        # where the category is unknown or overruled the sizes of all of them are the prior
+        source = "the category" if spec.kind[fit.hyp[b]] >= 0 else "the sizes of all categories"
         if weak[b].any():
             names = [("width", "depth", "height")[k] for k in np.flatnonzero(weak[b])]
             guessed = "size" if len(names) == 3 else " and ".join(names)
-            doubt.append(f"{guessed} guessed from the category")
+            doubt.append(f"{guessed} guessed from {source}")
         if parallax[b] < limits.min_parallax_deg:
-            doubt.append(f"distance guessed from the category, parallax {parallax[b]:.1f} deg")
+            doubt.append(f"distance guessed from {source}, parallax {parallax[b]:.1f} deg")
         status.append("prior_dominated" if doubt else "ok")
         if deviation[b] > limits.implausible_size:
             status[b] = "implausible"
@@ -2428,7 +2430,7 @@ def _status(
             status[b] = "rejected"
         if deviation[b] > limits.odd_size:
             why = "another object?" if growth[b] > 0.7 * deviation[b] else "partly occluded?"
-            doubt.append(f"size is {deviation[b]:.1f} sigma from its category's: {why}")
+            doubt.append(f"size is {deviation[b]:.1f} sigma from the usual one: {why}")
         if overruled[b]:
             doubt.append(f"category overruled: {overruled[b]}")
         reason.append("; ".join([rejection, *doubt] if rejection else doubt))

@@ -742,6 +742,13 @@ def test_status_reflects_the_evidence() -> None:
     assert (thin.prior_share.max(1) > 0.8).all() and (wide.prior_share.max(1) < 0.7).mean() > 0.9
 
 
+def test_a_reason_names_the_prior_that_was_used() -> None:
+    _, _, joint, flat, names, priors = fitted(30, 2, 0.5, 0.02, "box")
+    fits = q.fit_objects(joint, flat, syn.IMAGE, [None, *names[1:]], priors, up=UP)
+    assert "guessed from the sizes of all categories" in fits.reason[0]
+    assert "guessed from the category" in fits.reason[1]
+
+
 def test_contradictory_boxes_are_rejected() -> None:
     rng = np.random.default_rng(15)
     cams = syn.arc_cameras(8, 100, rng)

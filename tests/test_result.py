@@ -57,7 +57,7 @@ def test_implausible_objects_keep_their_tracks_and_are_not_counted(
     chairs: rt.Result, tmp_path: Path
 ) -> None:
     first, *rest = chairs.objects
-    why = "size is 7.2 sigma from its category's: another object?"
+    why = "size is 7.2 sigma from the usual one: another object?"
     odd = dataclasses.replace(first, status="implausible", reason=why)
     result = copy_of(chairs, objects=[odd, *rest], fits=None)
     result.save(tmp_path)
