@@ -23,3 +23,11 @@ def test_a_recording_is_compared_with_its_own_observations() -> None:
         moved, other = states_for(room, known)
         np.testing.assert_allclose(moved.center, place["center"], atol=1e-6)
         np.testing.assert_allclose(other.center, MONDAY["center"], atol=1e-6)
+
+
+def test_the_class_of_an_object_is_that_of_all_sessions() -> None:
+    monday = observed(1, "new", MONDAY, classes={"tv": 20.0})
+    tuesday = observed(2, "stayed", MONDAY, classes={"laptop": 5.0})
+    room = a_map([[monday, tuesday]], sessions=(a_session(1), a_session(2)))
+    (state,) = states_for(room, {1: tuesday})
+    assert state.class_name == "tv" and state.classes == {"laptop": 5.0}

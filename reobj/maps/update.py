@@ -145,12 +145,16 @@ def states_for(room: RoomMap, own: Mapping[int, Observation]) -> list[ObjectStat
 
     Args:
         own: earlier observations of this recording, by number. Such an object is where it was then,
-            wherever other sessions saw it.
+            wherever other sessions saw it; its class is that of all sessions.
     """
-    return [
-        object_state(dataclasses.replace(o, observations=(own[o.id],)) if o.id in own else o, room)
-        for o in room.objects
-    ]
+    states = []
+    for o in room.objects:
+        state = object_state(o, room)
+        if o.id in own:
+            alone = dataclasses.replace(o, observations=(own[o.id],))
+            state = dataclasses.replace(object_state(alone, room), class_name=state.class_name)
+        states.append(state)
+    return states
 
 
 def _states_before(room: RoomMap, session: int) -> dict[int, ObjectState]:
