@@ -125,10 +125,6 @@ def check_detector(folder: Path) -> None:
     assert chair["class"] == "chair" and chair["frames_seen"] == 4
 
 
-def check_example(folder: Path) -> None:
-    assert len(objects(folder / "out")) > 25 and (folder / "out/scene.html").is_file()
-
-
 def check_training(folder: Path) -> None:
     assert (folder / "trained/reobj.onnx").is_file() and objects(folder / "out")
 
@@ -154,7 +150,6 @@ def check_map(folder: Path) -> None:
 
 Step = Callable[[Path], None]
 PAGES: dict[str, tuple[Step, Step]] = {
-    "first_hour": (nothing, check_example),
     "phone_video": (nothing, check_phone),
     "scannet_scene": (scannet, check_scannet),
     "ar_poses": (arkit, check_ar),
@@ -183,9 +178,10 @@ def need(page: str) -> None:
 
 def test_every_tutorial_is_tested() -> None:
     pages = {path.stem for path in TUTORIALS.glob("*.md")} - {"README"}
-    assert pages == set(PAGES)
     listed = re.findall(r"\]\((\w+)\.md\)", (TUTORIALS / "README.md").read_text())
     assert set(listed) == pages
+    pages.remove("first_hour")  # front_door/test_documented.py
+    assert pages == set(PAGES)
     assert all(blocks(TUTORIALS / f"{page}.md") for page in pages)
 
 
