@@ -218,7 +218,13 @@ def result(line: Line, folder: Path) -> str:
     done = subprocess.run(shell, shell=True, cwd=folder, capture_output=True, text=True)
     errors = [row for row in done.stderr.splitlines() if row.startswith(("error:", "warning:"))]
     text = done.stdout.strip().partition("\nsigma:")[0].splitlines() + errors
-    text = [re.sub(r"\x1b\[\d*m", "", row.replace(str(folder), ".")) for row in text]
+    for path, name in (
+        (str(folder), "."),
+        (os.environ.get("REOBJ_MODELS", str(folder)), "$REOBJ_MODELS"),
+        (str(Path.home()), "~"),
+    ):
+        text = [row.replace(path, name) for row in text]
+    text = [re.sub(r"\x1b\[\d*m", "", row) for row in text]
     text = [row for row in text if not row.startswith("look at:")]
     if len(text) > MOST_LINES:
         text[MOST_LINES // 2 : -MOST_LINES // 2] = ["..."]

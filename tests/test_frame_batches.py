@@ -160,7 +160,8 @@ def test_a_model_of_one_image_gets_one(
 
 def test_images_of_different_input_sizes_are_not_joined(tmp_path: Path, spied: type[Spy]) -> None:
     """With a dynamic input size; with a fixed one they are, at their different scales."""
-    wide, high = plain(80, (320, 160)), plain(160, (160, 320))
+    wide = plain(80, (320, 160))
+    high = plain(160, (160, 320))
     images = [wide, wide, high, wide]
     for shape, batches in ((("n", 3, "h", "w"), [1, 4, 2, 1, 1]), (("n", 3, 64, 64), [1, 4, 4])):
         path = grey_model(tmp_path, shape)
@@ -292,7 +293,8 @@ def test_tracking_is_in_batches(clip: Path, camera_motion: bool) -> None:
 
 def test_a_live_source_is_not_delayed(clip: Path) -> None:
     """Its frames are detected as they come."""
-    noted, video = Noted(), Counted(clip)
+    noted = Noted()
+    video = Counted(clip)
     video.is_live = True
     video.__dict__["_from_live"] = video._from_capture
     for frame, _ in rt.track(video, noted.source, rt.Tracker()):

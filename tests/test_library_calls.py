@@ -13,6 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from small_models import small_rt_detr
 from torchvision_operators import declare_nms
 
 import reobj_track as rt
@@ -142,17 +143,8 @@ def test_torchvision(picture: Any, tmp_path: Path) -> None:
 def test_transformers(picture: Any, tmp_path: Path) -> None:
     tf = pytest.importorskip("transformers", reason=INSTALL)
     pytest.importorskip("torch", reason=INSTALL)
-    backbone = tf.RTDetrResNetConfig(
-        embedding_size=16, hidden_sizes=[16, 32, 64, 64], depths=[1, 1, 1, 1],
-        out_features=["stage2", "stage3", "stage4"],
-    )  # fmt: skip
-    config = tf.RTDetrV2Config(
-        backbone_config=backbone, encoder_in_channels=[32, 64, 64], encoder_hidden_dim=64,
-        decoder_in_channels=[64, 64, 64], encoder_layers=1, encoder_ffn_dim=64, d_model=64,
-        decoder_layers=2, num_queries=20, id2label={0: "lamp", 1: "plant"},
-    )  # fmt: skip
     folder = str(tmp_path / "model")
-    responsive(tf.RTDetrV2ForObjectDetection(config)).save_pretrained(folder)
+    responsive(small_rt_detr()).save_pretrained(folder)
     tf.RTDetrImageProcessor().save_pretrained(folder)
     pipeline = tf.pipeline("object-detection", model=folder)
 

@@ -76,9 +76,9 @@ def _one_class(result: Result, still: Sequence[Object]) -> str:
     if count < 8 or 2 * count <= len(still) or len(np.unique(boxes)) == 1:
         return ""
     return (
-        f"{count} of {len(still)} listed objects are of the class {name}: check that there are so "
-        f"many; if not, it is confused with other classes: try {OTHER_BOXES}, or leave the class "
-        "out (--classes)"
+        f"{count} of {len(still)} listed objects are of the class {name}: check that the room has "
+        f"that many; if not, it is confused with other classes: try {OTHER_BOXES}, or leave the "
+        "class out (--classes)"
     )
 
 

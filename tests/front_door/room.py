@@ -12,7 +12,7 @@ import shlex
 import sys
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -20,6 +20,9 @@ import truth as scores
 from scipy.spatial.transform import Rotation
 
 import reobj_track as rt
+
+if TYPE_CHECKING:  # also run where pytest is not installed
+    from pytest import CaptureFixture
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 ROOM = ROOT / "examples" / "room"
@@ -36,6 +39,15 @@ POSES = ("--poses", ROOM / "poses.txt", "--camera", CAMERA)
 def cli(*args: object) -> int:
     """Run a command in this process, as the installed program does."""
     return rt.main([str(a) for a in args])
+
+
+def refusal(capsys: CaptureFixture[str], *command: object) -> str:
+    """The line of a command that ends with exit code 2."""
+    capsys.readouterr()
+    assert cli(*command) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.startswith("error: ") and said.err.count("\n") == 1
+    return said.err
 
 
 def readme_command() -> list[str]:

@@ -13,18 +13,9 @@ import numpy as np
 import pytest
 
 import reobj_track as rt
-from front_door.room import ROOM, cli
+from front_door.room import ROOM, cli, refusal
 
 CLIP = ROOM / "room.mp4"
-
-
-def refusal(capsys: pytest.CaptureFixture[str], *command: object) -> str:
-    """The line of a command that ends with exit code 2."""
-    capsys.readouterr()
-    assert cli(*command) == 2
-    said = capsys.readouterr()
-    assert said.out == "" and said.err.startswith("error: ") and said.err.count("\n") == 1
-    return said.err
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="/proc is a folder of Linux")

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 import reobj.maps.room_map as room_map
 import reobj_track as rt
-from front_door.room import CAMERA, ROOM, ROOT, SMALL, cli, info
+from front_door.room import CAMERA, ROOM, ROOT, SMALL, cli, info, refusal
 from reobj.maps.room_map import RoomMap, map_lock
 from reobj.results.changes import read_changes
 
@@ -106,15 +106,6 @@ def number_of(true: dict[int, int], identity: int) -> int:
 
 def ids(out: Path, kind: str) -> set[int]:
     return {c.id for c in getattr(read_changes(out / "changes.json"), kind)}
-
-
-def one_line(capsys: pytest.CaptureFixture[str], *command: object) -> str:
-    """The message of a command that ends with exit code 2."""
-    capsys.readouterr()
-    assert cli(*command) == 2
-    said = capsys.readouterr()
-    assert said.out == "" and said.err.startswith("error: ") and said.err.count("\n") == 1
-    return said.err
 
 
 def test_tuesday_has_the_numbers_of_monday(made: Path) -> None:
@@ -245,7 +236,7 @@ def test_unusable_maps_end_the_run_before_any_work(
         else:
             (desk / "flat.map").write_bytes(content)
         shutil.rmtree(desk / "tuesday", ignore_errors=True)
-        text = one_line(capsys, *tuesday(desk, *more))
+        text = refusal(capsys, *tuesday(desk, *more))
         assert not (desk / "tuesday" / "objects.json").exists()
         assert not list((desk / "tuesday").rglob("*.npz"))  # no stage was run
         if content is not None:
@@ -263,7 +254,7 @@ def test_unusable_maps_end_the_run_before_any_work(
         text = refused(good)
     assert "another run is updating this map" in text and "--map-frozen" in text
     assert "no such map" in refused(None, "--map-frozen")
-    text = one_line(capsys, *tuesday(desk, "--map-frozen", "--map", ""))
+    text = refusal(capsys, *tuesday(desk, "--map-frozen", "--map", ""))
     assert "--map-frozen without --map" in text
 
 
@@ -338,7 +329,7 @@ def test_a_full_disk_loses_no_results(
 def test_a_missing_map_of_an_output_folder(desk: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (desk / "flat.map").unlink()
     before = (desk / "tuesday" / "objects.json").read_bytes()
-    text = one_line(capsys, "objects", desk / "tuesday", "--set", f"map.path={desk}/flat.map")
+    text = refusal(capsys, "objects", desk / "tuesday", "--set", f"map.path={desk}/flat.map")
     assert "is missing" in text and "--set map.path=" in text
     assert (desk / "tuesday" / "objects.json").read_bytes() == before
     assert not (desk / "flat.map").exists()

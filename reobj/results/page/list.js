@@ -101,7 +101,8 @@ function fillList() {
 
 const AND = new Intl.ListFormat("en-GB");        // 1, 2 and 3
 function evidence(link) {
-  const numbers = [...new Set(link.tracklets)], noun = numbers.length > 1 ? "tracklets" : "tracklet";
+  const numbers = [...new Set(link.tracklets)];
+  const noun = numbers.length > 1 ? "tracklets" : "tracklet";
   const owners = (t) => { const ids = objects.filter((o) => o.tracks.includes(t)).map((o) => o.id);
     return `${ids.length > 1 ? "objects" : "object"} ${AND.format(ids.map(String))}`; };
   const names = `${noun} ${numbers.map((t) => `${t} (${owners(t)})`).join(", ")}`;

@@ -231,7 +231,8 @@ function alongWalls(points) {                    // level direction of the walls
 }
 
 function lookFrom(back) {                        // frame path, points and solids below the buttons
-  const height = Math.max(canvas.clientHeight, 1), aspect = canvas.clientWidth / height;
+  const height = Math.max(canvas.clientHeight, 1);
+  const aspect = canvas.clientWidth / height;
   const hidden = Math.min($("tools").offsetTop + $("tools").offsetHeight, height / 2) / height;
   const tan = Math.tan(orbit.fov / 360 * Math.PI), side = unit(cross([0, 0, 1], back));
   const top = cross(back, side);
