@@ -1167,6 +1167,7 @@ def _known_camera_start(
 
 # ---- Levenberg-Marquardt over a batch of solids ---------------------------------------------
 
+BEHIND = 12.0  # sigma, residual of an edge whose point of contact is behind the camera
 SMOOTH = 1e-3  # smooths the kink of |m| in the support function of box and cylinder
 SIZE_WALL = 2.5  # sigma of growth beyond which the size prior is quartic
 SIZE_WALL_RISE = 16.0  # factor of the extra cost: rise * (s^2 - wall^2)^2 / wall^2
@@ -1276,8 +1277,9 @@ def _residuals(
     """Compute signed edge residuals: how far the solid extends beyond each tangent plane.
 
     h = sum_k p_k with p_k = a_k^2 m_k^2 / sqrt(sum of its group), m = R' n; then dh/dlog a_k = p_k
-    and dh/dm_k = a_k^2 m_k / sqrt(...). Residual = gain (n.c + d + h) / depth(c): the distance in
-    the image between the solid's outline and the edge, to second order.
+    and dh/dm_k = v_k = a_k^2 m_k / sqrt(...). The plane that is parallel to (n, d) and tangent to
+    the solid touches it at x = c + R v. Residual = gain (n.x + d) / depth(x): the distance in the
+    image between the projection of x and the edge.
 
     Returns:
         value (B, M) in sigma, M = V E, 0 where unused; jacobian (B, M, 9), empty on request.
@@ -1285,33 +1287,40 @@ def _residuals(
     n_prob, n_view, n_edge = edges.offset.shape
     flat = n_view * n_edge
     normal = edges.normal.reshape(n_prob, flat, 3)
-    depth = _depth(state, edges)  # (B, V)
-    near = 1e-3 * np.exp(state.log_half.max(1))[:, None]  # (B, 1) less depth counts as behind
-    behind = (depth <= near) & edges.used.any(-1)  # (B, V)
-    inv_depth = 1.0 / np.where(depth > near, depth, np.inf)  # (B, V), 0 where behind
     half = np.exp(state.log_half)[:, None]  # (B, 1, 3)
     m = normal @ state.rot  # (B, M, 3)
     square = (m * m + smooth**2) * (half * half)
-    root = np.sqrt(square @ groups) + 1e-300
-    p = square / root  # (B, M, 3)
+    inv_root = 1.0 / (np.sqrt(square @ groups) + 1e-300)
+    p = square * inv_root  # (B, M, 3)
+    v = m * (half * half) * inv_root  # (B, M, 3)
     excess = (normal @ state.center[:, :, None])[..., 0] + edges.offset.reshape(n_prob, flat)
     excess += p.sum(-1)
-    scale = (edges.gain * inv_depth[..., None]).reshape(n_prob, flat)  # (B, M)
+    ahead = np.repeat(edges.depth_row[..., :3] @ state.rot, n_edge, 1)  # (B, M, 3)
+    depth = np.repeat(_depth(state, edges), n_edge, 1) + (ahead * v).sum(-1)  # (B, M) of x
+    near = 1e-3 * np.exp(state.log_half.max(1))[:, None]  # (B, 1) less depth counts as behind
+    behind = depth <= near
+    inv_depth = 1.0 / np.where(behind, np.inf, depth)  # (B, M), 0 where behind
+    scale = edges.gain.reshape(n_prob, flat) * inv_depth  # (B, M)
     free = edges.one_sided.reshape(n_prob, flat) & (excess > 0)
     scale[free] = 0.0
     value = scale * excess
-    value[np.repeat(behind, n_edge, 1) & edges.used.reshape(n_prob, flat)] = 12.0  # sigma, constant
+    value[behind & edges.used.reshape(n_prob, flat)] = BEHIND
     if not jacobian:
         return value, np.empty(0)
+    shrink = inv_depth * value * (scale > 0)  # (B, M)
+    pull = ahead * v  # (B, M, 3)
+    spread = (pull * inv_root * inv_root) @ groups  # (B, M, 3)
     jac = np.empty((n_prob, flat, 9))
-    shrink = np.repeat(inv_depth, n_edge, 1) * value * (scale > 0)  # (B, M)
     rows = np.repeat(edges.depth_row[..., :3], n_edge, 1)  # (B, M, 3)
     jac[..., :3] = scale[..., None] * normal - shrink[..., None] * rows
-    jac[..., 3:6] = scale[..., None] * p
-    v = (scale[..., None] * m) * (half * half) / root  # dh/dm, scaled
-    jac[..., 6] = v[..., 1] * m[..., 2] - v[..., 2] * m[..., 1]
-    jac[..., 7] = v[..., 2] * m[..., 0] - v[..., 0] * m[..., 2]
-    jac[..., 8] = v[..., 0] * m[..., 1] - v[..., 1] * m[..., 0]
+    jac[..., 3:6] = scale[..., None] * p - shrink[..., None] * (2.0 * pull - square * spread)
+    # d depth = w . (v x ahead + (J' ahead) x m), J = dv/dm
+    bent = half * half * (ahead * inv_root - m * spread)  # (B, M, 3) J' ahead
+    left = scale[..., None] * v - shrink[..., None] * bent
+    right = shrink[..., None] * v
+    for k, i, j in ((6, 1, 2), (7, 2, 0), (8, 0, 1)):
+        jac[..., k] = left[..., i] * m[..., j] - left[..., j] * m[..., i]
+        jac[..., k] -= right[..., i] * ahead[..., j] - right[..., j] * ahead[..., i]
     return value, jac
 
 
