@@ -1330,6 +1330,13 @@ def _depth(state: _State, edges: _Edges) -> Array:
     return np.asarray(ahead[..., 0] + edges.depth_row[..., 3])
 
 
+def _mean_depth(state: _State, edges: _Edges) -> Array:
+    """Average the depth (B,) of the centres over the views with edges in use."""
+    seen = edges.used.any(-1)  # (B, V)
+    total = np.sum(np.abs(_depth(state, edges)) * seen, 1)
+    return np.asarray(total / np.maximum(seen.sum(1), 1) + 1e-12)
+
+
 _Loss = Callable[[Array], tuple[Array, Array]]  # a method of `RobustOptions`
 
 
@@ -1449,8 +1456,7 @@ def _minimise(
     hessian = normal.hessian.copy()
     alive = np.arange(len(cost))  # (A,) problems that have not converged
     damping = np.full(len(cost), 1e-3)
-    seen = edges.used.any(-1)  # (B, V)
-    reach = np.sum(np.abs(_depth(state, edges)) * seen, 1) / np.maximum(seen.sum(1), 1) + 1e-12
+    reach = _mean_depth(state, edges)
     for _ in range(iterations):
         trial = state.moved(_step(normal, damping, reach))
         new = _normal_equations(trial, edges, prob, loss)
@@ -2024,7 +2030,7 @@ def _log_evidence(
 ) -> Array:
     """Compute the Laplace evidence (B,) of each fit, noise integrated out (Student t).
 
-    -2 log p = (v + n) log(1 + S / v) + priors of size, tilt, floor + log det(H)
+    -2 log p = (v + n) log(1 + S / v) + priors of size, tilt, floor + log det(H) + 6 log(depth)
     - log det(information of the size prior) - 2 log_odds, S the truncated squares.
     The lower part of an object on a known floor may be occluded in all views: with probability
     OCCLUDED_BELOW, positive residuals in views whose lower edge is above the floor are free.
@@ -2049,6 +2055,8 @@ def _log_evidence(
     fits_boxes = np.where(stands, either, -0.5 * misfit)
     determinant = np.linalg.slogdet(fit.hessian + ROTATION_CAP)[1]
     determinant -= np.linalg.slogdet(prob.size_info)[1]
+    # a centre is uniform in direction and log distance: the volume of its region, over depth^3
+    determinant += 6.0 * np.log(_mean_depth(fit.state, data.edges[fit.obj]))
     return np.asarray(fits_boxes - 0.5 * (pull + determinant) + spec.log_odds[fit.hyp])
 
 
