@@ -2127,7 +2127,8 @@ def _fit_all(data: _Data, spec: _Spec, cfg: FitConfig) -> _Fit:
     _refit(fit, few, spec, cfg, robust.cauchy_loss)
     fit.evidence = _log_evidence(fit, _all_residuals(fit, few), spec, few, robust)
     # 3 in 1,000 of the winners on all views are lower than this on the first (simulated boxes)
-    fit = fit[fit.evidence >= -6.0 - _least(-fit.evidence, fit.obj)]
+    likely = fit.evidence >= -6.0 - _least(-fit.evidence, fit.obj)
+    fit = fit[likely | (fit.hyp == fit.obj) & (fit.evidence >= _best_of_category(fit))]
     fit.inlier = data.edges.used[fit.obj]
     _refit(fit, data, spec, cfg, robust.cauchy_loss)
     for largest in (None, robust.huber):
@@ -2139,11 +2140,59 @@ def _fit_all(data: _Data, spec: _Spec, cfg: FitConfig) -> _Fit:
         fit.inlier = used & (np.abs(standard) <= robust.edge_outlier) & fit.views[..., None]
         _refit(fit, data, spec, cfg, robust.huber_loss)
     fit.evidence = _log_evidence(fit, _all_residuals(fit, data), spec, data, robust)
-    sigma = np.sqrt(_safe_inverse(fit.hessian + ROTATION_CAP)[:, [3, 4, 5], [3, 4, 5]])  # (B, 3)
-    # a category is overruled only by a size that the boxes determine
-    fit.evidence[(fit.hyp != fit.obj) & (sigma > cfg.limits.loose_size).any(1)] = -np.inf
-    order = np.lexsort((-fit.evidence, fit.obj))
-    return fit[order[_group_starts(fit.obj[order])]]
+    fit = _best_fits(fit)
+    doubted = fit[(fit.hyp != fit.obj) & (fit.evidence > _best_of_category(fit))]
+    if len(doubted.obj):
+        odds = _log_odds_of_sizes(doubted, data, spec, cfg)
+        kept = doubted.obj[odds <= 0]
+        fit = fit[(fit.hyp == fit.obj) | ~np.isin(fit.obj, kept)]
+    return fit[np.lexsort((-fit.evidence, fit.obj))][_group_starts(np.sort(fit.obj))]
+
+
+def _best_of_category(fit: _Fit) -> Array:
+    """Return for each fit the highest evidence (B,) of its object's fits with the category."""
+    return -_least(np.where(fit.hyp == fit.obj, -fit.evidence, np.inf), fit.obj)
+
+
+def _best_fits(fit: _Fit) -> _Fit:
+    """Keep the fit of highest evidence of each hypothesis."""
+    order = np.lexsort((-fit.evidence, fit.hyp))
+    return fit[order[_group_starts(fit.hyp[order])]]
+
+
+def _log_odds_of_sizes(fit: _Fit, data: _Data, spec: _Spec, cfg: FitConfig) -> Array:
+    """Compute the log odds (B,) of the sizes of all categories against those of the category.
+
+    They are a ratio of marginal likelihoods of the boxes. The likelihood of the log size x is
+    normal; its information I is that of the posterior without a category, less the prior's. Of a
+    prior N(m, S): -2 log p = log det S + log det(I + S^-1) + m' S^-1 m - b' (I + S^-1)^-1 b + const,
+    b = I x + S^-1 m. The axes of the category may have any order that its uprightness allows.
+    """
+    cov = _curved_covariance(fit, data, spec, cfg.robust.huber_loss)
+    inverse = np.linalg.inv(spec.size_cov)  # roundness is of the shape, and the same for both
+    own = inverse[fit.hyp]
+    mean = _problems(spec, fit.hyp, fit.code, fit.axis).size_mean
+    usual_mean = _problems(spec, fit.obj, fit.code, fit.axis).size_mean
+    value, vector = _eigh(_safe_inverse(cov[:, 3:6, 3:6]) - own)
+    info = (vector * np.maximum(value, 0.0)[:, None]) @ vector.transpose(0, 2, 1)
+    at = fit.state.log_half[..., None]  # (B, 3, 1), where the gradients of both terms cancel
+    pull_here = vector.transpose(0, 2, 1) @ (own @ (at - mean[..., None]))
+    known = info @ at + vector @ np.where(value[..., None] > 0, pull_here, 0.0)
+
+    def cost(mean: Array, prior: Array) -> Array:
+        pull = prior @ mean[..., None]  # (B, 3, 1)
+        b = known + pull
+        both = info + prior
+        square = (mean * pull[..., 0]).sum(1) - (b * np.linalg.solve(both, b)).sum((1, 2))
+        return np.asarray(np.linalg.slogdet(both)[1] - np.linalg.slogdet(prior)[1] + square)
+
+    same_up = spec.upright[fit.obj] & bool(np.any(spec.up))
+    least = np.full(len(fit.obj), np.inf)
+    for order in AXIS_ORDERS:
+        usual = cost(usual_mean[:, order], inverse[fit.obj][:, order][:, :, order])
+        least = np.minimum(least, np.where(same_up & (order[2] != 2), np.inf, usual))
+    odds = spec.log_odds[fit.hyp] - spec.log_odds[fit.obj] + np.log(len(SUPPORTS))
+    return np.asarray(odds + 0.5 * (least - cost(mean, own)))
 
 
 # ---- fit_objects: scale, gravity, report ----------------------------------------------------
