@@ -1537,15 +1537,16 @@ class _Data(_Rows):
 class _Spec:
     """Priors of H hypotheses about the objects.
 
-    An object without a known category has one hypothesis, any other two: the category is right, or
-    it is wrong and the priors of unknown categories hold.
+    An object without a known category has one hypothesis, any other has two: the category is right,
+    or it is wrong and the priors of unknown categories hold. If the category is round, a third one:
+    it is right, but this object is not round.
     """
 
     obj: IntArray  # (H,) object
     log_odds: Array  # (H,) log of the hypothesis's probability, and of its density on the floor
     size_mean: Array  # (H, 3) log half axes, world units
     size_cov: Array  # (H, 3, 3)
-    kind: IntArray  # (H,) row of the category in the priors, -1 unknown
+    kind: IntArray  # (H,) row of the category in the priors, -1 unknown or wrong
     natural: IntArray  # (H,) shape to which the size prior applies, -1 unknown category
     allowed: BoolArray  # (H, 3) shapes to try
     round_: BoolArray  # (H,) yaw symmetric
@@ -1556,6 +1557,10 @@ class _Spec:
     floor_sigma: Array  # (H,) of the height of an object's lower side; inf: need not stand there
     points: Array  # (H, P, 3) that may lie on the object
     point_weight: Array  # (H, P) of the points, 0: no point
+
+    def overrules(self, fit: _Fit) -> BoolArray:
+        """Mark the fits (B,) whose hypothesis is that the category of the object is wrong."""
+        return np.asarray((self.kind[fit.hyp] < 0) & (self.kind[fit.obj] >= 0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -1621,14 +1626,21 @@ def _prior_spec(given: _Given, world: _World) -> _Spec:
     priors = given.priors
     rows = np.full(n_obj, -1) if priors is None else priors.index(given.categories)
     # without a scale all sizes are free: a wrong category is considered by `_scale_from_priors`
-    doubted = (rows >= 0) & (given.wrong_class > 0) & (world.scale_sigma < UNKNOWN_SCALE_LOG)
-    obj = np.concatenate([np.arange(n_obj), np.flatnonzero(doubted)])
-    rows = np.concatenate([rows, np.full(len(obj) - len(rows), -1)])
+    doubts = given.wrong_class > 0 and world.scale_sigma < UNKNOWN_SCALE_LOG
+    doubted = np.flatnonzero((rows >= 0) & doubts)
+    turned = np.zeros(0, np.int64) if priors is None else doubted  # of round categories
+    if priors is not None:
+        turned = doubted[priors.yaw_symmetric[rows[doubted]]]
+    obj = np.concatenate([np.arange(n_obj), doubted, turned])
+    rows = np.concatenate([rows, np.full(len(doubted), -1), rows[turned]])
     n = len(obj)
+    flat = np.arange(n) >= n_obj + len(doubted)  # hypotheses that the object is not round
     known = rows >= 0
     log_odds = np.where(known, np.log1p(-given.wrong_class), 0.0)
-    if given.wrong_class > 0:
-        log_odds[n_obj:] = np.log(given.wrong_class / len(SUPPORTS))
+    if doubts:
+        log_odds[turned] += np.log1p(-NOT_ROUND)
+        log_odds[flat] += np.log(NOT_ROUND / len(SUPPORTS))
+        log_odds[n_obj:][~flat[n_obj:]] = np.log(given.wrong_class / len(SUPPORTS))
     codes = given.codes[obj]
     points = given.points[obj]
     unknown = UNKNOWN_SIZE.aspect_log**2 * np.eye(3) + UNKNOWN_SIZE.size_log**2
@@ -1642,10 +1654,13 @@ def _prior_spec(given: _Given, world: _World) -> _Spec:
         mean[known] = priors.log_mean[pick]
         cov[known] = priors.log_cov[pick]
         natural[known] = priors.support[pick]
-        round_[known] = priors.yaw_symmetric[pick]
+        round_[known] = priors.yaw_symmetric[pick] & ~flat[known]
+        sigma = np.sqrt(np.einsum("oii->oi", cov[flat]))
+        cov[flat] = (FREE_CORR + (1.0 - FREE_CORR) * np.eye(3)) * sigma[:, :, None] * sigma[:, None]
         upright[known] = priors.upright[pick]
     cov = cov + world.scale_sigma**2
     code = np.where(codes == Shape.BY_EVIDENCE, -1, np.where(codes >= 0, codes, natural))  # (O,)
+    code = np.where(flat & (codes < 0), -1, code)
     allowed = (code[:, None] == np.arange(3)) | (code < 0)[:, None]
     size_mean = mean - np.log(2.0) - world.log_scale
     plane = np.zeros(4)
@@ -1809,6 +1824,8 @@ def _refine_start(
 # ---- fit_objects: starts, inliers, evidence -------------------------------------------------
 
 ROUND_LOG = 0.05  # log, sigma of width / depth of yaw-symmetric categories
+NOT_ROUND = 0.1  # probability that an object of a yaw-symmetric category is not (chosen)
+FREE_CORR = 0.3  # correlation of its log sizes, as of the other categories
 SIZE_WALL_LOG = 0.25  # log, least sigma of which SIZE_WALL is a multiple: a category may be wrong
 NOISE_PRIOR_DOF = 12.0  # residuals, weight of the nominal noise level
 OBJECT_NOISE_DOF = 20.0  # residuals, weight of the pooled noise level in that of one object
@@ -2128,7 +2145,7 @@ def _fit_all(data: _Data, spec: _Spec, cfg: FitConfig) -> _Fit:
     fit.evidence = _log_evidence(fit, _all_residuals(fit, few), spec, few, robust)
     # 3 in 1,000 of the winners on all views are lower than this on the first (simulated boxes)
     likely = fit.evidence >= -6.0 - _least(-fit.evidence, fit.obj)
-    fit = fit[likely | (fit.hyp == fit.obj) & (fit.evidence >= _best_of_category(fit))]
+    fit = fit[likely | ~spec.overrules(fit) & (fit.evidence >= _best_of_category(fit, spec))]
     fit.inlier = data.edges.used[fit.obj]
     _refit(fit, data, spec, cfg, robust.cauchy_loss)
     for largest in (None, robust.huber):
@@ -2141,17 +2158,17 @@ def _fit_all(data: _Data, spec: _Spec, cfg: FitConfig) -> _Fit:
         _refit(fit, data, spec, cfg, robust.huber_loss)
     fit.evidence = _log_evidence(fit, _all_residuals(fit, data), spec, data, robust)
     fit = _best_fits(fit)
-    doubted = fit[(fit.hyp != fit.obj) & (fit.evidence > _best_of_category(fit))]
+    doubted = fit[spec.overrules(fit) & (fit.evidence > _best_of_category(fit, spec))]
     if len(doubted.obj):
         odds = _log_odds_of_sizes(doubted, data, spec, cfg)
         kept = doubted.obj[odds <= 0]
-        fit = fit[(fit.hyp == fit.obj) | ~np.isin(fit.obj, kept)]
+        fit = fit[~spec.overrules(fit) | ~np.isin(fit.obj, kept)]
     return fit[np.lexsort((-fit.evidence, fit.obj))][_group_starts(np.sort(fit.obj))]
 
 
-def _best_of_category(fit: _Fit) -> Array:
+def _best_of_category(fit: _Fit, spec: _Spec) -> Array:
     """Return for each fit the highest evidence (B,) of its object's fits with the category."""
-    return -_least(np.where(fit.hyp == fit.obj, -fit.evidence, np.inf), fit.obj)
+    return -_least(np.where(spec.overrules(fit), np.inf, -fit.evidence), fit.obj)
 
 
 def _best_fits(fit: _Fit) -> _Fit:
@@ -2448,13 +2465,14 @@ def _overruled(fit: _Fit, spec: _Spec) -> list[str]:
     size = np.exp(error.mean(1))  # (B,)
     # axis 2 of `usual` is the height: of an object on its side another axis has that length
     turned = np.abs(fit.state.log_half[:, AXIS_ORDERS] - usual[:, None]).sum(2).argmin(1)
+    overruled = spec.overrules(fit)
     reasons = []
     for b in range(len(size)):
         why = f"size is {size[b]:.2g} times the usual"
         if max(size[b], 1.0 / size[b]) < 1.25:  # the size itself is no reason to overrule
             on_side = AXIS_ORDERS[turned[b], 2] != 2
             why = "it lies on its side" if on_side else "its proportions are not the usual ones"
-        reasons.append(why if fit.hyp[b] != fit.obj[b] else "")
+        reasons.append(why if overruled[b] else "")
     return reasons
 
 
