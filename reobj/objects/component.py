@@ -25,13 +25,21 @@ from reobj.objects.association import (
 from reobj.objects.categories import Categories
 from reobj.objects.frames import informative_frames, only_frames
 from reobj.objects.hypotheses import propose, propose_along_rays
-from reobj.objects.likelihood import NO_SHAPES, PosedDetections, Shapes
+from reobj.objects.likelihood import (
+    DEPTH_QUANTILES,
+    INNER_BOX,
+    MIN_POINTS,
+    NO_SHAPES,
+    PosedDetections,
+    Shapes,
+)
 from reobj.objects.observations import Fit, Scene, Views, gather_views
 from reobj.objects.occlusion import edges_above_floor, see_through_ratio
 from reobj.objects.phases import Reach, ignore
 from reobj.poses.floor import floor_of
 from reobj.tracking.linking import DUPLICATE_IOU, cut_at_gaps
 from reobj.types import Array, BoolArray, IntArray, Tracks, box_area, box_iou, class_shares, rows_by
+from reobj.visible_points import VisiblePoints, points_in_boxes
 
 # Least score of untracked detections that give hypotheses (.3 finds 73.5 objects instead of 72, in
 # 1.2 times the time: benchmarks/LOG.md)
@@ -198,16 +206,41 @@ def _posed_detections(table: Tracks, poses: Poses, frames: IntArray) -> PosedDet
     after[order[:-1][follows]] = order[1:][follows]
     before[order[1:][follows]] = order[:-1][follows]
     row, _ = place_of(poses, frames)
+    view = np.searchsorted(frames, table.frame)
+    box = undistort_boxes(table.xyxy, poses.camera)
     return PosedDetections(
-        np.searchsorted(frames, table.frame),
-        undistort_boxes(table.xyxy, poses.camera),
+        view,
+        box,
         table.score,
         table.class_id,
         before,
         after,
         poses.camera.K @ poses.cam_from_world[row],
         (poses.camera.width, poses.camera.height),
+        _depths_in(box, view, row, poses),
     )
+
+
+def _depths_in(box: Array, view: IntArray, row: IntArray, poses: Poses) -> Array:
+    """Return quantiles (N, DEPTH_QUANTILES) of the depths of sparse points in the inner boxes.
+
+    Args:
+        box: (N, 4) undistorted. view: (N,) ascending. row: (V,) of the views in the poses.
+    """
+    depths = np.full((len(box), DEPTH_QUANTILES), np.nan)
+    visible = VisiblePoints(poses)
+    margin = (1 - INNER_BOX) / 2 * (box[:, 2:] - box[:, :2])
+    inner = np.concatenate([box[:, :2] + margin, box[:, 2:] - margin], 1)
+    level = (np.arange(DEPTH_QUANTILES) + 0.5) / DEPTH_QUANTILES
+    for rows in rows_by(view):
+        place = row[view[rows[0]]]
+        points = poses.points[visible.in_frame(place)]
+        camera = poses.camera.K @ poses.cam_from_world[place]
+        found, _, depth = points_in_boxes(points, camera, inner[rows])
+        for k, inside in zip(np.unique(found), rows_by(found), strict=True):
+            if len(inside) >= MIN_POINTS:
+                depths[rows[k]] = np.quantile(depth[inside], level)
+    return depths
 
 
 def _project(shapes: Shapes, cams: Array, image_size: tuple[int, int]) -> Array:

@@ -33,6 +33,14 @@ MAX_BOX_ASSIGNMENT = 8.0
 CLASS_KEPT = 0.85  # of an object's detections have its class; the others have any class
 MIN_VISIBLE = 0.05  # least fraction of a projected box in the image to compare it with detections
 EXPECTED = 0.6  # and to expect a detection
+# Depths of the sparse points in the inner part of a box: their range elsewhere (log), their sigma
+# about the solid (log), the probability that they are of the object, and the inner part
+LOG_DEPTHS = 3.0
+DEPTH_SIGMA = 0.1
+POINTS_ON_OBJECT = 0.8
+INNER_BOX = 0.6
+DEPTH_QUANTILES = 9
+MIN_POINTS = 5  # of a box
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +51,7 @@ class PosedDetections:
         view: (N,) frame, 0 .. V - 1, ascending. box: (N, 4) xyxy in undistorted pixels.
         score, class_id: (N,). before, after: (N,) previous and next row of the tracklet, or -1.
         img_from_world: (V, 3, 4). image_size: (w, h) px.
+        depths: (N, DEPTH_QUANTILES) quantiles of the depths of sparse points in the box, NaN: none.
     """
 
     view: IntArray
@@ -53,6 +62,7 @@ class PosedDetections:
     after: IntArray
     img_from_world: Array
     image_size: tuple[int, int]
+    depths: Array
 
     @property
     def start_of_view(self) -> IntArray:
@@ -180,6 +190,10 @@ def _gather(
             CLASS_KEPT * (obj_class == row_class) / frequency[row_class.clip(0)] + 1 - CLASS_KEPT
         )
         rest = score_log_odds[row] + class_log_odds
+        rest += _depth_log_odds(
+            *_depth_span(shapes.ellipsoids[obj], detections.img_from_world[detections.view[row]]),
+            detections.depths[row],
+        )
         assignment = box.clip(max=MAX_BOX_ASSIGNMENT) + rest
         existence = box.clip(max=MAX_BOX_EXISTENCE) + rest
         keep = assignment > min_log_odds
@@ -189,6 +203,31 @@ def _gather(
     )
     order = np.lexsort((row, obj))
     return Evidence(obj[order], row[order], existence[order], assignment[order], expected)
+
+
+def _depth_span(solids: quadrics.Ellipsoids, cams: Array) -> tuple[Array, Array]:
+    """Return the least and largest depth (K,) of solids in cameras (K, 3, 4)."""
+    axis = cams[:, 2, :3]
+    middle = (axis * solids.center_in_world).sum(1) + cams[:, 2, 3]
+    in_object = np.einsum("ki,kij->kj", axis, solids.world_from_obj)
+    half = np.linalg.norm(in_object * solids.half_axes, axis=1)
+    return np.maximum(middle - half, 0.1 * middle), middle + half
+
+
+def _depth_log_odds(near: Array, far: Array, depths: Array) -> Array:
+    """Compare depths (K, Q) of points in boxes with spans (K,) of depth: log odds against clutter.
+
+    Points of the object are uniform over its span in log depth, others over LOG_DEPTHS. 0: none.
+    """
+    known = np.isfinite(depths[:, 0])
+    log_depth = np.log(np.where(known[:, None], depths, 1.0))
+    low = np.log(near)[:, None]
+    high = np.log(far)[:, None]
+    beyond = np.maximum(low - log_depth, log_depth - high).clip(0)
+    on_it = np.exp(-0.5 * (beyond / DEPTH_SIGMA) ** 2).mean(1)
+    span = (high - low)[:, 0] + 2.5 * DEPTH_SIGMA  # sqrt(2 pi) sigma: the area of both tails
+    odds = POINTS_ON_OBJECT * on_it * LOG_DEPTHS / span + 1 - POINTS_ON_OBJECT
+    return np.where(known, np.log(odds), 0.0)
 
 
 def logit(score: Array) -> Array:
