@@ -37,7 +37,7 @@ EXPECTED = 0.6  # and to expect a detection
 # about the solid (log), the probability that they are of the object, and the inner part
 LOG_DEPTHS = 3.0
 DEPTH_SIGMA = 0.1
-POINTS_ON_OBJECT = 0.8
+POINTS_ON_OBJECT = 0.7
 INNER_BOX = 0.6
 DEPTH_QUANTILES = 9
 MIN_POINTS = 5  # of a box
