@@ -1829,6 +1829,7 @@ FREE_CORR = 0.3  # correlation of its log sizes, as of the other categories
 SIZE_WALL_LOG = 0.25  # log, least sigma of which SIZE_WALL is a multiple: a category may be wrong
 NOISE_PRIOR_DOF = 12.0  # residuals, weight of the nominal noise level
 OBJECT_NOISE_DOF = 20.0  # residuals, weight of the pooled noise level in that of one object
+COMMON_ERRORS = 3.0  # factor on the errors of boxes that contradict every size prior (chosen)
 # Fraction of the objects on the floor whose lower part is occluded in all views
 OCCLUDED_BELOW = 0.25
 # (9, 9) information that keeps unobservable rotations finite: sigma .9 rad, that of a uniform angle
@@ -2163,7 +2164,42 @@ def _fit_all(data: _Data, spec: _Spec, cfg: FitConfig) -> _Fit:
         odds = _log_odds_of_sizes(doubted, data, spec, cfg)
         kept = doubted.obj[odds <= 0]
         fit = fit[~spec.overrules(fit) | ~np.isin(fit.obj, kept)]
-    return fit[np.lexsort((-fit.evidence, fit.obj))][_group_starts(np.sort(fit.obj))]
+    fit = fit[np.lexsort((-fit.evidence, fit.obj))][_group_starts(np.sort(fit.obj))]
+    return _with_common_errors(fit, data, spec, cfg) if cfg.wrong_class > 0 else fit
+
+
+def _size_deviation(fit: _Fit, spec: _Spec) -> tuple[Array, Array]:
+    """Compute the distance (B,) of sizes from the prior of their hypothesis, sigma of the prior.
+
+    Returns:
+        the distance, and that of the axes that are larger than usual.
+    """
+    prob = _problems(spec, fit.hyp, fit.code, fit.axis)
+    error = fit.state.log_half - prob.size_mean
+    deviation = np.sqrt(np.einsum("bi,bij,bj->b", error, prob.size_info, error))
+    return deviation, np.sqrt(((error > 0) / prob.size_var * error**2).sum(1))
+
+
+def _with_common_errors(fit: _Fit, data: _Data, spec: _Spec, cfg: FitConfig) -> _Fit:
+    """Fit objects of an implausible size again with larger errors of their boxes.
+
+    If all boxes of an object show the same part of it, or the same surroundings, their errors are
+    common to all views, and neither the residuals nor the number of views tell how large they are.
+    """
+    odd = _size_deviation(fit, spec)[0] > cfg.limits.implausible_size
+    if not odd.any():
+        return fit
+    again = fit[odd]
+    again.noise = again.noise * COMMON_ERRORS
+    standard = _all_residuals(again, data) / again.noise[:, None, None]
+    used = data.edges.used[again.obj]
+    again.views = _inlier_views(standard, used, cfg.robust)
+    again.inlier = used & (np.abs(standard) <= cfg.robust.edge_outlier) & again.views[..., None]
+    _refit(again, data, spec, cfg, cfg.robust.huber_loss)
+    for name in ("hessian", "inlier", "noise", "views"):
+        getattr(fit, name)[odd] = getattr(again, name)
+    fit.state.put(odd, again.state)
+    return fit
 
 
 def _best_of_category(fit: _Fit, spec: _Spec) -> Array:
@@ -2489,10 +2525,7 @@ def _status(
     """
     weak = posterior.prior_share > np.sqrt(0.5)  # more information from the prior than from data
     weak |= posterior.size_sigma > limits.loose_size
-    prob = _problems(spec, fit.hyp, fit.code, fit.axis)
-    error = fit.state.log_half - prob.size_mean
-    deviation = np.sqrt(np.einsum("bi,bij,bj->b", error, prob.size_info, error))  # (B,) sigma
-    growth = np.sqrt(((error > 0) / prob.size_var * error**2).sum(1))  # (B,) same, growth alone
+    deviation, growth = _size_deviation(fit, spec)
     overruled = _overruled(fit, spec)
     status = []
     reason = []
