@@ -106,7 +106,7 @@ def test_min_views_is_the_number_required(min_views: int, rejected: bool) -> Non
     tracks = tracks[np.isin(tracks.frame, [0, 13, 26, 39])]
     found = fitted(tracks, poses, options(min_views=min_views)).objects[0]
     assert (found.status == "rejected") == rejected
-    assert ("seen in 4 frames with a camera pose; 5 are needed" in found.reason) == rejected
+    assert ("seen in 4 frames with a camera pose (5 are needed)" in found.reason) == rejected
 
 
 @pytest.mark.parametrize(("score", "views"), [(0.0, 10), (0.25, 40)])
@@ -308,7 +308,7 @@ def test_only_rejected_objects_have_no_shape(status: str) -> None:
 def test_three_views_are_enough(count: int, status: str) -> None:
     found = described(count)
     assert found.status == status and found.views == count
-    assert ("seen in 2 frames with a camera pose; 3 are needed" == found.reason) == (count == 2)
+    assert ("seen in 2 frames with a camera pose (3 are needed)" == found.reason) == (count == 2)
 
 
 def test_unseen_frames_do_not_count_as_views() -> None:

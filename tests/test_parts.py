@@ -309,7 +309,7 @@ def test_a_component_with_too_few_cameras_rejects_its_objects_only() -> None:
     lost[BREAK + 3 :] = np.nan  # two cameras are left: 41 and 42
     result = finished(unlinked(dataclasses.replace(poses, cam_from_world=lost)))
     assert [o.status for o in result.objects] == ["ok"] * 3 + ["rejected"] * 3
-    assert result.objects[4].reason == "seen in 2 frames with a camera pose; 3 are needed"
+    assert result.objects[4].reason == "seen in 2 frames with a camera pose (3 are needed)"
     assert [p.registered_frames for p in result.world.parts] == [38, 2]
     assert len(result.ellipsoids()) == 3
 
@@ -518,8 +518,9 @@ def test_the_summary_has_a_line_for_each_component(parted: rt.Result) -> None:
     cameras = "cameras: 61 of 64 frames (pycolmap) in 2 components"
     assert f"{cameras}, each with its own frame and scale" in lines
     first, second = (line for line in lines if re.match(r"component \d: ", line))
-    assert first.startswith("component 0: frames 0-39; 38 of 40 frames; 3 objects; scale ")
-    assert second.startswith("component 1: frames 40-63; 23 of 24 frames; 3 objects; scale ")
+    objects = "3 objects with a shape; scale "
+    assert first.startswith(f"component 0: frames 0-39; 38 of 40 frames; {objects}")
+    assert second.startswith(f"component 1: frames 40-63; 23 of 24 frames; {objects}")
     groups = [k for k, line in enumerate(lines) if line in ("component 0", "component 1")]
     assert ["measured" in line for line in lines[groups[1] + 1 : groups[1] + 4]] == [True] * 3
     assert groups[1] - groups[0] == 4

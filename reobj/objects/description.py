@@ -142,7 +142,7 @@ def _verdict(
         return "rejected", "objects of this class move", None
     if view_count < min_views:
         seen_in = f"seen in {view_count} frame{'s' * (view_count != 1)} with a camera pose"
-        return "rejected", f"{seen_in}; {min_views} are needed", None
+        return "rejected", f"{seen_in} ({min_views} are needed)", None
     return str(fits.status[i]), str(fits.reason[i]), str(fits.support[i])
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import types
 import typing
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -107,6 +108,32 @@ class Object:
         """Return the entry of objects.json."""
         values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         return {_JSON_KEYS.get(k, k): _plain(v) for k, v in values.items()}
+
+
+def found_text(objects: Iterable[Object], names: bool = False) -> str:
+    """Say how many objects found have a shape, and how many have none.
+
+    Without cameras none can have one: then only their number.
+
+    Args:
+        names: add the classes, most frequent first.
+    """
+    found = [o for o in objects if o.counted]
+    shaped = [o for o in found if o.located]
+    others = [o for o in found if not o.located]
+    if all(o.status == "tracked" for o in found):
+        return counted(len(others), "object", "objects") + _classes_text(others) * names
+    text = counted(len(shaped), "object with a shape", "objects with a shape")
+    text += _classes_text(shaped) * names
+    rest = f"{len(others)} without{_classes_text(others) * names}"
+    return f"{text}{'; ' if names else ', '}{rest}" if others else text
+
+
+def _classes_text(objects: Sequence[Object]) -> str:
+    """Format the number of objects of each class, most frequent first: ": 2 cup, 1 chair"."""
+    counts = Counter(o.class_name for o in objects)
+    rows = sorted(counts.items(), key=lambda row: (-row[1], row[0]))
+    return ": " + ", ".join(f"{count} {name}" for name, count in rows) if rows else ""
 
 
 VISIT_GAP_S = 2.0  # between two visits of an object; a detector misses objects for shorter times

@@ -19,7 +19,7 @@ from reobj.cameras import Poses
 from reobj.results import notebook, report, saving, table
 from reobj.results.changes import Changes, EarlierSession
 from reobj.results.edits import Edits
-from reobj.results.entries import Object, Part, VideoInfo, World
+from reobj.results.entries import Object, Part, VideoInfo, World, found_text
 from reobj.sources.boxes_3d import Boxes3D
 from reobj.types import Embeddings, IntArray, ReobjError, Tracks, counted
 
@@ -76,8 +76,7 @@ class Result:
     def __repr__(self) -> str:
         """Describe the result in one line."""
         facts = [repr(Path(self.video.path).name)]
-        located = f" ({len(self.located)} located)" if self.poses is not None else ""
-        facts.append(counted(len(self.objects), "object", "objects") + located)
+        facts.append(found_text(self.objects))
         facts.append(counted(len(self.tracks), "box", "boxes"))
         facts += [] if self.poses is None else [self.poses.cameras_text]
         facts += [] if self.out is None else [f"out={str(self.out)!r}"]

@@ -100,6 +100,11 @@ function pointsOf(part) {                        // level positions, colours
 const seenAt = (o, step) => o.seen.some((s, i) => i % 2 === 0 && s <= step
   && step <= o.seen[i + 1]);
 const counted = (o) => o.status !== "doubtful" && o.status !== "implausible";  // as in entries.py
+function foundText(all) {                        // as in entries.py
+  const found = all.filter(counted), shaped = found.filter((o) => o.center).length, rest = found.length - shaped;
+  if (found.every((o) => o.status === "tracked")) return several(rest, "object");
+  return `${several(shaped, "object")} with a shape${rest ? `, ${rest} without` : ""}`;
+}
 const allowed = (o) => !state.hiddenIds.has(o.id) && (state.only === null || state.only === o.id)
   && !state.hidden.has(o.class) && !hiddenByKind(changeOf(o))
   && ($("doubtful").checked || o.status !== "doubtful");
