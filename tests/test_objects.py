@@ -14,7 +14,7 @@ from simulated import SIZE, chair_solids, fitted, tracks_of, walk, with_columns
 
 import quadrics
 import reobj_track as rt
-from reobj.objects.confidence import scores_far_off
+from reobj.objects.confidence import Existence, scores_far_off
 from reobj.objects.config import make_fit
 from reobj.objects.description import describe_objects, describe_world
 from reobj.objects.given_boxes import mean_box
@@ -380,6 +380,24 @@ def test_low_confidence_is_a_status_of_its_own(confidence: float, status: str) -
     found = described(confidence={1: confidence}, **rejected)
     assert found.status == ("rejected" if status == "ok" else "doubtful")
     assert "too few" in found.reason
+
+
+@pytest.mark.parametrize(
+    ("evidence", "named", "figure"),
+    [
+        ((-1.4, 1.0, 0.0), "scores", "0.20"),  # log odds, hit rate, log ratio of see-through
+        ((1.0, 0.12, 0.0), "detected in", "12 %"),
+        ((0.5, 0.7, 1.386), "background points", "4.0 times"),
+        ((0.5, np.nan, 0.0), "no object in 3D", ""),
+    ],
+)
+def test_the_reason_of_a_low_confidence_is_its_weightiest_evidence(
+    evidence: tuple[float, ...], named: str, figure: str
+) -> None:
+    causes = ("scores", "detected in", "background points", "no object in 3D")
+    reason = described(confidence={1: Existence(0.45, *evidence)}).reason
+    assert reason.startswith("45 % likely to exist: ") and figure in reason
+    assert [cause for cause in causes if cause in reason] == [named]
 
 
 @pytest.mark.parametrize(

@@ -703,3 +703,13 @@ def test_objects_that_are_seen_through_are_less_probable() -> None:
     assert [o.id for o in seen] == [o.id for o in plain]
     change = [a.confidence - b.confidence for a, b in zip(plain, seen, strict=True)]
     assert change[0] > 0.005 and np.allclose(change[1:], 0)
+
+
+def test_the_reason_of_a_low_confidence_names_its_cause() -> None:
+    """The second chair has scores of .12; it is detected wherever it should be."""
+    tracks = tracks_of(walk())
+    tracks = with_columns(tracks, score=np.where(tracks.track_id == 2, 0.12, tracks.score))
+    found = finished(unlinked(walk(), tracks)).objects
+    assert [o.status for o in found] == ["ok", "doubtful", "ok"]
+    assert "low scores (about 0.12)" in found[1].reason
+    assert "detected in" not in found[1].reason and "background" not in found[1].reason
