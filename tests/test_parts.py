@@ -705,6 +705,22 @@ def test_objects_that_are_seen_through_are_less_probable() -> None:
     assert change[0] > 0.005 and np.allclose(change[1:], 0)
 
 
+def test_a_scale_of_depth_maps_is_one_statement_with_a_sigma() -> None:
+    """In the summary and in every size, in each component; a known size replaces it."""
+    metric = dataclasses.replace(walk(), metric=True, scale=(1.0, 0.03), source="pycolmap")
+    result = finished(unlinked(metric, tracks_of(metric)))
+    (line,) = (line for line in result.summary().splitlines() if line.startswith("scale"))
+    assert line == "scale: 1.00 m per unit, sigma 3 % (from depth maps)"
+    supplied = finished(unlinked(dataclasses.replace(metric, scale=None), tracks_of(metric)))
+    for ours, theirs in zip(result.objects, supplied.objects, strict=True):
+        more = np.square(ours.size_rel_sigma) - np.square(theirs.size_rel_sigma)
+        np.testing.assert_allclose(more, 0.03**2, rtol=0.05)
+    parts = finished(unlinked(dataclasses.replace(two_parts(), metric=True, scale=(1.0, 0.03))))
+    assert [p.scale.source for p in parts.world.parts] == ["depth_maps"] * 2
+    known = finished(unlinked(metric, tracks_of(metric)), known_size="chair=.8m")
+    assert known.world.scale.source == "known_size"
+
+
 def test_the_reason_of_a_low_confidence_names_its_cause() -> None:
     """The second chair has scores of .12; it is detected wherever it should be."""
     tracks = tracks_of(walk())

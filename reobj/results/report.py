@@ -160,7 +160,7 @@ def _cameras(result: Result) -> list[str]:
 def _scale_text(scale: quadrics.Scale) -> str:
     sigma = scale.rel_sigma or 0.0
     ((value, *_),) = texts_with_sigma(np.array([scale.value]), np.array([sigma * scale.value]))
-    return f"{value} m per unit, sigma {100 * sigma:.0f} % (from {scale.source})"
+    return f"{value} m per unit, sigma {100 * sigma:.0f} % (from {scale.source.replace('_', ' ')})"
 
 
 def _wrapped(text: str) -> list[str]:
