@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -267,6 +268,32 @@ def test_sizes_are_in_metres_and_include_the_sigma_of_the_scale() -> None:
     np.testing.assert_allclose(found.center, [0.1, -0.2, 5.0])
     np.testing.assert_allclose(found.half_axes, [0.2, 0.3, 0.4])
     assert np.shape(found.cov) == (9, 9) and found.cov[4, 4] == 0.04
+
+
+@pytest.mark.parametrize(
+    ("row", "value", "named"),
+    [(2, 1e40, "place"), (4, 1e40, "size"), (8, 1e40, ""), (2, np.inf, "uncertainty"),
+     (3, np.nan, "uncertainty"), (3, -1e-3, "uncertainty")],
+)  # fmt: skip
+def test_a_sigma_without_a_meaning_is_bounded(row: int, value: float, named: str) -> None:
+    """A variance of 1e40 with a correlation of .9; numbers that are no variances."""
+    cov = np.diag([1, 1, 1, 0.01, 0.04, 0.09, 1, 1, 1.0])
+    other = (row + 1) % 9
+    cov[row, row] = value
+    if value == 1e40:
+        cov[row, other] = cov[other, row] = 0.9 * np.sqrt(value * cov[other, other])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = described(cov=cov[None])
+    assert named in found.reason and bool(found.reason) == bool(named)
+    most = np.repeat([50, 3, np.pi / 3**0.5], 3)  # 10 distances of 5; log; a full turn
+    sigma = np.sqrt(np.diag(found.cov))
+    assert (sigma <= 1.01 * most).all() and np.linalg.eigvalsh(found.cov).min() > 0
+    if value == 1e40:  # the others keep theirs
+        assert sigma[row] == pytest.approx(most[row], rel=0.01)
+        kept = np.delete(np.arange(9), row)
+        np.testing.assert_allclose(sigma[kept] ** 2, np.diag(cov)[kept])
+        assert found.cov[row, other] == pytest.approx(0.9 * sigma[row] * sigma[other])
 
 
 def test_without_a_scale_there_are_no_metres() -> None:

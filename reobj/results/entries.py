@@ -84,6 +84,11 @@ class Object:
     confidence: float | None = None
     classes: dict[str, float] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        """Remove a covariance that no 32-bit number can hold, as earlier versions wrote them."""
+        if self.cov is not None and not np.abs(self.cov).max() <= NUMBER_MAX**2:
+            object.__setattr__(self, "cov", None)
+
     def __repr__(self) -> str:
         """Describe the object in one line."""
         facts = [f"{self.id} {printable(self.class_name)}", self.status]

@@ -45,6 +45,7 @@ function quantile(values, share) {
 const decimals = (sigma) => sigma > 0 && sigma < Infinity
   ? Math.max(0, Math.ceil(-Math.log10(sigma))) : 2;
 const withSigma = (value, sigma, unitName) => {
+  if (!Number.isFinite(sigma)) return `${+value.toPrecision(3)} ${unitName}`;   // not known
   const digits = decimals(sigma);
   return `${value.toFixed(digits)} ± ${sigma.toFixed(digits)} ${unitName}`;
 };
