@@ -150,7 +150,7 @@ def estimate_poses(
         wanted = set(best.more_keyframes())
         extra = []
         if wanted:
-            frames = resized.shown(progress("more keys", len(resized.frames)))
+            frames = resized.shown(progress("more keyframes", len(resized.frames)))
             extra = [store.keep(f) for f in frames if f.row in wanted and f.has_texture]
         if extra:
             _move_models(best.mapped.models, first_models)
