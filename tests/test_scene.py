@@ -397,7 +397,7 @@ def test_doubtful_objects_are_shown_on_request(browser: Browser, page: Path) -> 
     browser.open(page)
     browser.eval("S.objects[2].status = 'doubtful'; replay(); draw()")
     state = "[here[2].row.hidden, here[2].group.visible, $('notes').innerText.split(',')[0]]"
-    assert browser.eval(state) == [True, False, "1 doubtful object"]
+    assert browser.eval(state) == [True, False, "1 object of low confidence"]
     browser.eval("$('doubtful').click(); draw()")
     assert browser.eval(state)[:2] == [False, True]
     browser.eval("S.objects[2].status = 'ok'; replay()")

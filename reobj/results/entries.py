@@ -42,8 +42,8 @@ class Object:
         score: mean of the boxes.
         status: "ok", "prior_dominated" (some size depends mainly on the category's prior),
             "implausible" (size more than 4 sigma from the usual ones of its category), "doubtful"
-            (probably a false positive), "rejected" (no shape), "tracked" (2D: no cameras).
-            reason: for the status.
+            (of low confidence: probably a false positive), "rejected" (no shape), "tracked" (2D: no
+            cameras). reason: for the status.
         confidence: probability that it is a real, separate object; None without cameras.
         classes: probabilities of the two most likely. support: "box", "cylinder" or "ellipsoid".
         center, half_axes: (3,) of the ellipsoid; quat_wxyz: (4,) world_from_obj.
@@ -101,12 +101,12 @@ class Object:
 
     @property
     def counted(self) -> bool:
-        """True if it is one of the objects found: neither doubtful nor implausible."""
+        """True if it is one of the objects found: neither of low confidence nor implausible."""
         return self.status not in ("doubtful", "implausible")
 
     @property
     def located(self) -> bool:
-        """True if a shape was fitted and the object is neither doubtful nor implausible."""
+        """True if a shape was fitted and the object is `counted`."""
         return self.status in ("ok", "prior_dominated")
 
     def to_json(self) -> dict[str, Any]:

@@ -108,7 +108,7 @@ class Result:
 
     @property
     def located(self) -> list[Object]:
-        """Objects that have a shape and are neither doubtful nor implausible, by id."""
+        """Objects that have a shape and are neither of low confidence nor implausible, by id."""
         return [o for o in self.objects if o.located]
 
     def of_part(self, part: int) -> Result:
@@ -130,7 +130,7 @@ class Result:
         )
 
     def without_doubtful(self) -> Result:
-        """Return the result without doubtful objects, their tracks and the fits."""
+        """Return the result without objects of low confidence, their tracks and the fits."""
         doubtful = [o.id for o in self.objects if o.status == "doubtful"]
         return dataclasses.replace(
             self,
@@ -172,7 +172,7 @@ class Result:
 
         changes.json is written after a run with a map, and removed after one without.
 
-        objects.json includes doubtful objects, tracks.txt only if `doubtful`. Each further
+        objects.json includes objects of low confidence, tracks.txt only if `doubtful`. Each further
         component of the trajectory has its own poses and objects: poses_part1.txt,
         objects_part1.ply, ... All files are complete before they replace those of an earlier run,
         whose overlay video and viewer are removed.
