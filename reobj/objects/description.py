@@ -151,7 +151,7 @@ def _verdict(
     return str(fits.status[i]), str(fits.reason[i]), str(fits.support[i])
 
 
-MOST_DISTANCES = 10.0  # sigma of a centre, in distances from the cameras that see it (chosen)
+MOST_DISTANCES = 10.0  # sigma of a centre, in distances of the object from the cameras (chosen)
 # of a rotation about an axis: that of a uniform distribution over the full turn
 MOST_TURN = np.pi / np.sqrt(3)
 MOST_LOG_SIZE = quadrics.UNKNOWN_SCALE_LOG
