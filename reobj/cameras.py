@@ -241,8 +241,9 @@ class Poses:
             a pose belongs to the component of the nearest frame with one.
         messages: warnings (frames without poses, and what to do about them).
         reading: how supplied poses were read: format, and the rule that matched their frames.
-        scale: metres per world unit and its relative standard deviation, given by a map; None:
-            estimated with the objects. map_id: of the map whose world this is; "": none.
+        scale: metres per world unit and its relative standard deviation, given by a map, or by
+            depth maps that made the poses metric; None: estimated with the objects, or as supplied.
+            map_id: of the map whose world this is; "": none.
     """
 
     camera: Camera
@@ -309,7 +310,7 @@ class Poses:
             self,
             **{k: getattr(self, k)[rows] for k in ("frame", "time_s", "cam_from_world", "status")},
             up_in_world=None if part else self.up_in_world,  # given in the world of component 0
-            scale=None if part else self.scale,
+            scale=None if part and not self.metric else self.scale,
             points=self.points[kept],
             colors=self.colors[kept],
             visibility=np.column_stack([row_of[seen[:, 0]], np.searchsorted(kept, seen[:, 1])]),

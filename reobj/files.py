@@ -398,7 +398,7 @@ class Progress:
             self._write(f"{self._count()}, continued")
 
     def step(self, n: int = 1) -> None:
-        """Count n more steps."""
+        """Count n more steps; 0: none yet, the stage continues."""
         self.done += n
         now = time.monotonic()
         if now - self.shown > self._every_s:  # readable, and costs no time
@@ -417,9 +417,11 @@ class Progress:
         self._recent_steps = self._recent_steps * kept + self.done - self._measured
         self._measured = self.done
         rate = self._recent_steps / self._recent_s if self._recent_s > 0 else 0.0
-        texts = [self._count()]
-        if self.total and rate:
-            texts.append(f"{duration(max(self.total - self.done, 0) / rate)} left")
+        texts = [self._count()] if self.done or self.total else []
+        if self.total > self.done and rate:
+            texts.append(f"{duration((self.total - self.done) / rate)} left")
+        elif not self.done or self.total:  # what is left is not known
+            texts.append(f"{duration(now - self.started)} so far")
         if self.counted and rate:
             texts.append(f"{rate:.1f}/s")
         self._write(", ".join(texts))

@@ -23,7 +23,7 @@ class FakeVideo:
         self.expected = self.frame_count = len(images)
         self.files = list(files)
         self.fingerprint = ""
-        self.config = None
+        self.config = rt.InputConfig()
 
     def __iter__(self):
         for i, image in enumerate(self.images):

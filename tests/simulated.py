@@ -130,6 +130,19 @@ def tracks_in_two_parts(poses: rt.Poses) -> rt.Tracks:
     return tracks_of(true, 0.5)
 
 
+def with_fitted_covariance(result: rt.Result, variance: float) -> rt.Result:
+    """The result of `fitted`, had the fit given all parameters of all objects this variance."""
+    assert result.fits is not None and result.poses is not None
+    classes = object_classes(result.tracks)
+    group = np.searchsorted(list(classes), result.tracks.track_id)
+    views = gather_views(result.tracks, result.poses, group, len(classes), MIN_SCORE)
+    cov = np.tile(variance * np.eye(9), (len(classes), 1, 1))
+    fits = dataclasses.replace(result.fits, cov=cov)
+    names, config = result.class_names, rt.ObjectsConfig()
+    objects = describe_objects(result.tracks, names, fits, views, config)
+    return dataclasses.replace(result, objects=objects, fits=fits)
+
+
 def unlinked(poses: rt.Poses | None = None, tracks: rt.Tracks | None = None) -> rt.Result:
     """Output of tracker and reconstruction, before linking: by default two components."""
     poses = two_parts() if poses is None else poses

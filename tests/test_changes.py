@@ -170,7 +170,7 @@ def test_the_report_has_the_summary(chairs: rt.Result) -> None:
     """After the counts of the objects, wrapped."""
     changes = dataclasses.replace(room_changes(), map_path="a/rather/long/path/of/the/flat.map")
     lines = dataclasses.replace(chairs, changes=changes).summary().splitlines()
-    (counts,) = (k for k, line in enumerate(lines) if " objects: " in line)
+    (counts,) = (k for k, line in enumerate(lines) if " objects with a shape: " in line)
     text = " ".join(line.strip() for line in lines[counts + 1 : counts + 3])
     assert text == changes.summary()
     assert max(map(len, lines[counts + 1 : counts + 3])) <= 80

@@ -155,6 +155,15 @@ def test_gaps_are_filled_up_to_max_gap(reconstructed, tmp_path, monkeypatch, max
 # ---- Failures ------------------------------------------------------------------------------------
 
 
+def test_a_smaller_step_is_advised_first(tmp_path):
+    """Of every sixth frame some do not connect: two rooms."""
+    video = FakeVideo(textured_room(5, 3.0)[0] + textured_room(4, 3.0, seed=5)[0])
+    video.config = rt.InputConfig(every=6)
+    first, *others = rt.estimate_poses(video, config(), tmp_path).messages
+    assert "--every 6" in first and "--every 3" in first and others
+    assert not any("--every" in text for text in others)
+
+
 @pytest.mark.parametrize(
     "images, message",
     [
@@ -168,6 +177,7 @@ def test_failures_are_reported_with_a_remedy(tmp_path, images, message):
     assert not poses.known.any() and poses.source == "none" and set(poses.status) == {"none"}
     assert len(poses.frame) == len(images) and poses.cam_from_world.shape == (len(images), 3, 4)
     assert message in poses.messages[0] and "--poses" in poses.messages[0]
+    assert "--every" not in " ".join(poses.messages)
     assert poses.camera.K[0, 0] == pytest.approx(0.8 * images[0].shape[1])
 
 

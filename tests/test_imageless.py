@@ -265,7 +265,7 @@ def test_the_command_line_needs_no_video_for_run_alone(
     words = ["-o", str(tmp_path / "out"), "--detections", str(as_csv(tmp_path)),
              "--poses", str(as_tum(tmp_path)), "--camera", LINE]  # fmt: skip
     assert rt.main(["run", *words]) == 0
-    assert "2 objects: 2 chair" in capsys.readouterr().out
+    assert "2 objects with a shape: 2 chair" in capsys.readouterr().out
     with pytest.raises(SystemExit):
         rt.main(["track", *words[:4]])
 

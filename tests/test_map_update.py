@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from map_worlds import some_points
-from simulated import chair_solids, fitted, tracks_of, walk
+from simulated import chair_solids, fitted, tracks_of, walk, with_fitted_covariance
 
 import quadrics
 import reobj_track as rt
@@ -93,6 +93,18 @@ def test_the_first_recording_gives_its_numbers_to_the_map(monday):
         state = object_state(found, monday)
         np.testing.assert_allclose(state.center, center, atol=0.04)
         assert state.class_name == "chair" and state.present
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_objects_of_unknown_place_are_kept_in_the_map(tmp_path):
+    """The fit gave them a variance of 1e40; the next recording is compared with the map."""
+    vague = with_fitted_covariance(seen([0, 1, 2]), 1e40)
+    room, _ = add_recording(RoomMap(), vague, recording("monday"))
+    room, result = add_recording(room, vague, recording("tuesday"))
+    assert len(result.objects) == 3
+    room.save(tmp_path / "room.map")
+    for found in RoomMap.load(tmp_path / "room.map").objects:
+        assert np.isfinite(object_state(found, room).cov).all()
 
 
 def test_objects_that_stayed_get_their_numbers_in_tracks_objects_and_fits(monday):

@@ -387,7 +387,7 @@ def test_packages_are_imported_while_the_child_maps(tmp_path, monkeypatch):
         raise ImportError(name)
 
     def run(progress):
-        for stage in ("features", "match", "mapping", "mapping"):
+        for stage in ("features", "match", "mapping", "adjusting", "mapping"):
             stages.append(stage)
             progress(stage, 5).close()
         return "stopped"
@@ -416,7 +416,7 @@ def test_a_killed_run_resumes(walk, tmp_path):
     again = ["features", "match", "mapping", "mapping", "features"]
 
     def note(stage, total):
-        if stage.startswith("mapping-"):  # a further attempt of the same search
+        if stage in ("adjusting", "mapping again", "second mapper"):  # of the same search
             return Progress(stage, total)
         started.append(stage)
         if started in (["features", "match", "mapping"], again):
@@ -450,12 +450,12 @@ def test_with_more_keyframes_only_new_work_is_done(walk, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, walk[0][::2], ids=range(1, 9, 2), progress=until_mapping)
     messages, model = run(tmp_path, walk[0], progress=note)
-    found = [entry for entry in totals if not entry[0].startswith("mapping")]
+    found = [entry for entry in totals if entry[0] in ("features", "match")]
     assert found == [("features", 4), ("match", 6), ("features", 4), ("match", 22)]
     assert messages == [] and ate_percent(model.cam_from_world, truth_of(model, walk[1])) < 1.0
     with pytest.raises(KeyboardInterrupt):  # other images under the same ids
         run(tmp_path, walk[0][::-1], progress=until_mapping)
-    again = [entry for entry in totals if not entry[0].startswith("mapping")]
+    again = [entry for entry in totals if entry[0] in ("features", "match")]
     assert again[4:] == [("features", 8), ("match", 28)]
 
 
@@ -488,6 +488,42 @@ from reobj.poses.child_job import Child
 with Child("sleeper", Path("work/mapping"), Path("work/log")) as child:
     child.run(Progress)
 """
+
+
+SILENT = """
+import time
+from reobj.poses.child_job import send_progress, serve
+def job(folder):
+    send_progress("mapping", 3, 3)
+    send_progress("second mapper", 0, 0)
+    time.sleep(3)
+if __name__ == "__main__":
+    serve(job)
+"""
+
+
+def test_a_silent_child_is_shown_to_work(tmp_path, monkeypatch, capsys):
+    """One call of COLMAP takes minutes, after the last image is mapped."""
+    (tmp_path / "silent.py").write_text(SILENT)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setenv("REOBJ_PROGRESS_S", "0.4")
+    with child_job.Child("silent", tmp_path / "work/mapping", tmp_path / "work/log") as child:
+        assert child.run(Progress) == ""
+    lines = capsys.readouterr().err.splitlines()
+    assert sum("so far" in line for line in lines) >= 3
+    assert all(line.startswith("second mapper ") for line in lines) and "3.0 s" in lines[-1]
+
+
+def test_what_follows_the_last_image_has_its_own_step(walk, tmp_path):
+    steps: list[str] = []
+
+    def note(step, total):
+        steps.append(step)
+        return Progress(step, total)
+
+    run(tmp_path, walk[0], progress=note)
+    assert steps[:4] == ["features", "match", "mapping", "adjusting"]
+    assert set(steps[4:]) <= {"mapping again", "second mapper", "adjusting"}
 
 
 @pytest.mark.parametrize("ending", [signal.SIGKILL, signal.SIGTERM])

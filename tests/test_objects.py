@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from simulated import SIZE, chair_solids, fitted, tracks_of, walk, with_columns
 
 import quadrics
 import reobj_track as rt
-from reobj.objects.confidence import scores_far_off
+from reobj.objects.confidence import Existence, scores_far_off
 from reobj.objects.config import make_fit
 from reobj.objects.description import describe_objects, describe_world
 from reobj.objects.given_boxes import mean_box
@@ -106,7 +107,7 @@ def test_min_views_is_the_number_required(min_views: int, rejected: bool) -> Non
     tracks = tracks[np.isin(tracks.frame, [0, 13, 26, 39])]
     found = fitted(tracks, poses, options(min_views=min_views)).objects[0]
     assert (found.status == "rejected") == rejected
-    assert ("seen in 4 frames with a camera pose; 5 are needed" in found.reason) == rejected
+    assert ("seen in 4 frames with a camera pose (5 are needed)" in found.reason) == rejected
 
 
 @pytest.mark.parametrize(("score", "views"), [(0.0, 10), (0.25, 40)])
@@ -269,6 +270,32 @@ def test_sizes_are_in_metres_and_include_the_sigma_of_the_scale() -> None:
     assert np.shape(found.cov) == (9, 9) and found.cov[4, 4] == 0.04
 
 
+@pytest.mark.parametrize(
+    ("row", "value", "named"),
+    [(2, 1e40, "place"), (4, 1e40, "size"), (8, 1e40, ""), (2, np.inf, "uncertainty"),
+     (3, np.nan, "uncertainty"), (3, -1e-3, "uncertainty")],
+)  # fmt: skip
+def test_a_sigma_without_a_meaning_is_bounded(row: int, value: float, named: str) -> None:
+    """A variance of 1e40 with a correlation of .9; numbers that are no variances."""
+    cov = np.diag([1, 1, 1, 0.01, 0.04, 0.09, 1, 1, 1.0])
+    other = (row + 1) % 9
+    cov[row, row] = value
+    if value == 1e40:
+        cov[row, other] = cov[other, row] = 0.9 * np.sqrt(value * cov[other, other])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = described(cov=cov[None])
+    assert named in found.reason and bool(found.reason) == bool(named)
+    most = np.repeat([50, 3, np.pi / 3**0.5], 3)  # 10 distances of 5; log; a full turn
+    sigma = np.sqrt(np.diag(found.cov))
+    assert (sigma <= 1.01 * most).all() and np.linalg.eigvalsh(found.cov).min() > 0
+    if value == 1e40:  # the others keep theirs
+        assert sigma[row] == pytest.approx(most[row], rel=0.01)
+        kept = np.delete(np.arange(9), row)
+        np.testing.assert_allclose(sigma[kept] ** 2, np.diag(cov)[kept])
+        assert found.cov[row, other] == pytest.approx(0.9 * sigma[row] * sigma[other])
+
+
 def test_without_a_scale_there_are_no_metres() -> None:
     found = described(scale=quadrics.Scale(1.0, 0.0, "none"))
     assert found.size_m is None and found.size is not None
@@ -308,7 +335,7 @@ def test_only_rejected_objects_have_no_shape(status: str) -> None:
 def test_three_views_are_enough(count: int, status: str) -> None:
     found = described(count)
     assert found.status == status and found.views == count
-    assert ("seen in 2 frames with a camera pose; 3 are needed" == found.reason) == (count == 2)
+    assert ("seen in 2 frames with a camera pose (3 are needed)" == found.reason) == (count == 2)
 
 
 def test_unseen_frames_do_not_count_as_views() -> None:
@@ -380,6 +407,24 @@ def test_low_confidence_is_a_status_of_its_own(confidence: float, status: str) -
     found = described(confidence={1: confidence}, **rejected)
     assert found.status == ("rejected" if status == "ok" else "doubtful")
     assert "too few" in found.reason
+
+
+@pytest.mark.parametrize(
+    ("evidence", "named", "figure"),
+    [
+        ((-1.4, 1.0, 0.0), "scores", "0.20"),  # log odds, hit rate, log ratio of see-through
+        ((1.0, 0.12, 0.0), "detected in", "12 %"),
+        ((0.5, 0.7, 1.386), "background points", "4.0 times"),
+        ((0.5, np.nan, 0.0), "no object in 3D", ""),
+    ],
+)
+def test_the_reason_of_a_low_confidence_is_its_weightiest_evidence(
+    evidence: tuple[float, ...], named: str, figure: str
+) -> None:
+    causes = ("scores", "detected in", "background points", "no object in 3D")
+    reason = described(confidence={1: Existence(0.45, *evidence)}).reason
+    assert reason.startswith("45 % likely to exist: ") and figure in reason
+    assert [cause for cause in causes if cause in reason] == [named]
 
 
 @pytest.mark.parametrize(

@@ -309,7 +309,7 @@ def test_a_component_with_too_few_cameras_rejects_its_objects_only() -> None:
     lost[BREAK + 3 :] = np.nan  # two cameras are left: 41 and 42
     result = finished(unlinked(dataclasses.replace(poses, cam_from_world=lost)))
     assert [o.status for o in result.objects] == ["ok"] * 3 + ["rejected"] * 3
-    assert result.objects[4].reason == "seen in 2 frames with a camera pose; 3 are needed"
+    assert result.objects[4].reason == "seen in 2 frames with a camera pose (3 are needed)"
     assert [p.registered_frames for p in result.world.parts] == [38, 2]
     assert len(result.ellipsoids()) == 3
 
@@ -518,8 +518,9 @@ def test_the_summary_has_a_line_for_each_component(parted: rt.Result) -> None:
     cameras = "cameras: 61 of 64 frames (pycolmap) in 2 components"
     assert f"{cameras}, each with its own frame and scale" in lines
     first, second = (line for line in lines if re.match(r"component \d: ", line))
-    assert first.startswith("component 0: frames 0-39; 38 of 40 frames; 3 objects; scale ")
-    assert second.startswith("component 1: frames 40-63; 23 of 24 frames; 3 objects; scale ")
+    objects = "3 objects with a shape; scale "
+    assert first.startswith(f"component 0: frames 0-39; 38 of 40 frames; {objects}")
+    assert second.startswith(f"component 1: frames 40-63; 23 of 24 frames; {objects}")
     groups = [k for k, line in enumerate(lines) if line in ("component 0", "component 1")]
     assert ["measured" in line for line in lines[groups[1] + 1 : groups[1] + 4]] == [True] * 3
     assert groups[1] - groups[0] == 4
@@ -702,3 +703,29 @@ def test_objects_that_are_seen_through_are_less_probable() -> None:
     assert [o.id for o in seen] == [o.id for o in plain]
     change = [a.confidence - b.confidence for a, b in zip(plain, seen, strict=True)]
     assert change[0] > 0.005 and np.allclose(change[1:], 0)
+
+
+def test_a_scale_of_depth_maps_is_one_statement_with_a_sigma() -> None:
+    """In the summary and in every size, in each component; a known size replaces it."""
+    metric = dataclasses.replace(walk(), metric=True, scale=(1.0, 0.03), source="pycolmap")
+    result = finished(unlinked(metric, tracks_of(metric)))
+    (line,) = (line for line in result.summary().splitlines() if line.startswith("scale"))
+    assert line == "scale: 1.00 m per unit, sigma 3 % (from depth maps)"
+    supplied = finished(unlinked(dataclasses.replace(metric, scale=None), tracks_of(metric)))
+    for ours, theirs in zip(result.objects, supplied.objects, strict=True):
+        more = np.square(ours.size_rel_sigma) - np.square(theirs.size_rel_sigma)
+        np.testing.assert_allclose(more, 0.03**2, rtol=0.05)
+    parts = finished(unlinked(dataclasses.replace(two_parts(), metric=True, scale=(1.0, 0.03))))
+    assert [p.scale.source for p in parts.world.parts] == ["depth_maps"] * 2
+    known = finished(unlinked(metric, tracks_of(metric)), known_size="chair=.8m")
+    assert known.world.scale.source == "known_size"
+
+
+def test_the_reason_of_a_low_confidence_names_its_cause() -> None:
+    """The second chair has scores of .12; it is detected wherever it should be."""
+    tracks = tracks_of(walk())
+    tracks = with_columns(tracks, score=np.where(tracks.track_id == 2, 0.12, tracks.score))
+    found = finished(unlinked(walk(), tracks)).objects
+    assert [o.status for o in found] == ["ok", "doubtful", "ok"]
+    assert "low scores (about 0.12)" in found[1].reason
+    assert "detected in" not in found[1].reason and "background" not in found[1].reason

@@ -144,7 +144,7 @@ def test_most_strong_boxes_unexplained(untracked: int, score: float, warned: boo
     assert len(lines) == warned
     if warned:
         assert lines[0].startswith(f"{untracked} of {60 + untracked} boxes of score 0.4 or more")
-        assert "--detector" in lines[0] and "doubtful" not in lines[0]
+        assert "--detector" in lines[0] and "low confidence" not in lines[0]
 
 
 def boxes(count: int, x: float, score: float = 0.9, apart: int = 1) -> rt.Tracks:

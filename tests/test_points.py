@@ -133,7 +133,8 @@ def test_progress_comes_from_the_child(corner, tmp_path):
         return Progress(stage, total)
 
     run(corner[2], corner[1], tmp_path, progress=progress)
-    assert [stage for stage, _ in stages] == ["keyframes", "features", "match"]
+    names = ["keyframes", "features", "match", "triangulating"]
+    assert [stage for stage, _ in stages] == names
     assert stages[1] == ("features", 9)
 
 

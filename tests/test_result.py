@@ -67,7 +67,7 @@ def test_implausible_objects_keep_their_tracks_and_are_not_counted(
     assert first.id in found.tracks.track_id and [o.id for o in found.located] == [2, 3]
     lines = " ".join(found.summary().split())
     assert f"implausible, not counted: chair 1 ({why})" in lines
-    assert "2 objects: 2 chair" in lines and "low confidence" not in lines
+    assert "2 objects with a shape: 2 chair" in lines and "low confidence" not in lines
     assert not any(line.split()[:1] == ["1"] for line in found.summary().splitlines())
     data = json.loads((tmp_path / "objects.json").read_text())
     data["objects"][0]["center"] = None
@@ -278,10 +278,25 @@ def test_the_summary_is_the_table_printed_by_run(chairs: rt.Result, saved: Path)
     assert re.search(rf"1  chair +40 +{w} x {d} x {h} +\d+ %  measured$", text, re.M)
     assert size is not None and np.allclose([float(w), float(d), float(h)], size, atol=0.0051)
     assert re.search(r"3  chair +40 +- +-  none$", text, re.M)
-    assert "\ntoo far: 3\n" in text
-    assert "width x depth x height, m" in text and text.startswith("3 objects: 3 chair\nlook at: ")
+    assert "\ntoo far: object 3\n" in text and "width x depth x height, m" in text
+    assert text.startswith("2 objects with a shape: 2 chair; 1 without: 1 chair\nlook at: ")
     assert "cameras: 40 of 40 frames (user)" in text and "seconds: track 1.2" in text
     assert f"look at: {saved / 'objects.json'}" in text
+
+
+def test_the_summary_counts_objects_without_a_shape_apart(chairs: rt.Result) -> None:
+    """They come second, also in the table; without cameras there is one number."""
+    first, *rest = chairs.objects
+    person = rt.Object(1, "person", 0.9, "rejected", "objects of this class move")
+    result = copy_of(chairs, objects=[person, *rest], fits=None)
+    lines = result.summary().splitlines()
+    assert lines[0] == "2 objects with a shape: 2 chair; 1 without: 1 person"
+    assert "2 objects with a shape, 1 without" in repr(result)
+    rows = [line.split()[0] for line in lines if line.endswith((" measured", " none"))]
+    assert rows == ["2", "3", "1"]
+    flat = [dataclasses.replace(o, status="tracked") for o in (person, first)]
+    result = copy_of(chairs, objects=flat, poses=None, fits=None)
+    assert result.summary().startswith("2 objects: 1 chair, 1 person")
 
 
 def test_the_summary_says_where_the_time_went(chairs: rt.Result) -> None:
@@ -320,9 +335,9 @@ def test_the_summary_fits_the_terminal(chairs: rt.Result) -> None:
     assert max(map(len, lines)) <= 80 and len(lines) < 160
     assert sum(reason in line for line in lines) == 1
     first = next(k for k, line in enumerate(lines) if reason in line)
-    assert lines[first].startswith(f"{reason}: 1, 2, 3,")
+    assert lines[first].startswith(f"{reason}: objects 1, 2, 3,")
     assert any(line.endswith(" 119, 120") for line in lines[first:])
-    assert "parallax of .3 deg: 120" in lines
+    assert "parallax of .3 deg: object 120" in lines
 
 
 # ---- The schema ----
@@ -580,7 +595,7 @@ def test_reprs_are_one_line_without_arrays(chairs: rt.Result, saved: Path) -> No
     size = " x ".join(f"{side:.3g}" for side in chairs.objects[1].size)
     box = rt.Detections.from_array([[0, 0, 10, 20, 0.9, 56]])
     expected = {
-        "Result('walk.mp4', 3 objects (3 located), 120 boxes, cameras: 40 of 40 frames (user))":
+        "Result('walk.mp4', 3 objects with a shape, 120 boxes, cameras: 40 of 40 frames (user))":
             chairs,
         "Result('walk.mp4', 0 objects, 0 boxes, out='o')":
             rt.Result(rt.Tracks.empty(), (), chairs.video, out=Path("o")),

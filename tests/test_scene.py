@@ -150,7 +150,7 @@ def center_of(browser: Browser, number: int) -> tuple[float, float]:
 
 def test_a_click_on_an_object_opens_its_panel(browser: Browser, page: Path) -> None:
     browser.open(page)
-    assert browser.eval("!!gl && document.title") == "a: 4 objects"
+    assert browser.eval("!!gl && document.title") == "a: 3 objects with a shape, 1 without"
     for number, name in zip((1, 2, 3), NAMES, strict=False):
         browser.click(*center_of(browser, number))
         assert browser.eval("state.selected.id") == number
@@ -397,7 +397,7 @@ def test_doubtful_objects_are_shown_on_request(browser: Browser, page: Path) -> 
     browser.open(page)
     browser.eval("S.objects[2].status = 'doubtful'; replay(); draw()")
     state = "[here[2].row.hidden, here[2].group.visible, $('notes').innerText.split(',')[0]]"
-    assert browser.eval(state) == [True, False, "1 doubtful object"]
+    assert browser.eval(state) == [True, False, "1 object of low confidence"]
     browser.eval("$('doubtful').click(); draw()")
     assert browser.eval(state)[:2] == [False, True]
     browser.eval("S.objects[2].status = 'ok'; replay()")
@@ -409,7 +409,7 @@ def test_the_title_counts_one_object_in_the_singular(browser: Browser, page: Pat
     doubtful = status.sub('"status":"doubtful"', page.read_text())
     alone.write_text(status.sub('"status":"ok"', doubtful, count=1))
     browser.open(alone)
-    assert browser.eval("document.title").endswith(": 1 object")
+    assert browser.eval("document.title").endswith(": 1 object with a shape")
 
 
 @pytest.mark.parametrize(("width", "height"), [(1280, 800), (390, 844)])
@@ -1033,7 +1033,7 @@ def test_selecting_a_component_updates_everything(browser: Browser, parted_folde
     )
     assert browser.eval("[$('part').hidden, $('part').options.length]") == [False, 2]
     name = parted_folder.parent.name
-    assert browser.eval("document.title") == f"{name}: 6 objects in 2 components"
+    assert browser.eval("document.title") == f"{name}: 6 objects with a shape in 2 components"
     assert browser.eval(rows) == [1, 2, 3]
     assert browser.eval(shown) == [[1, 2, 3], 40, 38, 39, 3]
     assert browser.eval("$('facts').textContent").startswith("cameras of 38 of 40 frames")

@@ -11,6 +11,7 @@ from point_worlds import PointWorld, wall
 from pose_worlds import ate_percent, sideways
 
 from reobj.cameras import invert_rigid
+from reobj.poses import windows
 from reobj.poses.features import MatchedPairs, read_pairs
 from reobj.poses.mapping import Focal, MapperSearch
 from reobj.poses.verification import FocalSource
@@ -290,3 +291,24 @@ def test_a_second_call_reads_the_windows_that_are_finished(mapped, monkeypatch):
         (folder / "windows" / lost / "search.json").unlink()
     (again,), *_ = run("windows", size=12, overlap=4)
     assert ran == [numbers(9, 20)] and error_percent(again, world) < 0.3
+
+
+def test_the_progress_of_windows_is_complete_when_the_last_one_is_verified(mapped, monkeypatch):
+    _, _, run, _ = mapped
+    events = []
+    search = MapperSearch.run
+
+    def note(self):
+        found = search(self)
+        events.append("verified")
+        return found
+
+    def send(step, done, total):
+        events.append((step, done / total if total else 0.0))
+
+    monkeypatch.setattr(MapperSearch, "run", note)
+    monkeypatch.setattr(windows, "send_progress", send)
+    run("shown", size=12, overlap=4)
+    last = len(events) - events[::-1].index("verified")
+    before = [event[1] for event in events[:last] if event != "verified"]
+    assert before and max(before) < 1 and ("mapping", 1.0) in events[last:]

@@ -52,13 +52,13 @@ class ComponentObjects:
 
     Attributes:
         label: (N,) object of each row, or -1. iou: (N,) of the box with the projected object, NaN
-            without one. confidence: (O,) probability that the object exists.
+            without one. confidence: probability that each object exists.
         floor: of the component, or None. ellipsoids: (O + 1,) of the objects, and NaN at the end.
     """
 
     label: IntArray
     iou: Array
-    confidence: Array
+    confidence: Sequence[confidence.Existence]
     floor: quadrics.Floor | None
     ellipsoids: quadrics.Ellipsoids
 
@@ -93,7 +93,7 @@ def associate_component(
     iou = np.full(len(rows), np.nan)
     unknown = quadrics.Ellipsoids(*(np.full(s, np.nan) for s in ((1, 3), (1, 3), (1, 3, 3))))
     if not len(tracked):
-        return ComponentObjects(label, iou, np.empty(0), None, unknown)
+        return ComponentObjects(label, iou, [], None, unknown)
     frames, informative = informative_frames(tracked, poses, processed)
     fragment = cut_at_gaps(tracked, looked)
     # fragments that show nothing new need no hypotheses: those before them have them

@@ -83,7 +83,11 @@ def make_fit(config: ObjectsConfig, poses: Poses, class_names: Sequence[str]) ->
         raise ReobjError(f"--solver {config.solver}: expected {expected}")
     up = parse_up(config.up) if config.up else poses.up_in_world
     support = None if config.support == "auto" else config.support
-    given = None if poses.scale is None else quadrics.Scale(*poses.scale, "map")
+    given = by_depth = None
+    if poses.scale is not None and poses.metric and not poses.map_id:
+        by_depth = quadrics.Scale(*poses.scale, "depth_maps")
+    elif poses.scale is not None:
+        given = quadrics.Scale(*poses.scale, "map")
     plain = quadrics.FitConfig(path_where_seen=int(poses.known.sum()) > FrameOptions().all_of)
 
     def fit(views: Views, classes: list[int], scene: Scene) -> quadrics.ObjectFits:
@@ -96,6 +100,8 @@ def make_fit(config: ObjectsConfig, poses: Poses, class_names: Sequence[str]) ->
             known_size=known_size, floor=scene.floor, points=views.points,
             config=dataclasses.replace(plain, wrong_class=0) if scene.trusts_classes else plain,
         )  # fmt: skip
+        if by_depth is not None and fits.scale.source == "poses":
+            fits = dataclasses.replace(fits, scale=by_depth)
         up_is_given = up is not None or scene.up is None
         return fits if up_is_given else dataclasses.replace(fits, up_source="floor")
 

@@ -131,7 +131,12 @@ def _fit_fields(
         "parallax_deg": rounded(fits.parallax_deg[i], 2),
         "reprojection_iou_median": rounded(np.median(iou[seen]), 3) if seen.any() else None,
     }
-    return fields if status == "rejected" else fields | _shape_fields(fits, i)
+    if status == "rejected":
+        return fields
+    distance = _median_distance(views.img_from_world, fits.ellipsoids.center_in_world[i])
+    cov, why = usable_covariance(fits.cov[i], distance)
+    fields["reason"] = "; ".join(filter(None, [reason, why]))
+    return fields | _shape_fields(fits, i, cov)
 
 
 def _verdict(
@@ -142,14 +147,54 @@ def _verdict(
         return "rejected", "objects of this class move", None
     if view_count < min_views:
         seen_in = f"seen in {view_count} frame{'s' * (view_count != 1)} with a camera pose"
-        return "rejected", f"{seen_in}; {min_views} are needed", None
+        return "rejected", f"{seen_in} ({min_views} are needed)", None
     return str(fits.status[i]), str(fits.reason[i]), str(fits.support[i])
 
 
-def _shape_fields(fits: quadrics.ObjectFits, i: int) -> dict[str, Any]:
-    """Return ellipsoid, size and covariance of object i, None where unknown."""
+MOST_DISTANCES = 10.0  # sigma of a centre, in distances of the object from the cameras (chosen)
+# of a rotation about an axis: that of a uniform distribution over the full turn
+MOST_TURN = np.pi / np.sqrt(3)
+MOST_LOG_SIZE = quadrics.UNKNOWN_SCALE_LOG
+
+
+def usable_covariance(cov: Array, distance: float) -> tuple[Array, str]:
+    """Limit a covariance (9, 9) of an object to sigmas that have a meaning.
+
+    A direction that the boxes hardly determine has a variance up to 1e40. Larger sigmas than the
+    limits are reduced to them, with their correlations. A matrix that is no covariance is replaced
+    by the limits.
+
+    Args:
+        distance: of the object from the cameras.
+    Returns:
+        the covariance (all NaN: as it is), and what the boxes hardly determine, "" if nothing. An
+        unknown rotation is not mentioned: that of a round object is never known.
+    """
+    if np.isnan(cov).all():
+        return cov, ""
+    most = np.repeat([MOST_DISTANCES * distance, MOST_LOG_SIZE, MOST_TURN], 3)
+    sigma = np.sqrt(np.diag(cov).clip(0))
+    bound = 1.000001 * np.maximum(sigma, 1e-9)  # correlations are at most 1
+    if not np.isfinite(cov).all() or (np.abs(cov) > bound * bound[:, None]).any():
+        return np.diag(most**2), "its uncertainty is not known"
+    ratio = most / np.maximum(sigma, most)
+    parts = {"place": ratio[:3], "size": ratio[3:6]}
+    vague = " and ".join(part for part, of_part in parts.items() if (of_part < 1).any())
+    why = f"the boxes hardly determine its {vague}" if vague else ""
+    return cov * ratio * ratio[:, None], why
+
+
+def _median_distance(img_from_world: Array, center: Array) -> float:
+    """Return the median distance of a place (3,) from cameras (n, 3, 4)."""
+    shift = img_from_world[:, :, :3] @ center + img_from_world[:, :, 3]
+    from_camera = np.linalg.solve(img_from_world[:, :, :3], shift[..., None])  # (n, 3, 1)
+    return float(np.median(np.linalg.norm(from_camera, axis=(1, 2))))
+
+
+def _shape_fields(fits: quadrics.ObjectFits, i: int, cov: Array) -> dict[str, Any]:
+    """Return ellipsoid, size and covariance (9, 9) of object i, None where unknown."""
     scale = fits.scale
-    variance = np.diag(fits.cov[i])[3:6] + scale.rel_sigma**2  # of log sizes in metres: both
+    variance = np.diag(cov)[3:6] + scale.rel_sigma**2  # of log sizes in metres: both
     rotation = fits.ellipsoids.world_from_obj[i : i + 1]
     values = {
         "center": fits.ellipsoids.center_in_world[i],
@@ -158,7 +203,7 @@ def _shape_fields(fits: quadrics.ObjectFits, i: int) -> dict[str, Any]:
         "size": fits.size[i],
         "size_m": fits.size[i] * scale.value if scale.source != "none" else None,
         "size_rel_sigma": np.sqrt(variance),
-        "cov": fits.cov[i],
+        "cov": cov,
     }
     unknown = {k for k, v in values.items() if v is None or not np.isfinite(v).all()}
     fields = {k: None if k in unknown else significant(v) for k, v in values.items()}

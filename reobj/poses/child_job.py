@@ -11,6 +11,7 @@ import ctypes
 import json
 import math
 import os
+import queue
 import signal
 import subprocess
 import sys
@@ -18,7 +19,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -158,14 +159,15 @@ class Child:
             self.process.stdin.write(b"go\n")
             self.process.stdin.flush()
         line: Progress | None = None
-        for text in self.process.stdout:
-            words = text.decode(errors="replace").split()
-            if words == ["reobj:", "done"]:
+        for words in _messages(self.process.stdout):
+            if words == DONE:
                 break
-            if len(words) != 4 or words[0] != "reobj:":
+            if not words and line is not None:
+                line.step(0)
+            if len(words) < 4 or words[0] != "reobj:":
                 continue
-            stage = words[1]
-            done, total = map(int, words[2:])
+            stage = " ".join(words[1:-2])
+            done, total = map(int, words[-2:])
             if line is None or line.stage != stage:
                 if line is not None:
                     line.close()
@@ -178,6 +180,36 @@ class Child:
         if line is not None:
             line.close()
         return ""
+
+
+DONE = ["reobj:", "done"]
+ALIVE_S = 0.5  # of silence of the child, after which its progress line is drawn again
+
+
+def _messages(stream: IO[bytes]) -> Iterator[list[str]]:
+    """Yield the words of each line of a child, up to DONE or the end; [] after ALIVE_S without one.
+
+    One call of COLMAP takes minutes, in which the child can send nothing.
+    """
+    found = queue.SimpleQueue[list[str] | None]()
+
+    def read() -> None:
+        words: list[str] = []
+        while words != DONE and (text := stream.readline()):
+            words = text.decode(errors="replace").split()
+            found.put(words)
+        found.put(None)
+
+    threading.Thread(target=read, daemon=True).start()
+    while True:
+        try:
+            words = found.get(timeout=ALIVE_S)
+        except queue.Empty:
+            yield []
+            continue
+        if words is None:
+            return
+        yield words
 
 
 def _lock_of(folder: Path) -> Path:
@@ -199,7 +231,7 @@ def serve(job: Callable[[Path], None]) -> None:
         threading.Thread(target=_watch_parent, args=(requests,), daemon=True).start()
         while requests.acquire():
             job(folder)
-            print("reobj: done", flush=True)
+            print(*DONE, flush=True)
 
 
 def _watch_parent(requests: threading.Semaphore) -> None:
@@ -211,5 +243,5 @@ def _watch_parent(requests: threading.Semaphore) -> None:
 
 
 def send_progress(stage: str, done: int, total: int) -> None:
-    """Print a line of progress for `Child.run`."""
+    """Print a line of progress for `Child.run`; total 0: the stage has no steps."""
     print("reobj:", stage, done, total, flush=True)

@@ -150,7 +150,7 @@ def estimate_poses(
         wanted = set(best.more_keyframes())
         extra = []
         if wanted:
-            frames = resized.shown(progress("more keys", len(resized.frames)))
+            frames = resized.shown(progress("more keyframes", len(resized.frames)))
             extra = [store.keep(f) for f in frames if f.row in wanted and f.has_texture]
         if extra:
             _move_models(best.mapped.models, first_models)
@@ -166,6 +166,7 @@ def estimate_poses(
     messages = best.mapped.messages
     if poses.known.any():
         messages = [*messages, *_breaks(poses), *_lost_frames(poses, best.tried, video)]
+    messages = [*_frames_far_apart(poses, video.config.every), *messages]
     return dataclasses.replace(poses, messages=tuple(messages))
 
 
@@ -441,6 +442,16 @@ def _exif_focal(video: Any) -> float:
 
 
 # ---- Messages ------------------------------------------------------------------------------------
+
+
+def _frames_far_apart(poses: Poses, every: int) -> list[str]:
+    """Advise to read more frames where some have no camera or do not connect; else []."""
+    if every == 1 or (poses.known.all() and poses.part_count == 1):
+        return []
+    return [
+        f"--every {every} may leave too few points in common between frames: first try a smaller "
+        f"one (--every {every // 2})"
+    ]
 
 
 def _breaks(poses: Poses) -> list[str]:

@@ -41,6 +41,8 @@ ADVICE = (  # where no cause is established
     "only turning, measured intrinsics (--camera)"
 )
 
+ADJUSTING = "adjusting"  # step of the progress: adjustment and verification of models
+
 FOCAL_GUESS = 0.8  # over the longer side, where it cannot be estimated (phones: .72-.85)
 
 
@@ -101,7 +103,7 @@ class MapperSearch:
             messages. pairs: their verified matches.
         focal: of all images, as far as it is known before mapping. guess: used in its place where
             the matches no longer determine it. options: of the checks and of the choice.
-        show: is called with the name of the attempt, the number of registered images and of all.
+        show: is called with the name of the step, the number of registered images and of all.
     """
 
     def __init__(
@@ -274,10 +276,16 @@ class MapperSearch:
         done = itertools.count(2)
         count = len(self.ids)
         self.attempts += 1
-        step = "mapping" if self.attempts == 1 else f"mapping-{self.attempts}"
+        step = "mapping" if self.attempts == 1 else "mapping again"
+        if mapper == "global":
+            step = "second mapper"
 
         def tick() -> None:
-            self.show(step, min(next(done), count), count)
+            registered = next(done)
+            if registered <= count:
+                self.show(step, registered, count)
+            if registered == count:  # a global adjustment follows
+                self.show(ADJUSTING, 0, 0)
 
         self.show(step, 0, count if mapper == "incremental" else 0)
         models = _run_mapper(self.database, mapper, keep_intrinsics, self.ids, self.seed, tick)
@@ -285,6 +293,7 @@ class MapperSearch:
 
     def components_of(self, models: Sequence[Any]) -> list[Component]:
         """Adjust models and measure their consistent components, the largest first."""
+        self.show(ADJUSTING, 0, 0)
         given = self.focal.source is FocalSource.GIVEN
         groups = list[tuple[IntArray, Adjusted]]()
         for model in models:

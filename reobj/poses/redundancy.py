@@ -97,7 +97,7 @@ def find_repeated(
             view_of[number] = 0
     rest = [number for number in ids if number not in view_of]
     extract(rest)
-    add(rest, "views-2")
+    add(rest, "views again")
     return view_of
 
 
@@ -170,6 +170,8 @@ def register(model: Any, database: Path, ids: Sequence[int], seed: int) -> list[
     Returns:
         those that were registered.
     """
+    if ids:
+        send_progress("registering", 0, 0)
     pc = import_pycolmap()
     names = [f"{number:06d}" for number in sorted({*model.reg_image_ids(), *ids})]
     with contextlib.closing(pc.Database.open(str(database))) as db:

@@ -23,7 +23,14 @@ import numpy as np
 
 from reobj.cameras import Camera, Poses, import_pycolmap, write_colmap
 from reobj.files import Progress, atomic, load_cached, load_json, load_npz, save_npz
-from reobj.poses.child_job import Child, ImageFile, read_job, serve, write_job
+from reobj.poses.child_job import (
+    Child,
+    ImageFile,
+    read_job,
+    send_progress,
+    serve,
+    write_job,
+)
 from reobj.poses.features import (
     MIN_MATCHES,
     UNORDERED,
@@ -323,7 +330,7 @@ def _map_job(folder: Path, job: dict[str, Any], images: ImageFile) -> None:
     every_pair = read_pairs(database)
     is_path = every_pair.only(mapped).in_order(mapped)
     if not is_path:
-        match_pairs(database, choose_pairs(path, mapped, vlad, UNORDERED), seed, "match-2")
+        match_pairs(database, choose_pairs(path, mapped, vlad, UNORDERED), seed, "match again")
         every_pair = read_pairs(database)
     pairs = dataclasses.replace(every_pair.only(mapped), is_path=is_path)
     frames = {number: job["frames"][row_of[number]] for number in mapped}
@@ -370,6 +377,7 @@ def _triangulate_job(folder: Path, job: dict[str, Any], images: ImageFile) -> No
     ids = range(1, len(images) + 1)
     extract_features(database, images, ids, [np.empty((0, 4))] * len(images), camera)
     match_pairs(database, [(i + 1, j + 1) for i, j in job["pairs"]], job["seed"])
+    send_progress("triangulating", 0, 0)
     model = _posed_model(camera, job, folder / "posed")
     options = {"num_threads": 1, "random_seed": job["seed"], "extract_colors": False}
     (folder / "sparse").mkdir()

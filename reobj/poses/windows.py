@@ -105,6 +105,9 @@ def map_keyframes(
     return models, found["messages"], found["weak"]
 
 
+FINISHED = "finished"  # step of a window
+
+
 def _map_windows(
     windows: list[list[int]], whole: MapperSearch, options: WindowOptions
 ) -> tuple[list[Any], dict[str, Any]]:
@@ -127,9 +130,11 @@ def _map_windows(
         folder.mkdir(exist_ok=True)
         path = folder / "database.db"
 
-        def show(_: str, registered: int, count: int) -> None:
+        def show(step: str, registered: int, count: int) -> None:
+            # adjustment, verification and second mapper take as long as the first, or longer
+            share = registered if step == FINISHED else registered // 2
             with lock:
-                done[k] = max(done[k], registered)
+                done[k] = max(done[k], share)
                 send_progress("mapping", sum(done), total)
 
         frames = {i: whole.frames[i] for i in ids}
@@ -143,7 +148,7 @@ def _map_windows(
 
         models, found = _kept(folder, ids, run)
         path.unlink(missing_ok=True)
-        show("", len(ids), len(ids))
+        show(FINISHED, len(ids), len(ids))
         return models, found
 
     with ThreadPoolExecutor(2) as pool:  # mappers use one core each: reproducible

@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import types
 import typing
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -41,8 +42,8 @@ class Object:
         score: mean of the boxes.
         status: "ok", "prior_dominated" (some size depends mainly on the category's prior),
             "implausible" (size more than 4 sigma from the usual ones of its category), "doubtful"
-            (probably a false positive), "rejected" (no shape), "tracked" (2D: no cameras).
-            reason: for the status.
+            (of low confidence: probably a false positive), "rejected" (no shape), "tracked" (2D: no
+            cameras). reason: for the status.
         confidence: probability that it is a real, separate object; None without cameras.
         classes: probabilities of the two most likely. support: "box", "cylinder" or "ellipsoid".
         center, half_axes: (3,) of the ellipsoid; quat_wxyz: (4,) world_from_obj.
@@ -83,6 +84,11 @@ class Object:
     confidence: float | None = None
     classes: dict[str, float] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        """Remove a covariance that no 32-bit number can hold, as earlier versions wrote them."""
+        if self.cov is not None and not np.abs(self.cov).max() <= NUMBER_MAX**2:
+            object.__setattr__(self, "cov", None)
+
     def __repr__(self) -> str:
         """Describe the object in one line."""
         facts = [f"{self.id} {printable(self.class_name)}", self.status]
@@ -95,18 +101,44 @@ class Object:
 
     @property
     def counted(self) -> bool:
-        """True if it is one of the objects found: neither doubtful nor implausible."""
+        """True if it is one of the objects found: neither of low confidence nor implausible."""
         return self.status not in ("doubtful", "implausible")
 
     @property
     def located(self) -> bool:
-        """True if a shape was fitted and the object is neither doubtful nor implausible."""
+        """True if a shape was fitted and the object is `counted`."""
         return self.status in ("ok", "prior_dominated")
 
     def to_json(self) -> dict[str, Any]:
         """Return the entry of objects.json."""
         values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         return {_JSON_KEYS.get(k, k): _plain(v) for k, v in values.items()}
+
+
+def found_text(objects: Iterable[Object], names: bool = False) -> str:
+    """Say how many objects found have a shape, and how many have none.
+
+    Without cameras none can have one: then only their number.
+
+    Args:
+        names: add the classes, most frequent first.
+    """
+    found = [o for o in objects if o.counted]
+    shaped = [o for o in found if o.located]
+    others = [o for o in found if not o.located]
+    if all(o.status == "tracked" for o in found):
+        return counted(len(others), "object", "objects") + _classes_text(others) * names
+    text = counted(len(shaped), "object with a shape", "objects with a shape")
+    text += _classes_text(shaped) * names
+    rest = f"{len(others)} without{_classes_text(others) * names}"
+    return f"{text}{'; ' if names else ', '}{rest}" if others else text
+
+
+def _classes_text(objects: Sequence[Object]) -> str:
+    """Format the number of objects of each class, most frequent first: ": 2 cup, 1 chair"."""
+    counts = Counter(o.class_name for o in objects)
+    rows = sorted(counts.items(), key=lambda row: (-row[1], row[0]))
+    return ": " + ", ".join(f"{count} {name}" for name, count in rows) if rows else ""
 
 
 VISIT_GAP_S = 2.0  # between two visits of an object; a detector misses objects for shorter times

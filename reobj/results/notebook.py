@@ -59,7 +59,7 @@ def viewer_page(result: Result) -> str:
 
 
 def _table(result: Result) -> str:
-    """Return the table of the objects as HTML, doubtful ones at its end."""
+    """Return the table of the objects as HTML, those that do not count at its end."""
     objects = sorted(result.objects, key=lambda o: not o.counted)
     titles = ("object", "class", "status", "frames", "width x depth x height", "sigma")
     rows = "".join(_row("td", _cells(o)) for o in objects)

@@ -113,7 +113,8 @@ def _unexplained(result: Result, high_score: float, new_score: float) -> str:
         text += ": most of them overlap no box in the frames before and after"
         return f"{text}: boxes of other frames, photos far apart, or try {OTHER_BOXES}"
     return (
-        f"{text}: look at the doubtful objects (--set output.doubtful=true), or try {OTHER_BOXES}"
+        f"{text}: look at the objects of low confidence (--set output.doubtful=true), or try "
+        f"{OTHER_BOXES}"
     )
 
 

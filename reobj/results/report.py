@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -10,7 +9,7 @@ import numpy as np
 
 import quadrics
 from reobj.files import cut, texts_with_sigma, wrapped
-from reobj.results.entries import Object
+from reobj.results.entries import Object, found_text
 
 if TYPE_CHECKING:
     from reobj.results.result import Result
@@ -67,7 +66,8 @@ def sides(found: Object) -> list[tuple[str, ...]]:
 def _table(result: Result, counted: Sequence[Object]) -> list[str]:
     """Format a header and a line for each object; sizes only if there are any.
 
-    Objects of several components are grouped by component, each below a line with its name.
+    Objects of several components are grouped by component, each below a line with its name. Those
+    without a shape come last.
     """
     in_metres = any(o.size_m is not None for o in result.objects)
     has_sizes = any(o.size is not None for o in counted)
@@ -79,7 +79,7 @@ def _table(result: Result, counted: Sequence[Object]) -> list[str]:
         columns += f"  {f'width x depth x height, {unit}':<26} {'sigma':>6}  size"
     lines = [columns]
     component = None
-    for o in sorted(counted, key=lambda o: o.part):
+    for o in sorted(counted, key=lambda o: (o.part, not o.located)):
         if several and o.part != component:
             component = o.part
             lines.append(f"component {component}")
@@ -113,7 +113,8 @@ def _reasons(counted: Sequence[Object]) -> list[str]:
             objects_of.setdefault(reason, []).append(o.id)
     lines = list[str]()
     for reason, ids in objects_of.items():
-        lines += _wrapped(f"{reason}: {', '.join(map(str, ids))}")
+        noun = "object" if len(ids) == 1 else "objects"
+        lines += _wrapped(f"{reason}: {noun} {', '.join(map(str, ids))}")
     return lines
 
 
@@ -125,11 +126,8 @@ def _implausible(result: Result) -> list[str]:
 
 
 def _counts(result: Result, counted: Sequence[Object]) -> list[str]:
-    """Format the number of objects, in all and of each class, most frequent first."""
-    counts = sorted(Counter(o.class_name for o in counted).items(), key=lambda c: (-c[1], c[0]))
-    names = ", ".join(f"{count} {name}" for name, count in counts) or "none"
-    noun = "object" if len(counted) == 1 else "objects"
-    text = f"{len(counted)} {noun}: {names}" if counted else "objects: none"
+    """Format the number of objects with and without a shape, in all and of each class."""
+    text = found_text(result.objects, names=True) if counted else "objects: none"
     if len(result.world.parts) > 1:
         text += " (each component counted separately)"
     if doubtful := sum(o.status == "doubtful" for o in result.objects):
@@ -148,11 +146,10 @@ def _cameras(result: Result) -> list[str]:
     count = f"{len(world.parts)} components, each with its own frame and scale"
     lines = [f"{result.poses.cameras_text} in {count}"]
     for k, component in enumerate(world.parts):
-        objects = sum(o.part == k for o in result.objects)
         facts = [
             component.span_text,
             f"{component.registered_frames} of {component.frames} frames",
-            f"{objects} object" if objects == 1 else f"{objects} objects",
+            found_text(o for o in result.objects if o.part == k),
         ]
         if component.scale:
             facts.append(f"scale {_scale_text(component.scale)}")
@@ -163,7 +160,7 @@ def _cameras(result: Result) -> list[str]:
 def _scale_text(scale: quadrics.Scale) -> str:
     sigma = scale.rel_sigma or 0.0
     ((value, *_),) = texts_with_sigma(np.array([scale.value]), np.array([sigma * scale.value]))
-    return f"{value} m per unit, sigma {100 * sigma:.0f} % (from {scale.source})"
+    return f"{value} m per unit, sigma {100 * sigma:.0f} % (from {scale.source.replace('_', ' ')})"
 
 
 def _wrapped(text: str) -> list[str]:

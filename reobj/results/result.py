@@ -19,7 +19,7 @@ from reobj.cameras import Poses
 from reobj.results import notebook, report, saving, table
 from reobj.results.changes import Changes, EarlierSession
 from reobj.results.edits import Edits
-from reobj.results.entries import Object, Part, VideoInfo, World
+from reobj.results.entries import Object, Part, VideoInfo, World, found_text
 from reobj.sources.boxes_3d import Boxes3D
 from reobj.types import Embeddings, IntArray, ReobjError, Tracks, counted
 
@@ -76,8 +76,7 @@ class Result:
     def __repr__(self) -> str:
         """Describe the result in one line."""
         facts = [repr(Path(self.video.path).name)]
-        located = f" ({len(self.located)} located)" if self.poses is not None else ""
-        facts.append(counted(len(self.objects), "object", "objects") + located)
+        facts.append(found_text(self.objects))
         facts.append(counted(len(self.tracks), "box", "boxes"))
         facts += [] if self.poses is None else [self.poses.cameras_text]
         facts += [] if self.out is None else [f"out={str(self.out)!r}"]
@@ -109,7 +108,7 @@ class Result:
 
     @property
     def located(self) -> list[Object]:
-        """Objects that have a shape and are neither doubtful nor implausible, by id."""
+        """Objects that have a shape and are neither of low confidence nor implausible, by id."""
         return [o for o in self.objects if o.located]
 
     def of_part(self, part: int) -> Result:
@@ -131,7 +130,7 @@ class Result:
         )
 
     def without_doubtful(self) -> Result:
-        """Return the result without doubtful objects, their tracks and the fits."""
+        """Return the result without objects of low confidence, their tracks and the fits."""
         doubtful = [o.id for o in self.objects if o.status == "doubtful"]
         return dataclasses.replace(
             self,
@@ -173,7 +172,7 @@ class Result:
 
         changes.json is written after a run with a map, and removed after one without.
 
-        objects.json includes doubtful objects, tracks.txt only if `doubtful`. Each further
+        objects.json includes objects of low confidence, tracks.txt only if `doubtful`. Each further
         component of the trajectory has its own poses and objects: poses_part1.txt,
         objects_part1.ply, ... All files are complete before they replace those of an earlier run,
         whose overlay video and viewer are removed.

@@ -615,7 +615,7 @@ def _scene_facts(world: World) -> str:
     facts = [f"cameras of {world.registered_frames} of {world.frames} frames"]
     if world.scale is not None and world.scale.source != "none":
         sigma = 100 * (world.scale.rel_sigma or 0)
-        facts.append(f"scale from {world.scale.source}, ± {sigma:.0f} %")
+        facts.append(f"scale from {world.scale.source.replace('_', ' ')}, ± {sigma:.0f} %")
     else:
         facts.append(f"units: {world.units}")
     facts += ["up is guessed from the cameras"] if world.up_in_world is None else []

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
-from simulated import SIZE, fitted, tracks_of, unlinked, walk
+from simulated import SIZE, fitted, tracks_of, unlinked, walk, with_fitted_covariance
 
 import reobj_track as rt
 from front_door.room import ROOM, cli
@@ -144,6 +144,15 @@ def tiny(result: rt.Result) -> rt.Result:
     return with_objects(result, half_axes=np.full(3, 1e-9), size=np.full(3, 2e-9))
 
 
+def absurd_covariance(result: rt.Result) -> rt.Result:
+    return with_fitted_covariance(result, 1e40)
+
+
+def absurd_covariance_of_a_file(result: rt.Result) -> rt.Result:
+    """As earlier versions wrote them."""
+    return with_objects(result, cov=1e40 * np.eye(9), size_rel_sigma=None)
+
+
 def one_object(result: rt.Result) -> rt.Result:
     rows = result.tracks[result.tracks.track_id == 2]
     return dataclasses.replace(result, objects=result.objects[1:2], tracks=rows, fits=None)
@@ -186,7 +195,8 @@ KINDS = [
     objects_without_boxes,
     dataclasses.replace, nothing, cameras_alone, no_cameras, cameras_nan, some_cameras_nan, behind,
     in_an_object, far_away, fisheye, all_rejected, all_doubtful, no_support, ellipsoids, huge, tiny,
-    one_object, one_frame, one_camera, boxes_outside, odd_names,
+    absurd_covariance, absurd_covariance_of_a_file, one_object, one_frame, one_camera,
+    boxes_outside, odd_names,
 ]  # fmt: skip
 
 
@@ -218,6 +228,33 @@ def test_every_result_is_written_drawn_and_exported(
             assert "\n" not in refused
             assert Path(default).parent == Path() or not (out / default).parent.exists()
     assert not list(out.rglob(".part*"))
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_no_absurd_covariance_reaches_a_file(
+    plain: rt.Result, source: rt.Video, tmp_path: Path
+) -> None:
+    """Place and size have bounded sigmas, and the reason says so."""
+    result = dataclasses.replace(
+        absurd_covariance(plain), video=VideoInfo(str(source.source), *SIZE, 30.0)
+    )
+    result = result.save(tmp_path)
+    assert write_pictures(result, tmp_path, source, "none") == []
+    assert "the boxes hardly determine its place and size: objects 1, 2, 3" in " ".join(
+        result.summary().split()
+    )
+    page = (tmp_path / "scene.html").read_text().split('id="data">')[1].split("</script>")[0]
+    data = json.loads((tmp_path / "objects.json").read_text())["objects"]
+    for entry, shown in zip(data, json.loads(page)["objects"], strict=True):
+        cov = np.frombuffer(base64.b64decode(shown["cov"]), "<f4").reshape(9, 9)
+        np.testing.assert_allclose(cov, entry["cov"], rtol=1e-5)
+        assert np.linalg.eigvalsh(cov)[[0, -1]].tolist() == pytest.approx([np.pi**2 / 3, 4000], 3)
+        assert max(entry["size_rel_sigma"]) == pytest.approx(3, rel=0.01)
+    (tmp_path / "cache").mkdir(exist_ok=True)
+    default, write = EXPORTS["ros"]
+    write(rt.Result.load(tmp_path), tmp_path / default)
+    (detection, *_) = json.loads((tmp_path / default).read_text())["detections"]
+    assert 1 < max(detection["results"][0]["pose"]["covariance"]) < 1e5
 
 
 # ---- A failure while drawing ----

@@ -22,7 +22,7 @@ from reobj.cameras import Camera, Poses, invert_rigid
 from reobj.files import load_json, read_lines
 from reobj.poses.supplied.frame_assignment import STAMP_TOLERANCE_S
 from reobj.sources.image_files import read_image
-from reobj.types import Array, BoolArray, Floats, IntArray, ReobjError
+from reobj.types import Array, BoolArray, Floats, IntArray, ReobjError, log
 from reobj.visible_points import VisiblePoints
 
 
@@ -236,7 +236,9 @@ def add_depth(poses: Poses, text: str, video: Any) -> Poses:
         scale = depth_scale(poses, maps)
         if isinstance(scale, str):
             return dataclasses.replace(poses, messages=(*poses.messages, scale))
-        poses = _scaled(poses, *scale)
+        metres, sigma, used = scale
+        log.info("metres per unit of the reconstruction by %d depth maps: %s", used, metres)
+        poses = _scaled(poses, metres, sigma)
     return _with_points(poses, maps, video)
 
 
@@ -267,14 +269,15 @@ def depth_scale(
         where = "" if poses.part_count == 1 else f" of component {component}"
         if len(logs) < 3:  # no median and spread
             return (
-                f"--depth: the scale{where} stays unknown, and no points are added from depth: "
-                f"{len(logs)} of {len(rows)} maps show enough sparse points, 3 are needed"
+                f"--depth: the maps do not give the scale{where}, and no points are added from "
+                f"them: {len(logs)} of {len(rows)} maps show enough sparse points; 3 maps are "
+                "needed"
             )
         spread = 1.4826 * float(np.median(np.abs(logs - np.median(logs))))
         if spread > max_spread:
             return (
                 f"--depth: the ratio of depth to the poses{where} varies by {100 * spread:.0f} % "
-                "between maps: depth or poses are wrong; the scale stays unknown"
+                "between maps: depth or poses are wrong; the maps do not give the scale"
             )
         used += len(logs)
         scales.append(float(np.exp(np.median(logs))))
@@ -323,22 +326,20 @@ def look_up_depth(depth: Floats, K: Array, in_depth: Array) -> Array:
     return np.where(inside, depth[y, x], 0.0)
 
 
-def _scaled(poses: Poses, scale: Array, sigma: Array, used: int) -> Poses:
-    """Scale the components of the trajectory to metres."""
+def _scaled(poses: Poses, scale: Array, sigma: Array) -> Poses:
+    """Scale the components of the trajectory to metres; the largest sigma is that of all."""
     cam_from_world = poses.cam_from_world.copy()
     points = poses.points.copy()
     cam_from_world[:, :, 3] *= scale[poses.part][:, None]
     component = np.zeros(len(points), np.int64)
     component[poses.visibility[:, 1]] = poses.part[poses.visibility[:, 0]]
     points *= scale[component][:, None]
-    figures = ", ".join(f"{s:.4g} m +- {100 * e:.1f} %" for s, e in zip(scale, sigma, strict=True))
-    message = f"metric by {used} depth maps: one unit of the reconstruction was {figures}"
     return dataclasses.replace(
         poses,
         cam_from_world=cam_from_world,
         points=points,
         metric=True,
-        messages=(*poses.messages, message),
+        scale=(1.0, float(sigma.max())),
     )
 
 

@@ -45,6 +45,7 @@ function quantile(values, share) {
 const decimals = (sigma) => sigma > 0 && sigma < Infinity
   ? Math.max(0, Math.ceil(-Math.log10(sigma))) : 2;
 const withSigma = (value, sigma, unitName) => {
+  if (!Number.isFinite(sigma)) return `${+value.toPrecision(3)} ${unitName}`;   // not known
   const digits = decimals(sigma);
   return `${value.toFixed(digits)} ± ${sigma.toFixed(digits)} ${unitName}`;
 };
@@ -100,6 +101,11 @@ function pointsOf(part) {                        // level positions, colours
 const seenAt = (o, step) => o.seen.some((s, i) => i % 2 === 0 && s <= step
   && step <= o.seen[i + 1]);
 const counted = (o) => o.status !== "doubtful" && o.status !== "implausible";  // as in entries.py
+function foundText(all) {                        // as in entries.py
+  const found = all.filter(counted), shaped = found.filter((o) => o.center).length, rest = found.length - shaped;
+  if (found.every((o) => o.status === "tracked")) return several(rest, "object");
+  return `${several(shaped, "object")} with a shape${rest ? `, ${rest} without` : ""}`;
+}
 const allowed = (o) => !state.hiddenIds.has(o.id) && (state.only === null || state.only === o.id)
   && !state.hidden.has(o.class) && !hiddenByKind(changeOf(o))
   && ($("doubtful").checked || o.status !== "doubtful");

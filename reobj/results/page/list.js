@@ -1,6 +1,6 @@
 // The list of objects and the panel of the chosen one.
 const nameOf = (o) => `${o.class} ${o.id}`;
-const NOTE = { ok: "", prior_dominated: "", rejected: "no solid", doubtful: "doubtful",
+const NOTE = { ok: "", prior_dominated: "", rejected: "no solid", doubtful: "low confidence",
   implausible: "implausible size", tracked: "in 2D only" };
 
 function bar(o) {                                // when the object was seen, over the part's frames
@@ -32,7 +32,7 @@ const ORDER = {
 function filterList() {
   const words = $("search").value.toLowerCase().split(/\s+/).filter(Boolean);
   for (const o of here) {
-    const text = `${nameOf(o)} ${o.status} ${o.reason} ${kindText(changeOf(o))}`.toLowerCase();
+    const text = `${nameOf(o)} ${o.status} ${NOTE[o.status]} ${o.reason} ${kindText(changeOf(o))}`.toLowerCase();
     o.found = words.every((word) => text.includes(word));
     o.row.hidden = !allowed(o) || !o.found;
     o.row.classList.toggle("now", state.step >= 0 && seenAt(o, state.step));
@@ -89,7 +89,7 @@ function fillList() {
     el("span", {}, el("b", {}, "| "), "now"), el("span", {}, `${ends[1]}`));
   const doubtful = here.filter((o) => o.status === "doubtful").length;
   $("notes").replaceChildren(
-    ...(doubtful ? [el("p", { className: "dim" }, `${several(doubtful, "doubtful object")}, `
+    ...(doubtful ? [el("p", { className: "dim" }, `${several(doubtful, "object")} of low confidence, `
       + "more likely absent than present: ", el("button", { onclick: () => {
         $("doubtful").checked = !$("doubtful").checked;
         $("doubtful").onchange();

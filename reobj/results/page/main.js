@@ -151,7 +151,7 @@ dark.addEventListener("change", () => {
 });
 
 // ---- Start ----
-document.title = $("title").textContent = `${S.title}: ${several(S.objects.filter(counted).length, "object")}`
+document.title = $("title").textContent = `${S.title}: ${foundText(S.objects)}`
   + (S.parts.length > 1 ? ` in ${S.parts.length} components` : "");
 $("part").append(...S.parts.map(({ name }, value) => el("option", { value }, name)));
 $("part").hidden = S.parts.length < 2;
