@@ -59,7 +59,7 @@ def visibility_of(
     apart_deg: float = 10.0,
     least_points: int = 3,
 ) -> Visibility:
-    """Count the independent views in which each object would be seen, and those through it.
+    """Count the independent views in which each object would be seen, was seen, and through it.
 
     An object is expected in an image if most of its projection lies inside, is large enough, and
     neither objects of the recording nor most of the sparse points in its outline lie nearer. Views
@@ -163,7 +163,6 @@ def _detected(
         (V, N) by any detection; (V, N) by one that belongs to no object with a shape.
     """
     size = (poses.camera.width, poses.camera.height)
-    box = undistort_boxes(detections.rows.xyxy, poses.camera)  # (D, 4)
     known = np.unique(detections.located)  # (M,)
     owner = np.searchsorted(known, detections.rows.track_id)  # (D,)
     owner[~np.isin(detections.rows.track_id, known)] = len(known)
@@ -174,13 +173,14 @@ def _detected(
     shown = np.zeros((len(rows), len(known) + 1), bool)
     for v, row in enumerate(rows.tolist()):
         here = np.flatnonzero(detections.rows.frame == poses.frame[row])
+        box = undistort_boxes(detections.rows.xyxy[here], poses.camera)  # (d, 4)
         camera = poses.camera.K @ poses.cam_from_world[row]
         shown[v, owner[here]] = True
         for shift in shifts:
             moved = dataclasses.replace(shapes, center_in_world=shapes.center_in_world + shift)
             projected = quadrics.solid_boxes(moved, support, camera[None])
             projected = quadrics.clip_boxes(projected, size)[0]  # (N, 4)
-            iou = quadrics.box_iou(projected[:, None], box[here])  # (N, d)
+            iou = quadrics.box_iou(projected[:, None], box)  # (N, d)
             np.logical_or.at(on[v], owner[here], iou.T >= LEAST_IOU)
     on &= expected[:, None]
     both = shown[:, :-1].T.astype(np.int64) @ expected  # (M, N) views
