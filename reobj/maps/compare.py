@@ -736,8 +736,8 @@ class _Verdicts:
         state = self.pairs.states[i]
         view = self.pairs.visibility
         expected, through = (int(v[i]) for v in (view.expected, view.seen_through))
-        detected = 0.0 if view.detected is None else float(view.detected[i])
-        missed = round(expected - detected)
+        detected = 0 if view.detected is None else round(view.detected[i])
+        missed = expected - detected
         there = float(self.pairs.there_log_odds()[i])
         similar = np.flatnonzero(
             (self.loss[i, :-1] < self.options.margin) & (self.stayed[i] >= self.moved[i])
@@ -750,9 +750,9 @@ class _Verdicts:
         elif len(similar):
             found = self.pairs.found[int(similar[0])]
             evidence = f"object {found.id} near its place may be this one"
-        elif detected >= 1 and not gone:
+        elif detected and not gone:
             evidence = (
-                f"detected on its place in {detected:.0f} of {expected} views, "
+                f"detected on its place in {detected} of {expected} views, "
                 "but none of the objects found is clearly this one"
             )
         elif through == 0:
