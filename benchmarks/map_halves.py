@@ -11,6 +11,7 @@ The parts are run one after the other through the command line, each as a record
     hololens own         the same with own cameras in the second half
     office_loop          two parts that overlap by 20 images, own cameras
     bonsai_mip360        the three rounds, own cameras, small detector
+    desk_orbit           every second image, then the others, own cameras, small detector
     sun3d                two fragments from opposite sides, supplied cameras, small detector
     mirrored             redkitchen, with the images of the second half flipped: must be refused
 
@@ -70,6 +71,7 @@ CASES = {  # truth (MOTChallenge, in DATA), overlap of a true box, parts
         Part(HOLO, 0, 190, poses=True), Part(HOLO, 190)]),
     "office": ("office_loop/gt_mot.txt", 0.4, [Part(OFFICE, 0, 120), Part(OFFICE, 100)]),
     "bonsai": ("", 0.5, [Part(BONSAI, a, b, boxes="") for a, b in ((0, 98), (98, 196), (196, 0))]),
+    "desk": ("", 0.5, [Part("desk_orbit/images", k, every=2, boxes="") for k in (0, 1)]),
     "sun3d": ("", 0.5, [Part(f"{SUN}/{s}/images", boxes="", poses=True) for s in ("s1", "s2")]),
     "mirrored": ("", 0.5, [Part(RED, 0, 250, 2), Part(RED, 250, 0, 2, flipped=True)]),
 }  # fmt: skip

@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from simulated import SIZE, tracks_of, unlinked, walk, with_columns
+from simulated import SIZE, fitted, tracks_of, unlinked, walk, with_columns
 
 import quadrics
 import reobj_track as rt
@@ -108,6 +108,52 @@ def test_a_merge_of_simultaneous_objects_is_reported(tmp_path: Path) -> None:
     made = applied(tmp_path, MERGE)
     assert "merged object 1 has two boxes in 10 frames" in made.messages[0]
     assert "1 correction by hand applied" in made.messages[1] and made.confirmed == {1}
+
+
+def two_boxes(*boxes: list[float]) -> rt.Tracks:
+    """Objects 1, 2, ... with one of these boxes each, in five frames; object 1 is the best."""
+    frame, k = np.divmod(np.arange(5 * len(boxes)), len(boxes))
+    box = np.array(boxes, float)[k] + frame[:, None]
+    return rt.Tracks(frame, k + 1, k + 1, box, 0.9 - 0.1 * k, np.zeros_like(k), k)
+
+
+@pytest.mark.parametrize(
+    ("boxes", "whole"),
+    [
+        ([[100, 50, 200, 150], [190, 55, 300, 150]], [100, 50, 300, 150]),  # halves that overlap
+        ([[100, 50, 195, 150], [205, 50, 300, 150]], [100, 50, 300, 150]),  # a gap of a twentieth
+        ([[100, 50, 140, 150], [100, 110, 200, 150]], [100, 50, 200, 150]),  # back and seat
+        ([[100, 50, 200, 150], [110, 55, 205, 150]], [100, 50, 200, 150]),  # the same twice
+        ([[120, 60, 170, 120], [100, 50, 200, 150]], [100, 50, 200, 150]),  # a detail first
+        ([[100, 50, 200, 150], [120, 60, 170, 120]], [100, 50, 200, 150]),
+        ([[100, 50, 200, 150], [300, 50, 400, 150]], [100, 50, 200, 150]),  # elsewhere
+        ([[100, 50, 200, 150], [195, 145, 300, 250]], [100, 50, 200, 150]),  # only corners meet
+        # three thirds: the last box joins the first two, which are apart
+        ([[100, 50, 200, 150], [300, 50, 400, 150], [200, 50, 300, 150]], [100, 50, 400, 150]),
+    ],
+)  # fmt: skip
+def test_boxes_of_parts_are_joined(
+    tmp_path: Path, boxes: list[list[float]], whole: list[float]
+) -> None:
+    tracks = two_boxes(*boxes)
+    refs = [{"id": k + 1, "frame": 0, "box": box} for k, box in enumerate(boxes)]
+    merges = [{"do": "merge", "object": refs[0], "with": other} for other in refs[1:]]
+    made = applied(tmp_path, *merges, tracks=tracks)
+    kept = made.tracks[made.keep]
+    np.testing.assert_array_equal(kept.frame, np.arange(5))
+    np.testing.assert_array_equal(kept.xyxy, np.array(whole) + kept.frame[:, None])
+    assert set(kept.score) == {0.9} and set(kept.detection_index) == {0}
+
+
+def test_a_cut_out_of_a_merged_object_has_one_box_a_frame(tmp_path: Path) -> None:
+    tracks = two_boxes([100, 50, 200, 150], [190, 55, 300, 150])
+    refs = [{"id": k + 1, "frame": 0, "box": tracks.xyxy[k].tolist()} for k in (0, 1)]
+    merge = {"do": "merge", "object": refs[0], "with": refs[1]}
+    cut = {"do": "split", "object": refs[1], "frames": [2, 3]}
+    made = applied(tmp_path, merge, cut, tracks=tracks)
+    kept = made.tracks[made.keep]
+    assert kept.track_id.tolist() == [1, 1, 2, 2, 1]
+    assert (kept.xyxy[:, 2] - kept.xyxy[:, 0] == 200).all()
 
 
 def test_a_new_class_is_added_to_the_names(tmp_path: Path) -> None:
@@ -232,6 +278,45 @@ def test_edits_are_stored_in_the_folder(folder: Path, tmp_path: Path, capsys: An
     assert rt.main(["objects", str(folder), "--edits", str(write(path))]) == 0  # none any more
     assert [o.id for o in rt.Result.load(folder).objects] == [1, 2, 3, 4, 5, 6]
     assert not (folder / "edits.json").exists()
+
+
+def test_two_halves_that_are_merged_are_one_object(tmp_path: Path, capsys: Any) -> None:
+    """The detector gives the middle chair as two halves; the boxes of the merge can be named."""
+    poses = walk()
+    whole = tracks_of(poses)
+    middle = whole[whole.track_id == 2]
+    cut = middle.xyxy.copy()
+    cut[:, 0] = (cut[:, 0] + cut[:, 2]) / 2
+    right = with_columns(middle, xyxy=cut, track_id=4, tracklet_id=4, score=0.6, detection_index=3)
+    left = whole.xyxy.copy()
+    left[whole.track_id == 2, 2] = cut[:, 0]
+    (tmp_path / "frames").mkdir()
+    for i in poses.frame.tolist():
+        cv2.imwrite(
+            str(tmp_path / f"frames/{i:03d}.jpg"), np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+        )
+    out = tmp_path / "out"
+    workspace = Workspace(out)
+    workspace.bind(rt.Video(tmp_path / "frames"))
+    tracks = rt.Tracks.joined([with_columns(whole, xyxy=left), right])
+    workspace.save_last(unlinked(poses, tracks), poses)
+    options = ("--set", "objects.link=false")
+    assert rt.main(["objects", str(out), *options]) == 0
+    assert [o.id for o in rt.Result.load(out).objects] == [1, 2, 3, 4]
+    merge = {"do": "merge", "object": box_of(out, 2), "with": box_of(out, 4)}
+    path = write(tmp_path / "e.json", merge)
+    assert rt.main(["objects", str(out), "--edits", str(path), *options]) == 0
+    result = rt.Result.load(out)
+    assert [o.id for o in result.objects] == [1, 2, 3]
+    rows = result.tracks[result.tracks.track_id == 2]
+    np.testing.assert_allclose(rows.xyxy, middle.xyxy, atol=0.01)
+    np.testing.assert_allclose(rows.score, 0.9)
+    expected = fitted(whole, poses).objects[1]
+    assert result.objects[1].center == pytest.approx(expected.center, abs=0.02)
+    assert result.objects[1].size_m == pytest.approx(expected.size_m, abs=0.03)
+    rename = {"do": "rename", "object": box_of(out, 2), "class": "stool"}
+    assert rt.main(["objects", str(out), "--edits", str(write(path, merge, rename)), *options]) == 0
+    assert listed(out) == [(1, "chair"), (2, "stool"), (3, "chair")]
 
 
 def test_the_same_edits_give_the_same_files(folder: Path, tmp_path: Path) -> None:

@@ -8,7 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from map_worlds import some_points
-from simulated import chair_solids, fitted, tracks_of, walk, with_fitted_covariance
+from simulated import (
+    CUP,
+    chair_solids,
+    fitted,
+    tracks_of,
+    walk,
+    with_columns,
+    with_fitted_covariance,
+)
 
 import quadrics
 import reobj_track as rt
@@ -147,6 +155,45 @@ def test_what_is_seen_through_is_gone_and_gets_its_number_back(monday):
     room, result = add_recording(room, seen([0, 1, 2]), recording("friday"))
     assert [o.id for o in result.objects] == [1, 2, 3]
     assert object_state(room.objects[1], room).present
+
+
+def weakly(result: rt.Result, every: int, grown: float = 0.0) -> rt.Result:
+    """The recording with untracked cups of low score on the middle chair, in every n-th frame.
+
+    Args:
+        grown: on each side, of the size of the box.
+    """
+    rows = tracks_of(walk(24))
+    rows = rows[(rows.detection_index == 1) & (rows.frame % every == 0)]
+    side = np.tile(rows.xyxy[:, 2:] - rows.xyxy[:, :2], 2) * [-1, -1, 1, 1]
+    weak = with_columns(
+        rows, track_id=0, tracklet_id=0, score=0.12, class_id=CUP, xyxy=rows.xyxy + grown * side
+    )
+    return dataclasses.replace(result, untracked=weak)
+
+
+@pytest.mark.parametrize(
+    ("every", "grown", "gone"),
+    [
+        (1, 0.0, False),
+        (2, 0.0, False),  # half of the views
+        (12, 0.0, True),  # by accident
+        (1, 0.5, True),  # of something larger
+    ],
+)
+def test_weak_detections_on_its_place_show_that_an_object_is_there(monday, every, grown, gone):
+    tuesday = weakly(seen([0, 2], wall=True), every, grown)
+    room, result = add_recording(monday, tuesday, recording("tuesday"))
+    (change,) = result.changes.gone if gone else result.changes.not_seen
+    assert change.id == 2 and ("detected on its place" in change.evidence) is not gone
+    assert object_state(room.objects[1], room).present is not gone
+
+
+def test_detections_of_an_object_whose_shape_lies_elsewhere_count_too(monday):
+    """The boxes of the middle chair are where they were; only its fit is not."""
+    tuesday = moved_by(seen([0, 1, 2], wall=True), 2, [0, 1.5, 0])
+    _, result = add_recording(monday, tuesday, recording("tuesday"))
+    assert [c.id for c in result.changes.not_seen] == [2] and not result.changes.gone
 
 
 def test_without_points_behind_it_an_object_is_not_called_gone(monday):

@@ -20,16 +20,17 @@ from reobj.maps.compare import (
     FoundObject,
     PointMotion,
     Visibility,
+    alignment_jacobian,
     compare,
 )
 from reobj.maps.fusion import ObjectState, object_state, scale_of
 from reobj.maps.motion import point_motions
 from reobj.maps.object_points import ObjectView
 from reobj.maps.room_map import MapObject, MapPoints, Observation, RoomMap, Session
-from reobj.maps.visibility import shapes_of, visibility_of, without_unlocated
+from reobj.maps.visibility import MapDetections, shapes_of, visibility_of
 from reobj.results.changes import Change, Changes, Shape
 from reobj.results.result import Object, Result
-from reobj.types import Array, Floats, IntArray, unit_rows
+from reobj.types import Array, Floats, IntArray, Tracks, unit_rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,10 +88,9 @@ def add_recording(room: RoomMap, result: Result, recording: Recording) -> tuple[
     objects = [o for o in result.located if o.part == 0]
     found = _with_motions(found_objects(result, objects), states, result, room, recording)
     is_first = not room.sessions
-    visibility = visibility_of(states, result.poses, shapes_of(objects), result.looked)
-    tracked = result.tracks
-    others = tracked[~np.isin(tracked.track_id, [o.id for o in result.located])]
-    visibility = without_unlocated(visibility, states, result.poses, others)
+    detections = _all_detections(result, states, recording.alignment_cov)
+    nearer = shapes_of(objects)
+    visibility = visibility_of(states, result.poses, nearer, result.looked, detections)
     metres = scale_of(room).value if room.sessions else recording.scale.value
     decisions = compare(
         states,
@@ -138,6 +138,18 @@ def add_recording(room: RoomMap, result: Result, recording: Recording) -> tuple[
     names = {s.id: s.class_name for s in states if not s.deleted}
     changes = _changes(decisions, before, names, found, numbers, recording, scale_of(new_room))
     return new_room, _renumbered(result, numbers, states, decisions, changes)
+
+
+def _all_detections(
+    result: Result, states: Sequence[ObjectState], alignment_cov: Array
+) -> MapDetections:
+    """Collect the detections of all tracks and those that the tracker did not use."""
+    tracked = result.tracks[result.tracks.detection_index >= 0]
+    rows = Tracks.joined([tracked, result.untracked])
+    located = np.array([o.id for o in result.located], np.int64)
+    jacobian = alignment_jacobian(np.array([s.center for s in states]).reshape(-1, 3))
+    cov = np.array([s.cov[:3, :3] for s in states]).reshape(-1, 3, 3)
+    return MapDetections(rows, located, cov + jacobian @ alignment_cov @ jacobian.swapaxes(1, 2))
 
 
 def states_for(room: RoomMap, own: Mapping[int, Observation]) -> list[ObjectState]:

@@ -4,18 +4,36 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 import quadrics
-from reobj.cameras import Poses, invert_rigid
+from reobj.cameras import Poses, invert_rigid, undistort_boxes
 from reobj.maps.compare import Visibility
 from reobj.maps.fusion import ObjectState
 from reobj.objects.occlusion import entry_depths
 from reobj.results.result import Object
-from reobj.types import Array, BoolArray, IntArray, Tracks, rows_by
+from reobj.types import Array, BoolArray, IntArray, Tracks
 from reobj.visible_points import VisiblePoints
+
+LEAST_IOU = 0.5  # of a detection that may show an object, with its projection
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapDetections:
+    """Detections of a recording, for N objects of a map.
+
+    Attributes:
+        rows: in native pixels, of all scores, also those that no track has.
+        located: (M,) identities of objects with a shape.
+        cov: (N, 3, 3) of the centres of the map's objects, as the recording is placed.
+    """
+
+    rows: Tracks
+    located: IntArray
+    cov: Array
 
 
 def shapes_of(states: Sequence[ObjectState] | Sequence[Object]) -> quadrics.Ellipsoids:
@@ -34,13 +52,14 @@ def visibility_of(
     poses: Poses,
     nearer: quadrics.Ellipsoids,
     looked: IntArray | None = None,
+    detections: MapDetections | None = None,
     most_views: int = 60,
     least_px: float = 16.0,
     in_view: float = 0.7,
     apart_deg: float = 10.0,
     least_points: int = 3,
 ) -> Visibility:
-    """Count the independent views in which each object would be seen, and those through it.
+    """Count the independent views in which each object would be seen, was seen, and through it.
 
     An object is expected in an image if most of its projection lies inside, is large enough, and
     neither objects of the recording nor most of the sparse points in its outline lie nearer. Views
@@ -49,7 +68,7 @@ def visibility_of(
     Args:
         states: N objects of the map. poses: placed in the map; only its first component is used.
         nearer: objects of the recording, which may occlude. looked: frames that the detector was
-            run on; None: all.
+            run on; None: all. detections: in these frames; None: there are none.
         most_views: spread over the recording; more take longer.
         least_px: root of the area of the projected box in an image 640 px wide; detectors miss
             smaller objects.
@@ -94,55 +113,79 @@ def visibility_of(
     through[:, [len(ids) < least_points for ids in behind]] = False
     spread = np.array([np.linalg.eigvalsh(s.cov[:3, :3])[-1] for s in states])
     vague = ~(np.sqrt(spread) < shapes.half_axes.mean(1)) if len(states) else np.empty(0, bool)
-    expected[:, vague] = through[:, vague] = around[:, vague] = False
+    expected[:, vague] = False
+    detected, unlocated = np.zeros((2, *expected.shape), bool)
+    if detections is not None and len(states):
+        detected, unlocated = _detected(shapes, support, poses, rows, detections, expected)
+    through &= expected & ~detected
+    around &= expected & ~detected
     ray = shapes.center_in_world - centre[:, None]  # (V, N, 3)
     ray = ray / np.linalg.norm(ray, axis=2, keepdims=True).clip(1e-9)
 
-    def independent(mask: BoolArray) -> Array:
-        """Count the independent views (N,) among those marked (V, N)."""
-        counts = [_independent(ray[mask[:, k], k], apart_deg) for k in range(len(states))]
+    def independent(mask: BoolArray, value: BoolArray | None = None) -> Array:
+        """Count the independent views (N,) among those marked (V, N), or add their mean values."""
+        value = mask if value is None else value
+        counts = [
+            _independent(ray[mask[:, k], k], value[mask[:, k], k], apart_deg)
+            for k in range(len(states))
+        ]
         return np.array(counts, np.float64)
 
     # one view of its surroundings may show them beside what stands before the object
     seen_through = np.maximum(independent(through), independent(around) - 1)
-    return Visibility(independent(expected), seen_through, vague)
+    return Visibility(
+        independent(expected),
+        seen_through,
+        vague,
+        independent(expected, detected),
+        independent(expected, unlocated),
+    )
 
 
-def without_unlocated(
-    visibility: Visibility,
-    states: Sequence[ObjectState],
+def _detected(
+    shapes: quadrics.Ellipsoids,
+    support: list[str],
     poses: Poses,
-    boxes: Tracks,
-    least_iou: float = 0.3,
-) -> Visibility:
-    """Return the visibility without places where something was detected that has no shape.
+    rows: IntArray,
+    detections: MapDetections,
+    expected: BoolArray,
+) -> tuple[BoolArray, BoolArray]:
+    """Mark the objects on whose projection a detection lies that may show it, of any class.
 
-    An object that is detected in too few views for a shape is not gone.
+    The projection is varied by the covariance of the centre (sigma points). Detections of another
+    object with a shape count only if at least half of them lie on the projection: those of an
+    object beside it do in some views.
 
     Args:
-        states: N objects of the map. poses: placed in the map.
-        boxes: detections that belong to no object with a shape, native pixels.
-        least_iou: of such a box with a projected object (as low scores in the tracker).
+        shapes: (N,) of the map, each of its support. rows: (V,) of the poses.
+        expected: (V, N) views in which the map's objects are expected.
+    Returns:
+        (V, N) by any detection; (V, N) by one that belongs to no object with a shape.
     """
-    unknown = np.zeros(len(states), bool)
-    row_of = np.full(int(poses.frame.max(initial=-1)) + 2, -1)
-    placed = np.flatnonzero(poses.measured & (poses.part == 0))
-    row_of[poses.frame[placed]] = placed
-    boxes = boxes[row_of[boxes.frame.clip(max=len(row_of) - 1)] >= 0]  # the last: none
-    shapes = shapes_of(states)
-    support = [s.support for s in states]
     size = (poses.camera.width, poses.camera.height)
-    for rows in rows_by(boxes.frame) if len(states) else []:
-        pose = poses.cam_from_world[row_of[boxes.frame[rows[0]]]]
-        projected = quadrics.solid_boxes(shapes, support, (poses.camera.K @ pose)[None])
-        clipped = quadrics.clip_boxes(projected, size)[0]  # (N, 4)
-        iou = quadrics.box_iou(clipped[:, None], boxes.xyxy[rows])
-        unknown |= (iou >= least_iou).any(1)
-    return dataclasses.replace(
-        visibility,
-        expected=np.where(unknown, 0, visibility.expected),
-        seen_through=np.where(unknown, 0, visibility.seen_through),
-    )
+    known = np.unique(detections.located)  # (M,)
+    owner = np.searchsorted(known, detections.rows.track_id)  # (D,)
+    owner[~np.isin(detections.rows.track_id, known)] = len(known)
+    variance, axes = np.linalg.eigh(detections.cov)
+    offset = (np.sqrt(3 * variance.clip(0))[:, None] * axes).transpose(2, 0, 1)  # (3, N, 3)
+    shifts = np.concatenate([np.zeros_like(offset[:1]), offset, -offset])  # (7, N, 3)
+    on = np.zeros((len(rows), len(known) + 1, len(support)), bool)  # the last: no such object
+    shown = np.zeros((len(rows), len(known) + 1), bool)
+    for v, row in enumerate(rows.tolist()):
+        here = np.flatnonzero(detections.rows.frame == poses.frame[row])
+        box = undistort_boxes(detections.rows.xyxy[here], poses.camera)  # (d, 4)
+        camera = poses.camera.K @ poses.cam_from_world[row]
+        shown[v, owner[here]] = True
+        for shift in shifts:
+            moved = dataclasses.replace(shapes, center_in_world=shapes.center_in_world + shift)
+            projected = quadrics.solid_boxes(moved, support, camera[None])
+            projected = quadrics.clip_boxes(projected, size)[0]  # (N, 4)
+            iou = quadrics.box_iou(projected[:, None], box)  # (N, d)
+            np.logical_or.at(on[v], owner[here], iou.T >= LEAST_IOU)
+    on &= expected[:, None]
+    both = shown[:, :-1].T.astype(np.int64) @ expected  # (M, N) views
+    on[:, :-1] &= on[:, :-1].sum(0) >= 0.5 * both
+    return np.asarray(on.any(1), bool), on[:, -1]
 
 
 def _area(box: Array) -> Array:
@@ -227,11 +270,13 @@ def _points_around(
     return occluded, beside, through
 
 
-def _independent(ray: Array, apart_deg: float) -> int:
-    """Count views whose rays (n, 3) are at least some degrees from those counted before."""
-    count = 0
+def _independent(ray: Array, value: BoolArray, apart_deg: float) -> float:
+    """Add the values of views; those of rays (n, 3) less than some degrees apart are averaged."""
+    total = 0.0
     least = np.cos(np.radians(apart_deg))
     while len(ray):
-        count += 1
-        ray = ray[ray @ ray[0] < least]
-    return count
+        near = ray @ ray[0] >= least
+        total += float(value[near].mean())
+        ray = ray[~near]
+        value = value[~near]
+    return total

@@ -124,7 +124,8 @@ class Changes:
         localised_frames, tried_frames: that agree with the map, and that were compared with it.
         components: components of the trajectory (`Object.part`) that were placed in the map.
         sigma_m: standard deviation of positions due to the alignment with the map, metres.
-        stayed, moved, gone, new: changes. not_seen: objects of the map where no view passed.
+        stayed, moved, gone, new: changes. not_seen: objects of the map where no view passed, or
+            of which the evidence is too weak.
         ambiguous: objects, listed above too, that another object of the same look may be.
 
     Raises:

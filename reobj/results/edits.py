@@ -25,7 +25,9 @@ from reobj.types import (
     IntArray,
     ReobjError,
     Tracks,
+    box_area,
     box_iou,
+    rows_by,
 )
 
 HEADER = {"format": "reobj-edits", "version": 1}
@@ -36,6 +38,12 @@ FIELDS = {  # keys of an edit besides `do`
     "delete": ("object",),
 }
 SPLIT_TRACKLETS = ("object", "visits")  # the keys of a split by tracklets
+
+# Two boxes of a merged object in one frame (chosen)
+DUPLICATE_IOU = 0.6  # above it they show the same (as in the association)
+CONTAINED = 0.9  # fraction of the smaller one from which on it is a detail of the larger one
+LARGEST_GAP = 0.1  # between boxes of parts, over the side of the box around both
+LEAST_COVERED = 0.55  # by the boxes of parts, of the box around both
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,7 +195,8 @@ class Edited:
     """Tracks after corrections.
 
     Attributes:
-        tracks: the N rows with their new identities and classes. keep: (N,) False: deleted.
+        tracks: the N rows with their new identities, classes and boxes. keep: (N,) False: deleted,
+            or another row has the box of the object in this frame.
         class_names: of the tracks. confirmed: identities that the user confirmed by an edit.
         messages: for the user.
     """
@@ -203,8 +212,8 @@ def apply_edits(tracks: Tracks, class_names: tuple[str, ...], edits: Edits) -> E
     """Correct identities and classes of tracks.
 
     A merged object keeps the lower identity; what is split off gets the next free one; other
-    identities stay. Where two merged objects have boxes in the same frame, the box of lower score
-    is dropped.
+    identities stay. Where merged objects have boxes in the same frame, the row of the highest score
+    is kept, with the box of `joined_box`.
 
     Raises:
         ReobjError: the box of an edit does not exist.
@@ -217,11 +226,13 @@ def apply_edits(tracks: Tracks, class_names: tuple[str, ...], edits: Edits) -> E
         except LookupError as error:
             hint = "were these edits made for another result? make them anew in scene.html"
             raise ReobjError(f"{where}: {error.args[0]}; {hint}") from error
-    keep, messages = table.without_duplicates(str(edits.path))
+    keep, boxes, messages = table.one_box_a_frame(str(edits.path))
     if (count := len(edits.edits)) > 0:
         corrections = f"{count} correction{'s' * (count != 1)}"
         messages.append(f"{NOTE_START}{corrections} by hand applied ({OutputFile.EDITS})")
-    edited = dataclasses.replace(tracks, track_id=table.identity, class_id=table.class_id)
+    edited = dataclasses.replace(
+        tracks, track_id=table.identity, class_id=table.class_id, xyxy=boxes
+    )
     confirmed = table.confirmed & set(table.identity[keep].tolist())
     return Edited(edited, keep, tuple(table.names), confirmed, messages)
 
@@ -254,9 +265,14 @@ class _Tables:
             self.confirmed.add(kept)
 
     def _row_of(self, ref: BoxRef) -> int:
-        """Find the row of a box: prefer the identity of the reference, then the highest IoU."""
+        """Find the row of a box: prefer the identity of the reference, then the highest IoU.
+
+        An edit that was made after a merge may refer to a joined box.
+        """
         rows = np.flatnonzero((self.identity > 0) & (self.tracks.frame == ref.frame))
-        iou: Array = box_iou(self.tracks.xyxy[rows], np.array([ref.box]))[:, 0]  # (n,)
+        own = box_iou(self.tracks.xyxy[rows], np.array([ref.box]))[:, 0]  # (n,)
+        joined = box_iou(self.joined(rows)[0][rows], np.array([ref.box]))[:, 0]  # (n,)
+        iou: Array = np.maximum(own, joined)
         same = iou >= 0.9  # the box of an edit is rounded to .1 px, which costs .02 at 10 px
         rows = rows[same]
         iou = iou[same]
@@ -280,21 +296,74 @@ class _Tables:
         if moved.any():  # else they are another object already
             self.identity[moved] = self.identity.max() + 1
 
-    def without_duplicates(self, where: str) -> tuple[BoolArray, list[str]]:
-        """Select the rows (N,) to keep: in each frame the best box of a merged object.
+    def joined(self, rows: IntArray) -> tuple[Array, IntArray]:
+        """Join the boxes that an object has in one frame, among rows (n,) of objects.
 
         Returns:
-            True for rows to keep (N,), and messages about the others.
+            the boxes (N, 4), and the rows (k,) whose box another one has taken over.
+        """
+        boxes = self.tracks.xyxy.copy()
+        rows = rows[np.lexsort((-self.tracks.score[rows], self.tracks.frame[rows]))]
+        pairs = np.stack([self.identity[rows], self.tracks.frame[rows]], 1)  # (n, 2)
+        _, group, count = np.unique(pairs, axis=0, return_inverse=True, return_counts=True)
+        several = count[group] > 1
+        removed = list[int]()
+        for members in rows_by(group[several]):
+            best, *others = rows[several][members].tolist()
+            boxes[best] = joined_box(boxes[[best, *others]])
+            removed += others
+        return boxes, np.array(removed, np.int64)
+
+    def one_box_a_frame(self, where: str) -> tuple[BoolArray, Array, list[str]]:
+        """Give every object one box a frame.
+
+        Returns:
+            True for rows to keep (N,), the boxes (N, 4), and messages about the others.
         """
         keep = self.identity > 0
+        boxes, removed = self.joined(np.flatnonzero(keep))
+        keep[removed] = False
         messages = list[str]()
-        for number in sorted(self.confirmed):
-            rows: IntArray = np.flatnonzero(self.identity == number)
-            rows = rows[np.argsort(-self.tracks.score[rows], kind="stable")]
-            best = rows[np.unique(self.tracks.frame[rows], return_index=True)[1]]
-            keep[np.setdiff1d(rows, best)] = False
-            if (both := len(rows) - len(best)) > 0:
-                frames = f"{both} frame{'s' * (both != 1)}"
-                text = f"merged object {number} has two boxes in {frames}"
-                messages.append(f"{where}: {text}; the box of lower score is left out")
-        return keep, messages
+        for number in np.unique(self.identity[removed]).tolist():
+            frames = len(np.unique(self.tracks.frame[removed][self.identity[removed] == number]))
+            text = f"merged object {number} has two boxes in {frames} frame{'s' * (frames != 1)}"
+            messages.append(
+                f"{where}: {text}; boxes of parts are joined, of others the best is kept"
+            )
+        return keep, boxes, messages
+
+
+def joined_box(boxes: Array) -> Array:
+    """Return the box (4,) of one object by its boxes (K, 4) in one frame, the best one first.
+
+    Boxes of its parts, which adjoin or overlap, are joined. Of duplicates the better one counts, of
+    two boxes one of which contains the other the larger one; boxes elsewhere do not count.
+    """
+    whole: Array = boxes[0]
+    others = list(boxes[1:])
+    k = 0
+    while k < len(others):
+        wider = _with_part(whole, others[k])
+        if wider is None:
+            k += 1
+        else:  # those before may adjoin it now
+            whole = wider
+            del others[k]
+            k = 0
+    return whole
+
+
+def _with_part(whole: Array, part: Array) -> Array | None:
+    """Return a box (4,) with a part of the object; None if the part adds nothing, or lies apart."""
+    side = np.minimum(whole[2:], part[2:]) - np.maximum(whole[:2], part[:2])  # (2,) < 0: a gap
+    around = np.append(np.minimum(whole[:2], part[:2]), np.maximum(whole[2:], part[2:]))  # (4,)
+    area = float(box_area(whole))
+    other = float(box_area(part))
+    common = float(side.clip(0).prod())
+    if common > DUPLICATE_IOU * (area + other - common):
+        return None
+    if common >= CONTAINED * min(area, other):
+        return part if other > area else None
+    adjoins = (side >= -LARGEST_GAP * (around[2:] - around[:2])).all()
+    covered = area + other - common >= LEAST_COVERED * box_area(around)
+    return around if adjoins and covered else None

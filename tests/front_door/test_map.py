@@ -20,6 +20,7 @@ import pytest
 from map_sessions import read_mot, true_objects
 from scipy.spatial.transform import Rotation
 
+import quadrics
 import reobj.maps.room_map as room_map
 import reobj_track as rt
 from front_door.room import CAMERA, ROOM, ROOT, SMALL, cli, info, refusal
@@ -124,6 +125,34 @@ def test_tuesday_has_the_numbers_of_monday(made: Path) -> None:
     assert ids(made / "tuesday", "gone") <= {known[BOTTLE], known[CHAIR]}
     new = ids(made / "tuesday", "new")
     assert number_of(second, BALL) in new and not new & set(first)
+
+
+@pytest.mark.parametrize("score", [0.12, None])
+def test_what_is_still_detected_is_not_gone(desk: Path, score: float | None) -> None:
+    """Nothing moved, but the detector has the bottle as a cup of low score, or not at all."""
+    shutil.copy(desk / "monday.map", desk / "flat.map")
+    folder = desk / "weak"
+    folder.mkdir()
+    for name in ("room.mp4", "poses.txt"):
+        (folder / name).symlink_to(ROOM / name)
+    with np.load(ROOM / "detections.npz") as data:
+        columns = {name: data[name] for name in ("frame", "xyxy", "score", "class_id")}
+        facts = {name: data[name] for name in ("class_names", "image_size")}
+    truth = read_mot(ROOM / "gt_mot.txt")
+    bottle = {int(row[0]) - 1: row[2:] for row in truth if row[1] == BOTTLE}
+    shown = np.array([bottle.get(f, np.zeros(4)) for f in columns["frame"].tolist()])
+    its = quadrics.box_iou(columns["xyxy"], shown) > 0.3
+    assert its.sum() > 20
+    columns["score"] = np.where(its, score or 0.0, columns["score"])
+    columns["class_id"] = np.where(its, rt.COCO_NAMES.index("cup"), columns["class_id"])
+    np.savez(folder / "detections.npz", **columns, **facts)
+    out = desk / "weak_out"
+    assert (
+        cli(*words(folder, out, desk / "flat.map", "--start", 2, "--stop", 62, "--every", 4)) == 0
+    )
+    number = number_of(true_of(desk / "monday", ROOM), BOTTLE)
+    assert (number in ids(out, "gone")) == (score is None)
+    assert (number in ids(out, "not_seen")) == (score is not None)
 
 
 def test_places_are_true_in_the_world_of_the_map(made: Path) -> None:
