@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import quadrics
-from reobj.cameras import Poses, invert_rigid
+from reobj.cameras import Poses, distort_boxes, invert_rigid
 from reobj.maps.compare import Visibility
 from reobj.maps.fusion import ObjectState
 from reobj.objects.occlusion import entry_depths
@@ -135,7 +135,7 @@ def without_unlocated(
     for rows in rows_by(boxes.frame) if len(states) else []:
         pose = poses.cam_from_world[row_of[boxes.frame[rows[0]]]]
         projected = quadrics.solid_boxes(shapes, support, (poses.camera.K @ pose)[None])
-        clipped = quadrics.clip_boxes(projected, size)[0]  # (N, 4)
+        clipped = quadrics.clip_boxes(distort_boxes(projected[0], poses.camera), size)  # (N, 4)
         iou = quadrics.box_iou(clipped[:, None], boxes.xyxy[rows])
         unknown |= (iou >= least_iou).any(1)
     return dataclasses.replace(
