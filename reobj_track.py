@@ -1466,7 +1466,7 @@ def refit(
         sizes = config.objects
         check_known_size(sizes.known_size, sizes.size_priors(), last.class_names)
         result = last
-        links = workspace.last_links(last, dataclasses.asdict(last_config.objects))
+        links = workspace.last_links(dataclasses.asdict(last_config.objects))
         if tracks:
             links = None
             result = _given_tracks(tracks, video, config.detect, last)

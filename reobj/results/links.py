@@ -54,6 +54,7 @@ class Links:
             (`tracked_key`); "": read from the results of a folder without links.
         before: numbers in the last result of the folder; none before a refit. changed: how many
             identities of the last result have other boxes, as the detections were linked again.
+        hidden: tracklets of identities of a folder without links whose boxes are not in tracks.txt.
     """
 
     tracks: Tracks
@@ -69,6 +70,7 @@ class Links:
     key: str = ""
     before: frozenset[int] = frozenset()
     changed: int = 0
+    hidden: Mapping[int, frozenset[int]] = field(default_factory=dict)
 
     def renumbered(self, numbers: Mapping[int, int]) -> Links:
         """Return the links with other numbers of identities, which must differ.
@@ -97,7 +99,7 @@ class Links:
         """Number identities as those of the last result with which they share most boxes.
 
         The assignment is one to one, with most shared boxes in all. Identities without an earlier
-        one get numbers that none had.
+        one get numbers that none had. Those without known boxes are the same if the tracklets are.
         """
         row = last.rows_of(self.tracks)
         new, new_of_row = np.unique(self.tracks.track_id, return_inverse=True)
@@ -106,11 +108,17 @@ class Links:
         np.add.at(shared, (new_of_row[row >= 0], old_of_row[row[row >= 0]]), 1)
         pairs = zip(*linear_sum_assignment(-shared), strict=True)
         numbers = {int(new[i]): int(old[j]) for i, j in pairs if shared[i, j]}
-        free = max([last.highest, *old.tolist()]) + 1
+        hidden = dict(last.hidden)
+        free = last.highest + 1
         for identity in new.tolist():
-            if identity not in numbers:
-                numbers[identity] = free
-                free += 1
+            if identity in numbers:
+                continue
+            of_identity = self.tracks.track_id == identity
+            tracklets = set(self.tracks.tracklet_id[of_identity].tolist())
+            alike = [i for i, known in hidden.items() if known == tracklets]
+            numbers[identity] = identity if identity in alike else min(alike, default=free)
+            free += numbers[identity] == free
+            hidden.pop(numbers[identity], None)
         made = self.renumbered(numbers)
         return dataclasses.replace(
             made,
@@ -119,30 +127,33 @@ class Links:
         )
 
     def rows_of(self, tracks: Tracks) -> IntArray:
-        """Return the row of the same box (M,) of each row of `tracks`; -1: none."""
-        own, others = (np.column_stack([t.frame, t.xyxy]) for t in (self.tracks, tracks))
-        if not len(own):
-            return np.full(len(others), -1)
+        """Return the row of the same detection (M,) of each row of `tracks`; -1: none."""
+        if not len(self.tracks):
+            return np.full(len(tracks), -1)
+        own, others = (
+            np.column_stack([t.frame, t.xyxy, t.detection_index * bool(self.key)])
+            for t in (self.tracks, tracks)
+        )  # tracks.txt has no detection index
         row = cKDTree(own).query(others, p=np.inf, distance_upper_bound=SAME_PX)[1]
         return np.where(row < len(own), row, -1)
 
     def count_changed(self, tracks: Tracks, row: IntArray) -> int:
-        """Count the identities of these links whose boxes have other identities in `tracks`.
+        """Count the identities of these links that have other detections in `tracks`.
 
         Args:
-            row: (M,) of the same box here, or -1.
+            row: (M,) of the same detection here, or -1.
         """
-        known = row >= 0
-        now = np.zeros(len(self.tracks), np.int64)
-        now[row[known]] = tracks.track_id[known]
-        differs = now != self.tracks.track_id
-        if not self.key:  # without all boxes
-            differs &= now > 0
-        changed = set(self.tracks.track_id[differs].tolist())
-        added = np.full(len(tracks), bool(self.key))
-        added[known] = self.tracks.track_id[row[known]] != tracks.track_id[known]
-        changed |= set(tracks.track_id[added].tolist()) & set(self.tracks.track_id.tolist())
-        return len(changed)
+        kept = np.append(self.tracks.track_id, -1)[row] == tracks.track_id  # (M,)
+        found = np.zeros(len(self.tracks), bool)
+        found[row[kept]] = True
+        left = ~found
+        if self.key:
+            added = tracks.track_id[~kept]
+        else:  # the boxes of some identities are unknown
+            added = np.empty(0, np.int64)
+            left &= np.isin(np.arange(len(found)), row)
+        own = set(self.tracks.track_id.tolist())
+        return len(own & {*self.tracks.track_id[left].tolist(), *added.tolist()})
 
 
 def _mapped(identity: IntArray, numbers: Mapping[int, int]) -> IntArray:
@@ -226,22 +237,14 @@ def load_links(path: Path) -> Links:
         raise ReobjError(f"{path}: written by another version ({error})") from error
 
 
-def links_of_results(result: Result, tracked: Result, options: Mapping[str, Any]) -> Links:
+def links_of_results(result: Result, options: Mapping[str, Any]) -> Links:
     """Make links of the results of a folder that has none: for the numbers of its identities.
 
     Args:
-        result: of the folder; tracks.txt may lack the boxes of doubtful objects. tracked: before
-            linking: boxes of the tracklets of these. options: of the last run.
+        result: of the folder. options: of the last run.
     """
-    known = result.tracks[result.tracks.score > 0]
-    boxes = [known]
-    unknown = Links(known, known.frame, known.frame).rows_of(tracked.tracks) < 0
-    for o in result.objects:
-        if not (known.track_id == o.id).any():
-            rows = tracked.tracks[unknown & np.isin(tracked.tracks.tracklet_id, o.tracklet_ids)]
-            boxes.append(dataclasses.replace(rows, track_id=np.full(len(rows), o.id)))
-    tracks = Tracks.joined(boxes)
-    ids = [o.id for o in result.objects] + result.tracks.track_id.tolist()
+    tracks = result.tracks[result.tracks.score > 0]
+    ids = {o.id for o in result.objects} | set(result.tracks.track_id.tolist())
     none = np.full(len(tracks), -1)
     return Links(
         tracks,
@@ -251,4 +254,9 @@ def links_of_results(result: Result, tracked: Result, options: Mapping[str, Any]
         highest=max(ids, default=0),
         options=options,
         before=frozenset(ids),
+        hidden={
+            o.id: frozenset(o.tracklet_ids)
+            for o in result.objects
+            if not (tracks.track_id == o.id).any()
+        },
     )

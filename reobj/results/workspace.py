@@ -270,18 +270,18 @@ class Workspace:
         path = self.out / OutputFile.LAST_TRACKS
         return Result.load_tracked(path) if path.exists() else None
 
-    def last_links(self, tracked: Result, options: Mapping[str, Any]) -> Links | None:
+    def last_links(self, options: Mapping[str, Any]) -> Links | None:
         """Return the links of the last result; those without a file are made of the results.
 
         Args:
-            tracked: the latest tracks, before linking. options: of the objects stage, last run.
+            options: of the objects stage in the last run.
         Returns:
             None if there is no readable result.
         """
         if (links := load_cached(self.out / OutputFile.LAST_LINKS, load_links)) is not None:
             return links
         try:
-            return links_of_results(Result.load(self.out), tracked, options)
+            return links_of_results(Result.load(self.out), options)
         except ReobjError:
             return None
 
