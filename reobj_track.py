@@ -140,6 +140,7 @@ from reobj.results.checkpoint import Checkpoint
 from reobj.results.edits import kept_edits, read_edits
 from reobj.results.evaluation import evaluate, score_report
 from reobj.results.export import EXPORTS, Viewer, export
+from reobj.results.links import Links
 from reobj.results.live import LivePage, open_viewer
 from reobj.results.names import OutputFile
 from reobj.results.overlay import film_layers
@@ -1441,9 +1442,10 @@ def refit(
     tracks: str | Path | None = None,
     edits: str | Path | None = None,
 ) -> Result:
-    """Link and fit the tracks of an output folder again, by default with its last options.
+    """Fit the objects of an output folder again, by default with its last options.
 
-    `config.map` names the map of the room.
+    Identities keep their numbers; other options of linking (`objects.link`, `objects.moving`) link
+    the tracks again, and new identities get new numbers. `config.map` names the map of the room.
 
     Args:
         config: options; or a dict of those that differ from the last ones.
@@ -1456,21 +1458,24 @@ def refit(
         last = workspace.load_last()
         video, warnings = (workspace.video(), []) if tracks else workspace.video_or_frames(last)
         corrections = read_edits(edits) if edits else None
-        config = as_config(_last_config(out), config)
+        last_config = _last_config(out)
+        config = as_config(last_config, config)
         poses_config = config.poses.absolute()
         config = dataclasses.replace(config, input=video.config, poses=poses_config)
         _check_objects(config.objects)
         sizes = config.objects
         check_known_size(sizes.known_size, sizes.size_priors(), last.class_names)
         result = last
+        links = workspace.last_links(dataclasses.asdict(last_config.objects))
         if tracks:
+            links = None
             result = _given_tracks(tracks, video, config.detect, last)
             warnings = workspace.save_last(result, last.poses, workspace.last_models())
         result = dataclasses.replace(
             result, poses=last.poses, edits=corrections, warnings=[*result.warnings, *warnings]
         )
         with opened_map(config.map, must_exist=True) as room:
-            return _finish(_Job(video, workspace, config), result, room)
+            return _finish(_Job(video, workspace, config), result, room, links=links)
 
 
 def _with_detector(config: Config, detector: Any, detections: Any) -> tuple[Config, Any]:
@@ -1767,15 +1772,16 @@ def _finish(
     room: OpenMap | None = None,
     placed: Placed | None = None,
     fit: bool = True,
+    links: Links | None = None,
 ) -> Result:
     """Link tracklets, fit one shape per object, and write the map and the output folder.
 
     Args:
-        fit: False: the result has the objects already.
+        fit: False: the result has the objects already. links: of the last result of the folder.
     """
     if fit:
         with job.timed("objects"):
-            result = _fit_objects(job, result)
+            result = _fit_objects(job, result, links)
     if room is not None:
         with job.timed("map"):
             path = job.workspace.out / OutputFile.CHANGES
@@ -1791,13 +1797,14 @@ def _finish(
     return dataclasses.replace(result, seconds=job.seconds, step_seconds=job.step_seconds)
 
 
-def _fit_objects(job: _Job, result: Result) -> Result:
+def _fit_objects(job: _Job, result: Result, links: Links | None = None) -> Result:
     """Link and fit; gaps of tracks are filled with the default solver's shapes."""
     config = job.config
     edits = result.edits or kept_edits(job.workspace.out)
     with job.progress("objects", PhasesOfFit.TOTAL, counted=False) as line:
         phases = PhasesOfFit(line, result.poses)
-        fitted = link_and_fit(dataclasses.replace(result, edits=edits), config.objects, phases)
+        result = dataclasses.replace(result, edits=edits)
+        fitted = link_and_fit(result, config.objects, phases, links)
         gap = 0 if result.identities_given else config.output.fill_gaps
         tracks = fill(fitted, job.video.size, gap)
         detected = np.flatnonzero(tracks.detection_index >= 0)  # rows that were not filled in

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import dataclasses
+import functools
 import signal
 import sys
 from collections.abc import Iterator, Sequence
@@ -103,11 +104,46 @@ class Camera:
             return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
         return np.asarray(self.to_pycolmap().calibration_matrix(), np.float64)
 
+    @property
+    def fold_radius(self) -> float:
+        """Radius |xy| / z of a ray up to which the distortion keeps moving points outwards.
+
+        Beyond it the model moves points back towards the image centre: they are in no image. At
+        most that of rays of 90 deg (inf).
+        """
+        return _fold_radius(self.model, tuple(self.params))
+
+    def project(self, in_cam: Array) -> Array:
+        """Project points (..., 3) in the camera's frame to pixels (..., 2), with distortion.
+
+        NaN for points that are not in front of the camera or lie beyond `fold_radius`.
+        """
+        flat = np.asarray(in_cam, np.float64).reshape(-1, 3)
+        pixels = np.full((len(flat), 2), np.nan)
+        front = np.flatnonzero(flat[:, 2] > 0)
+        ahead = flat[front]
+        if self.model == "PINHOLE":
+            pixels[front] = ahead[:, :2] / ahead[:, 2:] @ self.K[:2, :2].T + self.K[:2, 2]
+        elif len(front):
+            radius = np.linalg.norm(ahead[:, :2], axis=1) / (1 + 1e-9)  # rounding at the fold
+            inside = radius <= self.fold_radius * ahead[:, 2]
+            found = np.asarray(self.to_pycolmap().img_from_cam(ahead), np.float64)
+            pixels[front] = np.where(inside[:, None], found, np.nan)
+        return pixels.reshape(*np.shape(in_cam)[:-1], 2)
+
+    def distort(self, xy: Array) -> Array:
+        """Map pixels (..., 2) of a pinhole camera with the same K to those of the image.
+
+        NaN for NaN, and for pixels beyond `fold_radius`.
+        """
+        homogeneous = np.concatenate([xy, np.ones((*np.shape(xy)[:-1], 1))], -1)
+        return self.project(homogeneous @ np.linalg.inv(self.K).T)
+
     def undistort(self, xy: Array) -> Array:
         """Map pixels (..., 2) to those of a pinhole camera with the same K.
 
-        NaN for NaN, for rays 90 deg or more off the axis, and for pixels where the distortion has
-        no inverse (outside of the region to which it was fitted).
+        NaN for NaN, for rays 90 deg or more off the axis, and for pixels to which the distortion
+        maps no point within `fold_radius`.
         """
         camera = self.to_pycolmap()
         flat = np.asarray(xy, np.float64).reshape(-1, 2)
@@ -115,16 +151,33 @@ class Camera:
         rows = np.flatnonzero(np.isfinite(flat).all(1))
         if len(rows):
             ray = np.asarray(camera.cam_ray_from_img(flat[rows]), np.float64)  # (n, 3)
-            ahead = np.isfinite(ray).all(1) & (ray[:, 2] > 0)
-            ray = ray[ahead]
-            rows = rows[ahead]
-            back = np.asarray(camera.img_from_cam(ray), np.float64).reshape(-1, 2)
-            error = np.abs(back - flat[rows]).max(1, initial=0)  # inf where the terms diverge
+            error = np.abs(self.project(ray) - flat[rows]).max(1)  # NaN, inf: no inverse
             inverted = error < 0.01  # px, negligible
             ray = ray[inverted]
-            rows = rows[inverted]
-            ideal[rows] = ray[:, :2] / ray[:, 2:] @ self.K[:2, :2].T + self.K[:2, 2]
+            ideal[rows[inverted]] = ray[:, :2] / ray[:, 2:] @ self.K[:2, :2].T + self.K[:2, 2]
         return ideal.reshape(np.shape(xy))
+
+    def clip_segments(self, ends: Array) -> Array:
+        """Clip segments (n, 2, 3) in front of the camera to `fold_radius`; NaN: all is beyond."""
+        radius = self.fold_radius
+        if not np.isfinite(radius):
+            return ends
+        start = ends[:, 0]
+        way = ends[:, 1] - start
+        cone = np.array([1, 1, -(radius**2)])  # |xy|^2 - r^2 z^2 = 0 on the cone of rays
+        a = way**2 @ cone  # at start + t way: a t^2 + 2 b t + c
+        b = start * way @ cone
+        c = start**2 @ cone
+        q = -b - np.copysign(np.sqrt((b**2 - a * c).clip(0)), b)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = np.stack([0 * a, q / a, c / q, 0 * a + 1], 1)  # (n, 4)
+        t = np.sort(np.nan_to_num(t).clip(0, 1), 1)
+        middle = start[:, None] + ((t[:, :-1] + t[:, 1:]) / 2)[..., None] * way[:, None]
+        inside = (middle**2 @ cone <= 0) & (t[:, :-1] < t[:, 1:])  # (n, 3): neighbours if several
+        first = np.where(inside, t[:, :-1], np.inf).min(1)
+        last = np.where(inside, t[:, 1:], -np.inf).max(1)
+        kept = np.where(inside.any(1), [first, last], np.nan).T  # (n, 2)
+        return np.asarray(start[:, None] + kept[..., None] * way[:, None])
 
     def to_pycolmap(self) -> Any:
         """Convert to a `pycolmap.Camera` with id 1.
@@ -146,6 +199,28 @@ class Camera:
         camera = self.to_pycolmap()
         camera.rescale(*size)
         return Camera(self.model, *size, tuple(camera.params.tolist()))
+
+
+@functools.lru_cache(64)
+def _fold_radius(model: str, params: tuple[float, ...], step_deg: float = 0.1) -> float:
+    """Find the fold of `Camera.fold_radius`, the nearest one of 16 directions.
+
+    Args:
+        step_deg: between the rays that are tried; near the fold the image moves by less than 1e-4
+            focal lengths in a step.
+    """
+    if model in ("PINHOLE", "SIMPLE_PINHOLE"):
+        return float("inf")
+    camera = Camera(model, 1, 1, params)
+    radius = np.tan(np.radians(np.arange(0, 90, step_deg)))  # (r,)
+    turn = 2 * np.pi * np.arange(16) / 16
+    xy = radius[:, None, None] * np.stack([np.cos(turn), np.sin(turn)], 1)  # (r, 16, 2)
+    rays = np.concatenate([xy, np.ones((*xy.shape[:2], 1))], 2).reshape(-1, 3)
+    pixels = np.asarray(camera.to_pycolmap().img_from_cam(rays), np.float64).reshape(xy.shape)
+    offset = (pixels - camera.K[:2, 2]) / np.diag(camera.K)[:2]
+    with np.errstate(invalid="ignore"):
+        outwards = (np.diff(np.linalg.norm(offset, axis=2), axis=0) > 0).all(1)  # (r - 1,)
+    return float("inf") if outwards.all() else float(radius[outwards.argmin()])
 
 
 def checked_camera(camera: Camera, where: str) -> Camera:
@@ -402,6 +477,49 @@ def undistort_boxes(xyxy: Array, camera: Camera) -> Array:
     at_border = (xyxy <= 1) | (xyxy >= limit - 1)
     boxes = np.where(at_border, xyxy, undistorted)
     return np.where(np.isfinite(boxes).all(1, keepdims=True), boxes, np.nan)
+
+
+def distort_boxes(xyxy: Array, camera: Camera) -> Array:
+    """Return the bounds (..., 4), pixels of the image, of boxes (..., 4) of a pinhole camera.
+
+    Only the part within `Camera.fold_radius` has an image; NaN for boxes without such a part.
+    """
+    if camera.model in ("PINHOLE", "SIMPLE_PINHOLE"):
+        return xyxy
+    boxes = xyxy.reshape(-1, 4)
+    bounds = np.full_like(boxes, np.nan)
+    rows = np.flatnonzero(np.isfinite(boxes).all(1))
+    for count in (5, 33):  # points along a side: more where the fold cuts the box
+        cut = np.zeros(len(rows), bool)
+        for block in np.array_split(np.arange(len(rows)), len(rows) // 1024 + 1):  # memory
+            grid = _distorted_grid(boxes[rows[block]], camera, count)
+            cut[block] = np.isnan(grid).any((1, 2))
+            bounds[rows[block], :2] = np.nan_to_num(grid, nan=np.inf).min(1)
+            bounds[rows[block], 2:] = np.nan_to_num(grid, nan=-np.inf).max(1)
+        rows = rows[cut]
+    bounds[~(bounds[:, :2] < bounds[:, 2:]).all(1)] = np.nan
+    return bounds.reshape(xyxy.shape)
+
+
+def _distorted_grid(xyxy: Array, camera: Camera, count: int) -> Array:
+    """Distort a grid of points (N, g, 2) over the parts of boxes (N, 4) that may have an image.
+
+    Equal steps of the viewing angle, as a box may extend to nearly 90 deg, and the row and the
+    column nearest to the optical axis, where the fold is farthest out.
+
+    Args:
+        count: of the steps' ends along each side.
+    """
+    focal = np.diag(camera.K)[:2]
+    centre = camera.K[:2, 2]
+    limit = min(np.arctan(camera.fold_radius), np.radians(89.9))
+    ends = np.arctan((xyxy.reshape(-1, 2, 2) - centre) / focal).clip(-limit, limit)
+    low, high = np.moveaxis(ends, 1, 0)  # (N, 2) rad
+    share = np.linspace(0, 1, count)[:, None, None]
+    angle = np.append(low + share * (high - low), np.clip(0, low, high)[None], 0)
+    x, y = np.moveaxis(np.tan(angle) * focal + centre, 2, 0)  # (count + 1, N) each
+    xy = np.stack(np.broadcast_arrays(x[:, None], y), -1)  # (count + 1, count + 1, N, 2)
+    return np.moveaxis(camera.distort(xy).reshape((count + 1) ** 2, -1, 2), 1, 0)
 
 
 def viewing_rays(xyxy: Array, img_from_world: Array) -> Array:

@@ -11,6 +11,7 @@ from test_linking import CHAIR, CUP, NAMES, SIZE, chair_solids, table_of, walk
 
 import quadrics
 import reobj_track as rt
+from reobj.cameras import distort_boxes
 from reobj.objects import association, categories, component, likelihood
 from reobj.objects.association import Association, AssociationOptions, Associator
 from reobj.objects.categories import Categories
@@ -630,6 +631,23 @@ def test_missed_frames_are_filled_with_the_projection() -> None:
     np.testing.assert_array_equal(made.frame, true.frame)
     np.testing.assert_allclose(made.xyxy, true.xyxy.clip(0, np.tile(SIZE, 2)), atol=6)
     assert set(made.track_id) == {1} and (made.detection_index == -1).all()
+
+
+def test_filled_boxes_have_the_distortion_of_the_lens() -> None:
+    """They are pixels of the image, as detections are; beyond the lens's fold there are none."""
+    poses = walk(60)
+    camera = rt.Camera("OPENCV", *SIZE, (520.0, 520.0, 320.0, 240.0, -0.3, 0.0, 0.0, 0.0))
+    bent = dataclasses.replace(poses, camera=camera)
+    table = table_of(poses)
+    table = dataclasses.replace(table, xyxy=distort_boxes(table.xyxy, camera))
+    table = table[np.isfinite(table.xyxy).all(1)]
+    seen = (table.detection_index != 0) | (table.frame < 28) | (table.frame >= 33)
+    filled = fill_from_objects(table[seen], bent, np.array([1, 2, 3]), chair_solids(), ["box"] * 3)
+    made = filled[filled.score == 0]
+    true = table[~seen].xyxy.clip(0, np.tile(SIZE, 2))
+    np.testing.assert_allclose(made.xyxy, true, atol=4)
+    straight = table_of(poses)[~seen].xyxy.clip(0, np.tile(SIZE, 2))
+    assert np.abs(made.xyxy - straight).max() > 10
 
 
 def test_frames_are_filled_only_near_observed_viewpoints() -> None:

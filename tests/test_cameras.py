@@ -17,6 +17,7 @@ import reobj_track as rt
 from reobj.cameras import (
     angle_deg,
     camera_parameters,
+    distort_boxes,
     invert_rigid,
     load_poses,
     place_of,
@@ -168,6 +169,138 @@ def test_boxes_are_undistorted_by_the_middles_of_their_edges():
     rows = np.array([[2, 200, 90, 300.0], [200, 150, 400, 300]])  # the first reaches beyond 90 deg
     assert np.isnan(undistort_boxes(rows, fisheye)).all(1).tolist() == [True, False]
     assert undistort_boxes(boxes, PINHOLE) is boxes and not len(undistort_boxes(boxes[:0], camera))
+
+
+# ---- The fold of strong distortion ----
+
+
+FOLDED = {  # inside these images, or near their border, the distortion turns back
+    "SIMPLE_RADIAL": (400.0, 320.0, 240.0, -0.3),
+    "RADIAL": (523.7, 332.1, 250.0, 0.134, -0.233),
+    "OPENCV": (400.0, 390.0, 320.0, 240.0, -0.47, 0.1, 0.003, -0.012),
+    "FULL_OPENCV": (400.0, 400.0, 320.0, 240.0, -0.07, -0.1, 4e-3, 5e-3, 0.05, -0.4, -0.47, -0.24),
+    "OPENCV_FISHEYE": (400.0, 400.0, 320.0, 240.0, -0.62, -0.1, 0.22, -0.01),
+    "SIMPLE_RADIAL_FISHEYE": (300.0, 320.0, 240.0, -0.25),
+    "RADIAL_FISHEYE": (300.0, 320.0, 240.0, -0.2, -0.02),
+    "THIN_PRISM_FISHEYE": (400.0, 400.0, 320, 240, -0.35, -0.19, 5e-3, -0.018, 0.14, 0.01, 0, 0),
+}
+
+
+def folded(model: str) -> rt.Camera:
+    return rt.Camera(model, *SIZE, FOLDED[model])
+
+
+def rays_to(radius: np.ndarray, directions: int = 24) -> np.ndarray:
+    """Points (R, D, 3) at depth 2 in some directions from the optical axis."""
+    turn = np.linspace(0, 2 * np.pi, directions, endpoint=False)
+    xy = 2 * radius[:, None, None] * np.stack([np.cos(turn), np.sin(turn)], 1)
+    return np.concatenate([xy, np.full((*xy.shape[:2], 1), 2.0)], 2)
+
+
+@pytest.mark.parametrize("model", FOLDED)
+def test_points_beyond_the_fold_are_in_no_image(model):
+    """Within it pixels equal pycolmap's, move outwards and have an inverse; beyond it are none."""
+    camera = folded(model)
+    fold = camera.fold_radius
+    points = rays_to(np.linspace(0.01, 0.99, 30) * fold)
+    pixels = camera.project(points)
+    theirs = np.asarray(camera.to_pycolmap().img_from_cam(points.reshape(-1, 3)))
+    np.testing.assert_allclose(pixels.reshape(-1, 2), theirs, rtol=0, atol=1e-9)
+    offset = np.linalg.norm((pixels - camera.K[:2, 2]) / np.diag(camera.K)[:2], axis=2)
+    assert (np.diff(offset, axis=0) > 0).all()
+    ideal = points[..., :2] / 2 @ camera.K[:2, :2].T + camera.K[:2, 2]
+    np.testing.assert_allclose(camera.distort(ideal), pixels, rtol=0, atol=1e-6)
+    shown = ((pixels > 0) & (pixels < SIZE)).all(2)
+    np.testing.assert_allclose(camera.undistort(pixels[shown]), ideal[shown], rtol=0, atol=0.2)
+    assert np.isnan(camera.project(rays_to(np.geomspace(1.01, 50, 30) * fold))).all()
+    assert np.isnan(camera.project(np.array([[0, 0, -1.0], [0.1, 0, 0]]))).all()
+
+
+@pytest.mark.parametrize("model", FOLDED)
+def test_the_fold_is_where_pycolmap_turns_back(model):
+    camera = folded(model)
+    near = np.asarray(camera.to_pycolmap().img_from_cam(
+        rays_to(np.array([0.97, 1.0, 1.1]) * camera.fold_radius, 16).reshape(-1, 3)
+    )).reshape(3, 16, 2)  # fmt: skip
+    before, at, beyond = np.linalg.norm((near - camera.K[:2, 2]) / np.diag(camera.K)[:2], axis=2)
+    assert (before < at).all() and (beyond < at).any()
+
+
+def test_the_fold_of_one_radial_term_is_known():
+    """r (1 + k r^2) turns back at r^2 = -1 / (3 k); without a fold the radius has no limit."""
+    assert folded("SIMPLE_RADIAL").fold_radius == pytest.approx(np.sqrt(1 / 0.9), rel=0.005)
+    assert rt.Camera("RADIAL", *SIZE, (500.0, 320.0, 240.0, 0.1, 0.0)).fold_radius == np.inf
+    assert PINHOLE.fold_radius == np.inf
+
+
+@pytest.mark.parametrize("model", FOLDED)
+def test_no_pixel_is_undistorted_to_a_point_beyond_the_fold(model):
+    """Corners that no point within the fold reaches have none, whatever the iteration finds."""
+    camera = folded(model)
+    grid = np.stack(np.meshgrid(np.linspace(0, 640, 33), np.linspace(0, 480, 25)), -1)
+    ideal = camera.undistort(grid)
+    radius = np.linalg.norm((ideal - camera.K[:2, 2]) / np.diag(camera.K)[:2], axis=2)
+    assert np.nanmax(radius) <= camera.fold_radius
+    assert np.isfinite(radius).mean() > 0.3
+
+
+@pytest.mark.parametrize("model", FOLDED)
+def test_segments_end_at_the_fold(model):
+    """The part that remains is that of the points with an image; other segments are NaN."""
+    camera = folded(model)
+    rng = np.random.default_rng(0)
+    ends = np.append(rng.uniform(-4, 4, (300, 2, 2)), rng.uniform(0.1, 3, (300, 2, 1)), 2)
+    clipped = camera.clip_segments(ends)
+    share = np.linspace(0, 1, 401)[:, None, None]
+    lines = ends[:, 0] + share * (ends[:, 1] - ends[:, 0])  # (401, 300, 3)
+    shown = np.isfinite(camera.project(lines)).all(2)
+    kept = np.isfinite(clipped).all((1, 2))
+    assert np.isfinite(camera.project(clipped[kept])).all()
+    assert 100 < kept.sum() < 300 and not shown[:, ~kept].any()
+    for k in np.flatnonzero(shown.sum(0) > 2):
+        inside = lines[shown[:, k], k]
+        step = np.linalg.norm(ends[k, 1] - ends[k, 0]) / 400
+        assert np.linalg.norm(clipped[k] - inside[[0, -1]], axis=1).max() < 1.01 * step
+
+
+@pytest.mark.parametrize("model", FOLDED)
+def test_boxes_beyond_the_fold_keep_the_part_in_the_image(model):
+    """The bounds, in the image, of all points of the box within the fold."""
+    camera = folded(model)
+    fold_px = min(camera.fold_radius, 4) * camera.K[0, 0]
+    x, y = camera.K[:2, 2]
+    boxes = np.array([
+        [x - 90, y - 60, x + 80, y + 120],  # within
+        [x + 0.5 * fold_px, y - 100, x + 40 * fold_px, y + 150],  # partly beyond
+        [x - 0.4 * fold_px, y - 0.3 * fold_px, x + 2 * fold_px, y + 3 * fold_px],
+        [x - 9e4, y - 9e4, x + 9e4, y + 9e4],  # all of the image
+        [x + 1.1 * fold_px, y - 100, x + 3 * fold_px, y + 150],  # beyond
+        [np.nan] * 4,
+    ])  # fmt: skip
+    if camera.fold_radius < 4:
+        assert np.isnan(distort_boxes(boxes, camera)[4:]).all()
+    limit = np.array([*SIZE, *SIZE])
+    found = distort_boxes(boxes, camera)[:4].clip(0, limit)
+    side = np.tan(np.linspace(-1.5, 1.5, 601))
+    for box, bounds in zip(boxes, found, strict=False):
+        across, along = (
+            np.append(values[(values > low) & (values < high)], [low, high])
+            for values, low, high in (
+                (x + side * camera.K[0, 0], box[0], box[2]),
+                (y + side * camera.K[1, 1], box[1], box[3]),
+            )
+        )
+        pixels = camera.distort(np.stack(np.meshgrid(across, along), -1).reshape(-1, 2))
+        true = np.append(np.nanmin(pixels, 0), np.nanmax(pixels, 0)).clip(0, limit)
+        np.testing.assert_allclose(bounds, true, atol=2)
+
+
+def test_boxes_of_a_pinhole_camera_stay():
+    boxes = np.array([[100, 80, 200, 300.0], [-50, 50, 640, 480]])
+    assert distort_boxes(boxes, PINHOLE) is boxes
+    camera = folded("RADIAL")
+    assert distort_boxes(boxes[:0], camera).shape == (0, 4)
+    assert distort_boxes(boxes[None], camera).shape == (1, 2, 4)
 
 
 # ---- Rigid transforms and rays -------------------------------------------------------------------

@@ -26,7 +26,6 @@ from reobj.results.overlay import (
     draw_wireframes,
     ellipse_of_dual_conic,
     film_layers,
-    image_points,
     outline_of,
     place_labels,
     surface_points,
@@ -172,7 +171,7 @@ STILL = np.eye(3, 4)
 def test_edges_span_the_projection_of_the_object(kind: str, turn: np.ndarray) -> None:
     frames, bounds = one_solid(kind, (0.2, 0.1, 4.0), (0.2, 0.5, 0.9), turn)
     ends, _, _ = frames.segments(STILL)
-    pixels = image_points(PINHOLE, ends).reshape(-1, 2)
+    pixels = PINHOLE.project(ends).reshape(-1, 2)
     found = [*pixels.min(0), *pixels.max(0)]
     np.testing.assert_allclose(found, bounds, atol=0.5 if kind == "cylinder" else 1e-9)
 
@@ -235,8 +234,8 @@ def test_projections_are_distorted() -> None:
     points = np.random.default_rng(0).uniform([-1, -0.6, 3], [1, 0.6, 5], (40, 3))
     expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), lens.K,
                                  np.array(lens.params[4:]))[0][:, 0]  # fmt: skip
-    np.testing.assert_allclose(image_points(lens, points), expected, atol=1e-6)
-    straight = image_points(PINHOLE, points)
+    np.testing.assert_allclose(lens.project(points), expected, atol=1e-6)
+    straight = PINHOLE.project(points)
     assert np.abs(straight - expected).max() > 1
 
 
@@ -266,11 +265,49 @@ def test_edges_are_distorted() -> None:
     center = np.array([[0, 0, 4.0]])
     frames = wireframes(quadrics.Ellipsoids(center, half, np.eye(3)[None]), ["box"])
     image = drawn(frames, {1}, camera=lens)
-    ends = image_points(lens, np.array([[-1.2, 0.7, 3.8], [1.2, 0.7, 3.8]]))
-    x, y = np.round(image_points(lens, np.array([[0, 0.7, 3.8]]))[0] - 0.5).astype(int)
+    ends = lens.project(np.array([[-1.2, 0.7, 3.8], [1.2, 0.7, 3.8]]))
+    x, y = np.round(lens.project(np.array([[0, 0.7, 3.8]]))[0] - 0.5).astype(int)
     assert y > ends[:, 1].max() + 3
     assert (image[y, x] == object_color(1)).all()
     assert (image[int(ends[0, 1]), x] != object_color(1)).any()
+
+
+def test_edges_beyond_the_fold_of_the_lens_are_not_drawn() -> None:
+    """A plank from the image to far beside it: its lines end where the lens shows no more.
+
+    The model turns back at 1.05 times the focal length, and far points of the plank would be
+    projected across the image.
+    """
+    lens = rt.Camera("OPENCV", 200, 120, (90.0, 90.0, 60.0, 60.0, -0.3, 0.0, 0.0, 0.0))
+    center = np.array([[9.8, 0.0, 4.0]])
+    half = np.array([[10.0, 0.3, 0.2]])
+    frames = wireframes(quadrics.Ellipsoids(center, half, np.eye(3)[None]), ["box"])
+    image = drawn(frames, {1}, camera=lens)
+    y, x = np.nonzero((image != 127).any(2))
+    steps = np.linspace(-1, 1, 2001)
+    ends = frames.points[frames.edges]
+    line = ends.mean(1, keepdims=True) + steps[:, None] * np.diff(ends, axis=1) / 2
+    shown = lens.project(line).reshape(-1, 2)
+    shown = shown[np.isfinite(shown).all(1)] - 0.5
+    gap = np.linalg.norm(np.c_[x, y][:, None] - shown[::7], axis=2).min(1)
+    assert gap.max() < 3
+    assert x.max() > shown[:, 0].max() - 2.5 and x.min() < 60
+
+
+def test_huge_objects_are_not_drawn_with_a_fold_either() -> None:
+    lens = rt.Camera("OPENCV", 200, 120, (90.0, 90.0, 60.0, 60.0, -0.3, 0.0, 0.0, 0.0))
+    frames, _ = one_solid("box", (0.6, 0.0, 0.3), (0.5, 0.5, 0.5), np.eye(3))
+    assert (drawn(frames, {1}, camera=lens) == 127).all()
+
+
+def test_former_places_end_at_the_fold_of_the_lens() -> None:
+    lens = rt.Camera("OPENCV", 200, 120, (90.0, 90.0, 60.0, 60.0, -0.3, 0.0, 0.0, 0.0))
+    steps = np.linspace(-1, 11, 1200)
+    points = np.concatenate([np.c_[steps, 0 * steps + y, 0 * steps + 4] for y in (-0.3, 0.3)])
+    outline = outline_of(lens, STILL, points - [3.5, 0, 0])
+    assert outline is not None and np.isfinite(outline).all()
+    rim = 60 + 90 * 2 / 3 / np.sqrt(0.9)  # r (1 - .3 r^2) at its maximum
+    assert outline[:, 0].max() == pytest.approx(rim, abs=0.5)
 
 
 def test_nearer_solids_are_drawn_over_farther_ones() -> None:

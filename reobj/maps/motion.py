@@ -256,12 +256,9 @@ def _above_bottom(
 
 
 def _errors(xyz: Array, xy: Array, cam_from_map: Array, camera: Camera) -> Array:
-    """Return reprojection errors (n,) in native pixels; infinite behind the camera."""
+    """Return reprojection errors (n,) in native pixels; infinite out of view."""
     in_cam = xyz @ cam_from_map[:, :3].T + cam_from_map[:, 3]
-    error = np.full(len(xyz), np.inf)
-    front = in_cam[:, 2] > 0
-    projected = np.asarray(camera.to_pycolmap().img_from_cam(in_cam[front]), np.float64)
-    error[front] = np.linalg.norm(projected.reshape(-1, 2) - xy[front], axis=1)
+    error = np.linalg.norm(camera.project(in_cam) - xy, axis=1)
     return np.asarray(np.nan_to_num(error, nan=np.inf))
 
 

@@ -163,7 +163,6 @@ def points_with_descriptors(
     order = np.argsort(poses.visibility[:, 0], kind="stable")
     frame_row, point = poses.visibility[order].T
     centre = invert_rigid(poses.cam_from_world)[:, :, 3]
-    camera = poses.camera.to_pycolmap()
     near_px = 1.5 * max(poses.camera.width, poses.camera.height) / 640
     for image in features:
         if not len(image.xy):
@@ -171,11 +170,12 @@ def points_with_descriptors(
         first, last = np.searchsorted(frame_row, (image.row, image.row + 1))
         seen = point[first:last]
         pose = poses.cam_from_world[image.row]
-        in_cam = poses.points[seen] @ pose[:, :3].T + pose[:, 3]
-        seen = seen[in_cam[:, 2] > 0]
+        xy = poses.camera.project(poses.points[seen] @ pose[:, :3].T + pose[:, 3])
+        shown = np.isfinite(xy).all(1)
+        seen = seen[shown]
+        xy = xy[shown]
         if not len(seen):
             continue
-        xy = np.asarray(camera.img_from_cam(in_cam[in_cam[:, 2] > 0]), np.float64).reshape(-1, 2)
         gap, keypoint = cKDTree(image.xy).query(xy)
         seen = seen[gap < near_px]
         keypoint = keypoint[gap < near_px]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -102,7 +102,7 @@ def add_recording(room: RoomMap, result: Result, recording: Recording) -> tuple[
     )
     if old is not None:
         decisions = _as_before(decisions, before, own)
-    numbers = _numbers(result, decisions, room, is_first)
+    numbers = _numbers(result, decisions, room, is_first, {o.id for o in objects})
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     session = _session(number, recording, result.poses, now if old is None else old.date)
     observations = _observations(number, decisions, found, states, visibility)
@@ -334,18 +334,32 @@ def _with_new_points(
 
 
 def _numbers(
-    result: Result, decisions: Sequence[Decision], room: RoomMap, is_first: bool
+    result: Result,
+    decisions: Sequence[Decision],
+    room: RoomMap,
+    is_first: bool,
+    compared: Collection[int],
 ) -> dict[int, int]:
     """Return the number in the map of every identity of the result.
 
-    In the first session identities are the numbers. Otherwise objects that match keep theirs, and
-    all others get numbers that no object had.
+    In the first session identities are the numbers. Otherwise objects that match keep theirs; so do
+    identities of the last result of the folder, unless the map has another object of this number.
+    All others get numbers that no object had.
+
+    Args:
+        compared: identities of the objects that were compared with the map.
     """
     identities = [o.id for o in result.objects]
     if is_first:
         return {identity: identity for identity in identities}
     numbers = {d.found_id: d.map_id for d in decisions if d.found_id and d.map_id}
-    unused = room.next_id
+    before = frozenset[int]() if result.links is None else result.links.before
+    known = {o.id for o in room.objects}
+    taken = set(numbers.values())
+    kept = [i for i in identities if i in before and i not in numbers and i not in taken]
+    numbers |= {i: i for i in kept if i not in known or i not in compared}
+    highest = 0 if result.links is None or not before else result.links.highest
+    unused = max(room.next_id, highest + 1)
     for identity in identities:
         if identity not in numbers:
             numbers[identity] = unused
@@ -394,6 +408,7 @@ def _renumbered(
         embeddings=embeddings,
         embedding_row=row_of[result.embedding_row[embedded]],
         changes=changes,
+        links=None if result.links is None else result.links.renumbered(numbers),
     )
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -19,7 +19,7 @@ import quadrics
 from reobj.cameras import Poses, place_of
 from reobj.objects import confidence
 from reobj.objects.categories import name_of, on_floor
-from reobj.objects.component import ComponentObjects, associate_component, find_floor
+from reobj.objects.component import associate_component, find_floor
 from reobj.objects.config import ObjectsConfig, make_fit
 from reobj.objects.description import describe_objects, describe_world
 from reobj.objects.frames import informative_frames, only_frames
@@ -28,6 +28,7 @@ from reobj.objects.observations import MIN_SCORE, Fit, Scene, gather_views, poin
 from reobj.objects.occlusion import occluded_edges
 from reobj.objects.phases import PhasesOfFit, Reach, ignore
 from reobj.results.edits import Edits, apply_edits
+from reobj.results.links import ComponentShapes, Links, tracked_key
 from reobj.results.result import Object, Result
 from reobj.sources.boxes_3d import Boxes3D
 from reobj.tracking.interpolation import fill_from_objects, fill_gaps
@@ -47,7 +48,10 @@ from reobj.types import (
 
 
 def link_and_fit(
-    result: Result, config: ObjectsConfig, phases: PhasesOfFit | None = None
+    result: Result,
+    config: ObjectsConfig,
+    phases: PhasesOfFit | None = None,
+    last: Links | None = None,
 ) -> Result:
     """Decide which detections belong to one object, and fit a shape to each object.
 
@@ -58,9 +62,11 @@ def link_and_fit(
 
     Args:
         phases: shows the progress.
+        last: links of the last result of the folder. Its identities are used again if its tracks,
+            its cameras and the options of linking are the same, and keep their numbers else.
     Returns:
-        the result with its tracks (identities; untracked detections may join them), objects, fits
-        and world.
+        the result with its tracks (identities; untracked detections may join them), objects, fits,
+        world and links.
     Raises:
         ReobjError: an edit made now does not find its object.
     """
@@ -71,19 +77,17 @@ def link_and_fit(
     def reach(component: _Component) -> Reach:
         return ignore if phases is None else phases.of(component.number)
 
-    if result.identities_given:
-        linked = _unlinked(result.tracks, len(components))
-    else:
-        tables = zip(components, _split_table(result), strict=True)
-        linked = _joined(
-            _link_component(component, table, source, result, priors, config, reach(component))
-            for component, (table, source) in tables
-        )
+    links = _link(result, config, reach, last)
+    linked = links if _same(links, config, OPTIONS_OF_SHAPES) else _without_shapes(links)
     edited = _Edited(linked, result.class_names, [], None)
     if result.edits is not None:
-        edited = _edit(linked, result, result.edits, priors)
+        edited = _edit(linked, result, result.edits, priors, _last_numbers(links, last))
         components = _split_trajectory(poses, config, edited.class_names)
     linked = edited.linked
+    number = links.tracks.track_id if edited.number is None else edited.number
+    links = dataclasses.replace(
+        links, number=number, highest=max(links.highest, int(number.max(initial=0)))
+    )
     identity, object_of_row = np.unique(linked.tracks.track_id, return_inverse=True)
     component_of_object = _component_with_most_boxes(
         linked.tracks, object_of_row, len(identity), poses
@@ -117,6 +121,7 @@ def link_and_fit(
         embedding_row=embedding_row,
         warnings=[*result.warnings, *edited.warnings],
         edits=edited.edits,
+        links=links,
     )
 
 
@@ -155,30 +160,72 @@ def _split_trajectory(
 # ---- Linking -----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class _Linked:
-    """Tracks with the identities of objects, of one or of all components.
+OPTIONS_OF_LINKS = ("link", "moving")
+# These change floor and ellipsoids with which the fit begins: then it finds them anew
+OPTIONS_OF_SHAPES = (*OPTIONS_OF_LINKS, "priors", "prior", "known_size", "up")
 
-    Attributes:
-        tracks: N rows. source: (N,) row of the result's tracks, -1: an untracked detection.
-        category: (N,) class whose size prior is used.
-        events: joins and splits. confidence: of identities.
-        objects: of each component, None where no association was made. label_of: number of the
-            object in these of an identity.
+
+def _same(links: Links, config: ObjectsConfig, names: Sequence[str]) -> bool:
+    """Test whether some options are those of the links."""
+    options = dataclasses.asdict(config)
+    return all(links.options.get(name) == options[name] for name in names)
+
+
+def _link(
+    result: Result,
+    config: ObjectsConfig,
+    reach: Callable[[_Component], Reach],
+    last: Links | None,
+) -> Links:
+    """Return the identities of all components: those of the last result, or linked again.
+
+    Without a change of the options of linking, detections are linked as in the last run: known
+    sizes and priors of this one concern the fit.
     """
+    key = tracked_key(result)
+    linking = config
+    if last is not None and _same(last, config, OPTIONS_OF_LINKS):
+        if last.key == key:
+            return last
+        known = {f.name for f in dataclasses.fields(ObjectsConfig)}
+        linking = ObjectsConfig(**{k: v for k, v in last.options.items() if k in known})
+    components = _split_trajectory(result.poses, linking, result.class_names)
+    if result.identities_given:
+        links = _unlinked(result.tracks, len(components))
+    else:
+        priors = linking.size_priors()
+        links = _joined(
+            _link_component(component, *table, result, priors, linking, reach(component))
+            for component, table in zip(components, _split_table(result), strict=True)
+        )
+        links = links if last is None else links.keep_numbers_of(last)
+    options = dataclasses.asdict(linking)
+    highest = max(links.highest, int(links.tracks.track_id.max(initial=0)))
+    return dataclasses.replace(
+        links,
+        options=options,
+        key=key,
+        highest=highest,
+        before=frozenset() if last is None or result.identities_given else last.before,
+    )
 
-    tracks: Tracks
-    source: IntArray
-    category: IntArray
-    events: list[LinkEvent]
-    confidence: dict[int, float]
-    objects: list[ComponentObjects | None]
-    label_of: dict[int, int]
+
+def _without_shapes(links: Links) -> Links:
+    """Return links without the shapes of the association."""
+    return dataclasses.replace(links, shapes=[None] * len(links.shapes))
 
 
-def _unlinked(tracks: Tracks, count: int) -> _Linked:
+def _last_numbers(links: Links, last: Links | None) -> IntArray | None:
+    """Return the number (N,) of each row in the last result, 0: none; None: no last result."""
+    if last is None or links is last:
+        return None if last is None else last.number
+    row = last.rows_of(links.tracks)
+    return np.where(row >= 0, np.append(last.number, 0)[row], 0)
+
+
+def _unlinked(tracks: Tracks, count: int) -> Links:
     """Keep the identities of the tracks as they are, for `count` components."""
-    return _Linked(tracks, np.arange(len(tracks)), tracks.class_id, [], {}, [None] * count, {})
+    return Links(tracks, np.arange(len(tracks)), tracks.class_id, shapes=[None] * count)
 
 
 def _split_table(result: Result) -> list[tuple[Tracks, IntArray]]:
@@ -204,7 +251,7 @@ def _link_component(
     priors: quadrics.Priors,
     config: ObjectsConfig,
     reach: Reach,
-) -> _Linked:
+) -> Links:
     """Link the tracks of a component; identities are numbered from 1.
 
     Args:
@@ -242,15 +289,16 @@ def _link_component(
         certainty = confidence.of_identities(tracks, label, posed, objects.confidence)
         shown = label >= 0
         label_of = dict(zip(tracks.track_id[shown].tolist(), label[shown].tolist(), strict=True))
-    return _Linked(tracks, source, tracks.class_id, events, certainty, [objects], label_of)
+    shapes = None if objects is None else ComponentShapes(objects.floor, objects.ellipsoids)
+    return Links(tracks, source, tracks.class_id, events, certainty, [shapes], label_of)
 
 
-def _joined(components: Iterable[_Linked]) -> _Linked:
+def _joined(components: Iterable[Links]) -> Links:
     """Join the linked components; identities are numbered after those of the components before."""
     joined = list[Tracks]()
     sources = list[IntArray]()
     events = list[LinkEvent]()
-    objects = list[ComponentObjects | None]()
+    shapes = list[ComponentShapes | None]()
     certainty: dict[int, float] = {}
     label_of: dict[int, int] = {}
     offset = 0
@@ -258,14 +306,14 @@ def _joined(components: Iterable[_Linked]) -> _Linked:
         joined.append(dataclasses.replace(linked.tracks, track_id=linked.tracks.track_id + offset))
         sources.append(linked.source)
         events += linked.events
-        objects += linked.objects
+        shapes += linked.shapes
         certainty |= {identity + offset: value for identity, value in linked.confidence.items()}
         label_of |= {identity + offset: label for identity, label in linked.label_of.items()}
         offset = int(joined[-1].track_id.max(initial=offset))
     order = np.argsort(np.concatenate([tracks.frame for tracks in joined]), kind="stable")
     tracks = Tracks.joined(joined)
     source = np.concatenate(sources)[order]
-    return _Linked(tracks, source, tracks.class_id, events, certainty, objects, label_of)
+    return Links(tracks, source, tracks.class_id, events, certainty, shapes, label_of)
 
 
 def _with_untracked(tracks: Tracks, untracked: Tracks) -> tuple[Tracks, IntArray]:
@@ -352,23 +400,36 @@ def _select_embeddings(result: Result, source: IntArray) -> tuple[Embeddings, In
 
 @dataclass(frozen=True, slots=True)
 class _Edited:
-    """Linked tracks after the user's edits, the class names, warnings, and the applied edits."""
+    """Linked tracks after the user's edits, the class names, warnings, and the applied edits.
 
-    linked: _Linked
+    `number`: (N,) identity of each row of the tracks before the edits, 0: deleted; None: no edits.
+    """
+
+    linked: Links
     class_names: tuple[str, ...]
     warnings: list[str]
     edits: Edits | None
+    number: IntArray | None = None
 
 
-def _edit(linked: _Linked, result: Result, edits: Edits, priors: quadrics.Priors) -> _Edited:
+def _edit(
+    linked: Links,
+    result: Result,
+    edits: Edits,
+    priors: quadrics.Priors,
+    last: IntArray | None,
+) -> _Edited:
     """Correct identities and classes by hand; an object that the user names certainly exists.
 
     A new name that the priors know is a new category. Any other is a label: the size prior stays
     that of the detector's class.
+
+    Args:
+        last: (N,) number of each row in the last result of the folder, 0: none.
     """
     before = linked.tracks
     try:
-        applied = apply_edits(before, result.class_names, edits)
+        applied = apply_edits(before, result.class_names, edits, last, linked.highest)
     except ReobjError as error:
         if not edits.kept:
             raise
@@ -393,7 +454,8 @@ def _edit(linked: _Linked, result: Result, edits: Edits, priors: quadrics.Priors
         confidence=certainty,
         label_of={i: label for i, label in linked.label_of.items() if previous.get(i) == {i}},
     )
-    return _Edited(edited, applied.class_names, applied.messages, edits)
+    number = np.where(applied.keep, applied.tracks.track_id, 0)
+    return _Edited(edited, applied.class_names, applied.messages, edits, number)
 
 
 # ---- Fitting -----------------------------------------------------------------------------------
@@ -421,7 +483,7 @@ def _component_with_most_boxes(
 def _fit_component(
     component: _Component,
     rows: IntArray,
-    linked: _Linked,
+    linked: Links,
     boxes_3d: Boxes3D | None,
     class_names: Sequence[str],
     priors: quadrics.Priors,
@@ -447,15 +509,15 @@ def _fit_component(
         view_count = np.bincount(group[usable], minlength=len(classes))
         frames, informative = _frames_of_fit(tracks[usable], poses)
         views = gather_views(tracks, only_frames(poses, frames), group, len(classes), MIN_SCORE)
-        objects = linked.objects[number]
-        if objects is None:
+        shapes = linked.shapes[number]
+        if shapes is None:
             first = fit(views, categories, Scene())
             floor = find_floor(poses, first)
             ellipsoids = first.ellipsoids
         else:
             label = np.array([linked.label_of.get(identity, -1) for identity in classes])
-            floor = objects.floor
-            ellipsoids = objects.ellipsoids[label]
+            floor = shapes.floor
+            ellipsoids = shapes.ellipsoids[label]
         standing = on_floor(priors, [name_of(class_names, c) for c in categories])
         views = dataclasses.replace(
             views,

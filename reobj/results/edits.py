@@ -208,17 +208,26 @@ class Edited:
     messages: list[str]
 
 
-def apply_edits(tracks: Tracks, class_names: tuple[str, ...], edits: Edits) -> Edited:
+def apply_edits(
+    tracks: Tracks,
+    class_names: tuple[str, ...],
+    edits: Edits,
+    last: IntArray | None = None,
+    highest: int = 0,
+) -> Edited:
     """Correct identities and classes of tracks.
 
-    A merged object keeps the lower identity; what is split off gets the next free one; other
-    identities stay. Where merged objects have boxes in the same frame, the row of the highest score
-    is kept, with the box of `joined_box`.
+    A merged object keeps the lower identity; what is split off gets the number that it had in the
+    last result, or one that no identity had; other identities stay. Where merged objects have boxes
+    in the same frame, the row of the highest score is kept, with the box of `joined_box`.
 
+    Args:
+        last: (N,) number of each row in the last result, 0: none; None: those of the tracks.
+        highest: number that an identity ever had.
     Raises:
         ReobjError: the box of an edit does not exist.
     """
-    table = _Tables(tracks, class_names)
+    table = _Tables(tracks, class_names, last, highest)
     for number, edit in enumerate(edits.edits, 1):
         where = f"{edits.path}, edit {number} ({edit.text})"
         try:
@@ -240,8 +249,16 @@ def apply_edits(tracks: Tracks, class_names: tuple[str, ...], edits: Edits) -> E
 class _Tables:
     """Columns of tracks during the application of edits; deleted rows have identity 0."""
 
-    def __init__(self, tracks: Tracks, class_names: tuple[str, ...]) -> None:
+    def __init__(
+        self,
+        tracks: Tracks,
+        class_names: tuple[str, ...],
+        last: IntArray | None = None,
+        highest: int = 0,
+    ) -> None:
         self.tracks = tracks
+        self.last = tracks.track_id if last is None else last
+        self.highest = max(highest, int(tracks.track_id.max(initial=0)))
         self.names = list(class_names)
         self.identity = tracks.track_id.copy()  # (N,)
         self.class_id = tracks.class_id.copy()  # (N,)
@@ -294,7 +311,16 @@ class _Tables:
         if not (of_object & ~moved).any():
             raise LookupError("these are all boxes of the object")
         if moved.any():  # else they are another object already
-            self.identity[moved] = self.identity.max() + 1
+            self.identity[moved] = self._number_of_split(moved)
+
+    def _number_of_split(self, moved: BoolArray) -> int:
+        """Number what is split off: as in the last result, if no other identity has this number."""
+        known, count = np.unique(self.last[moved], return_counts=True)
+        number = int(known[count.argmax()])
+        if number and number not in self.identity:
+            return number
+        self.highest += 1
+        return self.highest
 
     def joined(self, rows: IntArray) -> tuple[Array, IntArray]:
         """Join the boxes that an object has in one frame, among rows (n,) of objects.

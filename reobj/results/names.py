@@ -45,3 +45,4 @@ class OutputFile(enum.StrEnum):
     EARLIER = "cache/earlier.json"  # other recordings of the map
     LAST_POSES = "cache/last-poses.npz"
     LAST_TRACKS = "cache/last-tracks.npz"  # before linking
+    LAST_LINKS = "cache/last-links.npz"  # identities of the result, for refits

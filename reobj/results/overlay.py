@@ -370,16 +370,6 @@ def _unit_cylinder() -> Mesh:
     return points, edges, faces, np.repeat([True, True, False], SIDES), planes
 
 
-def image_points(camera: Camera, points: Array) -> Array:
-    """Project points (..., 3) in front of a camera, in its frame, to pixels (..., 2), distorted."""
-    flat = points.reshape(-1, 3)
-    if camera.model == "PINHOLE" or not len(flat):
-        pixels = flat[:, :2] / flat[:, 2:] @ camera.K[:2, :2].T + camera.K[:2, 2]
-    else:
-        pixels = np.asarray(camera.to_pycolmap().img_from_cam(flat), np.float64)
-    return pixels.reshape(*points.shape[:-1], 2)
-
-
 def draw_wireframes(
     image: Image,
     frames: Wireframes,
@@ -398,10 +388,13 @@ def draw_wireframes(
         seen: identities with a box in this frame; other solids are thin, without occluded edges.
     """
     ends, edge, front = frames.segments(cam_from_world)
+    straight = scale * (ends @ camera.K.T)[..., :2] / ends[..., 2:]  # (n, 2, 2) undistorted
+    clipped = camera.clip_segments(ends)
+    within = np.asarray(np.isfinite(clipped).all((1, 2)), bool)  # (n,)
     pieces = 1 if camera.model == "PINHOLE" else 8  # segments of an edge: 8 look smooth
     fraction = np.linspace(0, 1, pieces + 1)[:, None]  # (B + 1, 1)
-    line = ends[:, :1] + fraction * (ends[:, 1:] - ends[:, :1])  # (n, B + 1, 3)
-    pixels = scale * image_points(camera, line) - 0.5  # OpenCV draws with the pixel's centre at 0
+    line = clipped[:, :1] + fraction * (clipped[:, 1:] - clipped[:, :1])  # (n, B + 1, 3)
+    pixels = scale * camera.project(line) - 0.5  # OpenCV draws with the pixel's centre at 0
     shift = 4  # sub-pixel bits of OpenCV's lines
     solids, first = np.unique(frames.solid[edge], return_index=True)  # their edges are consecutive
     stop = np.append(first, len(edge))[1:]  # (S,)
@@ -409,10 +402,10 @@ def draw_wireframes(
     for k in sorted(edges_of, key=lambda k: -ends[edges_of[k], :, 2].mean()):  # nearest last
         rows = edges_of[k]
         obj = object_id[k]
-        if not drawn[k] or not _fits(pixels[rows], image):
+        if not drawn[k] or not _fits(straight[rows], image):
             continue
-        lines = np.round(pixels[rows] * (1 << shift)).astype(np.int32)
-        shown = front[rows]
+        lines = np.round(pixels[rows][within[rows]] * (1 << shift)).astype(np.int32)
+        shown = front[rows][within[rows]]
         color = object_color(obj)
         dim = tuple(int(0.6 * c) for c in color)
         if obj in seen:
@@ -480,10 +473,12 @@ def outline_of(camera: Camera, cam_from_world: Array, points: Array) -> Array | 
     least = 0.05 * np.linalg.norm(np.ptp(in_cam, axis=0))  # as for edges: nearer is not drawn
     if not (in_cam[:, 2] > least).all():
         return None
-    middle = image_points(camera, in_cam.mean(0))
+    middle = camera.project(in_cam.mean(0))
     if not ((middle > 0) & (middle < (camera.width, camera.height))).all():
         return None
-    hull = cv2.convexHull(image_points(camera, in_cam).astype(np.float32))[:, 0]
+    pixels = camera.project(in_cam)
+    pixels = pixels[np.isfinite(pixels).all(1)]
+    hull = cv2.convexHull(pixels.astype(np.float32))[:, 0]
     return np.concatenate([hull, hull[:1]]).astype(np.float64)
 
 

@@ -25,6 +25,10 @@ def summary(result: Result) -> str:
     counted = [o for o in result.objects if o.counted]
     lines = _counts(result, counted)
     lines += _implausible(result)
+    if result.links is not None and (changed := result.links.changed):
+        total = len(result.links.before)
+        text = f"linked again: {changed} of {total} identities have other boxes than before"
+        lines += _wrapped(text)
     if result.changes is not None:
         lines += _wrapped(result.changes.summary())
     if result.out is not None:

@@ -20,6 +20,7 @@ from reobj.results import notebook, report, saving, table
 from reobj.results.changes import Changes, EarlierSession
 from reobj.results.edits import Edits
 from reobj.results.entries import Object, Part, VideoInfo, World, found_text
+from reobj.results.links import Links
 from reobj.sources.boxes_3d import Boxes3D
 from reobj.types import Embeddings, IntArray, ReobjError, Tracks, counted
 
@@ -49,6 +50,8 @@ class Result:
         warnings: for the user. edits: manual corrections.
         changes: since the map that the recording was placed in; None: run without a map.
         earlier: the other recordings in that map, in their order; for the viewer.
+        links: how detections were linked to identities, for refits; None for a result read from a
+            folder.
         out: the folder that it was saved to or loaded from.
     """
 
@@ -71,6 +74,7 @@ class Result:
     edits: Edits | None = None
     changes: Changes | None = None
     earlier: Sequence[EarlierSession] = ()
+    links: Links | None = None
     out: Path | None = None
 
     def __repr__(self) -> str:

@@ -41,6 +41,7 @@ from reobj.results.changes import (
 )
 from reobj.results.edits import write_edits
 from reobj.results.entries import Object, VideoInfo, World, decode
+from reobj.results.links import save_links
 from reobj.results.names import OutputFile
 from reobj.results.ply import write_ply
 from reobj.results.upright import component_of, upright_pose
@@ -54,7 +55,7 @@ if TYPE_CHECKING:
 HEADER = {"format": "reobj-objects", "version": 1}  # of objects.json
 STALE = (  # files that not every run writes; cameras.csv: before 0.2
     OutputFile.POSES, OutputFile.MESH, OutputFile.LAST_POSES, OutputFile.CHANGES,
-    OutputFile.EARLIER,
+    OutputFile.EARLIER, OutputFile.LAST_LINKS,
     "cameras.csv", "overlay.mp4", "overlay.webm", "scene.html",
 )  # fmt: skip
 
@@ -143,6 +144,8 @@ def save(
         write_mot(new / OutputFile.TRACKS, shown.tracks)
         write_objects(result, new / OutputFile.OBJECTS)
         write_edits(new, result.edits)
+        if result.links is not None:
+            save_links(result.links, new / OutputFile.LAST_LINKS)
         if result.changes is not None:
             write_changes(new / OutputFile.CHANGES, result.changes)
         if result.earlier:

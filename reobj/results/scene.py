@@ -151,9 +151,7 @@ def _distorted_grid(camera: Camera, width: int, height: int) -> npt.NDArray[np.f
 
 def _distorted(camera: Camera, xy: Array) -> Array:
     """Return the distorted pixels (N, 2) of pixels (N, 2) of the pinhole camera; -.5: none."""
-    rays = np.hstack([xy, np.ones((len(xy), 1))]) @ np.linalg.inv(camera.K).T  # (N, 3)
-    distorted = np.asarray(camera.to_pycolmap().img_from_cam(rays), np.float64)
-    return np.asarray(np.nan_to_num(distorted, nan=-0.5))
+    return np.asarray(np.nan_to_num(camera.distort(xy), nan=-0.5))
 
 
 def _lens(camera: Camera, columns: int = 64, rows: int = 48) -> dict[str, Any] | None:

@@ -7,7 +7,7 @@ import dataclasses
 import hashlib
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from reobj.files import (
     writing,
 )
 from reobj.results.entries import decode
+from reobj.results.links import Links, links_of_results, load_links
 from reobj.results.names import OutputFile
 from reobj.results.result import Result
 from reobj.results.saving import (
@@ -268,6 +269,21 @@ class Workspace:
         """The latest tracks of the tracker, before linking; None if there are none."""
         path = self.out / OutputFile.LAST_TRACKS
         return Result.load_tracked(path) if path.exists() else None
+
+    def last_links(self, options: Mapping[str, Any]) -> Links | None:
+        """Return the links of the last result; those without a file are made of the results.
+
+        Args:
+            options: of the objects stage in the last run.
+        Returns:
+            None if there is no readable result.
+        """
+        if (links := load_cached(self.out / OutputFile.LAST_LINKS, load_links)) is not None:
+            return links
+        try:
+            return links_of_results(Result.load(self.out), options)
+        except ReobjError:
+            return None
 
     def load_last(self) -> Result:
         """Return the latest tracks of the tracker, before linking, with the latest poses."""

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import quadrics
-from reobj.cameras import Camera, Poses
+from reobj.cameras import Poses, distort_boxes
 from reobj.sources.masks import NO_RUNS
 from reobj.sources.recorded import RecordedDetections
 from reobj.sources.tables import BOXES_3D, Table, read_cells, seconds, text_classes
@@ -143,7 +143,7 @@ def _projected(box: Array, time_s: Array, poses: Poses, video: Video) -> tuple[I
         rows = np.flatnonzero(nearest == k)
         xyxy[rows] = quadrics.solid_boxes(solids[rows], "box", img_from_world[k : k + 1])[0]
     size = (poses.camera.width, poses.camera.height)
-    xyxy = quadrics.clip_boxes(_distorted(xyxy, poses.camera), size)
+    xyxy = quadrics.clip_boxes(distort_boxes(xyxy, poses.camera), size)
     return frame, xyxy * np.tile(np.divide(video.size, size), 2)
 
 
@@ -157,26 +157,3 @@ def _nearest(times_s: Array, time_s: Array) -> IntArray:
     offset = np.abs(times_s[pair] - time_s[:, None])
     nearest = np.take_along_axis(pair, offset.argmin(1)[:, None], 1)[:, 0]
     return np.asarray(np.where(offset.min(1) <= half, nearest, -1), np.int64)
-
-
-def _distorted(xyxy: Array, camera: Camera) -> Array:
-    """Map bounds (N, 4) of a pinhole camera to those with the distortion of the camera.
-
-    By corners and middles of the sides, clipped to twice the image: distortions diverge beyond.
-    """
-    if camera.model in ("PINHOLE", "SIMPLE_PINHOLE"):
-        return xyxy
-    w = camera.width
-    h = camera.height
-    near = np.clip(xyxy, [-w / 2, -h / 2] * 2, [1.5 * w, 1.5 * h] * 2)
-    x = near[:, [0, 2, 0, 2]].mean(1)
-    y = near[:, [1, 3]].mean(1)
-    along_x = np.stack([near[:, 0], x, near[:, 2]], 1)[:, [0, 1, 2, 0, 2, 0, 1, 2]]
-    along_y = np.stack([near[:, 1], y, near[:, 3]], 1)[:, [0, 0, 0, 1, 1, 2, 2, 2]]
-    rays = np.stack([along_x, along_y, np.ones_like(along_x)], 2) @ np.linalg.inv(camera.K).T
-    rows = np.flatnonzero(np.isfinite(near).all(1))
-    found = np.full((len(near), 8, 2), np.nan)
-    if len(rows):
-        flat = rays[rows].reshape(-1, 3)
-        found[rows] = np.asarray(camera.to_pycolmap().img_from_cam(flat)).reshape(-1, 8, 2)
-    return np.hstack([found.min(1), found.max(1)])

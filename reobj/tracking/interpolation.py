@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 import quadrics
-from reobj.cameras import Poses
+from reobj.cameras import Poses, distort_boxes
 from reobj.tracking.box_noise import STD_POSITION, STD_START, STD_VELOCITY
 from reobj.tracking.ellipsoid_map import EXPECTED_IN_VIEW
 from reobj.types import (
@@ -108,8 +108,10 @@ def fill_from_objects(
     tables = [tracks]
     for o, track_id in enumerate(identity.tolist()):
         whole = quadrics.solid_boxes(ellipsoids[[o]], [support[o]], cams)[:, 0]
-        box = quadrics.clip_boxes(whole, size)  # (V, 4)
-        visible = box_area(box) > EXPECTED_IN_VIEW * box_area(whole)  # False where NaN
+        inside = box_area(quadrics.clip_boxes(whole, size))
+        visible = inside > EXPECTED_IN_VIEW * box_area(whole)  # False where NaN
+        box = quadrics.clip_boxes(distort_boxes(whole, poses.camera), size)  # (V, 4)
+        visible &= np.isfinite(box[:, 0])
         rows = tracks[(tracks.track_id == track_id) & np.isin(tracks.frame, frame)]  # (n,)
         empty = np.setdiff1d(np.flatnonzero(visible), np.searchsorted(frame, rows.frame))  # (T,)
         rows = rows if sources is None else rows[np.isin(rows.frame, sources)]

@@ -59,9 +59,8 @@ class DepthMaps:
         xy = np.stack([x, y], -1)  # (h, w, 2)
         if self.camera.model not in ("PINHOLE", "SIMPLE_PINHOLE"):
             # pixels of an ideal pinhole camera lie elsewhere in the distorted image
-            ray = np.concatenate([xy + 0.5, np.ones_like(x)[..., None]], -1) @ np.linalg.inv(K).T
-            distorted = self.camera.to_pycolmap().img_from_cam(ray.reshape(-1, 3))
-            xy = np.floor(np.reshape(distorted, xy.shape)).astype(int)
+            distorted = np.nan_to_num(self.camera.distort((xy + 0.5).astype(np.float64)), nan=-1)
+            xy = np.floor(distorted.clip(-1, max(size))).astype(int)
         inside: BoolArray = np.all((xy >= 0) & (xy < size), axis=-1)
         xy = np.where(inside[..., None], xy, 0)
         depth = np.where(inside, image[xy[..., 1], xy[..., 0]], 0).astype(np.float32)

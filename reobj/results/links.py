@@ -1,0 +1,262 @@
+"""Identities of the detections of a recording: kept in the output folder, so that a refit has them.
+
+An identity keeps its number: a refit with other options of the fit uses the same identities. If
+detections are linked again, identities get the numbers of earlier ones by the boxes they share.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial import cKDTree
+
+import quadrics
+from reobj.files import load_npz, save_npz
+from reobj.types import IntArray, LinkEvent, ReobjError, Tracks
+
+if TYPE_CHECKING:
+    from reobj.results.result import Result
+
+SAME_PX = 0.02  # between a box and the same one in tracks.txt, which is rounded to .01 px
+
+
+class ComponentShapes(NamedTuple):
+    """Shapes by which the detections of a component were associated.
+
+    Attributes:
+        floor: or None. ellipsoids: (O + 1,) of the objects, and NaN at the end.
+    """
+
+    floor: quadrics.Floor | None
+    ellipsoids: quadrics.Ellipsoids
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Links:
+    """Tracks with the identities of objects, of one or of all components, before edits.
+
+    Attributes:
+        tracks: N rows. source: (N,) row of the result's tracks, -1: an untracked detection.
+        category: (N,) class whose size prior is used.
+        events: joins and splits. confidence: of identities.
+        shapes: of each component, None where no association was made. label_of: number of the
+            object in these of an identity.
+        number: (N,) identity of each row after edits, and in a map; 0: deleted.
+        highest: number that an identity of the folder ever had.
+        options: of the objects stage when they were linked. key: of the tracks and cameras
+            (`tracked_key`); "": read from the results of a folder without links.
+        before: numbers in the last result of the folder; none before a refit. changed: how many
+            identities of the last result have other boxes, as the detections were linked again.
+        hidden: tracklets of identities of a folder without links whose boxes are not in tracks.txt.
+    """
+
+    tracks: Tracks
+    source: IntArray
+    category: IntArray
+    events: list[LinkEvent] = field(default_factory=list)
+    confidence: dict[int, float] = field(default_factory=dict)
+    shapes: list[ComponentShapes | None] = field(default_factory=list)
+    label_of: dict[int, int] = field(default_factory=dict)
+    number: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+    highest: int = 0
+    options: Mapping[str, Any] = field(default_factory=dict)
+    key: str = ""
+    before: frozenset[int] = frozenset()
+    changed: int = 0
+    hidden: Mapping[int, frozenset[int]] = field(default_factory=dict)
+
+    def renumbered(self, numbers: Mapping[int, int]) -> Links:
+        """Return the links with other numbers of identities, which must differ.
+
+        An identity without a new number keeps its own one unless another identity gets it.
+        """
+        taken = set(numbers.values())
+        own = {*np.unique(self.tracks.track_id).tolist(), *np.unique(self.number).tolist()} - {0}
+        new = dict(numbers)
+        free = max([self.highest, *taken, *own]) + 1
+        for identity in sorted(own - new.keys()):
+            new[identity] = identity
+            if identity in taken:
+                new[identity] = free
+                free += 1
+        return dataclasses.replace(
+            self,
+            tracks=dataclasses.replace(self.tracks, track_id=_mapped(self.tracks.track_id, new)),
+            number=_mapped(self.number, new),
+            confidence={new[i]: value for i, value in self.confidence.items()},
+            label_of={new[i]: label for i, label in self.label_of.items()},
+            highest=max([self.highest, *new.values()]),
+        )
+
+    def keep_numbers_of(self, last: Links) -> Links:
+        """Number identities as those of the last result with which they share most boxes.
+
+        The assignment is one to one, with most shared boxes in all. Identities without an earlier
+        one get numbers that none had. Those without known boxes are the same if the tracklets are.
+        """
+        row = last.rows_of(self.tracks)
+        new, new_of_row = np.unique(self.tracks.track_id, return_inverse=True)
+        old, old_of_row = np.unique(last.tracks.track_id, return_inverse=True)
+        shared = np.zeros((len(new), len(old)))
+        np.add.at(shared, (new_of_row[row >= 0], old_of_row[row[row >= 0]]), 1)
+        pairs = zip(*linear_sum_assignment(-shared), strict=True)
+        numbers = {int(new[i]): int(old[j]) for i, j in pairs if shared[i, j]}
+        hidden = dict(last.hidden)
+        free = last.highest + 1
+        for identity in new.tolist():
+            if identity in numbers:
+                continue
+            of_identity = self.tracks.track_id == identity
+            tracklets = set(self.tracks.tracklet_id[of_identity].tolist())
+            alike = [i for i, known in hidden.items() if known == tracklets]
+            numbers[identity] = identity if identity in alike else min(alike, default=free)
+            free += numbers[identity] == free
+            hidden.pop(numbers[identity], None)
+        made = self.renumbered(numbers)
+        return dataclasses.replace(
+            made,
+            highest=max([last.highest, *numbers.values()]),
+            changed=last.count_changed(made.tracks, row),
+        )
+
+    def rows_of(self, tracks: Tracks) -> IntArray:
+        """Return the row of the same detection (M,) of each row of `tracks`; -1: none."""
+        if not len(self.tracks):
+            return np.full(len(tracks), -1)
+        own, others = (
+            np.column_stack([t.frame, t.xyxy, t.detection_index * bool(self.key)])
+            for t in (self.tracks, tracks)
+        )  # tracks.txt has no detection index
+        row = cKDTree(own).query(others, p=np.inf, distance_upper_bound=SAME_PX)[1]
+        return np.where(row < len(own), row, -1)
+
+    def count_changed(self, tracks: Tracks, row: IntArray) -> int:
+        """Count the identities of these links that have other detections in `tracks`.
+
+        Args:
+            row: (M,) of the same detection here, or -1.
+        """
+        kept = np.append(self.tracks.track_id, -1)[row] == tracks.track_id  # (M,)
+        found = np.zeros(len(self.tracks), bool)
+        found[row[kept]] = True
+        left = ~found
+        if self.key:
+            added = tracks.track_id[~kept]
+        else:  # the boxes of some identities are unknown
+            added = np.empty(0, np.int64)
+            left &= np.isin(np.arange(len(found)), row)
+        own = set(self.tracks.track_id.tolist())
+        return len(own & {*self.tracks.track_id[left].tolist(), *added.tolist()})
+
+
+def _mapped(identity: IntArray, numbers: Mapping[int, int]) -> IntArray:
+    """Return the new numbers (N,) of identities (N,); 0 stays."""
+    own, row = np.unique(identity, return_inverse=True)
+    new = np.array([numbers[i] if i else 0 for i in own.tolist()], np.int64)
+    return np.asarray(new[row])
+
+
+def tracked_key(result: Result) -> str:
+    """Hash the tracks before linking, and the cameras."""
+    tables = (result.tracks, result.untracked)
+    arrays = [getattr(t, f.name) for t in tables for f in dataclasses.fields(Tracks)]
+    if result.poses is not None:
+        arrays += [result.poses.cam_from_world, result.poses.part]
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+# ---- File --------------------------------------------------------------------------------------
+
+
+def save_links(links: Links, path: Path) -> None:
+    """Write links as npz."""
+    arrays = {f.name: getattr(links.tracks, f.name) for f in dataclasses.fields(Tracks)}
+    arrays |= {name: getattr(links, name) for name in ("source", "category", "number")}
+    for name in ("confidence", "label_of"):
+        known: dict[int, Any] = getattr(links, name)
+        arrays |= {f"{name}_id": np.array(list(known), np.int64), name: np.array([*known.values()])}
+    floors = []
+    for k, shapes in enumerate(links.shapes):
+        floor = None if shapes is None else shapes.floor
+        floors.append(None if floor is None else (floor.normal.tolist(), *floor[1:]))
+        if shapes is not None:
+            columns = dataclasses.fields(quadrics.Ellipsoids)
+            arrays |= {f"{f.name}_{k}": getattr(shapes.ellipsoids, f.name) for f in columns}
+    facts = {name: getattr(links, name) for name in ("highest", "options", "key")}
+    events = [dataclasses.asdict(event) for event in links.events]
+    save_npz(path, arrays, events=events, floors=floors, **facts)
+
+
+def load_links(path: Path) -> Links:
+    """Read what `save_links` wrote.
+
+    Raises:
+        ReobjError: damaged, or of another version.
+    """
+    data, facts = load_npz(path, sealed=True)
+    try:
+        tracks = Tracks(*(data[f.name] for f in dataclasses.fields(Tracks)))
+        confidence, label_of = (
+            dict(zip(data[f"{name}_id"].tolist(), data[name].tolist(), strict=True))
+            for name in ("confidence", "label_of")
+        )
+        shapes = list[ComponentShapes | None]()
+        columns = [f.name for f in dataclasses.fields(quadrics.Ellipsoids)]
+        for k, values in enumerate(facts["floors"]):
+            floor = values and quadrics.Floor(np.array(values[0]), *values[1:])
+            shapes.append(None)
+            if f"{columns[0]}_{k}" in data:
+                ellipsoids = quadrics.Ellipsoids(*(data[f"{name}_{k}"] for name in columns))
+                shapes[k] = ComponentShapes(floor, ellipsoids)
+        events = [LinkEvent(**e | {"tracklets": tuple(e["tracklets"])}) for e in facts["events"]]
+        return Links(
+            tracks,
+            data["source"],
+            data["category"],
+            events,
+            confidence,
+            shapes,
+            label_of,
+            data["number"],
+            facts["highest"],
+            facts["options"],
+            facts["key"],
+            before=frozenset(data["number"].tolist()) - {0},
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise ReobjError(f"{path}: written by another version ({error})") from error
+
+
+def links_of_results(result: Result, options: Mapping[str, Any]) -> Links:
+    """Make links of the results of a folder that has none: for the numbers of its identities.
+
+    Args:
+        result: of the folder. options: of the last run.
+    """
+    tracks = result.tracks[result.tracks.score > 0]
+    ids = {o.id for o in result.objects} | set(result.tracks.track_id.tolist())
+    none = np.full(len(tracks), -1)
+    return Links(
+        tracks,
+        none,
+        none,
+        number=tracks.track_id,
+        highest=max(ids, default=0),
+        options=options,
+        before=frozenset(ids),
+        hidden={
+            o.id: frozenset(o.tracklet_ids)
+            for o in result.objects
+            if not (tracks.track_id == o.id).any()
+        },
+    )
