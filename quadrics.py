@@ -1620,27 +1620,38 @@ def _cosines(center: Array, point: Array) -> Array:
     return np.asarray(view @ view.transpose(0, 2, 1))
 
 
-def _prior_spec(given: _Given, world: _World) -> _Spec:
-    """Look up the priors of size, shape and uprightness in world units; list the hypotheses."""
-    n_obj = len(given.categories)
-    priors = given.priors
-    rows = np.full(n_obj, -1) if priors is None else priors.index(given.categories)
-    # without a scale all sizes are free: a wrong category is considered by `_scale_from_priors`
-    doubts = given.wrong_class > 0 and world.scale_sigma < UNKNOWN_SCALE_LOG
-    doubted = np.flatnonzero((rows >= 0) & doubts)
-    turned = np.zeros(0, np.int64) if priors is None else doubted  # of round categories
-    if priors is not None:
-        turned = doubted[priors.yaw_symmetric[rows[doubted]]]
-    obj = np.concatenate([np.arange(n_obj), doubted, turned])
-    rows = np.concatenate([rows, np.full(len(doubted), -1), rows[turned]])
-    n = len(obj)
-    flat = np.arange(n) >= n_obj + len(doubted)  # hypotheses that the object is not round
-    known = rows >= 0
-    log_odds = np.where(known, np.log1p(-given.wrong_class), 0.0)
+def _hypotheses(
+    rows: IntArray, given: _Given, doubts: bool
+) -> tuple[IntArray, IntArray, BoolArray, Array]:
+    """List the hypotheses about objects of categories `rows` (O,), -1 unknown; see `_Spec`.
+
+    Returns:
+        object (H,), row of the category (H,), is the object not round (H,), log of the probability
+        (H,).
+    """
+    n_obj = len(rows)
+    wrong = np.flatnonzero((rows >= 0) & doubts)
+    turned = wrong if given.priors is None else wrong[given.priors.yaw_symmetric[rows[wrong]]]
+    obj = np.concatenate([np.arange(n_obj), wrong, turned])
+    rows = np.concatenate([rows, np.full(len(wrong), -1), rows[turned]])
+    flat = np.arange(len(obj)) >= n_obj + len(wrong)
+    log_odds = np.where(rows >= 0, np.log1p(-given.wrong_class), 0.0)
     if doubts:
         log_odds[turned] += np.log1p(-NOT_ROUND)
         log_odds[flat] += np.log(NOT_ROUND / len(SUPPORTS))
-        log_odds[n_obj:][~flat[n_obj:]] = np.log(given.wrong_class / len(SUPPORTS))
+        log_odds[n_obj : n_obj + len(wrong)] = np.log(given.wrong_class / len(SUPPORTS))
+    return obj, rows, flat, log_odds
+
+
+def _prior_spec(given: _Given, world: _World) -> _Spec:
+    """Look up the priors of size, shape and uprightness in world units; list the hypotheses."""
+    priors = given.priors
+    rows = np.full(len(given.categories), -1) if priors is None else priors.index(given.categories)
+    # without a scale all sizes are free: a wrong category is considered by `_scale_from_priors`
+    doubts = given.wrong_class > 0 and world.scale_sigma < UNKNOWN_SCALE_LOG
+    obj, rows, flat, log_odds = _hypotheses(rows, given, doubts)
+    n = len(obj)
+    known = rows >= 0
     codes = given.codes[obj]
     points = given.points[obj]
     unknown = UNKNOWN_SIZE.aspect_log**2 * np.eye(3) + UNKNOWN_SIZE.size_log**2
@@ -2176,7 +2187,8 @@ def _size_deviation(fit: _Fit, spec: _Spec) -> tuple[Array, Array]:
     """
     prob = _problems(spec, fit.hyp, fit.code, fit.axis)
     error = fit.state.log_half - prob.size_mean
-    deviation = np.sqrt(np.einsum("bi,bij,bj->b", error, prob.size_info, error))
+    info = np.linalg.inv(spec.size_cov)[fit.hyp]  # without that of roundness
+    deviation = np.sqrt(np.einsum("bi,bij,bj->b", error, info, error))
     return deviation, np.sqrt(((error > 0) / prob.size_var * error**2).sum(1))
 
 
@@ -2216,17 +2228,18 @@ def _best_fits(fit: _Fit) -> _Fit:
 def _log_odds_of_sizes(fit: _Fit, data: _Data, spec: _Spec, cfg: FitConfig) -> Array:
     """Compute the log odds (B,) of the sizes of all categories against those of the category.
 
-    They are a ratio of marginal likelihoods of the boxes. The likelihood of the log size x is
-    normal; its information I is that of the posterior without a category, less the prior's. Of a
-    prior N(m, S): -2 log p = log det S + log det(I + S^-1) + m' S^-1 m - b' (I + S^-1)^-1 b + const,
-    b = I x + S^-1 m. The axes of the category may have any order that its uprightness allows.
+    They are a ratio of marginal likelihoods of the boxes, infinite where the boxes determine the
+    size. The likelihood of the log size x is normal; its information I is that of the posterior
+    without a category, less the prior's. Of a prior N(m, S), but for a constant:
+    -2 log p = log det S + log det(I + S^-1) + m' S^-1 m - b' (I + S^-1)^-1 b, b = I x + S^-1 m.
+    The axes of the category may have any order that its uprightness allows.
     """
-    cov = _curved_covariance(fit, data, spec, cfg.robust.huber_loss)
+    cov = _curved_covariance(fit, data, spec, cfg.robust.huber_loss)[:, 3:6, 3:6]
     inverse = np.linalg.inv(spec.size_cov)  # roundness is of the shape, and the same for both
     own = inverse[fit.hyp]
     mean = _problems(spec, fit.hyp, fit.code, fit.axis).size_mean
     usual_mean = _problems(spec, fit.obj, fit.code, fit.axis).size_mean
-    value, vector = _eigh(_safe_inverse(cov[:, 3:6, 3:6]) - own)
+    value, vector = _eigh(_safe_inverse(cov) - own)
     info = (vector * np.maximum(value, 0.0)[:, None]) @ vector.transpose(0, 2, 1)
     at = fit.state.log_half[..., None]  # (B, 3, 1), where the gradients of both terms cancel
     pull_here = vector.transpose(0, 2, 1) @ (own @ (at - mean[..., None]))
@@ -2245,7 +2258,8 @@ def _log_odds_of_sizes(fit: _Fit, data: _Data, spec: _Spec, cfg: FitConfig) -> A
         usual = cost(usual_mean[:, order], inverse[fit.obj][:, order][:, :, order])
         least = np.minimum(least, np.where(same_up & (order[2] != 2), np.inf, usual))
     odds = spec.log_odds[fit.hyp] - spec.log_odds[fit.obj] + np.log(len(SUPPORTS))
-    return np.asarray(odds + 0.5 * (least - cost(mean, own)))
+    determined = (np.einsum("bii->bi", cov) < cfg.limits.loose_size**2).all(1)
+    return np.where(determined, np.inf, odds + 0.5 * (least - cost(mean, own)))
 
 
 # ---- fit_objects: scale, gravity, report ----------------------------------------------------

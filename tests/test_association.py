@@ -33,8 +33,9 @@ def detected_in(table: rt.Tracks, poses: rt.Poses) -> PosedDetections:
     """Rows in no tracklet, of frames that all have a pose."""
     none = np.full(len(table), -1)
     cams = poses.camera.K @ poses.cam_from_world
+    no_points = np.full((len(table), 1), np.nan)
     return PosedDetections(
-        table.frame, table.xyxy, table.score, table.class_id, none, none, cams, SIZE
+        table.frame, table.xyxy, table.score, table.class_id, none, none, cams, SIZE, no_points
     )
 
 

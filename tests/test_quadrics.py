@@ -357,17 +357,18 @@ def cost_terms(
     rot = solid[2] @ q.rotations(delta[None, 6:])[0]
     terms = []
     for (x1, y1, x2, y2), cam in zip(boxes, cams, strict=True):
-        u, v, depth = cam @ np.append(center, 1.0)
         edges = ([-1, 0, x1], [0, -1, y1], [1, 0, -x2], [0, 1, -y2])
         for line in np.array(edges, float):
             m = rot.T @ (cam[:, :3].T @ line)
             square = half**2 * (m**2 + 1e-6 * np.sum(m**2))  # the kink of |m| is rounded by 1e-3
-            h = {
-                "ellipsoid": np.sqrt(square.sum()),
-                "box": np.sqrt(square).sum(),
-                "cylinder": np.sqrt(square[:2].sum()) + np.sqrt(square[2]),
+            root = {
+                "ellipsoid": np.sqrt(np.full(3, square.sum())),
+                "box": np.sqrt(square),
+                "cylinder": np.sqrt([square[:2].sum(), square[:2].sum(), square[2]]),
             }[support]
-            terms.append((line @ [u, v, depth] + h) / depth / sigma_px)
+            excess = line @ cam @ np.append(center, 1.0) + (square / root).sum()
+            contact = center + rot @ (half**2 * m / root)  # where the solid is tangent to the plane
+            terms.append(excess / (cam[2] @ np.append(contact, 1.0)) / sigma_px)
     error = np.log(2 * half) - prior[0]
     terms.extend(error / prior[1])
     wall = np.sum((np.maximum(error, 0) / max(prior[1], 0.25)) ** 2) - 2.5**2
