@@ -196,6 +196,17 @@ def test_detections_of_an_object_whose_shape_lies_elsewhere_count_too(monday):
     assert [c.id for c in result.changes.not_seen] == [2] and not result.changes.gone
 
 
+def test_detections_of_an_object_beside_its_place_do_not_count(monday):
+    """They lie on it in every second view, as from some directions."""
+    tuesday = moved_by(seen([0, 1, 2], wall=True), 2, [0, 1.5, 0])
+    tracks = tuesday.tracks
+    beside = (tracks.track_id == 2) & (tracks.frame % 2 == 1)
+    xyxy = tracks.xyxy + np.outer(beside, [200, 0, 200, 0])
+    tuesday = dataclasses.replace(tuesday, tracks=dataclasses.replace(tracks, xyxy=xyxy))
+    _, result = add_recording(monday, tuesday, recording("tuesday"))
+    assert [c.id for c in result.changes.gone] == [2]
+
+
 def test_without_points_behind_it_an_object_is_not_called_gone(monday):
     _, result = add_recording(monday, seen([0, 2]), recording("tuesday"))
     assert [c.id for c in result.changes.not_seen] == [2] and not result.changes.gone

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.special import betaln
 
 from reobj.appearance.reid import SimilarityCalibration
 from reobj.maps.fusion import ObjectState
@@ -80,15 +79,17 @@ class Visibility:
             rays through its middle), or views besides a first one that show its surroundings.
         vague: (N,) the position in the map is too uncertain to know what a view shows; None: of
             no object.
-        detected: (N,) of the expected ones, views in which a detection may show the object;
-            a fraction if some of the views that count as one have one. None: none.
-        unlocated: (N,) the same for detections that belong to no object of the recording.
+        detected: (N,) of the expected ones, views in which a detection may show the object; a
+            fraction if some of the views that count as one have one. None: none.
+        accident: (N,) log probability that these detections lie there by accident; None: 0.
+        unlocated: (N,) as `detected`, by detections that belong to no object of the recording.
     """
 
     expected: Array
     seen_through: Array
     vague: BoolArray | None = None
     detected: Array | None = None
+    accident: Array | None = None
     unlocated: Array | None = None
 
 
@@ -129,11 +130,6 @@ class CompareOptions:
         new_objects: expected new objects, besides those that replace what was taken away.
         detected: probability that an object in a part of the room that was seen is found.
         missed_floor: least probability that an object is missed, whatever the number of views.
-        accidental: probability that a view of a place where the object is not has a detection that
-            may show it. (On 18 recordings with the shapes of their objects shifted by 1.2
-            diameters: 0 to .26, median .09; not shifted: .36 to 1, median .92.)
-        rate_views: independent views that the detection rate of an object rests on (a Beta
-            distribution): another camera, light or detector has another rate.
         position_floor_m: standard deviation of a centre besides its covariance (2 cm: design).
         extent_share: the same, as a fraction of the largest half axis: the centre of an object
             that is seen from one side shifts with its depth.
@@ -185,8 +181,6 @@ class CompareOptions:
     new_objects: float = 1.0
     detected: float = 0.9
     missed_floor: float = 1e-3
-    accidental: float = 0.1
-    rate_views: float = 10.0
     position_floor_m: float = 0.02
     extent_share: float = 0.05
     near_move_m: float = 0.5
@@ -299,10 +293,15 @@ class _Pairs:
         self.fate[[not s.present for s in states]] = options.absent_fate
         seen = visibility.expected > 0
         self.reach = options.detected * (seen.sum() + 1) / (len(states) + 2)
-        self.seen_there = self._log_ratio(visibility.detected)
-        most = self._log_ratio(None, np.full(len(states), 0.5))  # views near the image border
-        missed = np.exp(np.minimum(self._log_ratio(visibility.unlocated), most))
-        self.missed = missed.clip(min=options.missed_floor)
+        rate = np.array([s.detection_rate for s in states]).clip(0.05, 0.95)
+        none = np.zeros(len(states))
+        unlocated = none if visibility.unlocated is None else visibility.unlocated
+        without = np.maximum(visibility.expected - unlocated, 0.5)  # views near the image border
+        self.missed = ((1 - rate) ** without).clip(min=options.missed_floor)
+        detected = none if visibility.detected is None else visibility.detected
+        accident = none if visibility.accident is None else visibility.accident
+        self.seen_there = detected * np.log(rate) - accident
+        self.seen_there += (visibility.expected - detected) * np.log(1 - rate)
         counts = self.of_map.sum(0) + self.of_found.sum(0) + 0.5
         self.frequency = counts / counts.sum()  # (C,)
         replaced = (self.of_map * self.fate[:, 2:]).sum(0)
@@ -323,23 +322,6 @@ class _Pairs:
         self.own_recognised = self.points >= options.margin
         self.appearance = np.zeros(self.overlap.shape)
         self.appearance_there = np.zeros(self.overlap.shape)
-
-    def _log_ratio(self, detected: Array | None, expected: Array | None = None) -> Array:
-        """Return the log likelihood ratio (N,) of views: the object is in its place, or absent.
-
-        Args:
-            detected: (N,) views in which a detection may show it; None: none. expected: (N,) all
-                views; None: those of the visibility.
-        """
-        rate = np.array([s.detection_rate for s in self.states]).clip(0.05, 0.95)
-        expected = self.visibility.expected if expected is None else expected
-        detected = np.zeros(len(rate)) if detected is None else detected
-        missed = expected - detected
-        a = self.options.rate_views * rate
-        b = self.options.rate_views * (1 - rate)
-        accidental = self.options.accidental
-        absent = detected * np.log(accidental) + missed * np.log(1 - accidental)
-        return np.asarray(betaln(a + detected, b + missed) - betaln(a, b) - absent)
 
     def place(self, alignment_cov: Array, metres_per_unit: float) -> None:
         """Compute displacements and position likelihoods, the alignment refined by what stayed."""
