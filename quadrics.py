@@ -2245,7 +2245,7 @@ def _log_odds_of_sizes(fit: _Fit, data: _Data, spec: _Spec, cfg: FitConfig) -> A
     pull_here = vector.transpose(0, 2, 1) @ (own @ (at - mean[..., None]))
     known = info @ at + vector @ np.where(value[..., None] > 0, pull_here, 0.0)
 
-    def cost(mean: Array, prior: Array) -> Array:
+    def cost(mean: Array, prior: Any) -> Array:
         pull = prior @ mean[..., None]  # (B, 3, 1)
         b = known + pull
         both = info + prior

@@ -218,7 +218,7 @@ def _fold_radius(model: str, params: tuple[float, ...], step_deg: float = 0.1) -
     rays = np.concatenate([xy, np.ones((*xy.shape[:2], 1))], 2).reshape(-1, 3)
     pixels = np.asarray(camera.to_pycolmap().img_from_cam(rays), np.float64).reshape(xy.shape)
     offset = (pixels - camera.K[:2, 2]) / np.diag(camera.K)[:2]
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):
         outwards = (np.diff(np.linalg.norm(offset, axis=2), axis=0) > 0).all(1)  # (r - 1,)
     return float("inf") if outwards.all() else float(radius[outwards.argmin()])
 

@@ -152,7 +152,7 @@ def test_a_cut_out_of_a_merged_object_has_one_box_a_frame(tmp_path: Path) -> Non
     cut = {"do": "split", "object": refs[1], "frames": [2, 3]}
     made = applied(tmp_path, merge, cut, tracks=tracks)
     kept = made.tracks[made.keep]
-    assert kept.track_id.tolist() == [1, 1, 2, 2, 1]
+    assert kept.track_id.tolist() == [1, 1, 3, 3, 1]  # 2 was merged: its number is not given again
     assert (kept.xyxy[:, 2] - kept.xyxy[:, 0] == 200).all()
 
 
