@@ -304,15 +304,17 @@ NOISE_PX = 0.5  # standard deviation of the edges
 def shake(seed: int) -> None:
     """Add noise to all boxes before objects are made of them, in this process."""
 
-    def shaken(result: rt.Result, config: rt.ObjectsConfig, phases: Any = None) -> rt.Result:
+    def shaken(
+        result: rt.Result, config: rt.ObjectsConfig, phases: Any = None, links: Any = None
+    ) -> rt.Result:
         rng = np.random.default_rng(seed)
         for name in ("tracks", "untracked"):
             rows = getattr(result, name)
             xyxy = rows.xyxy + rng.normal(0, NOISE_PX, rows.xyxy.shape)
             result = dataclasses.replace(result, **{name: dataclasses.replace(rows, xyxy=xyxy)})
-        return link_and_fit(result, config, phases)
+        return link_and_fit(result, config, phases, links)
 
-    rt.link_and_fit = shaken  # type: ignore[attr-defined]
+    rt.link_and_fit = shaken  # type: ignore[attr-defined,assignment]
 
 
 def mean_of(runs: Sequence[Figures]) -> Figures:
