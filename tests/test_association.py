@@ -65,6 +65,25 @@ def test_a_box_supports_its_object_and_not_the_neighbour() -> None:
     assert odds_of(table, poses, solid=2) == -np.inf
 
 
+def test_points_in_a_box_support_the_object_at_their_depth() -> None:
+    """Points before the object mean that something else is seen, and so do those behind it."""
+    poses = walk(20)
+    table = table_of(poses)
+    own = table[table.detection_index == 0]
+    detections = detected_in(own, poses)
+    solid = chairs()[[0]]
+    view = detections.img_from_world[own.frame]
+    depth = view[:, 2, :3] @ solid.ellipsoids.center_in_world[0] + view[:, 2, 3]
+    odds = []
+    for factor in (1.0, 0.5, 2.0, np.nan):
+        depths = np.repeat(factor * depth[:, None], 3, 1)
+        found = gather_evidence(solid, dataclasses.replace(detections, depths=depths), -99.0)
+        odds.append(np.median(found.assignment))
+    on_it, before, behind, no_points = odds
+    assert before < no_points < on_it and behind < no_points
+    assert abs(no_points - before) < 3.0  # one box never decides
+
+
 @pytest.mark.parametrize(
     ("inside", "outside"),
     [([0.3, 0, 0, 0], [-0.3, 0, 0, 0]), ([0, 0, 0, -0.4], [0, 0, 0, 0.4])],

@@ -341,6 +341,74 @@ def test_evidence_selects_the_shape(shape: str) -> None:
     assert (fits.support == shape).mean() > 0.9
 
 
+@pytest.mark.parametrize("support", q.SUPPORTS)
+def test_residuals_are_distances_in_the_image(support: str) -> None:
+    """Also of a solid eight times as long as wide, of which the near end makes the outline."""
+    rng = np.random.default_rng(5)
+    half = np.tile([0.1, 0.1, 0.8], (40, 1)) * rng.uniform(0.8, 1.2, (40, 3))
+    solids = q.Ellipsoids(
+        rng.normal(0, 0.05, (40, 3)), half, q.rotations(rng.normal(0, 1.0, (40, 3)))
+    )
+    cams = syn.arc_cameras(6, 90, rng, distance=3.0)
+    boxes = q.solid_boxes(solids, support, cams).transpose(1, 0, 2)  # (40, 6, 4)
+    outwards = np.array([-1, -1, 1, 1])
+    config = q.FitConfig(edge_noise_px=1.0, edge_noise_rel=0.0)
+    edges = q._tangent_planes(
+        boxes - 2.0 * outwards,  # the solid extends 2 px beyond each edge
+        np.broadcast_to(q._with_positive_depth(cams), (40, 6, 3, 4)),
+        np.zeros(boxes.shape, bool),
+        config,
+    )
+    state = q._State(solids.center_in_world, np.log(half), solids.world_from_obj)
+    groups = np.repeat(q.AXIS_GROUPS[[q.SUPPORTS.index(support)]], 40, 0)
+    value = q._residuals(state, edges, groups, jacobian=False)[0]
+    assert (np.abs(value - 2.0) < 0.1).mean() > 0.98  # of boxes another corner may be the outermost
+
+
+def test_a_size_that_the_boxes_leave_open_is_that_of_the_category() -> None:
+    """The image cuts the plants at the top and at the right."""
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        truth = q.Ellipsoids(
+            np.zeros((1, 3)), np.array([[0.35, 0.35, 0.5]]) / 2, syn.random_yaw(1, rng)
+        )
+        cams = syn.arc_cameras(5, 40, rng, distance=0.6)
+        boxes = syn.noisy(q.solid_boxes(truth, "ellipsoid", cams), 0.02, rng)
+        boxes[..., 1] = 0
+        boxes[..., 2] = syn.IMAGE[0]
+        fits = q.fit_objects(boxes, cams, syn.IMAGE, ["potted plant"], q.load_priors(), up=UP)
+        assert fits.size.max() < 0.9 and fits.status[0] == "prior_dominated"
+        assert "overruled" not in fits.reason[0]
+
+
+@pytest.mark.parametrize("shape", ["box", "cylinder"])
+def test_a_flat_bottle_is_not_made_round(shape: str) -> None:
+    rng = np.random.default_rng(1)
+    truth = q.Ellipsoids(
+        np.zeros((1, 3)), np.array([[0.096, 0.058, 0.19]]) / 2, syn.random_yaw(1, rng)
+    )
+    cams = syn.arc_cameras(20, 120, rng, distance=0.8)
+    boxes = q.solid_boxes(truth, shape, cams)
+    fits = q.fit_objects(boxes, cams, syn.IMAGE, ["bottle"], q.load_priors(), up=UP)
+    assert fits.support[0] == shape and fits.reason[0] == ""
+    assert syn.box_overlap(fits.ellipsoids, truth)[0] > 0.95
+
+
+def test_few_boxes_of_a_part_do_not_make_an_object_implausible() -> None:
+    """A quarter metre of each screen is detected; a third of the usual width."""
+    statuses = []
+    for views, arc, noise in ((4, 8, 0.03), (8, 20, 0.05)):
+        for seed in range(8):
+            rng = np.random.default_rng(seed)
+            half = np.array([[0.25, 0.02, 0.25]]) / 2
+            part = q.Ellipsoids(np.zeros((1, 3)), half, syn.random_yaw(1, rng))
+            cams = syn.arc_cameras(views, arc, rng)
+            boxes = syn.noisy(q.solid_boxes(part, "box", cams), noise, rng)
+            fits = q.fit_objects(boxes, cams, syn.IMAGE, ["tv"], q.load_priors(), up=UP)
+            statuses.append(fits.status[0])
+    assert set(statuses) <= {"ok", "prior_dominated"}
+
+
 # ---- The minimum of the documented cost ----------------------------------------------------
 
 
