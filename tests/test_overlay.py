@@ -300,6 +300,14 @@ def test_huge_objects_are_not_drawn_with_a_fold_either() -> None:
     assert (drawn(frames, {1}, camera=lens) == 127).all()
 
 
+def test_objects_far_off_the_axis_of_a_lens_without_a_fold_are_not_drawn() -> None:
+    """There the terms of the distortion are larger than any image."""
+    lens = rt.Camera("RADIAL", 200, 120, (90.0, 60.0, 60.0, 0.0, 0.01))
+    assert lens.fold_radius == np.inf
+    frames, _ = one_solid("box", (900.0, 0.0, 3.0), (0.5, 0.5, 0.01), np.eye(3))
+    assert (drawn(frames, {1}, camera=lens) == 127).all()
+
+
 def test_former_places_end_at_the_fold_of_the_lens() -> None:
     lens = rt.Camera("OPENCV", 200, 120, (90.0, 90.0, 60.0, 60.0, -0.3, 0.0, 0.0, 0.0))
     steps = np.linspace(-1, 11, 1200)

@@ -8,7 +8,7 @@ of the map, M of the recording, C classes. Lengths are metres, log probabilities
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +20,7 @@ from reobj.types import Array, BoolArray, Floats, IntArray, unit_rows
 from reobj.words import canonical, merged
 
 IMPOSSIBLE = -1e9  # nats; finite, for the solver
+GIVEN = 1e6  # nats, of pairs that are given: more than all evidence
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -221,6 +222,7 @@ def compare(
     metres_per_unit: float,
     same_embedder: bool,
     options: CompareOptions | None = None,
+    known: Collection[int] = (),
 ) -> list[Decision]:
     """Decide what happened to each object, by one assignment over all of them.
 
@@ -233,12 +235,13 @@ def compare(
             a point q of the recording lies at exp(s) exp([w]) q + t in the map, about its origin.
         metres_per_unit: of the world of the map (its best estimate if the scale is unknown).
         same_embedder: embeddings of map and recording come from one model.
+        known: numbers of map objects that are the found objects of the same number.
 
     Returns:
         One decision per map object, in their order, then one per new object.
     """
     options = options or CompareOptions()
-    pairs = _Pairs(states, found, visibility, options)
+    pairs = _Pairs(states, found, visibility, options, known)
     pairs.place(alignment_cov, metres_per_unit)
     pairs.compare_appearance(same_embedder)
     return _Verdicts(pairs).decisions()
@@ -271,7 +274,7 @@ class _Pairs:
             object in its place is not among the found ones. seen_there: (N,) log likelihood ratio
             of all detections, of an object in its place over its absence. reach: share of the room
             that was seen.
-        room: volume of the room in cubic metres.
+        room: volume of the room in cubic metres. known: (N, M) True for pairs that are given.
     """
 
     def __init__(
@@ -280,9 +283,12 @@ class _Pairs:
         found: Sequence[FoundObject],
         visibility: Visibility,
         options: CompareOptions,
+        known: Collection[int] = (),
     ) -> None:
         self.states = states
         self.found = found
+        numbers = np.array([s.id if s.id in known else -1 for s in states], np.int64)
+        self.known = numbers[:, None] == np.array([f.id for f in found], np.int64)
         self.visibility = visibility
         self.options = options
         self.names = class_names_of([*states, *found])
@@ -482,7 +488,8 @@ class _Pairs:
 
     def gain(self, score: Array) -> Array:
         """Return (N, M) scores above the explanation that both objects are unmatched."""
-        return score - self.undetected()[:, None] - self.new()
+        unmatched = self.undetected()[:, None] + self.new()
+        return np.asarray(score - unmatched + GIVEN * self.known)
 
     def there_log_odds(self) -> Array:
         """Return (N,) log odds that an object that was not found is in its place nonetheless."""
@@ -691,7 +698,7 @@ class _Verdicts:
         else:  # looks and size alone gave three wrong numbers in eleven rendered pairs
             proven = bool(self.pairs.recognised()[i, j])
             accepted = proven and lead >= self.options.margin and self._distinguished(i, j)
-        if not accepted:
+        if not (accepted or self.pairs.known[i, j]):
             return None
         odds = min(lead, abs(float(self.stayed[i, j] - self.moved[i, j])))
         kind = "stayed" if there else "moved"

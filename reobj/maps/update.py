@@ -92,6 +92,9 @@ def add_recording(room: RoomMap, result: Result, recording: Recording) -> tuple[
     nearer = shapes_of(objects)
     visibility = visibility_of(states, result.poses, nearer, result.looked, detections)
     metres = scale_of(room).value if room.sessions else recording.scale.value
+    given = frozenset[int]()
+    if result.links is not None:
+        given = result.links.before & (own.keys() | result.links.in_map)
     decisions = compare(
         states,
         found,
@@ -99,6 +102,7 @@ def add_recording(room: RoomMap, result: Result, recording: Recording) -> tuple[
         recording.alignment_cov,
         metres,
         any(s.embedder == recording.embedder for s in states),
+        known=given,
     )
     if old is not None:
         decisions = _as_before(decisions, before, own)
@@ -378,6 +382,10 @@ def _renumbered(
     deleted = {s.id for s in states if s.deleted}
     name_of = {s.id: s.class_name for s in states}
     matched = {d.map_id for d in decisions if d.found_id and d.map_id}
+    links = result.links
+    if links is not None:
+        links = links.renumbered(numbers)
+        links = dataclasses.replace(links, in_map=links.in_map | matched)
     identities, row = np.unique(result.tracks.track_id, return_inverse=True)
     new = np.array([numbers.get(i, i) for i in identities.tolist()], np.int64)
     track_id = new[row] if len(new) else result.tracks.track_id
@@ -408,7 +416,7 @@ def _renumbered(
         embeddings=embeddings,
         embedding_row=row_of[result.embedding_row[embedded]],
         changes=changes,
-        links=None if result.links is None else result.links.renumbered(numbers),
+        links=links,
     )
 
 

@@ -52,6 +52,7 @@ class Links:
         highest: number that an identity of the folder ever had.
         options: of the objects stage when they were linked. key: of the tracks and cameras
             (`tracked_key`); "": read from the results of a folder without links.
+        in_map: numbers that the map of the recording gave to some of its identities.
         before: numbers in the last result of the folder; none before a refit. changed: how many
             identities of the last result have other boxes, as the detections were linked again.
         hidden: tracklets of identities of a folder without links whose boxes are not in tracks.txt.
@@ -68,6 +69,7 @@ class Links:
     highest: int = 0
     options: Mapping[str, Any] = field(default_factory=dict)
     key: str = ""
+    in_map: frozenset[int] = frozenset()
     before: frozenset[int] = frozenset()
     changed: int = 0
     hidden: Mapping[int, frozenset[int]] = field(default_factory=dict)
@@ -90,6 +92,7 @@ class Links:
             self,
             tracks=dataclasses.replace(self.tracks, track_id=_mapped(self.tracks.track_id, new)),
             number=_mapped(self.number, new),
+            in_map=frozenset(new.get(i, i) for i in self.in_map),
             confidence={new[i]: value for i, value in self.confidence.items()},
             label_of={new[i]: label for i, label in self.label_of.items()},
             highest=max([self.highest, *new.values()]),
@@ -122,6 +125,7 @@ class Links:
         made = self.renumbered(numbers)
         return dataclasses.replace(
             made,
+            in_map=last.in_map,
             highest=max([last.highest, *numbers.values()]),
             changed=last.count_changed(made.tracks, row),
         )
@@ -146,14 +150,10 @@ class Links:
         kept = np.append(self.tracks.track_id, -1)[row] == tracks.track_id  # (M,)
         found = np.zeros(len(self.tracks), bool)
         found[row[kept]] = True
-        left = ~found
-        if self.key:
-            added = tracks.track_id[~kept]
-        else:  # the boxes of some identities are unknown
-            added = np.empty(0, np.int64)
-            left &= np.isin(np.arange(len(found)), row)
-        own = set(self.tracks.track_id.tolist())
-        return len(own & {*self.tracks.track_id[left].tolist(), *added.tolist()})
+        changed = {*self.tracks.track_id[~found].tolist()}
+        if self.key:  # else the boxes of some identities are unknown
+            changed |= {*tracks.track_id[~kept].tolist()}
+        return len(changed & {*self.tracks.track_id.tolist()})
 
 
 def _mapped(identity: IntArray, numbers: Mapping[int, int]) -> IntArray:
@@ -194,7 +194,7 @@ def save_links(links: Links, path: Path) -> None:
             arrays |= {f"{f.name}_{k}": getattr(shapes.ellipsoids, f.name) for f in columns}
     facts = {name: getattr(links, name) for name in ("highest", "options", "key")}
     events = [dataclasses.asdict(event) for event in links.events]
-    save_npz(path, arrays, events=events, floors=floors, **facts)
+    save_npz(path, arrays, events=events, floors=floors, in_map=sorted(links.in_map), **facts)
 
 
 def load_links(path: Path) -> Links:
@@ -231,6 +231,7 @@ def load_links(path: Path) -> Links:
             facts["highest"],
             facts["options"],
             facts["key"],
+            in_map=frozenset(facts["in_map"]),
             before=frozenset(data["number"].tolist()) - {0},
         )
     except (KeyError, TypeError, ValueError) as error:
@@ -245,6 +246,8 @@ def links_of_results(result: Result, options: Mapping[str, Any]) -> Links:
     """
     tracks = result.tracks[result.tracks.score > 0]
     ids = {o.id for o in result.objects} | set(result.tracks.track_id.tolist())
+    changes = result.changes
+    matched = () if changes is None else (*changes.stayed, *changes.moved)
     none = np.full(len(tracks), -1)
     return Links(
         tracks,
@@ -253,6 +256,7 @@ def links_of_results(result: Result, options: Mapping[str, Any]) -> Links:
         number=tracks.track_id,
         highest=max(ids, default=0),
         options=options,
+        in_map=frozenset(change.id for change in matched),
         before=frozenset(ids),
         hidden={
             o.id: frozenset(o.tracklet_ids)

@@ -402,9 +402,10 @@ def draw_wireframes(
     for k in sorted(edges_of, key=lambda k: -ends[edges_of[k], :, 2].mean()):  # nearest last
         rows = edges_of[k]
         obj = object_id[k]
-        if not drawn[k] or not _fits(straight[rows], image):
+        found = pixels[rows][within[rows]]
+        if not (drawn[k] and len(found) and _fits(straight[rows], image) and _fits(found, image)):
             continue
-        lines = np.round(pixels[rows][within[rows]] * (1 << shift)).astype(np.int32)
+        lines = np.round(found * (1 << shift)).astype(np.int32)
         shown = front[rows][within[rows]]
         color = object_color(obj)
         dim = tuple(int(0.6 * c) for c in color)

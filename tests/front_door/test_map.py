@@ -155,6 +155,51 @@ def test_what_is_still_detected_is_not_gone(desk: Path, score: float | None) -> 
     assert (number in ids(out, "not_seen")) == (score is not None)
 
 
+def refitted(out: Path, *options: object) -> dict[int, tuple[str, list[int]]]:
+    """Class and tracklets of each object of a folder after a refit."""
+    assert cli("objects", out, *options) == 0
+    return {o.id: (o.class_name, o.tracklet_ids) for o in rt.Result.load(out).objects}
+
+
+@pytest.mark.parametrize(
+    ("recording", "name", "frozen"),
+    [("monday", "flat.map", 0), ("tuesday", "flat.map", 0), ("tuesday", "monday.map", 1)],
+)
+def test_refits_keep_all_numbers(desk: Path, recording: str, name: str, frozen: int) -> None:
+    """Those of the map, and those of doubtful objects, which the map does not have."""
+    out = desk / recording
+    where = ("--set", f"map.path={desk / name}", "--set", f"map.frozen={frozen}")
+    before = refitted(out, *where)
+    for options in (("--known-size", "chair=1.2m"), ("--shape", "box"), ("--shape", "auto")):
+        assert refitted(out, *options) == before
+
+
+def test_corrections_keep_all_other_numbers(desk: Path) -> None:
+    """A split object gets a number that no object of the map had, in every later refit the same."""
+    out = desk / "tuesday"
+    before = {o.id: o.tracklet_ids for o in rt.Result.load(out).objects}
+    rows = np.loadtxt(out / "tracks.txt", delimiter=",")
+    rows = rows[(rows[:, 1] == rows[0, 1]) & (rows[:, 6] > 0)]
+    frame, number, x, y, w, h = rows[0, :6]
+    edit = {"do": "split", "object": {"id": int(number), "frame": int(frame) - 1,
+            "box": [x, y, x + w, y + h]}, "frames": [int(rows[len(rows) // 2, 0]) - 1,
+            int(rows[-1, 0]) - 1]}  # fmt: skip
+    path = desk / "e.json"
+    path.write_text(json.dumps({"format": "reobj-edits", "version": 1, "edits": [edit]}))
+    highest = RoomMap.load(desk / "flat.map").next_id - 1
+    found = []
+    for options in (("--edits", path), (), ("--shape", "box")):
+        assert refit(desk, *options) == 0
+        now = {o.id: o.tracklet_ids for o in rt.Result.load(out).objects}
+        (new,) = now.keys() - before.keys()
+        assert before.keys() <= now.keys() and new > max(highest, *before)
+        assert {i: now[i] for i in before if i != number} == {
+            i: before[i] for i in before if i != number
+        }
+        found.append(new)
+    assert len(set(found)) == 1
+
+
 def test_places_are_true_in_the_world_of_the_map(made: Path) -> None:
     """Monday's poses are in the room's frame, and so is everything of Tuesday."""
     second = true_of(made / "tuesday", LATER)
