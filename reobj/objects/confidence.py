@@ -13,14 +13,13 @@ from reobj.types import Array, BoolArray, IntArray, Tracks, rows_by
 
 # Logistic regression of existence: intercept, log odds of the best scores, hit rate over the frames
 # where the object should be visible, see-through ratio (`occlusion.see_through_ratio`). Fitted to
-# 365 objects of 9 runs on 5 real recordings, three box noises each, with the coefficients of 1,202
-# objects, most of rendered rooms, as the prior (benchmarks/RESULTS.md)
-CONFIDENCE = (-0.7, 1.7, 2.1, -1.0)
+# 1,202 objects of 48 runs of 10 rooms (benchmarks/RESULTS.md)
+CONFIDENCE = (-1.0, 1.5, 1.8, -1.5)
 FITTED_TO = "YOLOv8s, deimv2-femto, rendered rooms"
 FITTED_SCORES = (0.13, 0.87)  # lowest and highest median score of the recordings it was fitted to
 FAR_OFF = 1.0  # in log odds, beyond which a median is reported (chosen)
 USUAL_HIT_RATE = 0.75  # if it should be visible in no frame, as an always truncated table (mean)
-NO_SHAPE = -1.95  # instead of the intercept for identities without a 3D object (8 of 89 were real)
+NO_SHAPE = -1.9  # instead of the intercept for identities without a 3D object (8 of 89 were real)
 # Number and least fraction of an object's detections that its score is taken from: most views of a
 # half-occluded object are poor (20 to 40 are alike; all, or ten, are worse: benchmarks/LOG.md)
 BEST_DETECTIONS = 30
