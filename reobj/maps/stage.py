@@ -333,11 +333,9 @@ def finish_map(
     new_room, numbered = add_recording(room, result, recording)
     earlier = earlier_sessions(new_room, opened.path, recording.fingerprint)
     numbered = dataclasses.replace(numbered, earlier=earlier)
-    old = room.session_of(recording.fingerprint)
-    if old is not None and placed is not None:
-        text = f"{NOTE_START}map {opened.path}: it has this recording as session {old.number}"
-        text += f" ({old.name})" if opened.frozen else f" ({old.name}), which is replaced"
-        numbered = dataclasses.replace(numbered, warnings=[*numbered.warnings, text])
+    if placed is not None:
+        notes = _notes_of_known(opened, recording)
+        numbered = dataclasses.replace(numbered, warnings=[*numbered.warnings, *notes])
     if opened.frozen:
         return numbered
     try:
@@ -346,6 +344,16 @@ def finish_map(
         text = f"map {error}; the results are complete, but the map lacks this recording"
         return dataclasses.replace(numbered, warnings=[*numbered.warnings, text])
     return numbered
+
+
+def _notes_of_known(opened: OpenMap, recording: Recording) -> list[str]:
+    """Say that the map has this recording, perhaps as a copy under another name; [] if not."""
+    old = opened.room.session_of(recording.fingerprint)
+    if old is None:
+        return []
+    replaced = "" if opened.frozen else ", which is replaced"
+    text = f"it has this recording as session {old.number} ({old.name}){replaced}"
+    return [f"{NOTE_START}map {opened.path}: {text}"]
 
 
 def _with_object_points(
