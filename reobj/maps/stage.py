@@ -333,9 +333,8 @@ def finish_map(
     new_room, numbered = add_recording(room, result, recording)
     earlier = earlier_sessions(new_room, opened.path, recording.fingerprint)
     numbered = dataclasses.replace(numbered, earlier=earlier)
-    if placed is not None:
-        notes = _notes_of_known(opened, recording)
-        numbered = dataclasses.replace(numbered, warnings=[*numbered.warnings, *notes])
+    warnings = [*numbered.warnings, *_notes_of_known(opened, recording, placed)]
+    numbered = dataclasses.replace(numbered, warnings=warnings)
     if opened.frozen:
         return numbered
     try:
@@ -346,10 +345,10 @@ def finish_map(
     return numbered
 
 
-def _notes_of_known(opened: OpenMap, recording: Recording) -> list[str]:
-    """Say that the map has this recording, perhaps as a copy under another name; [] if not."""
+def _notes_of_known(opened: OpenMap, recording: Recording, placed: Placed | None) -> list[str]:
+    """Say that the map has this recording, perhaps as a copy under another name; [] of a refit."""
     old = opened.room.session_of(recording.fingerprint)
-    if old is None:
+    if old is None or placed is None:
         return []
     replaced = "" if opened.frozen else ", which is replaced"
     text = f"it has this recording as session {old.number} ({old.name}){replaced}"

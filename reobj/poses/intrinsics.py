@@ -205,8 +205,8 @@ def camera_from_json(data: Any, size: tuple[int, int] | None) -> Camera | None:
         data: focal length `fx`, `fy` (`fl_x`, or `camera_angle_x` in radians) and centre `cx`,
             `cy`, or a matrix `K`, `camera_matrix`, `intrinsic_matrix`; distortion by name (`k1`,
             ...) or as a list in OpenCV's order (`_is_list`); `w`, `h` or `width`, `height`; `model`
-            or `camera_model`, with COLMAP's `params` or the names of its parameters. All of these may
-            be in an object `camera` or `intrinsics`.
+            or `camera_model`, with COLMAP's `params` or the names of its parameters. All of these
+            may be in an object `camera` or `intrinsics`.
         size: (w, h) where the data have none.
     Returns:
         the camera at the size of the data; None without a focal length.
