@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import json
 import os
 from pathlib import Path
 from types import SimpleNamespace
@@ -405,6 +406,47 @@ def test_class_names_come_from_the_user_first(
     (tmp_path / "names.txt").write_text("a\n\nb\n")
     with pytest.raises(rt.ReobjError, match="class 2, but there are only 2 class names"):
         rt.OnnxDetector(path, config)(IMAGE)
+
+
+def test_class_names_in_a_model_go_by_their_number(tmp_path: Path) -> None:
+    rows = np.zeros((1, 4 + 12, 84))  # 12 classes
+    for at in range(3):
+        rows[0, :4, 20 + at] = [20 * at + 10, 32, 10, 10]
+        rows[0, 4 + (1, 2, 10)[at], 20 + at] = 0.9
+    expected = tuple(f"name{i}" for i in range(12))
+    for names in (
+        json.dumps({str(i): name for i, name in enumerate(expected)}),  # as text 10 is before 2
+        str(dict(reversed(list(enumerate(expected))))),
+        str(list(expected)),
+    ):
+        detector = rt.OnnxDetector(model(tmp_path, {"o": rows}, names=names))
+        assert detector.class_names == expected
+        assert sorted(detector(IMAGE).class_id.tolist()) == [1, 2, 10]
+
+
+@pytest.mark.parametrize(
+    ("names", "found"),
+    [
+        ("{1: 'mug', 2: 'lamp', 3: 'box'}", "1-3"),
+        ("{0: 'mug', 2: 'lamp'}", "0, 2"),
+        ("{0: 'mug', 1: 'lamp'}", "0-1"),  # of three classes
+        ("['mug', 'lamp', 'box', 'cup']", "0-3"),
+        ("{0: mug, 1: lamp, 2: box}", "unreadable"),
+        ("{'mug': 0, 'lamp': 1, 'box': 2}", "unreadable"),
+    ],
+)
+def test_class_names_that_do_not_fit_their_model_are_one_error(
+    clip: rt.Video, tmp_path: Path, names: str, found: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = model(tmp_path, yolov8(), names=names)
+    command = ["track", str(clip.source), "-o", str(tmp_path / "out"), "--detector", str(path)]
+    assert rt.main([*command, "--embed", "none"]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "detect.class_names" in error
+    assert found in error and "expected 0-2" in error
+    (tmp_path / "names.txt").write_text("mug\nlamp\nbox\n")
+    config = rt.DetectConfig(class_names=str(tmp_path / "names.txt"))
+    assert rt.OnnxDetector(path, config).class_names == ("mug", "lamp", "box")
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 from simulated import fitted, tracks_of, walk
 
 import reobj_track as rt
+from reobj.cameras import invert_rigid
 from reobj.results.export import EXPORTS, Viewer
 from reobj.results.result import VideoInfo
 from reobj.results.workspace import Workspace
@@ -215,7 +216,7 @@ def test_corrected_mot_keeps_the_classes(room: Path, tmp_path: Path) -> None:
     # Some are at a limit: boxes in the file are rounded, and a first fit and not the association
     # decides which edges are occluded, and which points lie on which object.
     changed = [x for x in status if x[0] != x[1]]
-    assert len(changed) <= len(before) // 5
+    assert len(changed) <= len(before) // 4
     assert all(set(x) == {"ok", "prior_dominated"} for x in changed)
 
 
@@ -342,8 +343,8 @@ def test_nerfstudio_of_a_folder_copies_nothing(tmp_path: Path) -> None:
         (("PINHOLE", 500.0, 510.0, 320.0, 240.0), {"k1": 0.0}, False),
         (("SIMPLE_RADIAL", 500.0, 320.0, 240.0, 0.1), {"k1": 0.1, "k2": 0.0}, False),
         (("RADIAL", 500.0, 320.0, 240.0, 0.1, 0.2), {"k1": 0.1, "k2": 0.2}, False),
-        (("OPENCV", 500.0, 510.0, 320.0, 240.0, 0.1, 0.2, 0.3, 0.4),
-         {"k1": 0.1, "k2": 0.2, "p1": 0.3, "p2": 0.4}, False),
+        (("OPENCV", 500.0, 510.0, 320.0, 240.0, 0.1, 0.2, 0.03, 0.04),
+         {"k1": 0.1, "k2": 0.2, "p1": 0.03, "p2": 0.04}, False),
         (("OPENCV_FISHEYE", 500.0, 510.0, 320.0, 240.0, 0.1, 0.2, 0.3, 0.4),
          {"k3": 0.3, "k4": 0.4}, False),
         (("FULL_OPENCV", 500.0, 510.0, 320.0, 240.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.0, 0.0, 0.0),
@@ -510,6 +511,30 @@ def test_glb_stands_upright_in_metres(chairs: rt.Result, tmp_path: Path) -> None
     middle = np.array([nodes[f"chair {i}"][0].mean(0) for i in (1, 2, 3)])
     apart = np.linalg.norm(np.diff(middle, axis=0), axis=1)
     np.testing.assert_allclose(apart, np.hypot(1.1, 0.1), atol=0.05)
+
+
+@pytest.mark.parametrize("up", [(0.01, -1, 0), (0, -1, 0.01), (0, 0, 1), (0.3, 0.4, -0.6)])
+def test_glb_has_the_frame_of_the_other_exports(
+    chairs: rt.Result, tmp_path: Path, up: tuple[float, ...]
+) -> None:
+    """(x, z, -y) of `center_m` (the centres in the CSV), objects and cameras alike."""
+    up_in_world = np.array(up) / np.linalg.norm(up)
+    world = dataclasses.replace(chairs.world, up_in_world=up_in_world)
+    parts = tuple(dataclasses.replace(p, up_in_world=up_in_world) for p in world.parts)
+    result = dataclasses.replace(chairs, world=dataclasses.replace(world, parts=parts))
+    nodes = in_glb(result, tmp_path / "a.glb")
+    EXPORTS["csv"][1](result, tmp_path / "a.csv")
+    with (tmp_path / "a.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    expected = np.array([[float(row[f"center_m_{axis}"]) for axis in "xyz"] for row in rows])
+    found = np.array([nodes[f"chair {row['id']}"][0].mean(0) for row in rows])
+    np.testing.assert_allclose(found, expected[:, [0, 2, 1]] * [1, 1, -1], atol=2e-3)
+    # the frame of the objects is that of the cameras: their distances are those of the world
+    eyes = invert_rigid(chairs.poses.cam_from_world)[:, :, 3]
+    path = nodes["cameras"][0][[0, *range(1, 2 * len(eyes) - 2, 2)]]  # both ends of each segment
+    in_file = np.linalg.norm(path[:, None] - found, axis=2)
+    in_world = np.linalg.norm(eyes[:, None] - [o.center for o in chairs.objects], axis=2)
+    np.testing.assert_allclose(in_file, in_world, rtol=0, atol=2e-3)
 
 
 def test_glb_in_trimesh(room: Path, tmp_path: Path) -> None:

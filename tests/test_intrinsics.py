@@ -109,6 +109,61 @@ def test_json_files_are_read(tmp_path, name):
     assert parse_camera(str(path), SIZE) == PINHOLE
 
 
+LIST = [-0.37, 0.14, -0.0002, -0.0004, -0.024]
+OPENCV_YAML = """%YAML:1.0
+---
+{matrix}: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 500., 0., 320., 0., 510., 240., 0., 0., 1. ]
+{key}: !!opencv-matrix
+   rows: 1
+   cols: 5
+   dt: d
+   data: {values}
+"""
+
+
+@pytest.mark.parametrize("yaml", [False, True])
+@pytest.mark.parametrize(
+    "key",
+    ["distortion_coefficients", "Distortion_Coefficients", "distortionCoefficients", "dist_coeffs",
+     "dist_coeff", "distCoeffs", "distcoef", "distortion_coeffs", "distortion_coef", "distortion",
+     "dist", "D", "kc"],
+)  # fmt: skip
+def test_all_spellings_of_distortion_are_read(tmp_path, key, yaml):
+    path = tmp_path / ("camera.yaml" if yaml else "camera.json")
+    text = OPENCV_YAML.format(matrix="cameraMatrix", key=key, values=LIST)
+    path.write_text(text if yaml else json.dumps({"cameraMatrix": K, key: [LIST]}))
+    camera = parse_camera(str(path), SIZE)
+    assert camera.model == "FULL_OPENCV" and camera.params[4:9] == tuple(LIST)
+
+
+@pytest.mark.parametrize(
+    "more, key",
+    [
+        ({"distortion_params": LIST}, "distortion_params"),  # nerfstudio's have another order
+        ({"lensDistortion": LIST}, "lensDistortion"),
+        ({"radial_distortion": [0.1, 0.2]}, "radial_distortion"),
+        ({"K1": 0.1}, "K1"),
+        ({"dist_coeffs": LIST, "k7": 0.1}, "k7"),
+        ({"dist_coeffs": LIST, "D": [0.1]}, "D"),
+        ({"is_fisheye": True, "k1": 0.1, "p1": 0.1}, "p1"),
+        ({"model": "PINHOLE", "params": [500, 510, 320, 240], "k1": 0.1}, "k1"),
+        ({"model": "FOV", "omega": 0.9, "dist_coeffs": LIST}, "dist_coeffs"),
+    ],
+)
+def test_distortion_that_is_not_read_is_refused(tmp_path, more, key):
+    path = tmp_path / "camera.json"
+    path.write_text(json.dumps(FX | more))
+    with pytest.raises(rt.ReobjError, match=f"the distortion '{key}' is not read"):
+        parse_camera(str(path), SIZE)
+    zeros = {k: np.zeros_like(v).tolist() if k == key else v for k, v in more.items()}
+    path.write_text(json.dumps({**FX, **zeros, "distortion_model": "", "is_undistorted": 1}))
+    assert parse_camera(str(path), SIZE) is not None  # nothing is lost
+
+
 FX = {"fx": 500, "fy": 510, "cx": 320, "cy": 240, "w": 640, "h": 480}
 TERMS = (-0.1, 0.02, 0.001, 0.002)
 NAMED = dict(zip(("k1", "k2", "p1", "p2"), TERMS, strict=True))
@@ -121,6 +176,7 @@ NAMED = dict(zip(("k1", "k2", "p1", "p2"), TERMS, strict=True))
         ({**NAMED, "k3": 0.3}, "FULL_OPENCV", (*TERMS, 0.3, 0, 0, 0)),
         ({"dist_coeffs": [*TERMS, 0.3]}, "FULL_OPENCV", (*TERMS, 0.3, 0, 0, 0)),
         ({"distortion": [[*TERMS, 0.0]]}, "OPENCV", TERMS),
+        ({"distortion": NAMED}, "OPENCV", TERMS),
         ({"is_fisheye": True, "k1": 0.1, "k4": 0.4}, "OPENCV_FISHEYE", (0.1, 0, 0, 0.4)),
         ({"camera_model": "OPENCV_FISHEYE", "D": [0.1, 0.2, 0.3, 0.4]}, "OPENCV_FISHEYE",
          (0.1, 0.2, 0.3, 0.4)),

@@ -98,7 +98,7 @@ def test_ellipsoids_out_of_view_are_not_projected() -> None:
         assert np.isnan(ellipsoids.project(view_at(0, turn), SIZE, 0.0)[0]).all()
 
 
-@pytest.mark.parametrize(("length", "known"), [(0.2, True), (4.0, False)])
+@pytest.mark.parametrize(("length", "known"), [(0.2, True), (6.0, False)])
 def test_elongated_ellipsoids_are_rejected(length: float, known: bool) -> None:
     """Truncated objects give ellipsoids that extend beyond the camera and are uninformative."""
     assert bool(mapped([ball(0, (length, 0.1, 0.1))], WALK).known[0]) is known

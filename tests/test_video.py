@@ -396,7 +396,7 @@ def test_a_file_with_glob_characters_in_its_name(tmp_path: Path) -> None:
 
 
 def test_copies_have_the_same_content_fingerprint(movie: Path, tmp_path: Path) -> None:
-    """Whatever their folder and times; of another content of the same size it differs."""
+    """Whatever their names, folder and times; of another content of the same size it differs."""
 
     def fingerprint(source: Path | str | int) -> str:
         return video_room.content_fingerprint(video_room.files_of(source))
@@ -404,12 +404,15 @@ def test_copies_have_the_same_content_fingerprint(movie: Path, tmp_path: Path) -
     for name in ("one", "other"):
         (tmp_path / name).mkdir()
         for k in range(20):
-            (tmp_path / name / f"{k:02d}.png").write_bytes(bytes([k]) * 10_000)
-        os.utime(tmp_path / name / "03.png", (len(name), 0))
+            (tmp_path / name / f"{name}_{k:02d}.png").write_bytes(bytes([k]) * 10_000)
+        os.utime(tmp_path / name / f"{name}_03.png", (len(name), 0))
     first = fingerprint(tmp_path / "one")
     assert fingerprint(tmp_path / "other") == first != fingerprint(movie)
-    (tmp_path / "other" / "03.png").write_bytes(bytes([3]) * 9_999 + b"x")
+    (tmp_path / "other" / "other_03.png").write_bytes(bytes([3]) * 9_999 + b"x")
     assert fingerprint(tmp_path / "other") != first
+    (tmp_path / "a.mp4").write_bytes(bytes(50_000) + b"x" * 100_000 + bytes(50_000))
+    (tmp_path / "b.mp4").write_bytes(bytes(200_000))
+    assert fingerprint(tmp_path / "a.mp4") != fingerprint(tmp_path / "b.mp4")
     assert fingerprint("rtsp://camera/1") == fingerprint(0) == ""
 
 

@@ -37,7 +37,7 @@ from reobj.results.names import recording_name
 from reobj.results.result import Result
 from reobj.results.scene import best_pictures
 from reobj.sources.video import Video, content_fingerprint, files_of
-from reobj.types import ReobjError, option
+from reobj.types import NOTE_START, ReobjError, option
 
 
 @dataclass(frozen=True, slots=True)
@@ -333,6 +333,8 @@ def finish_map(
     new_room, numbered = add_recording(room, result, recording)
     earlier = earlier_sessions(new_room, opened.path, recording.fingerprint)
     numbered = dataclasses.replace(numbered, earlier=earlier)
+    warnings = [*numbered.warnings, *_notes_of_known(opened, recording, placed)]
+    numbered = dataclasses.replace(numbered, warnings=warnings)
     if opened.frozen:
         return numbered
     try:
@@ -341,6 +343,16 @@ def finish_map(
         text = f"map {error}; the results are complete, but the map lacks this recording"
         return dataclasses.replace(numbered, warnings=[*numbered.warnings, text])
     return numbered
+
+
+def _notes_of_known(opened: OpenMap, recording: Recording, placed: Placed | None) -> list[str]:
+    """Say that the map has this recording, perhaps as a copy under another name; [] of a refit."""
+    old = opened.room.session_of(recording.fingerprint)
+    if old is None or placed is None:
+        return []
+    replaced = "" if opened.frozen else ", which is replaced"
+    text = f"it has this recording as session {old.number} ({old.name}){replaced}"
+    return [f"{NOTE_START}map {opened.path}: {text}"]
 
 
 def _with_object_points(
@@ -428,13 +440,15 @@ def _recording(
         )
     best = placed.placement.best
     assert best.similarity is not None
+    made_the_map = old is not None and not _placed_by(opened.room, old)
     if old is not None and placed.scale is None:
         scale = quadrics.Scale(old.metres_per_unit, old.scale_rel_sigma, old.scale_source)
     else:
         scale = placed.scale or none
     return Recording(
         opened.path, name, session_key(video), embedder, best.similarity.cov,
-        len(best.images), best.tried, scale, points, placed_by=placed.placement.by,
+        len(best.images), best.tried, scale, points,
+        placed_by="" if made_the_map else placed.placement.by,
     )  # fmt: skip
 
 

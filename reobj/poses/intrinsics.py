@@ -204,12 +204,14 @@ def camera_from_json(data: Any, size: tuple[int, int] | None) -> Camera | None:
     Args:
         data: focal length `fx`, `fy` (`fl_x`, or `camera_angle_x` in radians) and centre `cx`,
             `cy`, or a matrix `K`, `camera_matrix`, `intrinsic_matrix`; distortion by name (`k1`,
-            ...) or as a list in OpenCV's order; `w`, `h` or `width`, `height`; `model` or
-            `camera_model`, with COLMAP's `params` or the names of its parameters. All of these may
-            be in an object `camera` or `intrinsics`.
+            ...) or as a list in OpenCV's order (`_is_list`); `w`, `h` or `width`, `height`; `model`
+            or `camera_model`, with COLMAP's `params` or the names of its parameters. All of these
+            may be in an object `camera` or `intrinsics`.
         size: (w, h) where the data have none.
     Returns:
         the camera at the size of the data; None without a focal length.
+    Raises:
+        ReobjError: distortion that is not read, an unknown lens model.
     """
     # names and keys, also below, of COLMAP, nerfstudio and instant-ngp, OpenCV and ROS, Open3D,
     # Record3D, RealSense
@@ -220,6 +222,11 @@ def camera_from_json(data: Any, size: tuple[int, int] | None) -> Camera | None:
         "RADIAL_TANGENTIAL",
     )  # fmt: skip
     data = data | next((data[k] for k in ("camera", "intrinsics") if _is_object(data.get(k))), {})
+    for key, value in tuple(data.items()):
+        if key.replace("_", "").lower() == "cameramatrix":  # Camera_Matrix, cameraMatrix
+            data["camera_matrix"] = value
+        elif _is_distortion(key) and _is_object(value) and "data" not in value:
+            data |= value  # {"k1": ...}
     sides = (("w", "h"), ("width", "height"), ("image_width", "image_height"))
     size = next(
         ((image_side(data[w]), image_side(data[h])) for w, h in sides if w in data and h in data),
@@ -229,6 +236,7 @@ def camera_from_json(data: Any, size: tuple[int, int] | None) -> Camera | None:
     lens = str(data.get("distortion_model", "")).upper()  # of ROS and Kalibr
     model = lens if model in ("", "PINHOLE") and lens else model
     if size and model and "params" in data:
+        _check_read(data, camera_parameters(model))
         return colmap_camera([model, *map(str, (*size, *data["params"]))])
     pinhole = _pinhole_of_json(data, size)
     if pinhole is None:
@@ -256,12 +264,6 @@ def camera_from_yaml(data: dict[str, Any], size: tuple[int, int] | None) -> Came
         raise ReobjError(f"cameras {', '.join(kalibr)}; expected one: leave the others out")
     data = data[kalibr[0]] if kalibr else data
     keys = {re.sub(r"^Camera1?\.", "", key): data[key] for key in data}
-    normalised = {key.replace("_", "").lower(): value for key, value in keys.items()}
-    for key in ("camera_matrix", "distortion_coefficients"):  # Camera_Matrix, cameraMatrix
-        if (word := key.replace("_", "")) in normalised:
-            keys[key] = normalised[word]
-    if "distortion_coeffs" in keys:
-        keys["distortion_coefficients"] = keys["distortion_coeffs"]
     if len(keys.get("resolution", ())) == 2:
         keys["width"], keys["height"] = keys.pop("resolution")
     if isinstance(keys.get("intrinsics"), list):
@@ -305,13 +307,45 @@ def _pinhole_of_json(
 def _terms(data: dict[str, Any], order: str) -> list[float]:
     """Return the distortion in the order of its names, words; 0 where it is not given."""
     names = order.split()
-    keys = ("distortion_coefficients", "dist_coeffs", "distortion", "dist", "coeffs", "D")
-    given: Any = next((data[key] for key in keys if key in data), [])
-    values = np.ravel(given["data"] if _is_object(given) else given).tolist()
+    key = next((key for key, value in data.items() if _is_list(key) and _numbers(value)), "")
+    _check_read(data, (*names, key))
+    values = _numbers(data.get(key))
     if len(values) > len(names) and any(values[len(names) :]):
         raise ReobjError(f"{len(values)} distortion coefficients; expected {','.join(names)}")
     listed = dict(zip(names, values, strict=False)) or {"k1": data.get("k", 0.0)}
     return [float(data.get(name, listed.get(name, 0.0))) for name in names]
+
+
+def _is_list(key: str) -> bool:
+    """Test for a list of distortion coefficients: dist_coeffs, distCoeff, distortion, D, ..."""
+    form = r"dist(ortion)?(coef|coeffs?|coefs|coefficients?)?|coeffs?|kc"  # kc: Bouguet's toolbox
+    word = re.sub(r"[_\W]", "", key).lower()
+    return key == "D" or re.fullmatch(form, word) is not None
+
+
+def _is_distortion(key: str) -> bool:
+    """Test whether a key looks like distortion; `undistorted` does not."""
+    named = re.search(r"(?<!un)distort", key, re.IGNORECASE) is not None
+    return named or _is_list(key) or re.fullmatch(r"[kps]\d", key, re.IGNORECASE) is not None
+
+
+def _numbers(value: Any) -> list[float]:
+    """Return the numbers in a value, nested or under `data`; [] of anything else."""
+    values = np.ravel(value.get("data", []) if _is_object(value) else value)
+    return values.astype(np.float64).tolist() if values.dtype.kind in "iuf" else []
+
+
+def _check_read(data: dict[str, Any], read: Sequence[str]) -> None:
+    """Refuse distortion under keys other than those that are read, unless it is 0 or repeated."""
+    known = [_numbers(data.get(key)) for key in read if _is_list(key)]
+    for key, value in data.items():
+        if key in read or not _is_distortion(key):
+            continue
+        found = _numbers(value)
+        if any(found) and found not in known:
+            expected = ", ".join(filter(None, read))
+            raise ReobjError(f"the distortion {key!r} is not read; expected {expected}, or a list "
+                             "distortion_coefficients in OpenCV's order")  # fmt: skip
 
 
 def _camera_of_names(
@@ -320,6 +354,7 @@ def _camera_of_names(
     """Make a camera of another of COLMAP's models from parameters with its names."""
     values = data | dict(zip(("fx", "fy", "cx", "cy"), pinhole, strict=True)) | {"f": pinhole[0]}
     names = camera_parameters(model)
+    _check_read(data, names)
     missing = [name for name in names if name not in values]
     if missing:
         raise ReobjError(f"no {', '.join(missing)} of a {model} camera")

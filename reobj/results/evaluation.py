@@ -376,7 +376,8 @@ def evaluate(
     """Evaluate an output folder of `run`, or a tracks.txt, against ground truth.
 
     Boxes of truth and result do not count in frames on which the detector was not run, nor true
-    boxes in frames excluded by --start, --stop and --every.
+    boxes in frames excluded by --start, --stop and --every, nor boxes of the result in frames that
+    a truth with a list of its frames (COCO-VID, CVAT with a frame step) does not have.
 
     Args:
         out: output folder, or MOT rows; tracks.txt of an output folder means the folder.
@@ -412,6 +413,7 @@ def evaluate(
         )
         truth, predicted = _looked_at(read, predicted, tracked.looked, notes)
         check_counts(truth, Path(gt), "none lies in a frame that the detector was run on")
+    predicted = _in_true_frames(truth, predicted, notes)
     truth, predicted, named = with_common_names(truth, predicted, notes)
     known = sorted({*truth.name.tolist(), *predicted.name.tolist()} - {""})
     if unknown := [word for word in classes if not meant(word, known)]:
@@ -466,6 +468,33 @@ def _looked_at(
         f"on which the detector was not run (it was run on {len(looked)})"
     )
     return kept, predicted[np.isin(predicted.frame - 1, looked)]
+
+
+def _in_true_frames(
+    truth: LabelledBoxes, predicted: LabelledBoxes, notes: list[str]
+) -> LabelledBoxes:
+    """Select the boxes of the result in the frames that the truth lists; note those without it."""
+    unnamed = dataclasses.replace(predicted, name=np.full(len(predicted), ""))
+    if len(predicted) and not any((iou > 0).any() for *_, iou in _frame_steps(truth, unnamed)):
+        true, found = (f"{boxes.frame.min()}-{boxes.frame.max()}" for boxes in (truth, predicted))
+        notes.append(f"no true box overlaps a box of the result (frames from 1: truth {true}, "
+                     f"result {found}): truth of another video?")  # fmt: skip
+    if truth.listed is not None:
+        kept = predicted[np.isin(predicted.frame, truth.listed)]
+        if left := len(predicted) - len(kept):
+            notes.append(f"{left} of {len(predicted)} boxes of the result do not count: they lie "
+                         f"in frames that the truth does not list (it lists {len(truth.listed)})"
+                         )  # fmt: skip
+        return kept
+    frames = np.unique(predicted.frame)
+    without = np.setdiff1d(frames, truth.frame)
+    if len(without):
+        true_frames = np.unique(truth.frame)
+        step = int(np.gcd.reduce(np.diff(true_frames))) if len(true_frames) > 2 else 1
+        apart = f", whose frames are a multiple of {step} apart" if step > 1 else ""
+        notes.append(f"{len(without)} of {len(frames)} frames with boxes of the result have no "
+                     f"ground truth{apart}: boxes in them count as false")  # fmt: skip
+    return predicted
 
 
 def score_appearance(tracked: Result, truth: LabelledBoxes) -> dict[str, float]:

@@ -179,19 +179,21 @@ def _cvat_boxes(track: ET.Element, rows: Tracks, following: dict[int, int]) -> N
 def export_glb(result: Result, path: Path) -> None:
     """Write binary glTF 2.0 with trimesh: a mesh per object, the sparse points, the camera path.
 
-    The nodes are named "CLASS ID"; `extras` of a mesh has data of its object. y is up, units are
-    metres if the scale is known.
+    The nodes are named "CLASS ID"; `extras` of a mesh has data of its object. (x, z, -y) of the
+    upright frame of the other exports, as y is up in glTF; metres if the scale is known.
     """
     try:
         import trimesh
     except ImportError as error:
         raise ReobjError("trimesh is not installed: pip install trimesh") from error
     result, origin = centred(largest_part(result, path))
-    scale, turn = upright(result, path, [0.0, 1, 0])
+    scale, rotation = upright(result, path)
     warn_of_origin(origin, path)
     world = np.eye(4)
     poses = result.poses
-    world[:3, :3] = scale * turn
+    if result.world.up_in_world is not None:
+        rotation = rotation[[0, 2, 1]] * [[1], [1], [-1]]  # (3, 3) z up to y up: x, z, -y
+    world[:3, :3] = scale * rotation
     scene: Any = trimesh.Scene(metadata={"origin_in_world": origin.tolist()})
     ellipsoids = result.ellipsoids()
     columns = ellipsoids.world_from_obj * ellipsoids.half_axes[:, None]  # (O, 3, 3)
@@ -377,7 +379,7 @@ class Viewer:
         rr = self.rr
         rec = self.rec
         largest, origin = centred(largest_part(result, path))
-        scale, turn = upright(largest, path, [0.0, 0, 1])
+        scale, turn = upright(largest, path)
         warn_of_origin(origin, path)
         names = {o.id: f"{o.id} {o.class_name}" for o in result.objects}
         rec.log("world", rr.Transform3D(mat3x3=turn), static=True)  # a scale: no pinholes

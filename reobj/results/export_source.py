@@ -68,11 +68,11 @@ def frames_read(result: Result) -> tuple[list[int], list[str]]:
     return np.union1d(read, result.tracks.frame).tolist(), names
 
 
-def upright(result: Result, path: Path, up_axis: Sequence[float]) -> tuple[float, Array]:
+def upright(result: Result, path: Path) -> tuple[float, Array]:
     """Compute scale and rotation of the world for a viewer; warn if scale or up is unknown.
 
     Returns:
-        metres per unit (1 if unknown), and the rotation (3, 3) from up to `up_axis`.
+        metres per unit (1 if unknown), and the rotation (3, 3) from up to z.
     """
     scale = result.world.scale
     up = result.world.up_in_world
@@ -82,7 +82,7 @@ def upright(result: Result, path: Path, up_axis: Sequence[float]) -> tuple[float
             log.warning("the scale is unknown: %s is not in metres; give --known-size", path)
         if up is None:
             log.warning("up is unknown: %s keeps the world's axes", path)
-    return metres or 1.0, rotation_to_up(up, up_axis)
+    return metres or 1.0, rotation_to_up(up)
 
 
 def warn_of_origin(origin: Array, path: Path) -> None:
@@ -136,7 +136,7 @@ def upright_world(result: Result, path: Path, float32: bool = False) -> UprightW
     if not part.located and (poses is None or not poses.known.any()):
         raise ReobjError(f"{path}: nothing to export: the result has no solids and no cameras, see "
                          "`run`")  # fmt: skip
-    scale, rotation = upright(part, path, (0.0, 0.0, 1.0))
+    scale, rotation = upright(part, path)
     ellipsoids = part.ellipsoids()
     turned = quadrics.Ellipsoids(
         scale * ellipsoids.center_in_world @ rotation.T,

@@ -63,9 +63,9 @@ class FilmWriter:
         self.size = (width, height)
         self.count = 0
         try:
-            os.fsencode(self.path).decode()
-        except UnicodeDecodeError:  # OpenCV 5.0 would end the process
-            where = ascii(str(self.path))
+            str(self.part).encode()
+        except UnicodeEncodeError:  # OpenCV 5.0 would end the process
+            where = ascii(str(self.part.parent))
             raise OSError(f"{where}: the overlay needs a folder whose name is UTF-8") from None
         with self._named(), contextlib.ExitStack() as stack:
             stack.callback(self.part.unlink, missing_ok=True)

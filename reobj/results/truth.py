@@ -44,6 +44,7 @@ class LabelledBoxes:
         frame: (N,) from 1, as in MOTChallenge files. identity: (N,). xyxy: (N, 4) native pixels.
         name: (N,) class names; "" matches every class.
         role: (N,) Role.SCORED, Role.IGNORED or Role.ABSENT; all Role.SCORED in a result.
+        listed: (F,) frames that the file of the truth lists; None: it lists none.
     """
 
     frame: IntArray
@@ -51,12 +52,14 @@ class LabelledBoxes:
     xyxy: Array
     name: npt.NDArray[np.str_]
     role: IntArray
+    listed: IntArray | None = None
 
     def __len__(self) -> int:
         return len(self.frame)
 
     def __getitem__(self, keep: Any) -> LabelledBoxes:
-        return LabelledBoxes(*(getattr(self, f.name)[keep] for f in dataclasses.fields(self)))
+        columns = ("frame", "identity", "xyxy", "name", "role")
+        return dataclasses.replace(self, **{name: getattr(self, name)[keep] for name in columns})
 
 
 def labelled(rows: Array, name: Any = "", role: Any = Role.SCORED) -> LabelledBoxes:
@@ -96,7 +99,10 @@ def read_truth(
             )
         names = np.array(recorded.class_names, str)[recorded.class_id]
         role = np.full(len(names), Role.SCORED)
-        truth = LabelledBoxes(recorded.frame + 1, recorded.identity, recorded.xyxy, names, role)
+        listed = None if recorded.looked is None else recorded.looked + 1
+        truth = LabelledBoxes(
+            recorded.frame + 1, recorded.identity, recorded.xyxy, names, role, listed
+        )
         notes += recorded.messages
     elif path.suffix.lower() == ".json":
         truth = _read_coco_video(path)
@@ -309,6 +315,7 @@ def _read_coco_video(path: Path) -> LabelledBoxes:
              *a["bbox"]] for a in data["annotations"]
         ]  # fmt: skip
         table = np.array(rows, np.float64).reshape(-1, 6)
+        listed = np.array(list(frame_of.values()), np.float64) + 1  # (F,)
         names = [name_of[a["category_id"]] for a in data["annotations"]]
         crowd = [Role.IGNORED if a.get("iscrowd") or a.get("ignore") else Role.SCORED
                  for a in data["annotations"]]  # fmt: skip
@@ -318,9 +325,11 @@ def _read_coco_video(path: Path) -> LabelledBoxes:
         expected = "COCO-VID: images with frame_id, annotations with instance_id and bbox"
         raise ReobjError(f"{path}: {error!r}; expected {expected}") from error
     # Above 2^53 not every integer is a float64
-    if not np.isfinite(table).all() or (np.abs(table) > 2.0**53).any():
+    numbers = np.append(table, listed)
+    if not np.isfinite(numbers).all() or (np.abs(numbers) > 2.0**53).any():
         raise ReobjError(f"{path}: a number is not finite; expected COCO-VID")
-    return labelled(table, np.array(names, str), np.array(crowd, np.int64))
+    boxes = labelled(table, np.array(names, str), np.array(crowd, np.int64))
+    return dataclasses.replace(boxes, listed=np.unique(listed.astype(np.int64)))
 
 
 def _check_identities(boxes: LabelledBoxes, path: Path) -> None:

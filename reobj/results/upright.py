@@ -6,7 +6,6 @@ Robots plan in such a frame (ROS REP 103), whatever the axes and units of the po
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,10 +16,10 @@ from reobj.results.entries import Object, Part, World
 from reobj.types import Array
 
 
-def rotation_to_up(up: Array | None, up_axis: Sequence[float] = (0.0, 0.0, 1.0)) -> Array:
-    """Return the smallest rotation (3, 3) that maps `up` (3,) to `up_axis`; identity for None."""
-    known = up_axis if up is None else up
-    return np.asarray(Rotation.align_vectors([up_axis], [known])[0].as_matrix())
+def rotation_to_up(up: Array | None) -> Array:
+    """Return the smallest rotation (3, 3) that maps `up` (3,) to z; identity for None."""
+    z = np.array([0.0, 0, 1])
+    return np.asarray(Rotation.align_vectors([z], [z if up is None else up])[0].as_matrix())
 
 
 def upright_pose(found: Object, world: World | Part) -> dict[str, Any]:

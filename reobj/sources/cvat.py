@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import zipfile
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -18,7 +18,7 @@ from reobj.sources.image_frames import frames_of_names
 from reobj.sources.masks import NO_RUNS, Counts, crop_runs, polygon_runs
 from reobj.sources.recorded import RecordedDetections, scale_to
 from reobj.sources.video import Video
-from reobj.types import Array, ReobjError
+from reobj.types import Array, IntArray, ReobjError
 
 
 def read_cvat(path: Path, video: Video, first: str = "") -> RecordedDetections:
@@ -55,6 +55,7 @@ def read_cvat(path: Path, video: Video, first: str = "") -> RecordedDetections:
         raise ReobjError(f"{path}: {error}") from error
     except Exception as error:  # zip, zlib and expat have their own exceptions for damaged files
         raise ReobjError(f"{path}: no annotations of CVAT for video 1.1 ({error!r:.200})") from None
+    looked = None
     skeletons = sum(1 for _ in root.iter("skeleton"))
     if not shapes:
         raise ReobjError(f"{path}: no track with a box; export the task as 'CVAT for video 1.1'")
@@ -65,6 +66,8 @@ def read_cvat(path: Path, video: Video, first: str = "") -> RecordedDetections:
         messages += [note] if note else []
     else:
         frame = np.array(frames, np.int64) - int(first or 0)
+        looked = _listed_frames(root, frames)
+        looked = None if looked is None else looked - int(first or 0)
     names, class_id = np.unique(labels, return_inverse=True)
     for name in names.tolist():
         check_length(name, f"{path}, label")
@@ -78,8 +81,25 @@ def read_cvat(path: Path, video: Video, first: str = "") -> RecordedDetections:
     return RecordedDetections(
         frame, np.array(boxes, np.float64) * scale, np.ones(n), class_id.astype(np.int64),
         runs, tuple(names.tolist()), video.size, video.working_size, np.arange(n), "box",
-        messages, ids if (ids > 0).any() else np.empty(0, np.int64),
+        messages, ids if (ids > 0).any() else np.empty(0, np.int64), looked=looked,
     )  # fmt: skip
+
+
+def _listed_frames(root: ET.Element, frames: Sequence[int | str]) -> IntArray | None:
+    """Return the frames (F,) of a task that skips some; None: all, or `frames` are not in them.
+
+    Our exports begin at 0 and have no step, whatever frames were read.
+    """
+    start, stop, step = (
+        root.findtext(f"meta/task/{key}", "").removeprefix("step=").strip()
+        for key in ("start_frame", "stop_frame", "frame_filter")
+    )
+    if not start.isdecimal() or not stop.isdecimal() or not (step or "1").isdecimal():
+        return None
+    listed = range(int(start), int(stop) + 1, max(int(step or 1), 1))
+    if (listed.start == 0 and listed.step == 1) or not all(f in listed for f in frames):
+        return None
+    return np.array(listed, np.int64)
 
 
 Shape = tuple[int | str, int, str, ET.Element]  # frame or image, identity, label, element

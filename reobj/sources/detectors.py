@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from reobj.cameras import Poses
-from reobj.files import did_you_mean, save_npz
+from reobj.files import did_you_mean, save_npz, spans
 from reobj.sources.class_names import Vocabulary, check_length, load_class_names
 from reobj.sources.detection_files import (
     DetectConfig,
@@ -36,6 +36,7 @@ from reobj.sources.libraries import (
     is_function,
     library_detector,
     library_of,
+    names_by_id,
     user_function,
 )
 from reobj.sources.onnx_layouts import (
@@ -270,14 +271,33 @@ class OnnxDetector:
         """Name `count` classes (0: unknown) by option, metadata of the model, COCO, or numbers."""
         if self.config.class_names:
             return load_class_names(self.config.class_names)
-        names = self._session.get_modelmeta().custom_metadata_map.get("names", "")
-        if names.startswith("{"):
-            return tuple(str(name) for _, name in sorted(ast.literal_eval(names).items()))
+        names = self._session.get_modelmeta().custom_metadata_map.get("names", "").strip()
+        if names.startswith(("{", "[")):
+            return self._names_in_model(names, count)
         if count in (0, len(COCO_NAMES)):
             return COCO_NAMES
         log.warning("%s: %d classes without names: give a file of names with --set "
                     "detect.class_names=FILE", self.path, count)  # fmt: skip
         return tuple(f"class {i}" for i in range(count))
+
+    def _names_in_model(self, text: str, count: int) -> tuple[str, ...]:
+        """Read class names from a list, or a map from numbers, with one for each of the classes."""
+        first = self._layout.first
+        try:
+            table = ast.literal_eval(text)
+            entries = table.items() if isinstance(table, dict) else enumerate(table, first)
+            named = {int(number): str(name) for number, name in entries}
+            numbers = spans(sorted(named)) or "none"
+        except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
+            named = {}
+            numbers = f"unreadable ({text:.40})"
+        last = first + (count or max(len(named), 1)) - 1
+        if sorted(named) == list(range(first, last + 1)):
+            return tuple(named[number] for number in sorted(named))
+        raise ReobjError(
+            f"{self.path}: the numbers of the class names in it are {numbers}, expected "
+            f"{first}-{last}: give a file of names with --set detect.class_names=FILE"
+        )
 
 
 def nms(xyxy: Array, class_id: IntArray, max_iou: float) -> IntArray:
@@ -655,6 +675,5 @@ def _stated_names(detector: Any) -> tuple[str, ...]:
     """Return the class names in a detector's attributes, a list or a dict by id; () if none."""
     names = getattr(detector, "class_names", None) or getattr(detector, "names", None)
     if isinstance(names, Mapping):
-        ids = range(max((int(i) for i in names), default=-1) + 1)
-        return tuple(str(names.get(i, f"class {i}")) for i in ids)
+        return names_by_id(names)
     return tuple(map(str, names)) if isinstance(names, list | tuple) else ()

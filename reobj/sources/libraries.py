@@ -98,7 +98,7 @@ def _ultralytics(options: LibraryOptions) -> LibraryDetector:
             images, conf=options.min_score, device=options.device, retina_masks=True, verbose=False
         )
 
-    return LibraryDetector(run, _by_id(model.names))
+    return LibraryDetector(run, names_by_id(model.names))
 
 
 def _rfdetr(options: LibraryOptions) -> LibraryDetector:
@@ -182,7 +182,7 @@ def _transformers(options: LibraryOptions) -> LibraryDetector:
         answers = processor.post_process_grounded_object_detection(outputs, **asked)
         return (_with_words(found, words) for found in answers)
 
-    return LibraryDetector(run, options.words or _by_id(model.config.id2label))
+    return LibraryDetector(run, options.words or names_by_id(model.config.id2label))
 
 
 def _with_words(image: Any, words: list[str]) -> dict[str, Any]:
@@ -289,7 +289,7 @@ def user_function(detector: str) -> Any:
     return found
 
 
-def _by_id(names: Mapping[Any, Any]) -> tuple[str, ...]:
+def names_by_id(names: Mapping[Any, Any]) -> tuple[str, ...]:
     """Return the names of ids 0, 1, ...; ids without a name get a number."""
     of_id = {int(i): str(name) for i, name in names.items()}
     return tuple(of_id.get(i, f"class {i}") for i in range(max(of_id, default=-1) + 1))

@@ -577,24 +577,28 @@ def source_fingerprint(source: Any) -> str:
     return hashlib.sha256(json.dumps(facts).encode()).hexdigest()[:16]
 
 
-def content_fingerprint(files: Sequence[Path], most: int = 8, piece: int = 4096) -> str:
-    """Hash names, sizes and some content of files.
+def content_fingerprint(files: Sequence[Path], most: int = 16, piece: int = 4096) -> str:
+    """Hash sizes and some content of files.
 
-    Copies in another folder have the same one, whatever their times.
+    Copies have the same one, whatever their names, folders and times.
 
     Args:
-        most: files, spread over all, of which the first and the last `piece` bytes are read.
+        most: pieces of `piece` bytes that are read, spread over at most most / 2 files, with the
+            first and the last bytes of each.
     Returns:
         16 hex digits; "" without files.
     """
     if not files:
         return ""
-    digest = hashlib.sha256(json.dumps([(p.name, p.stat().st_size) for p in files]).encode())
-    for path in files[:: -(-len(files) // most)]:
+    digest = hashlib.sha256(json.dumps([p.stat().st_size for p in files]).encode())
+    read = files[:: -(-len(files) // (most // 2))]
+    for path in read:
+        last = max(path.stat().st_size - piece, 0)
+        count = most // len(read)
         with open(path, "rb") as file:
-            digest.update(file.read(piece))
-            file.seek(max(path.stat().st_size - piece, 0))
-            digest.update(file.read(piece))
+            for k in range(count):
+                file.seek(last * k // (count - 1))
+                digest.update(file.read(piece))
     return digest.hexdigest()[:16]
 
 

@@ -348,3 +348,89 @@ def test_cvat_for_video(tmp_path: Path) -> None:
     (tmp_path / "cvat.xml").write_text(text + "</annotations>")
     found = rt.evaluate(out, tmp_path / "cvat.xml")["tracks"]
     assert len(found) == 5 and all(s["HOTA"] == 1 for s in found.values())
+
+
+# ---- Truth in some frames only ----
+
+LISTED = (1, 6, 11, 16, 21, 26)  # frames from 1, a step of 5
+
+
+def coco_video(path: Path, rows: np.ndarray, frames: tuple[int, ...]) -> Path:
+    """Write COCO-VID whose `images` are these frames."""
+    data = {
+        "videos": [{"id": 1, "name": "v"}],
+        "images": [{"id": f, "video_id": 1, "frame_id": f - 1} for f in frames],
+        "categories": [{"id": 1, "name": "cup"}],
+        "annotations": [
+            {"id": i, "image_id": int(f), "category_id": 1, "instance_id": int(o), "bbox": box}
+            for i, (f, o, *box) in enumerate(rows.tolist())
+        ],
+    }
+    path.write_text(json.dumps(data))
+    return path
+
+
+def cvat_task(path: Path, rows: np.ndarray, task: str) -> Path:
+    tracks = "".join(
+        f'<track id="{o:.0f}" label="cup">'
+        + "".join(
+            f'<box frame="{f - 1:.0f}" outside="0" xtl="{x}" ytl="{y}" xbr="{x + w}" '
+            f'ybr="{y + h}"/>'
+            for f, _, x, y, w, h in rows[rows[:, 1] == o].tolist()
+        )
+        + "</track>"
+        for o in np.unique(rows[:, 1])
+    )
+    path.write_text(f"<annotations><meta><task>{task}</task></meta>{tracks}</annotations>")
+    return path
+
+
+def test_frames_that_the_truth_does_not_list_do_not_count(result: Path, tmp_path: Path) -> None:
+    rows = ROWS[np.isin(ROWS[:, 0], LISTED)]
+    span = "<start_frame>0</start_frame><stop_frame>29</stop_frame>"
+    step = f"{span}<frame_filter>step=5</frame_filter>"
+    late = "<start_frame>10</start_frame><stop_frame>19</stop_frame>"
+    for gt in (
+        coco_video(tmp_path / "a.json", rows, LISTED),
+        cvat_task(tmp_path / "a.xml", rows, step),
+        cvat_task(tmp_path / "late.xml", ROWS[(ROWS[:, 0] > 10) & (ROWS[:, 0] <= 20)], late),
+    ):
+        found, said = score(result, gt)
+        assert found["HOTA"] == found["IDF1"] == found["MOTA"] == 1
+        assert any("of 150 boxes of the result do not count" in text for text in said)
+    empty = rows[rows[:, 0] != 6]  # a listed frame without true boxes: boxes in it are false
+    for gt in (
+        coco_video(tmp_path / "b.json", empty, LISTED),
+        cvat_task(tmp_path / "b.xml", empty, step),
+    ):
+        found, said = score(result, gt)
+        assert found["MOTA"] == pytest.approx(1 - 5 / 25)
+    every = coco_video(tmp_path / "c.json", ROWS, tuple(range(1, 31)))
+    found, said = score(result, every)
+    assert found["MOTA"] == 1 and not any("do not count" in text for text in said)
+
+
+@pytest.mark.parametrize(
+    ("frames", "count", "step"), [(LISTED, 24, "5 apart"), ((1, 2, 3, 7, 30), 25, "")]
+)
+def test_frames_without_truth_are_counted_in_a_note(
+    result: Path, tmp_path: Path, frames: tuple[int, ...], count: int, step: str
+) -> None:
+    """A MOT file does not list its frames: one without a row may be empty."""
+    gt = write(tmp_path / "gt.txt", ROWS[np.isin(ROWS[:, 0], frames)], "1")
+    found, said = score(result, gt)
+    assert found["precision"] == pytest.approx(1 - count / 30)
+    (note,) = said
+    assert f"{count} of 30 frames with boxes of the result have no ground truth" in note
+    assert step in note and ("apart" in note) == bool(step)
+
+
+def test_the_truth_of_another_video_is_noted(result: Path, tmp_path: Path) -> None:
+    later, elsewhere = ROWS + 1000 * np.eye(1, 6), ROWS + 5000 * np.eye(1, 6, 2)
+    for gt in (
+        write(tmp_path / "gt.txt", later, "1"),
+        write(tmp_path / "gt2.txt", elsewhere, "1"),
+        coco_video(tmp_path / "gt.json", later, tuple(range(1001, 1031))),
+    ):
+        found, said = score(result, gt)
+        assert found["HOTA"] == 0 and any("truth of another video?" in text for text in said)

@@ -238,6 +238,25 @@ def test_a_recording_that_is_run_again_keeps_its_numbers(desk: Path) -> None:
     assert after.next_id == before.next_id and after.next_session == before.next_session
 
 
+def test_a_renamed_copy_of_a_recording_is_its_session(
+    desk: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It is no second observation of the objects, whose sigmas would shrink."""
+    shutil.copy(desk / "monday.map", desk / "flat.map")
+    before = RoomMap.load(desk / "flat.map")
+    shutil.copy(ROOM / "room.mp4", desk / "VID_1 (1).mp4")
+    video, *rest = monday(desk, "copy")[1:]
+    assert video == ROOM / "room.mp4"
+    assert cli("run", desk / "VID_1 (1).mp4", *rest) == 0
+    streams = capsys.readouterr()
+    assert streams.err.count("it has this recording as session 1 (room.mp4") == 1
+    assert f"made with {len(before.objects)} objects" in streams.out  # not: all of them are new
+    after = RoomMap.load(desk / "flat.map")
+    assert [s.number for s in after.sessions] == [1]
+    assert statuses(after) == statuses(before)
+    assert true_of(desk / "copy", ROOM) == true_of(desk / "monday", ROOM)
+
+
 def test_a_frozen_map_stays_as_it_is(desk: Path) -> None:
     """Tuesday is compared with the map of Monday, which another run is updating."""
     shutil.move(desk / "monday.map", desk / "flat.map")
