@@ -306,13 +306,15 @@ NOISE_PX = 0.5  # standard deviation of the edges
 def shake(seed: int) -> None:
     """Add noise to all boxes before objects are made of them, in this process."""
 
-    def shaken(result: rt.Result, config: rt.ObjectsConfig, *others: Any) -> rt.Result:
+    def shaken(
+        result: rt.Result, config: rt.ObjectsConfig, phases: Any = None, last: Any = None
+    ) -> rt.Result:
         rng = np.random.default_rng(seed)
         for name in ("tracks", "untracked"):
             rows = getattr(result, name)
             xyxy = rows.xyxy + rng.normal(0, NOISE_PX, rows.xyxy.shape)
             result = dataclasses.replace(result, **{name: dataclasses.replace(rows, xyxy=xyxy)})
-        return link_and_fit(result, config, *others)
+        return link_and_fit(result, config, phases, last)
 
     rt.link_and_fit = shaken  # type: ignore[attr-defined]
 
