@@ -111,7 +111,8 @@ def fill_from_objects(
         inside = box_area(quadrics.clip_boxes(whole, size))
         visible = inside > EXPECTED_IN_VIEW * box_area(whole)  # False where NaN
         box = np.full_like(whole, np.nan)  # (V, 4)
-        box[visible] = quadrics.clip_boxes(distort_boxes(whole[visible], poses.camera), size)
+        shown = inside > 0
+        box[shown] = quadrics.clip_boxes(distort_boxes(whole[shown], poses.camera), size)
         visible &= np.isfinite(box[:, 0])
         rows = tracks[(tracks.track_id == track_id) & np.isin(tracks.frame, frame)]  # (n,)
         empty = np.setdiff1d(np.flatnonzero(visible), np.searchsorted(frame, rows.frame))  # (T,)
