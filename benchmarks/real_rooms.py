@@ -291,6 +291,8 @@ def measure(case: Case, data: Path, out: Path, without: str = "", seed: int = 0)
     folder = out / f"{case.name}-{zlib.crc32(without.encode()):08x}-{seed}"
     shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree(out / case.name, folder)
+    for name in ("objects.json", "cache/last-links.npz"):  # else a refit keeps the identities
+        (folder / name).unlink(missing_ok=True)
     result = rt.refit(folder, configured(case, data, out))
     result.save(folder / WITH_DOUBTFUL, doubtful=True)
     figures = spent(result) | score_case(case, data, out, folder)
@@ -305,14 +307,14 @@ def shake(seed: int) -> None:
     """Add noise to all boxes before objects are made of them, in this process."""
 
     def shaken(
-        result: rt.Result, config: rt.ObjectsConfig, phases: Any = None, links: Any = None
+        result: rt.Result, config: rt.ObjectsConfig, phases: Any = None, last: Any = None
     ) -> rt.Result:
         rng = np.random.default_rng(seed)
         for name in ("tracks", "untracked"):
             rows = getattr(result, name)
             xyxy = rows.xyxy + rng.normal(0, NOISE_PX, rows.xyxy.shape)
             result = dataclasses.replace(result, **{name: dataclasses.replace(rows, xyxy=xyxy)})
-        return link_and_fit(result, config, phases, links)
+        return link_and_fit(result, config, phases, last)
 
     rt.link_and_fit = shaken  # type: ignore[attr-defined,assignment]
 

@@ -125,7 +125,7 @@ class Camera:
         if self.model == "PINHOLE":
             pixels[front] = ahead[:, :2] / ahead[:, 2:] @ self.K[:2, :2].T + self.K[:2, 2]
         elif len(front):
-            radius = np.linalg.norm(ahead[:, :2], axis=1) / (1 + 1e-9)  # rounding at the fold
+            radius = np.hypot(*ahead[:, :2].T) / (1 + 1e-9)  # rounding at the fold
             inside = radius <= self.fold_radius * ahead[:, 2]
             found = np.asarray(self.to_pycolmap().img_from_cam(ahead), np.float64)
             pixels[front] = np.where(inside[:, None], found, np.nan)
@@ -217,8 +217,8 @@ def _fold_radius(model: str, params: tuple[float, ...], step_deg: float = 0.1) -
     xy = radius[:, None, None] * np.stack([np.cos(turn), np.sin(turn)], 1)  # (r, 16, 2)
     rays = np.concatenate([xy, np.ones((*xy.shape[:2], 1))], 2).reshape(-1, 3)
     pixels = np.asarray(camera.to_pycolmap().img_from_cam(rays), np.float64).reshape(xy.shape)
-    offset = (pixels - camera.K[:2, 2]) / np.diag(camera.K)[:2]
-    with np.errstate(invalid="ignore", over="ignore"):
+    with np.errstate(all="ignore"):  # the terms of the distortion may diverge
+        offset = (pixels - camera.K[:2, 2]) / np.diag(camera.K)[:2]
         outwards = (np.diff(np.linalg.norm(offset, axis=2), axis=0) > 0).all(1)  # (r - 1,)
     return float("inf") if outwards.all() else float(radius[outwards.argmin()])
 

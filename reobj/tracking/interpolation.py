@@ -110,7 +110,9 @@ def fill_from_objects(
         whole = quadrics.solid_boxes(ellipsoids[[o]], [support[o]], cams)[:, 0]
         inside = box_area(quadrics.clip_boxes(whole, size))
         visible = inside > EXPECTED_IN_VIEW * box_area(whole)  # False where NaN
-        box = quadrics.clip_boxes(distort_boxes(whole, poses.camera), size)  # (V, 4)
+        box = np.full_like(whole, np.nan)  # (V, 4)
+        shown = inside > 0
+        box[shown] = quadrics.clip_boxes(distort_boxes(whole[shown], poses.camera), size)
         visible &= np.isfinite(box[:, 0])
         rows = tracks[(tracks.track_id == track_id) & np.isin(tracks.frame, frame)]  # (n,)
         empty = np.setdiff1d(np.flatnonzero(visible), np.searchsorted(frame, rows.frame))  # (T,)
