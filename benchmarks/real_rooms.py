@@ -316,7 +316,7 @@ def shake(seed: int) -> None:
             result = dataclasses.replace(result, **{name: dataclasses.replace(rows, xyxy=xyxy)})
         return link_and_fit(result, config, phases, last)
 
-    rt.link_and_fit = shaken  # type: ignore[attr-defined,assignment]
+    rt.link_and_fit = shaken  # type: ignore[attr-defined]
 
 
 def mean_of(runs: Sequence[Figures]) -> Figures:
