@@ -36,8 +36,8 @@ EXPECTED = 0.6  # and to expect a detection
 # Depths of the sparse points in the inner part of a box: their range elsewhere (log), their sigma
 # about the solid (log), the probability that they are of the object, and the inner part
 LOG_DEPTHS = 3.0
-DEPTH_SIGMA = 0.1
-POINTS_ON_OBJECT = 0.7
+DEPTH_SIGMA = 0.15
+POINTS_ON_OBJECT = 0.8
 INNER_BOX = 0.6
 DEPTH_QUANTILES = 9
 MIN_POINTS = 5  # of a box
