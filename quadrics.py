@@ -2176,7 +2176,9 @@ def _fit_all(data: _Data, spec: _Spec, cfg: FitConfig) -> _Fit:
         kept = doubted.obj[odds <= 0]
         fit = fit[~spec.overrules(fit) | ~np.isin(fit.obj, kept)]
     fit = fit[np.lexsort((-fit.evidence, fit.obj))][_group_starts(np.sort(fit.obj))]
-    return _with_common_errors(fit, data, spec, cfg) if cfg.wrong_class > 0 else fit
+    for _ in range(2 if cfg.wrong_class > 0 else 0):
+        fit = _with_common_errors(fit, data, spec, cfg)
+    return fit
 
 
 def _size_deviation(fit: _Fit, spec: _Spec) -> tuple[Array, Array]:
