@@ -2204,7 +2204,8 @@ def _with_common_errors(fit: _Fit, data: _Data, spec: _Spec, cfg: FitConfig) -> 
     if not odd.any():
         return fit
     again = fit[odd]
-    again.noise = again.noise * COMMON_ERRORS
+    most = np.maximum(again.noise, cfg.limits.max_noise)  # more would be a reason to reject it
+    again.noise = np.minimum(again.noise * COMMON_ERRORS, most)
     standard = _all_residuals(again, data) / again.noise[:, None, None]
     used = data.edges.used[again.obj]
     again.views = _inlier_views(standard, used, cfg.robust)
