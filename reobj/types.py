@@ -676,6 +676,26 @@ def rows_by(group: IntArray) -> list[IntArray]:
     return np.split(order, starts[1:]) if len(group) else []
 
 
+class Existence(float):
+    """Probability that an object exists, with its evidence (`objects.confidence`).
+
+    Attributes:
+        score: log odds of the best detections. hit_rate: over the frames where it should be
+            visible, NaN without a shape. see_through: log ratio of points behind it.
+    """
+
+    def __new__(cls, probability: float, *_: float) -> Existence:
+        """Make the number."""
+        return super().__new__(cls, probability)
+
+    def __init__(
+        self, probability: float, score: float, hit_rate: float, see_through: float
+    ) -> None:
+        self.score = score
+        self.hit_rate = hit_rate
+        self.see_through = see_through
+
+
 def nearest_of(values: IntArray, known: IntArray) -> IntArray:
     """Return the index of the nearest of K known values, ascending, to each value (N,).
 

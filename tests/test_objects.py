@@ -380,10 +380,8 @@ def test_up_comes_from_the_fit_or_the_poses(
     assert flat.scale is None and flat.up_source == ("poses" if poses_know else "none")
 
 
-@pytest.mark.parametrize(
-    ("scale", "status", "sigma"), [(1.0, "ok", "3.9"), (0.95, "implausible", "4.1")]
-)
-def test_a_size_beyond_four_sigma_is_implausible(scale: float, status: str, sigma: str) -> None:
+@pytest.mark.parametrize("scale", [1.0, 0.95])
+def test_a_size_of_four_sigma_is_reported_and_not_set_aside(scale: float) -> None:
     """A chair that the detector calls a couch, in a world of two sizes."""
     poses = walk()
     cams = poses.cam_from_world.copy()
@@ -392,9 +390,8 @@ def test_a_size_beyond_four_sigma_is_implausible(scale: float, status: str, sigm
     tracks = tracks_of(poses)
     tracks = with_columns(tracks, class_id=np.where(tracks.track_id == 2, couch, tracks.class_id))
     found = fitted(tracks, dataclasses.replace(poses, cam_from_world=cams)).objects
-    assert found[1].status == status and f"size is {sigma} sigma" in found[1].reason
-    assert [o.counted and o.located for o in found] == [True, status == "ok", True]
-    assert all(o.center is not None and o.size_m is not None for o in found)
+    assert found[1].status == "ok" and "sigma from the usual one" in found[1].reason
+    assert all(o.counted and o.located for o in found)
 
 
 @pytest.mark.parametrize(("confidence", "status"), [(0.9, "ok"), (0.4, "doubtful")])

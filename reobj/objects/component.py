@@ -38,7 +38,17 @@ from reobj.objects.occlusion import edges_above_floor, see_through_ratio
 from reobj.objects.phases import Reach, ignore
 from reobj.poses.floor import floor_of
 from reobj.tracking.linking import DUPLICATE_IOU, cut_at_gaps
-from reobj.types import Array, BoolArray, IntArray, Tracks, box_area, box_iou, class_shares, rows_by
+from reobj.types import (
+    Array,
+    BoolArray,
+    Existence,
+    IntArray,
+    Tracks,
+    box_area,
+    box_iou,
+    class_shares,
+    rows_by,
+)
 from reobj.visible_points import VisiblePoints, points_in_boxes
 
 # Least score of untracked detections that give hypotheses (.3 finds 73.5 objects instead of 72, in
@@ -58,7 +68,7 @@ class ComponentObjects:
 
     label: IntArray
     iou: Array
-    confidence: Sequence[confidence.Existence]
+    confidence: Sequence[Existence]
     floor: quadrics.Floor | None
     ellipsoids: quadrics.Ellipsoids
 

@@ -9,7 +9,7 @@ import numpy as np
 from reobj.objects.association import Association
 from reobj.objects.likelihood import PosedDetections, logit
 from reobj.results.result import Result
-from reobj.types import Array, BoolArray, IntArray, Tracks, rows_by
+from reobj.types import Array, BoolArray, Existence, IntArray, Tracks, rows_by
 
 # Logistic regression of existence: intercept, log odds of the best scores, hit rate over the frames
 # where the object should be visible, see-through ratio (`occlusion.see_through_ratio`). Fitted to
@@ -69,21 +69,6 @@ def scores_far_off(result: Result) -> list[str]:
     return [f"the median score of the detections is {median:.2g}, that of the recordings that the "
             f"confidence of objects was fitted to {fitted} ({FITTED_TO}): it may order objects, "
             "but is no probability here"]  # fmt: skip
-
-
-class Existence(float):
-    """Probability that an object exists, with its evidence as of `existence_probability`."""
-
-    def __new__(cls, probability: float, *_: float) -> Existence:
-        """Make the number."""
-        return super().__new__(cls, probability)
-
-    def __init__(
-        self, probability: float, score: float, hit_rate: float, see_through: float
-    ) -> None:
-        self.score = score
-        self.hit_rate = hit_rate
-        self.see_through = see_through
 
 
 def of_objects(

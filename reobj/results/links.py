@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 import quadrics
 from reobj.files import load_npz, save_npz
-from reobj.types import IntArray, LinkEvent, ReobjError, Tracks
+from reobj.types import Existence, IntArray, LinkEvent, ReobjError, Tracks
 
 if TYPE_CHECKING:
     from reobj.results.result import Result
@@ -183,8 +183,10 @@ def save_links(links: Links, path: Path) -> None:
     arrays = {f.name: getattr(links.tracks, f.name) for f in dataclasses.fields(Tracks)}
     arrays |= {name: getattr(links, name) for name in ("source", "category", "number")}
     for name in ("confidence", "label_of"):
-        known: dict[int, Any] = getattr(links, name)
-        arrays |= {f"{name}_id": np.array(list(known), np.int64), name: np.array([*known.values()])}
+        arrays[f"{name}_id"] = np.array(list(getattr(links, name)), np.int64)
+    arrays["label_of"] = np.array([*links.label_of.values()])
+    evidence = [_evidence_row(value) for value in links.confidence.values()]
+    arrays["confidence"] = np.reshape(np.array(evidence, np.float64), (-1, 4))
     floors = []
     for k, shapes in enumerate(links.shapes):
         floor = None if shapes is None else shapes.floor
@@ -197,6 +199,13 @@ def save_links(links: Links, path: Path) -> None:
     save_npz(path, arrays, events=events, floors=floors, in_map=sorted(links.in_map), **facts)
 
 
+def _evidence_row(value: float) -> tuple[float, float, float, float]:
+    """Return a confidence and its evidence; NaN where it was given by hand."""
+    if isinstance(value, Existence):
+        return float(value), value.score, value.hit_rate, value.see_through
+    return value, np.nan, np.nan, np.nan
+
+
 def load_links(path: Path) -> Links:
     """Read what `save_links` wrote.
 
@@ -206,10 +215,13 @@ def load_links(path: Path) -> Links:
     data, facts = load_npz(path, sealed=True)
     try:
         tracks = Tracks(*(data[f.name] for f in dataclasses.fields(Tracks)))
-        confidence, label_of = (
-            dict(zip(data[f"{name}_id"].tolist(), data[name].tolist(), strict=True))
-            for name in ("confidence", "label_of")
-        )
+        label_of = dict(zip(data["label_of_id"].tolist(), data["label_of"].tolist(), strict=True))
+        confidence = {
+            identity: row[0] if np.isnan(row[1]) else Existence(*row)
+            for identity, row in zip(
+                data["confidence_id"].tolist(), data["confidence"].tolist(), strict=True
+            )
+        }
         shapes = list[ComponentShapes | None]()
         columns = [f.name for f in dataclasses.fields(quadrics.Ellipsoids)]
         for k, values in enumerate(facts["floors"]):
