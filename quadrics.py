@@ -1860,6 +1860,7 @@ class _Fit(_Rows):
     hessian: Array  # (B, 9, 9) at unit noise
     inlier: BoolArray  # (B, V, E) edges in use
     noise: Array  # (B,) factor on the nominal edge sigma
+    common: Array  # (B,) part of it for errors that all boxes of the object have in common
     evidence: Array  # (B,)
     views: BoolArray  # (B, V) inlier views
     spread: Array  # (B, 9, 9) second moment of the other local minima
@@ -1941,7 +1942,7 @@ def _best_starts(few: _Data, spec: _Spec, cfg: FitConfig) -> _Fit:
     evidence = np.zeros(len(keep))
     return _Fit(
         obj, hyp[keep], code[keep], axis[keep], state[keep], hessian[keep], inlier, noise,
-        evidence, np.asarray(inlier.any(-1)), total / mass[:, None, None],
+        noise.copy(), evidence, np.asarray(inlier.any(-1)), total / mass[:, None, None],
     )  # fmt: skip
 
 
@@ -2204,14 +2205,14 @@ def _with_common_errors(fit: _Fit, data: _Data, spec: _Spec, cfg: FitConfig) -> 
     if not odd.any():
         return fit
     again = fit[odd]
-    most = np.maximum(again.noise, cfg.limits.max_noise)  # more would be a reason to reject it
-    again.noise = np.minimum(again.noise * COMMON_ERRORS, most)
+    again.noise = again.noise * COMMON_ERRORS
+    again.common = again.common * COMMON_ERRORS
     standard = _all_residuals(again, data) / again.noise[:, None, None]
     used = data.edges.used[again.obj]
     again.views = _inlier_views(standard, used, cfg.robust)
     again.inlier = used & (np.abs(standard) <= cfg.robust.edge_outlier) & again.views[..., None]
     _refit(again, data, spec, cfg, cfg.robust.huber_loss)
-    for name in ("hessian", "inlier", "noise", "views"):
+    for name in ("hessian", "inlier", "noise", "common", "views"):
         getattr(fit, name)[odd] = getattr(again, name)
     fit.state.put(odd, again.state)
     return fit
@@ -2497,7 +2498,8 @@ def _rejection_reasons(
     """Give the reason to reject each of B fits; empty where it is accepted."""
     finite = _finite(fit.state.center, 1) & _finite(size_sigma, 1)
     reasons = []
-    for b, (noise, inside) in enumerate(zip(fit.noise, fit.views.sum(1), strict=True)):
+    own = fit.noise / fit.common
+    for b, (noise, inside) in enumerate(zip(own, fit.views.sum(1), strict=True)):
         why = ""
         if not finite[b]:
             why = "no finite solution"
