@@ -22,6 +22,10 @@ LEAST_VERSIONS = {
     "onnxruntime": "1.19.2",
     "pycolmap": "4.2.1",
     "filterpy": "2.0.0",
+    "av": "15",
+    "pillow": "11",
+    "pyyaml": "6.0.2",
+    "msgspec": "0.19",
 }
 
 

@@ -1,0 +1,160 @@
+"""Registries of file formats: one entry a format, recognised by structure alone or named by a flag.
+
+There is one registry each for detections, poses, cameras and ground truth. Nothing is scored or
+guessed: a file that fits no entry, or several, is refused with their names and the flag.
+"""
+
+from __future__ import annotations
+
+import functools
+import xml.etree.ElementTree as ElementTree
+import zipfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from reobj.files import did_you_mean, load_json
+from reobj.types import ReobjError
+
+R = TypeVar("R", bound=Callable[..., Any])
+AUTO = "auto"
+HEAD_BYTES = 65536
+
+
+class Probe:
+    """What `recognise` looks at: names, the first lines, and top-level keys of a file or folder."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.suffix = path.suffix.lower()
+        self.is_dir = path.is_dir()
+
+    @functools.cached_property
+    def names(self) -> frozenset[str]:
+        """Names in the folder, or in the zip archive; empty of another file."""
+        if self.is_dir:
+            return frozenset(entry.name for entry in self.path.iterdir())
+        if zipfile.is_zipfile(self.path):
+            with zipfile.ZipFile(self.path) as archive:
+                return frozenset(archive.namelist())
+        return frozenset()
+
+    @functools.cached_property
+    def lines(self) -> list[str]:
+        """Non-empty lines at the start of a text file; [] of a folder or a binary file."""
+        if self.is_dir:
+            return []
+        with self.path.open("rb") as file:
+            head = file.read(HEAD_BYTES)
+        if b"\0" in head and not head.startswith((b"\xff\xfe", b"\xfe\xff")):
+            return []
+        coding = "utf-16" if head.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig"
+        lines = head.decode(coding, "replace").splitlines()
+        return [line.strip() for line in lines if line.strip()]
+
+    @functools.cached_property
+    def json(self) -> Any:
+        """Content of a JSON file; None of another file. Reads it once.
+
+        Raises:
+            ReobjError: the name ends with .json, and the content is damaged.
+        """
+        if self.suffix != ".json" and not (self.lines and self.lines[0][0] in "[{"):
+            return None
+        return load_json(self.path)
+
+    @functools.cached_property
+    def root(self) -> ElementTree.Element | None:
+        """Root element of an XML file, without its children; None of another file."""
+        if not (self.lines and self.lines[0].startswith("<")):
+            return None
+        try:
+            element: ElementTree.Element = next(ElementTree.iterparse(self.path, ("start",)))[1]
+        except (ElementTree.ParseError, StopIteration):
+            return None
+        return element
+
+    def keys(self) -> frozenset[str]:
+        """Keys of a JSON object, or of the first object of a JSON list; else empty."""
+        data = self.json
+        data = data[0] if isinstance(data, list) and data else data
+        return frozenset(data) if isinstance(data, dict) else frozenset()
+
+
+@dataclass(frozen=True, slots=True)
+class Format(Generic[R]):
+    """One file format.
+
+    Attributes:
+        name: value of the flag. title: the tools and datasets that write it.
+        recognise: tests structure alone (names, suffix, header, keys).
+        read: the reader; None: a format that is only named, with `advice` on the export to use.
+        frames, units, unread: numbering of frames, units, and what is not read (for the table).
+    """
+
+    name: str
+    title: str
+    recognise: Callable[[Probe], bool]
+    read: R | None
+    frames: str = ""
+    units: str = ""
+    unread: str = ""
+    advice: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Registry(Generic[R]):
+    """All formats of one kind of content. `flag` names an entry; `what`: in messages."""
+
+    what: str
+    flag: str
+    formats: Sequence[Format[R]]
+
+    @property
+    def readable(self) -> list[Format[R]]:
+        """The formats with a reader."""
+        return [entry for entry in self.formats if entry.read is not None]
+
+    def reader(self, path: Path, name: str = AUTO) -> R:
+        """Return the reader of a file: of the format that the user names, or that it fits.
+
+        Raises:
+            ReobjError: no such file or format; a file that fits none, several, or one that is
+                only named.
+        """
+        entry = self.find(path, name)
+        if entry.read is None:
+            raise ReobjError(f"{path}: {entry.title}, not read; {entry.advice}")
+        return entry.read
+
+    def find(self, path: Path, name: str = AUTO) -> Format[R]:
+        """Return the format of a file, as `reader` does."""
+        if not path.exists():
+            raise ReobjError(f"{path}: no such file of {self.what}")
+        known = {entry.name: entry for entry in self.readable}
+        if name not in ("", AUTO):
+            if name not in known:
+                close = did_you_mean(name, known) or f"; expected {AUTO}, {', '.join(known)}"
+                raise ReobjError(f"{self.flag} {name}: no such format{close}")
+            return known[name]
+        probe = Probe(path)
+        fits = [entry for entry in self.formats if entry.recognise(probe)]
+        if len(fits) == 1:
+            return fits[0]
+        names = [entry.name for entry in fits if entry.read is not None]
+        if fits:
+            raise ReobjError(f"{path}: fits {len(fits)} formats of {self.what}: "
+                             f"{', '.join(names)}; name one with {self.flag}")  # fmt: skip
+        raise ReobjError(f"{path}: no known format of {self.what}; expected one of "
+                         f"{', '.join(known)} ({self.flag}; docs/input_formats.md)")  # fmt: skip
+
+    def table(self) -> str:
+        """Return the Markdown table of docs/input_formats.md."""
+        rows = [("format", "written by", "frames", "units", "not read"), ("---",) * 5]
+        rows += [
+            (f"`{entry.name}`" if entry.read else "", entry.title, entry.frames, entry.units,
+             entry.unread if entry.read else f"the file; {entry.advice}")
+            for entry in sorted(self.formats, key=lambda entry: entry.read is None)
+        ]  # fmt: skip
+        return "\n".join(f"| {' | '.join(row)} |" for row in rows) + "\n"
