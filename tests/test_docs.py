@@ -246,8 +246,6 @@ def test_the_dockerfile_copies_what_the_wheel_needs() -> None:
     wheel = project["tool"]["hatch"]["build"]["targets"]["wheel"]["only-include"]
     assert copied == {*wheel, project["project"]["readme"], "LICENSE", "pyproject.toml"}
     assert re.search(r"^FROM python:3\.1[123]-slim$", text, re.M)
-    (extra,) = re.findall(r'"\.\[(\w+)\]"', text)
-    assert extra in project["project"]["optional-dependencies"]
 
 
 PAGES_OF_TEXT = [
