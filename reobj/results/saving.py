@@ -13,6 +13,7 @@ import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,7 +41,7 @@ from reobj.results.changes import (
     write_earlier,
 )
 from reobj.results.edits import write_edits
-from reobj.results.entries import Object, VideoInfo, World, decode
+from reobj.results.entries import Object, VideoInfo, World, read_json, written_by
 from reobj.results.links import save_links
 from reobj.results.names import OutputFile
 from reobj.results.ply import write_ply
@@ -217,18 +218,6 @@ def load_last_poses(out: Path) -> Poses | None:
         raise ReobjError(f"{path}: {written_by(out)}") from error
 
 
-def written_by(out: Path) -> str:
-    """Explain why a file of an output folder is unreadable: damaged, or of another version."""
-    data: dict[str, Any] = {}
-    with contextlib.suppress(ReobjError):
-        data = load_json(out / OutputFile.OBJECTS)
-    wrote = data.get("reobj_track") if isinstance(data, dict) else None
-    if wrote == __version__:
-        return "is damaged: run the video again"
-    by = f"written by reobj_track {wrote or 'before 0.2'}, this is {__version__}"
-    return f"{by}: run the video again"
-
-
 # ---- objects.json ------------------------------------------------------------------------------
 
 
@@ -236,8 +225,6 @@ def written_by(out: Path) -> str:
 class ObjectsFile:
     """Content of objects.json that is read back."""
 
-    format: str
-    version: int
     video: VideoInfo
     world: World
     objects: list[Object]
@@ -281,19 +268,12 @@ def write_objects(result: Result, path: Path) -> None:
 
 def read_objects(path: Path) -> ObjectsFile:
     """Read objects.json, and check the types, shapes and ranges of its values."""
-    try:
-        entries: ObjectsFile = decode(ObjectsFile, load_json(path))
-    except ReobjError as error:
-        fault = str(error).removeprefix(f"{path}: ")
-        raise ReobjError(f"{path}: {fault}; {written_by(path.parent)}") from error
+    entries: ObjectsFile = read_json(ObjectsFile, path, HEADER, partial(written_by, path.parent))
     return entries
 
 
 def _contradiction(entries: ObjectsFile, poses: Poses | None) -> str:
     """Describe a contradiction between entries of objects.json, or to the poses; "" if none."""
-    form, number = HEADER.values()
-    if (entries.format, entries.version) != (form, number):
-        return f"expected format {form}, version {number}"
     ids = [o.id for o in entries.objects]
     if len(set(ids)) != len(ids):
         return "two objects of one id"
@@ -301,15 +281,10 @@ def _contradiction(entries: ObjectsFile, poses: Poses | None) -> str:
     described = len(entries.world.parts)
     if component_count not in (1, described):
         return f"{described} components of a trajectory that has {component_count}"
-    statuses = ("ok", "prior_dominated", "implausible", "doubtful", "rejected", "tracked")
     for o in entries.objects:
         shape = (o.center, o.half_axes, o.size, o.quat_wxyz)
-        has_shape = o.located or o.status == "implausible"
-        if o.status not in statuses or (has_shape and any(value is None for value in shape)):
+        if (o.located or o.status == "implausible") and any(value is None for value in shape):
             return f"object {o.id} is {o.status} without a shape"
-        # rounded to six digits its length is off by 1e-6
-        if o.quat_wxyz is not None and abs(np.linalg.norm(o.quat_wxyz) - 1) > 1e-3:
-            return f"quat_wxyz of object {o.id} is not of length 1"
         if o.part >= max(component_count, described):
             return f"object {o.id} is in component {o.part}, which does not exist"
     return ""

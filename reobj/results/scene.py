@@ -326,7 +326,7 @@ def write_scene(
         "doubtful": doubtful,
         "size": {"width": result.video.width, "height": result.video.height},
         "visit_gap": visit_gap(result.tracks.frame, result.video.fps),
-        "edits": [] if result.edits is None else result.edits.entries,
+        "edits": [] if result.edits is None else result.edits.to_json(),
         "map": "" if result.poses is None else result.poses.map_id,
         "why_flat": _why_flat(result),
         "steps": {

@@ -9,8 +9,11 @@ import json
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import msgspec
 
 from reobj import __version__
 from reobj.cameras import Poses, save_poses
@@ -24,7 +27,7 @@ from reobj.files import (
     locked,
     writing,
 )
-from reobj.results.entries import decode
+from reobj.results.entries import read_json, written_by
 from reobj.results.links import Links, links_of_results, load_links
 from reobj.results.names import OutputFile
 from reobj.results.result import Result
@@ -32,21 +35,22 @@ from reobj.results.saving import (
     check_results,
     load_last_poses,
     remove_stale,
-    written_by,
 )
 from reobj.sources.imageless import ImagelessVideo
 from reobj.sources.video import InputConfig, Video
-from reobj.types import COORDINATE_MAX, ReobjError
+from reobj.types import COORDINATE_MAX, FiniteFloat, Int32, ReobjError
+
+Side = Annotated[int, msgspec.Meta(ge=1, le=int(COORDINATE_MAX))]
 
 
 @dataclass(frozen=True, slots=True)
 class _Frames:
     """Frames of a video without images: the arguments of `ImagelessVideo`."""
 
-    size: list[int]
-    times_s: list[float] | None = None
+    size: tuple[Side, Side]
+    times_s: list[FiniteFloat] | None = None
     names: list[str] = field(default_factory=list)
-    count: int = 0
+    count: Int32 = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +58,7 @@ class _Binding:
     """Content of cache/source.json that is read back."""
 
     source: str
-    input: dict[str, int]
+    input: dict[str, Int32]
     content: str = ""
     frames: _Frames | None = None
 
@@ -208,19 +212,9 @@ class Workspace:
 
     def _read_binding(self) -> _Binding:
         """Read what `bind` wrote."""
-        path = self._source_file
-        try:
-            binding: _Binding = decode(_Binding, load_json(path))
-        except ReobjError as error:
-            fault = str(error).removeprefix(f"{path}: ")
-            raise ReobjError(f"{path}: {fault}; {written_by(self.out)}") from error
-        frames = binding.frames
-        counts = [*binding.input.values(), 0 if frames is None else frames.count]
-        right_size = frames is None or (
-            len(frames.size) == 2 and 1 <= min(frames.size) <= max(frames.size) <= COORDINATE_MAX
+        binding: _Binding = read_json(
+            _Binding, self._source_file, {}, partial(written_by, self.out)
         )
-        if max(counts) >= 2**31 or not right_size:  # int32 of OpenCV
-            raise ReobjError(f"{path}: a number is out of range; {written_by(self.out)}")
         return binding
 
     def path(self, stage: str, *key: Any) -> Path:
