@@ -133,7 +133,7 @@ class _EditsFile(msgspec.Struct):
     """Content of a file of edits."""
 
     edits: tuple[Edit, ...]
-    map: str = ""
+    map_path: str = ""  # identifier of the map
 
 
 def read_edits(path: str | Path) -> Edits:
@@ -144,7 +144,7 @@ def read_edits(path: str | Path) -> Edits:
     """
     path = Path(path)
     content: _EditsFile = read_json(_EditsFile, path, HEADER, lambda: "scene.html saves such files")
-    return Edits(content.edits, path, map_id=content.map)
+    return Edits(content.edits, path, map_id=content.map_path)
 
 
 def write_edits(folder: Path, edits: Edits | None) -> None:

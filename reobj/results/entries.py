@@ -42,10 +42,11 @@ from reobj.types import (
 # first and last frame of each run of frames
 Spans = list[Annotated[list[NonNegativeInt], msgspec.Meta(min_length=2, max_length=2)]]
 
-# Names of fields that differ from the keys of objects.json and changes.json, by the key of the list
+# Names of fields that differ from the keys of objects.json and changes.json, by the key above
 _OF_CHANGE = {"class": "class_name", "from": "before", "to": "after", "from_shape": "before_shape"}
 _FIELD_NAMES = {
     "objects": {"class": "class_name", "tracks": "tracklet_ids", "frames": "visits"},
+    "": {"map": "map_path"},
     "changes": {"map": "map_path"},
     **dict.fromkeys(("stayed", "moved", "gone", "new", "not_seen", "ambiguous"), _OF_CHANGE),
 }
@@ -326,7 +327,7 @@ def read_json(
             raise ReobjError(f"expected {json.dumps(header)}")
         if missing := [key for key in required if key not in data]:
             raise ReobjError(f"{missing[0]!r} is missing")
-        return decode(kind, data, path.stem)
+        return decode(kind, data)
     except ReobjError as error:
         fault = str(error).removeprefix(f"{path}: ")
         raise ReobjError(f"{path}: {fault}; {advice()}") from error
@@ -352,18 +353,18 @@ class _Scale(msgspec.Struct):
     source: str
 
 
-def decode(kind: Any, value: Any, key: str = "", at: str = "$") -> Any:
+def decode(kind: Any, value: Any, at: str = "$") -> Any:
     """Convert a JSON value to a type made of our dataclasses.
 
     Missing fields get their default; unknown keys are ignored.
 
     Args:
-        key: of the value in a file, if it is one of `_FIELD_NAMES`. at: JSON path, for messages.
+        at: JSON path of the value, for messages.
     Raises:
         ReobjError: the value has another type or shape, or a number is out of range.
     """
     try:
-        value = _with_field_names(value, key, at)
+        value = _with_field_names(value, "", at)
         return msgspec.convert(value, kind, dec_hook=_array, str_keys=True)
     except (msgspec.ValidationError, UnicodeError) as error:
         text = re.sub(r"[.`]\w+", lambda m: m[0][0] + _KEYS.get(m[0][1:], m[0][1:]), str(error))
@@ -377,12 +378,14 @@ def _with_field_names(value: Any, key: str, at: str) -> Any:
         return [_with_field_names(item, key, f"{at}[{k}]") for k, item in enumerate(value)]
     if key == "scale" and value is not None:
         return msgspec.structs.astuple(decode(_Scale, value, at=at))
-    if key == "class" and isinstance(value, str):
+    if key == "class_name" and isinstance(value, str):
         return visible_name(value)
     if not isinstance(value, dict):
         return value
     names = _FIELD_NAMES.get(key, {})
-    return {names.get(k, k): _with_field_names(v, k, f"{at}.{k}") for k, v in value.items()}
+    return {
+        (name := names.get(k, k)): _with_field_names(v, name, f"{at}.{k}") for k, v in value.items()
+    }
 
 
 def _array(kind: Any, value: Any) -> Array:
