@@ -18,6 +18,7 @@ from simulated import CHAIR, CUP, chair_solids, fitted, tracks_of, walk, with_co
 
 import quadrics
 import reobj_track as rt
+from reobj.results.entries import decode
 from reobj.results.ply import write_ply
 from reobj.results.report import sides
 from reobj.results.result import VideoInfo
@@ -197,7 +198,7 @@ def test_evidence_is_rounded_to_four_digits() -> None:
     written = rt.World(links=links).to_json()["links"]
     assert [e["place_iou"] for e in written] == [0.1235, None]
     assert [e["appearance_log_odds"] for e in written] == [-9.8765, 0.0]
-    again = rt.World.from_json(json.loads(json.dumps({"links": written})))
+    again = decode(rt.World, json.loads(json.dumps({"links": written})))
     assert again.to_json()["links"] == written and again.links[0].tracklets == (1, 2)
 
 

@@ -22,7 +22,7 @@ import numpy.typing as npt
 import quadrics
 from reobj import __version__
 from reobj.cameras import Camera
-from reobj.files import LockedError, load_npz, locked, save_npz
+from reobj.files import LockedError, columns_of, load_npz, locked, save_npz
 from reobj.results.entries import decode
 from reobj.types import (
     Array,
@@ -364,7 +364,7 @@ def save_map(path: Path, room: RoomMap) -> None:
         ValueError: the file could not be read again.
     """
     origin = _origin(room.points.xyz)
-    columns = {f.name: getattr(room.points, f.name) for f in dataclasses.fields(MapPoints)}
+    columns = columns_of(room.points)
     columns["xyz"] = columns["xyz"] - origin
     arrays: dict[str, Any] = {"points_origin": origin}
     arrays |= {f"points_{name}": columns[name].astype(POINTS[name][0]) for name in POINTS}
@@ -426,8 +426,7 @@ def _origin(xyz: Array) -> Array:
 
 def _without_arrays(record: Any, arrays: Sequence[str]) -> dict[str, Any]:
     """Return the fields of a dataclass that are not stored as arrays."""
-    values = {f.name: getattr(record, f.name) for f in dataclasses.fields(record)}
-    kept = {k: v for k, v in values.items() if k not in arrays}
+    kept = {k: v for k, v in columns_of(record).items() if k not in arrays}
     if "classes" in kept:
         kept["classes"] = dict(sorted(kept["classes"].items()))
     return {k: dataclasses.asdict(v) if isinstance(v, Camera) else v for k, v in kept.items()}

@@ -6,15 +6,13 @@ import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
-import numpy as np
 
-from reobj.files import atomic, base64_text, numbers, rounded
-from reobj.results.entries import Object, check_shape, read_json, written_by
+from reobj.files import atomic, numbers, rounded
+from reobj.results.entries import Object, check_shape, read_json
 from reobj.types import (
     Array,
     FiniteFloat,
@@ -243,8 +241,7 @@ def write_earlier(path: Path, sessions: Sequence[EarlierSession]) -> None:
             "date": session.date,
             "objects": [o.to_json() for o in session.objects],
             "changes": None if session.changes is None else session.changes.to_json(),
-            "pictures": {str(i): base64_text(np.frombuffer(jpeg, np.uint8), "u1")
-                         for i, jpeg in session.pictures.items()},
+            "pictures": msgspec.to_builtins(session.pictures, str_keys=True),
         }
         for session in sessions
     ]  # fmt: skip
@@ -265,10 +262,7 @@ def read_earlier(path: Path) -> tuple[EarlierSession, ...]:
     Raises:
         ReobjError: damaged, or another kind of file.
     """
-    content: _EarlierFile = read_json(
-        _EarlierFile, path, {}, partial(written_by, path.parent.parent)
-    )
-    return content.sessions
+    return read_json(_EarlierFile, path, out=path.parent.parent).sessions
 
 
 def _moved_text(change: Change) -> str:
@@ -290,7 +284,4 @@ def read_changes(path: Path) -> Changes:
     Raises:
         ReobjError: damaged, or another kind of file.
     """
-    changes: Changes = read_json(
-        Changes, path, HEADER, partial(written_by, path.parent), Changes.KINDS
-    )
-    return changes
+    return read_json(Changes, path, HEADER, path.parent, Changes.KINDS)

@@ -143,7 +143,7 @@ def read_edits(path: str | Path) -> Edits:
         ReobjError: another kind of file, or an invalid edit.
     """
     path = Path(path)
-    content: _EditsFile = read_json(_EditsFile, path, HEADER, lambda: "scene.html saves such files")
+    content = read_json(_EditsFile, path, HEADER)
     return Edits(content.edits, path, map_id=content.map_path)
 
 

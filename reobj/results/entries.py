@@ -7,10 +7,10 @@ import json
 import re
 import typing
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -39,6 +39,7 @@ from reobj.types import (
     visible_name,
 )
 
+T = TypeVar("T")
 # first and last frame of each run of frames
 Spans = list[Annotated[list[NonNegativeInt], msgspec.Meta(min_length=2, max_length=2)]]
 
@@ -268,19 +269,14 @@ class World:
     def to_json(self) -> dict[str, Any]:
         """Return the `world` of objects.json."""
         values: dict[str, Any] = msgspec.to_builtins(self, enc_hook=_plain)
-        for world, entry in zip((self, *self.parts), (values, *values["parts"]), strict=True):
+        worlds: list[World | Part] = [self, *self.parts]
+        for world, entry in zip(worlds, (values, *values["parts"]), strict=True):
             if world.scale is not None:
                 entry["scale"] = msgspec.to_builtins(_Scale(*world.scale))
         for link in values["links"]:
             for key in ("place_iou", "appearance_log_odds"):
                 link[key] = rounded(link[key], 4)  # a box is measured to 1 in 100
         return values
-
-    @staticmethod
-    def from_json(entry: dict[str, Any]) -> World:
-        """Read the `world` of objects.json."""
-        world: World = decode(World, entry, "$.world")
-        return world
 
 
 def _plain(value: Any) -> Any:
@@ -307,17 +303,17 @@ class VideoInfo:
 
 
 def read_json(
-    kind: Any,
+    kind: type[T],
     path: Path,
-    header: dict[str, Any],
-    advice: Callable[[], str],
+    header: dict[str, Any] | None = None,
+    out: Path | None = None,
     required: Sequence[str] = (),
-) -> Any:
+) -> T:
     """Read a JSON file of ours.
 
     Args:
         kind: type of the content, as in `decode`. header: keys with their values: format, version.
-        advice: returns the end of a message. required: keys of fields that have a default.
+        out: output folder of the file, for the advice. required: keys of fields with a default.
     Raises:
         ReobjError: damaged, another kind of file, or of another version.
     """
@@ -327,10 +323,11 @@ def read_json(
             raise ReobjError(f"expected {json.dumps(header)}")
         if missing := [key for key in required if key not in data]:
             raise ReobjError(f"{missing[0]!r} is missing")
-        return decode(kind, data)
+        content: T = decode(kind, data)
     except ReobjError as error:
-        fault = str(error).removeprefix(f"{path}: ")
-        raise ReobjError(f"{path}: {fault}; {advice()}") from error
+        fault = f"{path}: {str(error).removeprefix(f'{path}: ')}"
+        raise ReobjError(f"{fault}; {written_by(out)}" if out else fault) from error
+    return content
 
 
 def written_by(out: Path) -> str:
@@ -384,7 +381,8 @@ def _with_field_names(value: Any, key: str, at: str) -> Any:
         return value
     names = _FIELD_NAMES.get(key, {})
     return {
-        (name := names.get(k, k)): _with_field_names(v, name, f"{at}.{k}") for k, v in value.items()
+        (name := str(names.get(k, k))): _with_field_names(v, name, f"{at}.{k}")
+        for k, v in value.items()
     }
 
 

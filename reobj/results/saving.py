@@ -13,7 +13,6 @@ import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,7 +24,9 @@ from reobj.cameras import Poses, load_poses, save_poses, write_tum
 from reobj.files import (
     atomic,
     check_places,
+    columns_of,
     cut,
+    from_columns,
     load_json,
     load_npz,
     part_path,
@@ -172,7 +173,7 @@ def load(kind: type[Result], out: Path) -> Result:
     if not path.is_file() or not (out / OutputFile.TRACKS).is_file():
         raise ReobjError(f"{out}: no objects.json and tracks.txt; make them first with `run`")
     poses = load_last_poses(out)
-    entries = read_objects(path)
+    entries = read_json(ObjectsFile, path, HEADER, out)
     if fault := _contradiction(entries, poses):
         raise ReobjError(f"{path}: {fault}; {written_by(out)}")
     class_names = tuple(dict.fromkeys(o.class_name for o in entries.objects))
@@ -266,12 +267,6 @@ def write_objects(result: Result, path: Path) -> None:
         part.write_text(json.dumps(data, indent=1) + "\n")
 
 
-def read_objects(path: Path) -> ObjectsFile:
-    """Read objects.json, and check the types, shapes and ranges of its values."""
-    entries: ObjectsFile = read_json(ObjectsFile, path, HEADER, partial(written_by, path.parent))
-    return entries
-
-
 def _contradiction(entries: ObjectsFile, poses: Poses | None) -> str:
     """Describe a contradiction between entries of objects.json, or to the poses; "" if none."""
     ids = [o.id for o in entries.objects]
@@ -324,21 +319,18 @@ def _is_finite(_: Any, value: Any) -> bool:
 # ---- Tracks before linking ---------------------------------------------------------------------
 
 
-BOXES_3D_COLUMNS = tuple(f.name for f in dataclasses.fields(Boxes3D))
-
-
 def save_tracked(result: Result, path: Path) -> None:
     """Write tracks and embeddings, before they are linked and fitted, as npz."""
-    looked = {} if result.looked is None else {"looked": result.looked}
-    columns = {f.name: getattr(result.tracks, f.name) for f in dataclasses.fields(Tracks)}
-    columns |= {f"untracked_{n}": getattr(result.untracked, n) for n in columns}
-    columns |= {name: getattr(result.embeddings, name) for name in ("foreground", "background")}
+    columns = columns_of(result.tracks) | columns_of(result.untracked, "untracked_{}")
+    columns |= columns_of(result.embeddings) | {"embedding_row": result.embedding_row}
     if result.boxes_3d is not None:
-        columns |= {f"boxes_3d_{n}": getattr(result.boxes_3d, n) for n in BOXES_3D_COLUMNS}
+        columns |= columns_of(result.boxes_3d, "boxes_3d_{}")
+    if result.looked is not None:
+        columns["looked"] = result.looked
     facts = {"class_names": result.class_names, "warnings": result.warnings,
              "identities_given": result.identities_given,
              "video": dataclasses.asdict(result.video), "version": __version__}  # fmt: skip
-    save_npz(path, columns | looked | {"embedding_row": result.embedding_row}, **facts)
+    save_npz(path, columns, **facts)
 
 
 def load_tracked(kind: type[Result], path: Path) -> Result:
@@ -347,20 +339,18 @@ def load_tracked(kind: type[Result], path: Path) -> Result:
     Args:
         kind: `Result`, whose module imports this one.
     """
-    names = [f.name for f in dataclasses.fields(Tracks)]
     try:
         data, facts = load_npz(path, sealed=True)
+        boxes = "boxes_3d_frame" in data
         return kind(
-            Tracks(*(data[name] for name in names)),
+            from_columns(Tracks, data),
             tuple(facts["class_names"]),
             VideoInfo(**facts["video"]),
-            embeddings=Embeddings(data["foreground"], data["background"]),
+            embeddings=from_columns(Embeddings, data),
             embedding_row=data["embedding_row"],
-            untracked=Tracks(*(data[f"untracked_{name}"] for name in names)),
+            untracked=from_columns(Tracks, data, "untracked_{}"),
             looked=data.get("looked"),
-            boxes_3d=Boxes3D(*(data[f"boxes_3d_{n}"] for n in BOXES_3D_COLUMNS))
-            if "boxes_3d_frame" in data
-            else None,
+            boxes_3d=from_columns(Boxes3D, data, "boxes_3d_{}") if boxes else None,
             identities_given=bool(facts["identities_given"]),
             warnings=list(facts["warnings"]),
         )

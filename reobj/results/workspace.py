@@ -22,7 +22,6 @@ from reobj.files import (
     LockedError,
     atomic,
     load_cached,
-    load_json,
     load_npz,
     locked,
     writing,
@@ -138,12 +137,11 @@ class Workspace:
             "frames": video.facts() if isinstance(video, ImagelessVideo) else None,
         }
         if path.exists():
-            old = load_cached(path, load_json)
-            old = old if isinstance(old, dict) else {}
-            if old.get("content") != fingerprint["content"]:
+            old = load_cached(path, partial(read_json, _Binding)) or _Binding("another video", {})
+            if old.content != fingerprint["content"]:
                 if not overwrite and self._has_results():
-                    found = f"{old.get('source', 'another video')}, not of {video.source}"
-                    if old.get("source") == fingerprint["source"]:
+                    found = f"{old.source}, not of {video.source}"
+                    if old.source == fingerprint["source"]:
                         found = f"{video.source} as it was before it changed"
                     advice = "choose another -o, or add --overwrite"
                     raise ReobjError(f"{self.out}: holds the results of {found}; {advice}")
@@ -180,14 +178,7 @@ class Workspace:
         frames = self._read_binding().frames
         if frames is None:
             return Video(source, config)
-        return ImagelessVideo(
-            source,
-            frames.size,
-            config,
-            times_s=frames.times_s,
-            names=frames.names,
-            count=frames.count,
-        )
+        return ImagelessVideo(source, config=config, **dataclasses.asdict(frames))
 
     def video_or_frames(self, result: Result) -> tuple[Video, list[str]]:
         """Open the video, or its frames without images if it was moved or deleted since.
@@ -212,10 +203,7 @@ class Workspace:
 
     def _read_binding(self) -> _Binding:
         """Read what `bind` wrote."""
-        binding: _Binding = read_json(
-            _Binding, self._source_file, {}, partial(written_by, self.out)
-        )
-        return binding
+        return read_json(_Binding, self._source_file, out=self.out)
 
     def path(self, stage: str, *key: Any) -> Path:
         """Return the cache file of a stage's result.
