@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+import shutil
 import sys
 from collections.abc import Callable
 from html.parser import HTMLParser
@@ -386,6 +387,12 @@ def test_validate_names_file_and_path_in_every_line(saved: Path) -> None:
         ]
 
 
+def test_validate_prints_no_control_characters_of_a_path(saved: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(saved, tmp_path / "\x1b[31mred")
+    (folder / "objects.json").write_text("{}")
+    assert all(line.isprintable() for line in validate_objects(folder))
+
+
 def test_validate_refuses_invalid_json(tmp_path: Path) -> None:
     (tmp_path / "x.json").write_text("{")
     with pytest.raises(rt.ReobjError, match="not valid JSON"):
@@ -520,6 +527,13 @@ def old_tracks(out: Path) -> None:
     np.savez_compressed(out / "cache/last-tracks.npz", **columns, fixed=False, split=0,
                         look=np.zeros((0, 0), np.float16), look_row=np.zeros(0, np.int64),
                         class_names=np.array(rt.COCO_NAMES), messages=np.array([]))  # fmt: skip
+
+
+def test_objects_of_an_old_folder_load(saved: Path) -> None:
+    old_objects(saved)
+    (saved / "cache/last-poses.npz").unlink()
+    (link,) = rt.Result.load(saved).world.links
+    assert link == rt.LinkEvent("join", (1, 2), 0.5, 0.87, True)
 
 
 COMMANDS: dict[str, Callable[[Path], tuple[object, ...]]] = {

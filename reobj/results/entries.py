@@ -52,6 +52,7 @@ _FIELD_NAMES = {
     **dict.fromkeys(("stayed", "moved", "gone", "new", "not_seen", "ambiguous"), _OF_CHANGE),
 }
 _KEYS = {name: key for names in _FIELD_NAMES.values() for key, name in names.items()}
+_FIELD_NAMES["links"] = {"look": "appearance_log_odds"}  # in version 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -363,7 +364,7 @@ def decode(kind: Any, value: Any, at: str = "$") -> Any:
     try:
         value = _with_field_names(value, "", at)
         return msgspec.convert(value, kind, dec_hook=_array, str_keys=True)
-    except (msgspec.ValidationError, UnicodeError) as error:
+    except (msgspec.ValidationError, UnicodeError, RecursionError) as error:
         text = re.sub(r"[.`]\w+", lambda m: m[0][0] + _KEYS.get(m[0][1:], m[0][1:]), str(error))
         fault, _, path = text.replace("`", "").rpartition(" - at ")
         raise ReobjError(f"{at}{path[1:]}: {fault}" if fault else f"{at}: {path}") from error

@@ -307,7 +307,7 @@ def validate_objects(path: Path) -> list[str]:
     lines = []
     for found in validator.iter_errors(load_json(path)):
         fault = cut(f"{found.json_path}: {found.message}", 200)  # it quotes the value
-        lines.append(f"{path}: {printable(fault)}")
+        lines.append(printable(f"{path}: {fault}"))
     return sorted(lines)
 
 
