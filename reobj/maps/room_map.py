@@ -54,6 +54,10 @@ OBSERVATIONS: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {
     "quat_wxyz": (np.dtype(np.float32), (4,)),
     "cov": (np.dtype(np.float32), (9, 9)),
 }
+CONCATENATED = {
+    "foreground": np.dtype(np.float16), "background": np.dtype(np.float16),
+    "picture": np.dtype(np.uint8),
+}  # fmt: skip
 LOWER = np.tril_indices(9)  # entries of a covariance in the file
 UNIT = 1.001  # largest component of a unit vector, rounded to float16
 JPEG_START = b"\xff\xd8\xff"
@@ -374,14 +378,11 @@ def save_map(path: Path, room: RoomMap) -> None:
         values = np.array([getattr(o, name) for o in rows], np.float64).reshape(-1, *shape)
         values = values[:, LOWER[0], LOWER[1]] if name == "cov" else values
         arrays[f"observation_{name}"] = values.astype(kind)
-    for name in Observation.EMBEDDINGS:
-        means = [np.asarray(getattr(o, name), np.float16) for o in rows]
-        arrays[f"observation_{name}"] = np.concatenate([np.empty(0, np.float16), *means])
-        arrays[f"observation_{name}_length"] = np.array([len(m) for m in means], np.int32)
-    if any(o.picture for o in rows):
-        pictures = np.frombuffer(b"".join(o.picture for o in rows), np.uint8)
-        arrays["observation_picture"] = pictures
-        arrays["observation_picture_length"] = np.array([len(o.picture) for o in rows], np.int32)
+    for name, kind in CONCATENATED.items():
+        parts = [np.array(list(getattr(o, name)), kind) for o in rows]
+        if name in Observation.EMBEDDINGS or any(map(len, parts)):
+            arrays[f"observation_{name}"] = np.concatenate([np.empty(0, kind), *parts])
+            arrays[f"observation_{name}_length"] = np.array([*map(len, parts)], np.int32)
     sessions = sorted(room.sessions, key=lambda session: session.number)
     for session in sessions:
         for name in Session.ARRAYS:
@@ -513,12 +514,12 @@ def _column(
     return np.asarray(values)
 
 
-def _split_column(arrays: dict[str, Any], name: str, kind: np.dtype[Any]) -> list[npt.NDArray[Any]]:
+def _split_column(arrays: dict[str, Any], name: str) -> list[npt.NDArray[Any]]:
     """Return a value (n,) of each observation; in the file they are concatenated."""
-    column = _column(arrays, f"observation_{name}", kind, ())
+    column = _column(arrays, f"observation_{name}", CONCATENATED[name], ())
     length = _column(arrays, f"observation_{name}_length", np.dtype(np.int32), ())
-    if (length < 0).any() or length.sum() != len(column):
-        raise ValueError(f"{len(column)} values of {name}, {length.sum()} expected")
+    right = not (length < 0).any() and length.sum() == len(column)
+    _expect(right, f"{len(column)} values of {name}, {length.sum()} expected")
     return np.split(column, np.cumsum(length))[:-1]
 
 
@@ -533,13 +534,12 @@ def _decoded_observations(arrays: dict[str, Any], facts: dict[str, Any]) -> list
     cov[:, LOWER[1], LOWER[0]] = values["cov"]
     values["cov"] = cov
     for name in Observation.EMBEDDINGS:
-        means = _split_column(arrays, name, np.dtype(np.float16))
-        values[name] = [mean.astype(np.float32) for mean in means]
+        values[name] = [mean.astype(np.float32) for mean in _split_column(arrays, name)]
     if "observation_picture" in arrays:
-        pictures = _split_column(arrays, "picture", np.dtype(np.uint8))
-        values["picture"] = [picture.tobytes() for picture in pictures]
-    if any(len(column) != len(facts["observations"]) for column in values.values()):
-        raise ValueError(f"arrays of other lengths than {len(facts['observations'])} observations")
+        values["picture"] = [picture.tobytes() for picture in _split_column(arrays, "picture")]
+    count = len(facts["observations"])
+    right = all(len(column) == count for column in values.values())
+    _expect(right, f"arrays of other lengths than {count} observations")
     rows = (dict(zip(values, row, strict=True)) for row in zip(*values.values(), strict=True))
     return [_known(Observation, f) | r for f, r in zip(facts["observations"], rows, strict=True)]
 
