@@ -28,6 +28,7 @@ from reobj.types import (
     FiniteFloat,
     IntArray,
     LinkEvent,
+    NonNegativeFloat,
     NonNegativeInt,
     PositiveFloat,
     PositiveInt,
@@ -347,7 +348,7 @@ class _Scale(msgspec.Struct):
     """A `quadrics.Scale` in JSON."""
 
     metres_per_unit: PositiveFloat
-    rel_sigma: FiniteFloat
+    rel_sigma: NonNegativeFloat
     source: str
 
 
