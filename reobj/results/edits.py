@@ -95,8 +95,9 @@ class Edit(
             if value
         )  # fmt: skip
         if given not in KEYS[self.do]:
-            expected = " or ".join(KEYS[self.do])
-            raise ValueError(f"{self.do} with {given or 'nothing'}, expected object and {expected}")
+            expected = " or ".join(KEYS[self.do]) or "nothing"
+            found = f"{given or 'nothing'} besides object"
+            raise ValueError(f"{self.do} has {found}, expected {expected}")
         if self.frames is not None and self.frames[0] > self.frames[1]:
             raise ValueError(f"frames {list(self.frames)} are not in order")
         if not self.class_name.isprintable():
