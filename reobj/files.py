@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import dataclasses
 import difflib
 import errno
 import hashlib
@@ -18,7 +19,7 @@ import time
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -293,6 +294,17 @@ def save_npz(path: Path, arrays: Mapping[str, Any], **metadata: Any) -> None:
     metadata = metadata | {"digest": _digest(content, metadata)}
     with atomic(path) as part, part.open("wb") as file:
         np.savez_compressed(file, **content, metadata=np.array(json.dumps(metadata)))
+
+
+def columns_of(record: Any, form: str = "{}") -> dict[str, Any]:
+    """Return the arrays of a dataclass by names, for `save_npz`; form: of a name."""
+    return {form.format(f.name): getattr(record, f.name) for f in dataclasses.fields(record)}
+
+
+def from_columns(kind: Callable[..., T], arrays: Mapping[str, Any], form: str = "{}") -> T:
+    """Make a dataclass of its arrays; the inverse of `columns_of`."""
+    names = [f.name for f in dataclasses.fields(cast(Any, kind))]
+    return kind(*(arrays[form.format(name)] for name in names))
 
 
 def _digest(arrays: Mapping[str, Any], metadata: Mapping[str, Any]) -> str:

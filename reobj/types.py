@@ -7,9 +7,10 @@ import logging
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import cv2
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
@@ -18,6 +19,20 @@ IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 Image = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.float32]
+Vector = np.ndarray[tuple[Literal[3]], np.dtype[np.float64]]
+Quaternion = np.ndarray[tuple[Literal[4]], np.dtype[np.float64]]
+Covariance = np.ndarray[tuple[Literal[9], Literal[9]], np.dtype[np.float64]]
+
+# Numbers in JSON files. Up to 2**53 parsers that use doubles are exact; products of a few lengths
+# of at most NUMBER_MAX stay within the range of doubles.
+NUMBER_MAX = 1e12
+NonNegativeInt = Annotated[int, msgspec.Meta(ge=0, le=2**53)]
+PositiveInt = Annotated[int, msgspec.Meta(ge=1, le=2**53)]
+Int32 = Annotated[int, msgspec.Meta(ge=0, lt=2**31)]
+FiniteFloat = Annotated[float, msgspec.Meta(ge=-NUMBER_MAX, le=NUMBER_MAX)]
+NonNegativeFloat = Annotated[float, msgspec.Meta(ge=0, le=NUMBER_MAX)]
+PositiveFloat = Annotated[float, msgspec.Meta(gt=0, le=NUMBER_MAX)]
+
 log = logging.getLogger("reobj_track")
 NOTE = 25  # level of a log line that is no warning, but is shown without --verbose
 NOTE_START = "note: "  # of a message of a result that is no warning
@@ -339,13 +354,14 @@ class LinkEvent:
         kind: "join" or "split". tracklets: ids of the tracklets. kept: always True; False in older
             files, for a join that was undone.
         place_iou: median IoU of the boxes with the projected object; None where appearance decided.
-        appearance_log_odds: of one object, from the embeddings (`SimilarityCalibration`).
+        appearance_log_odds: of one object, from the embeddings (`SimilarityCalibration`); None in
+            a file: infinite.
     """
 
     kind: str
-    tracklets: tuple[int, ...]
-    place_iou: float | None
-    appearance_log_odds: float
+    tracklets: tuple[NonNegativeInt, ...]
+    place_iou: FiniteFloat | None
+    appearance_log_odds: FiniteFloat | None
     kept: bool
 
 

@@ -16,6 +16,7 @@ import quadrics
 import reobj_track as rt
 from reobj.objects.description import describe_world
 from reobj.poses.floor import find_floor, floor_of
+from reobj.results.entries import decode
 
 UP = np.array([0, 0, 1.0])
 
@@ -190,7 +191,7 @@ def test_every_component_has_its_own_floor():
         assert part.floor is not None and part.floor_reason == ""
         assert abs(part.floor.middle @ UP - height) < 0.03
     assert world.floor is world.parts[0].floor
-    back = rt.World.from_json(json.loads(json.dumps(world.to_json())))
+    back = decode(rt.World, json.loads(json.dumps(world.to_json())))
     assert back.to_json() == world.to_json()
     np.testing.assert_array_equal(back.parts[1].floor.middle, world.parts[1].floor.middle)
     assert describe_world(poses_in_two_parts(), [fit, None], []).parts[1].floor is None
@@ -202,7 +203,7 @@ def test_without_gravity_there_is_no_floor():
 
 def test_the_floor_is_saved_and_loaded():
     world = describe_world(poses_in_room(), [None], [])
-    back = rt.World.from_json(world.to_json())
+    back = decode(rt.World, world.to_json())
     assert world.floor is not None and back.floor is not None and back.floor_reason == ""
     for name in ("offset", "sigma", "tilt_sigma_deg", "inliers"):
         assert getattr(back.floor, name) == getattr(world.floor, name)
@@ -211,7 +212,7 @@ def test_the_floor_is_saved_and_loaded():
     assert back.to_json() == world.to_json()
     entry = world.to_json()
     del entry["floor"], entry["floor_reason"]  # an older file
-    assert rt.World.from_json(entry).floor is None
+    assert decode(rt.World, entry).floor is None
 
 
 def test_the_reason_for_a_missing_floor_is_saved():

@@ -259,7 +259,7 @@ def test_corrections_of_the_viewer_reach_the_map_once(monday):
         Edit("delete", BoxRef(0, (0.0, 0, 1, 1), 3)),
         Edit("rename", BoxRef(0, (0.0, 0, 1, 1), 77), class_name="table"),  # not in the map
     )
-    ours = Edits(edits, [], Path("edits.json"), map_id=monday.map_id)
+    ours = Edits(edits, Path("edits.json"), map_id=monday.map_id)
     room = with_edits(with_edits(monday, ours), ours)
     assert room.object(1).name == "armchair" and room.object(3).deleted
     assert with_edits(monday, dataclasses.replace(ours, map_id="another")) is monday

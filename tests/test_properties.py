@@ -292,27 +292,15 @@ FIRST = ("objects", 0)
     ),
     path=st.none(),
 )  # fmt: skip
-@example(changes=[(0.0, "x")], path=(*FIRST, "center"))  # each was a traceback once
-@example(changes=[(0.0, [[]])], path=(*FIRST, "half_axes"))
-@example(changes=[(0.0, [0, 0, 0])], path=(*FIRST, "half_axes"))
+@example(changes=[(0.0, [0, 0, 0])], path=(*FIRST, "half_axes"))  # each was a traceback once
 @example(changes=[(0.0, [0, 0, 0])], path=(*FIRST, "quat_wxyz"))
 @example(changes=[(0.0, None)], path=(*FIRST, "quat_wxyz"))
-@example(changes=[(0.0, 1.5)], path=(*FIRST, "class"))
 @example(changes=[(0.0, "a\x00b\x1b[2J")], path=(*FIRST, "class"))
 @example(changes=[(0.0, "\ud800")], path=(*FIRST, "class"))
-@example(changes=[(0.0, 10**30)], path=(*FIRST, "id"))
 @example(changes=[(0.0, 2)], path=(*FIRST, "id"))  # two of one number
-@example(changes=[(0.0, None)], path=(*FIRST, "frames"))
 @example(changes=[(0.0, 7)], path=(*FIRST, "part"))
-@example(changes=[(0.0, {})], path=(*FIRST, "size_m"))
 @example(changes=[(0.0, "x")], path=("world", "scale"))
-@example(changes=[(0.0, [float("nan")] * 4)], path=("world", "up_in_world"))
-@example(changes=[(0.0, "x")], path=("world", "parts", 0, "spans"))
-@example(changes=[(0.0, [0])], path=("world", "links"))
-@example(changes=[(0.0, None)], path=("video",))
-@example(changes=[(0.0, "x")], path=("video", "width"))
 @example(changes=[(0.0, "gone")], path=("world",))
-@example(changes=[(0.0, 5)], path=("warnings",))
 def test_an_output_folder_is_read_or_refused(
     chairs_folder: tuple[Path, str], changes: list[tuple[float, Any]], path: tuple[Any, ...] | None
 ) -> None:

@@ -173,10 +173,8 @@ FRAMES = '{"source": "a", "input": {}, "frames": {"size": [640, %s], "count": 3%
     "text",
     [
         "{", "[]", "{}", '{"source": "a", "input": {"evry": 1}}',
-        '{"source": 5, "input": {}}', '{"source": "a", "input": {"every": "x"}}',
-        '{"source": "a", "input": {"every": 1.5}}', '{"source": "a", "input": {}, "frames": []}',
+        '{"source": "a", "input": {"every": 1.5}}', '{"source": "a", "input": {"every": 3e9}}',
         FRAMES % (0, ""), FRAMES % ("NaN", ""), FRAMES % (480, ', "times_s": [1, "x"]'),
-        FRAMES % (480, ', "names": [5]'),
     ],
 )  # fmt: skip
 def test_a_damaged_source_file_is_reported(tmp_path: Path, text: str) -> None:

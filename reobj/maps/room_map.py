@@ -13,16 +13,29 @@ import uuid
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
 import quadrics
 from reobj import __version__
 from reobj.cameras import Camera
-from reobj.files import LockedError, load_npz, locked, save_npz
-from reobj.types import Array, Floats, IntArray, ReobjError, one_line
+from reobj.files import LockedError, columns_of, load_npz, locked, save_npz
+from reobj.results.entries import decode
+from reobj.types import (
+    Array,
+    FiniteFloat,
+    Floats,
+    Int32,
+    IntArray,
+    NonNegativeFloat,
+    PositiveFloat,
+    ReobjError,
+    Vector,
+    one_line,
+)
 
 HEADER = {"format": "reobj-map", "version": 1}
 # Dtypes in the file, and shapes of a row. float16 of a direction: 3e-4 rad; of a covariance it
@@ -41,11 +54,15 @@ OBSERVATIONS: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {
     "quat_wxyz": (np.dtype(np.float32), (4,)),
     "cov": (np.dtype(np.float32), (9, 9)),
 }
+CONCATENATED = {
+    "foreground": np.dtype(np.float16), "background": np.dtype(np.float16),
+    "picture": np.dtype(np.uint8),
+}  # fmt: skip
 LOWER = np.tril_indices(9)  # entries of a covariance in the file
 UNIT = 1.001  # largest component of a unit vector, rounded to float16
 JPEG_START = b"\xff\xd8\xff"
 PICTURE_MAX = 1 << 16  # bytes; a JPEG of 160 px has 13 kB even if it is noise
-STATUSES = ("new", "stayed", "moved", "gone", "not_seen")
+Number = Annotated[int, msgspec.Meta(ge=1, lt=2**31)]  # of an object or a session
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,21 +84,21 @@ class Observation:
         picture: JPEG; empty unless pictures were asked for.
     """
 
-    session: int
-    status: str
+    session: Number
+    status: Annotated[str, msgspec.Meta(pattern="^(new|stayed|moved|gone|not_seen)$")]
     support: str = ""
     center: Array = field(default_factory=lambda: np.full(3, np.nan))
     half_axes: Array = field(default_factory=lambda: np.full(3, np.nan))
     quat_wxyz: Array = field(default_factory=lambda: np.full(4, np.nan))
     cov: Array = field(default_factory=lambda: np.full((9, 9), np.nan))
-    classes: dict[str, float] = field(default_factory=dict)
+    classes: dict[str, NonNegativeFloat] = field(default_factory=dict)
     foreground: Floats = field(default_factory=lambda: np.empty(0, np.float32))
     background: Floats = field(default_factory=lambda: np.empty(0, np.float32))
-    embedded: int = 0
-    views: int = 0
-    expected: int = 0
-    missed: int = 0
-    log_odds: float = 0.0
+    embedded: Int32 = 0
+    views: Int32 = 0
+    expected: Int32 = 0
+    missed: Int32 = 0
+    log_odds: FiniteFloat = 0.0
     picture: bytes = b""
 
     ARRAYS = ("center", "half_axes", "quat_wxyz", "cov")
@@ -103,7 +120,7 @@ class MapObject:
         deleted: by the user: no object; it is matched, and then left out of results.
     """
 
-    id: int
+    id: Number
     observations: tuple[Observation, ...]
     name: str = ""
     deleted: bool = False
@@ -125,19 +142,19 @@ class Session:
         localised_frames, tried_frames: that agreed with the map, that were compared.
     """
 
-    number: int
+    number: Number
     name: str
     date: str
     fingerprint: str
     embedder: str
     camera: Camera
     cam_from_map: Array
-    metres_per_unit: float = 1.0
-    scale_rel_sigma: float = 0.0
-    scale_source: str = "none"
+    metres_per_unit: PositiveFloat = 1.0
+    scale_rel_sigma: NonNegativeFloat = 0.0
+    scale_source: Annotated[str, msgspec.Meta(pattern="^(poses|priors|known_size|none)$")] = "none"
     alignment_cov: Array = field(default_factory=lambda: np.zeros((7, 7)))
-    localised_frames: int = 0
-    tried_frames: int = 0
+    localised_frames: Int32 = 0
+    tried_frames: Int32 = 0
 
     ARRAYS = ("cam_from_map", "alignment_cov")
 
@@ -202,10 +219,10 @@ class RoomMap:
     objects: tuple[MapObject, ...] = ()
     points: MapPoints = field(default_factory=MapPoints.empty)
     metric: bool = False
-    up: Array | None = None
-    next_id: int = 1
-    next_session: int = 1
-    merged: dict[int, int] = field(default_factory=dict)
+    up: Vector | None = None
+    next_id: Number = 1
+    next_session: Number = 1
+    merged: dict[Number, Number] = field(default_factory=dict)
 
     def session(self, number: int) -> Session:
         """Return a session by number."""
@@ -246,16 +263,12 @@ class RoomMap:
 
 
 def check_map(room: RoomMap) -> None:
-    """Refuse a map whose content is inconsistent or not finite.
+    """Refuse a map whose content is inconsistent or not finite; `_decoded` checks types.
 
     Raises:
         ValueError: names the fault.
     """
-    _expect(isinstance(room.map_id, str), f"map_id {room.map_id!r}")
-    _expect(isinstance(room.metric, bool), f"metric {room.metric!r}")
-    _expect(_whole(room.next_id, 1), f"next_id {room.next_id!r}")
-    _expect(_whole(room.next_session, 1), f"next_session {room.next_session!r}")
-    _expect(room.up is None or _unit(room.up, 3), f"up {room.up}")
+    _expect(room.up is None or _unit(room.up), f"up {room.up}")
     for session in room.sessions:
         _check_session(session, room.next_session)
     numbers = [session.number for session in room.sessions]
@@ -265,8 +278,8 @@ def check_map(room: RoomMap) -> None:
     ids = [found.id for found in room.objects]
     _expect(len(set(ids)) == len(ids), "two objects of one number")
     for old, kept in room.merged.items():
-        known = _whole(old, 1, room.next_id) and old not in ids and kept in ids
-        _expect(known, f"object {old!r} merged into {kept!r}")
+        known = old < room.next_id and old not in ids and kept in ids
+        _expect(known, f"object {old} merged into {kept}")
     _check_points(room.points, numbers, ids)
 
 
@@ -275,19 +288,9 @@ def _expect(valid: bool, fault: str) -> None:
         raise ValueError(fault)
 
 
-def _whole(value: Any, least: int = 0, below: int = 1 << 31) -> bool:
-    """Test for a whole number in a range; True and False are none."""
-    return type(value) is int and least <= value < below
-
-
-def _number(value: Any, least: float = -np.inf) -> bool:
-    """Test for a finite number of at least `least`."""
-    return isinstance(value, int | float) and bool(np.isfinite(value)) and value >= least
-
-
-def _unit(vector: Array, size: int) -> bool:
+def _unit(vector: Array) -> bool:
     """Test for a vector of length 1, up to the rounding of float32."""
-    return np.shape(vector) == (size,) and bool(abs(np.linalg.norm(vector) - 1) < 1e-5)
+    return bool(abs(np.linalg.norm(vector) - 1) < 1e-5)
 
 
 def _bounded(values: npt.NDArray[Any], most: float = 1e30) -> bool:
@@ -303,70 +306,52 @@ def _is_cov(cov: Array, size: int) -> bool:
 
 def _check_session(session: Session, next_session: int) -> None:
     """Refuse an invalid session."""
-    where = f"session {session.number!r}: "
-    _expect(_whole(session.number, 1, next_session), f"{where}next is {next_session}")
-    for name in ("name", "date", "fingerprint", "embedder"):
-        _expect(isinstance(getattr(session, name), str), f"{where}{name} is no text")
+    where = f"session {session.number}: "
+    _expect(session.number < next_session, f"{where}next is {next_session}")
     camera = session.camera
-    sides = _whole(camera.width, 1) and _whole(camera.height, 1)
-    params = all(_number(value) for value in camera.params)
-    _expect(isinstance(camera.model, str) and sides and params, f"{where}camera {camera}")
+    right = min(camera.width, camera.height) > 0 and _bounded(np.array(camera.params))
+    _expect(right, f"{where}camera {camera}")
     cameras = session.cam_from_map
-    right = cameras.ndim == 3 and cameras.shape[1:] == (3, 4) and bool(np.isfinite(cameras).all())
+    right = cameras.ndim == 3 and cameras.shape[1:] == (3, 4) and _bounded(cameras)
     _expect(right, f"{where}cam_from_map {cameras.shape}")
-    scale = (session.metres_per_unit, session.scale_rel_sigma, session.scale_source)
-    known = session.scale_source in ("poses", "priors", "known_size", "none")
-    positive = _number(session.metres_per_unit, np.nextafter(0, 1))
-    _expect(positive and known and _number(session.scale_rel_sigma, 0), f"{where}scale {scale}")
     _expect(_is_cov(session.alignment_cov, 7), f"{where}alignment_cov")
-    for name in ("localised_frames", "tried_frames"):
-        _expect(_whole(getattr(session, name)), f"{where}{name}")
 
 
 def _check_object(found: MapObject, sessions: set[int], next_id: int) -> None:
     """Refuse an invalid object."""
-    where = f"object {found.id!r}: "
-    _expect(_whole(found.id, 1, next_id), f"{where}next_id is {next_id}")
-    _expect(isinstance(found.name, str) and found.name.isprintable(), f"{where}name")
-    _expect(isinstance(found.deleted, bool), f"{where}deleted is {found.deleted!r}")
+    where = f"object {found.id}: "
+    _expect(found.id < next_id, f"{where}next_id is {next_id}")
+    _expect(found.name.isprintable(), f"{where}name")
     _expect(any(o.detected for o in found.observations), f"{where}never detected")
     seen = [o.session for o in found.observations]
     _expect(len(set(seen)) == len(seen), f"{where}two observations in a session")
     for o in found.observations:
-        _expect(o.session in sessions, f"{where}no session {o.session!r}")
+        _expect(o.session in sessions, f"{where}no session {o.session}")
         _check_observation(o, f"{where}session {o.session}: ")
 
 
 def _check_observation(o: Observation, where: str) -> None:
     """Refuse an invalid observation."""
-    _expect(o.status in STATUSES, f"{where}status {o.status!r}")
     kinds = quadrics.SUPPORTS if o.status in ("new", "stayed", "moved") else ("",)
     _expect(o.support in kinds, f"{where}{o.status}, shape {o.support!r}")
     if o.detected:
-        _expect(np.shape(o.center) == (3,) and bool(np.isfinite(o.center).all()), f"{where}center")
-        sizes = np.shape(o.half_axes) == (3,) and _bounded(o.half_axes)
-        _expect(sizes and bool((np.float32(o.half_axes) > 0).all()), f"{where}half_axes")
-        _expect(_unit(o.quat_wxyz, 4), f"{where}quat_wxyz")
+        _expect(_bounded(o.center), f"{where}center")
+        _expect(_bounded(o.half_axes) and bool((o.half_axes > 0).all()), f"{where}half_axes")
+        _expect(_unit(o.quat_wxyz), f"{where}quat_wxyz")
         _expect(_is_cov(o.cov, 9), f"{where}cov")
-    named = all(isinstance(n, str) and n.isprintable() for n in o.classes)
-    _expect(named and all(_number(w, 0) for w in o.classes.values()), f"{where}classes")
-    for name in ("embedded", "views", "expected", "missed"):
-        _expect(_whole(getattr(o, name)), f"{where}{name}")
+    _expect("".join(o.classes).isprintable(), f"{where}classes")
     _expect(o.missed <= o.expected, f"{where}missed {o.missed} of {o.expected}")
-    _expect(_number(o.log_odds), f"{where}log_odds")
     jpeg = o.picture.startswith(JPEG_START) and len(o.picture) <= PICTURE_MAX
     _expect(not o.picture or (o.detected and jpeg), f"{where}picture")
     for name in Observation.EMBEDDINGS:
-        mean = getattr(o, name)
-        _expect(mean.ndim == 1 and _bounded(mean, UNIT), f"{where}{name}")
+        _expect(_bounded(getattr(o, name), UNIT), f"{where}{name}")
 
 
 def _check_points(points: MapPoints, sessions: Sequence[int], ids: Sequence[int]) -> None:
     """Refuse invalid points."""
-    for name, (kind, shape) in POINTS.items():
+    for name, (kind, _) in POINTS.items():
         values = getattr(points, name)
-        right = values.shape == (len(points), *shape) and values.dtype.kind == kind.kind
-        _expect(right, f"points: {name} is an array {values.shape} of {values.dtype}")
+        _expect(len(values) == len(points), f"points: {name} is an array {values.shape}")
         most = UNIT if name == "viewing_ray" else 1e30
         _expect(kind.kind != "f" or _bounded(values, most), f"points: {name} out of range")
     _expect(bool(np.isin(points.session, sessions).all()), "points of unknown sessions")
@@ -380,11 +365,10 @@ def save_map(path: Path, room: RoomMap) -> None:
     """Write a map as npz, atomically; for the content see `RoomMap`. Same map, same bytes.
 
     Raises:
-        ValueError: `check_map` found a fault, so that the file could not be read again.
+        ValueError: the file could not be read again.
     """
-    check_map(room)
     origin = _origin(room.points.xyz)
-    columns = {f.name: getattr(room.points, f.name) for f in dataclasses.fields(MapPoints)}
+    columns = columns_of(room.points)
     columns["xyz"] = columns["xyz"] - origin
     arrays: dict[str, Any] = {"points_origin": origin}
     arrays |= {f"points_{name}": columns[name].astype(POINTS[name][0]) for name in POINTS}
@@ -394,14 +378,11 @@ def save_map(path: Path, room: RoomMap) -> None:
         values = np.array([getattr(o, name) for o in rows], np.float64).reshape(-1, *shape)
         values = values[:, LOWER[0], LOWER[1]] if name == "cov" else values
         arrays[f"observation_{name}"] = values.astype(kind)
-    for name in Observation.EMBEDDINGS:
-        means = [np.asarray(getattr(o, name), np.float16) for o in rows]
-        arrays[f"observation_{name}"] = np.concatenate([np.empty(0, np.float16), *means])
-        arrays[f"observation_{name}_length"] = np.array([len(m) for m in means], np.int32)
-    if any(o.picture for o in rows):
-        pictures = np.frombuffer(b"".join(o.picture for o in rows), np.uint8)
-        arrays["observation_picture"] = pictures
-        arrays["observation_picture_length"] = np.array([len(o.picture) for o in rows], np.int32)
+    for name, kind in CONCATENATED.items():
+        parts = [np.array(list(getattr(o, name)), kind) for o in rows]
+        if name in Observation.EMBEDDINGS or any(map(len, parts)):
+            arrays[f"observation_{name}"] = np.concatenate([np.empty(0, kind), *parts])
+            arrays[f"observation_{name}_length"] = np.array([*map(len, parts)], np.int32)
     sessions = sorted(room.sessions, key=lambda session: session.number)
     for session in sessions:
         for name in Session.ARRAYS:
@@ -430,6 +411,7 @@ def save_map(path: Path, room: RoomMap) -> None:
             for o in rows
         ],
     }  # fmt: skip
+    check_map(_decoded(arrays, facts))
     save_npz(path, arrays, **facts)
 
 
@@ -445,8 +427,7 @@ def _origin(xyz: Array) -> Array:
 
 def _without_arrays(record: Any, arrays: Sequence[str]) -> dict[str, Any]:
     """Return the fields of a dataclass that are not stored as arrays."""
-    values = {f.name: getattr(record, f.name) for f in dataclasses.fields(record)}
-    kept = {k: v for k, v in values.items() if k not in arrays}
+    kept = {k: v for k, v in columns_of(record).items() if k not in arrays}
     if "classes" in kept:
         kept["classes"] = dict(sorted(kept["classes"].items()))
     return {k: dataclasses.asdict(v) if isinstance(v, Camera) else v for k, v in kept.items()}
@@ -505,24 +486,22 @@ def _decoded(arrays: dict[str, Any], facts: dict[str, Any]) -> RoomMap:
         kind = {"f": np.float64, "i": np.int64, "u": np.uint8}[stored.kind]
         columns[name] = _column(arrays, f"points_{name}", stored, shape).astype(kind)
     columns["xyz"] += _column(arrays, "points_origin", np.dtype(np.float64), ())
-    return RoomMap(
-        map_id=facts["map_id"],
-        sessions=tuple(
-            Session(
-                **entry
-                | {"camera": _camera(entry["camera"])}
-                | {name: arrays[f"session{entry['number']}_{name}"] for name in Session.ARRAYS}
-            )
-            for entry in facts["sessions"]
-        ),
-        objects=_decoded_objects(facts["objects"], _decoded_observations(arrays, facts)),
-        points=MapPoints(**columns),
-        metric=facts["metric"],
-        up=None if facts["up"] is None else np.array(facts["up"], np.float64),
-        next_id=facts["next_id"],
-        next_session=facts["next_session"],
-        merged={int(old): kept for old, kept in facts["merged"].items()},
-    )
+    sessions = [
+        _known(Session, entry)
+        | {name: arrays[f"session{entry['number']}_{name}"] for name in Session.ARRAYS}
+        for entry in facts["sessions"]
+    ]
+    objects = _decoded_objects(facts["objects"], _decoded_observations(arrays, facts))
+    content = facts | {"sessions": sessions, "objects": objects, "points": columns}
+    room: RoomMap = decode(RoomMap, content)
+    return room
+
+
+def _known(kind: type, entry: dict[str, Any]) -> dict[str, Any]:
+    """Return an entry that has no other keys than the fields of a dataclass."""
+    unknown = set(entry) - {f.name for f in dataclasses.fields(kind)}
+    _expect(not unknown, f"unknown field {sorted(unknown)}")
+    return entry
 
 
 def _column(
@@ -535,16 +514,16 @@ def _column(
     return np.asarray(values)
 
 
-def _split_column(arrays: dict[str, Any], name: str, kind: np.dtype[Any]) -> list[npt.NDArray[Any]]:
+def _split_column(arrays: dict[str, Any], name: str) -> list[npt.NDArray[Any]]:
     """Return a value (n,) of each observation; in the file they are concatenated."""
-    column = _column(arrays, f"observation_{name}", kind, ())
+    column = _column(arrays, f"observation_{name}", CONCATENATED[name], ())
     length = _column(arrays, f"observation_{name}_length", np.dtype(np.int32), ())
-    if (length < 0).any() or length.sum() != len(column):
-        raise ValueError(f"{len(column)} values of {name}, {length.sum()} expected")
+    right = not (length < 0).any() and length.sum() == len(column)
+    _expect(right, f"{len(column)} values of {name}, {length.sum()} expected")
     return np.split(column, np.cumsum(length))[:-1]
 
 
-def _decoded_observations(arrays: dict[str, Any], facts: dict[str, Any]) -> list[Observation]:
+def _decoded_observations(arrays: dict[str, Any], facts: dict[str, Any]) -> list[dict[str, Any]]:
     """Build the observations of all objects, in the order of the file."""
     values: dict[str, Any] = {}
     for name, (kind, shape) in OBSERVATIONS.items():
@@ -555,36 +534,28 @@ def _decoded_observations(arrays: dict[str, Any], facts: dict[str, Any]) -> list
     cov[:, LOWER[1], LOWER[0]] = values["cov"]
     values["cov"] = cov
     for name in Observation.EMBEDDINGS:
-        means = _split_column(arrays, name, np.dtype(np.float16))
-        values[name] = [mean.astype(np.float32) for mean in means]
+        values[name] = [mean.astype(np.float32) for mean in _split_column(arrays, name)]
     if "observation_picture" in arrays:
-        pictures = _split_column(arrays, "picture", np.dtype(np.uint8))
-        values["picture"] = [picture.tobytes() for picture in pictures]
-    if any(len(column) != len(facts["observations"]) for column in values.values()):
-        raise ValueError(f"arrays of other lengths than {len(facts['observations'])} observations")
+        values["picture"] = [picture.tobytes() for picture in _split_column(arrays, "picture")]
+    count = len(facts["observations"])
+    right = all(len(column) == count for column in values.values())
+    _expect(right, f"arrays of other lengths than {count} observations")
     rows = (dict(zip(values, row, strict=True)) for row in zip(*values.values(), strict=True))
-    return [Observation(**f, **r) for f, r in zip(facts["observations"], rows, strict=True)]
+    return [_known(Observation, f) | r for f, r in zip(facts["observations"], rows, strict=True)]
 
 
 def _decoded_objects(
-    entries: list[dict[str, Any]], observations: list[Observation]
-) -> tuple[MapObject, ...]:
+    entries: list[dict[str, Any]], observations: list[dict[str, Any]]
+) -> list[dict[str, Any]]:
     """Distribute the observations to the objects."""
-    objects = []
-    row = 0
-    for entry in entries:
-        end = row + entry["observations"]
-        rows = tuple(observations[row:end])
-        objects.append(MapObject(entry["id"], rows, entry["name"], entry["deleted"]))
-        row = end
-    if row != len(observations):
-        raise ValueError(f"{len(observations)} observations, {row} expected")
-    return tuple(objects)
-
-
-def _camera(entry: dict[str, Any]) -> Camera:
-    """Read a camera."""
-    return Camera(entry["model"], entry["width"], entry["height"], tuple(entry["params"]))
+    ends = np.cumsum([entry["observations"] for entry in entries]).tolist()
+    count = ends[-1] if ends else 0
+    _expect(count == len(observations), f"{len(observations)} observations, {count} expected")
+    return [
+        _known(MapObject, entry)
+        | {"observations": tuple(observations[end - entry["observations"] : end])}
+        for entry, end in zip(entries, ends, strict=True)
+    ]
 
 
 @contextlib.contextmanager

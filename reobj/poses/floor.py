@@ -13,7 +13,7 @@ import numpy as np
 
 from reobj.cameras import Poses, invert_rigid
 from reobj.files import numbers
-from reobj.types import Array, BoolArray, IntArray
+from reobj.types import Array, BoolArray, FiniteFloat, IntArray, NonNegativeInt, Vector
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,12 +27,12 @@ class Floor:
         inliers: number of points on it.
     """
 
-    normal: Array
-    offset: float
-    middle: Array
-    sigma: float
-    tilt_sigma_deg: float
-    inliers: int
+    normal: Vector
+    offset: FiniteFloat
+    middle: Vector
+    sigma: FiniteFloat
+    tilt_sigma_deg: FiniteFloat
+    inliers: NonNegativeInt
 
 
 NOISE = 0.012  # of points along the height, over their distance (chosen: 4 cm at 3 m)

@@ -10,11 +10,13 @@ import dataclasses
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
+import msgspec
 import numpy as np
 
-from reobj.files import atomic, load_json, shortened
+from reobj.files import atomic
+from reobj.results.entries import read_json
 from reobj.results.names import OutputFile
 from reobj.types import (
     CLASS_NAME_MAX,
@@ -23,6 +25,7 @@ from reobj.types import (
     Array,
     BoolArray,
     IntArray,
+    NonNegativeInt,
     ReobjError,
     Tracks,
     box_area,
@@ -31,13 +34,10 @@ from reobj.types import (
 )
 
 HEADER = {"format": "reobj-edits", "version": 1}
-FIELDS = {  # keys of an edit besides `do`
-    "merge": ("object", "with"),
-    "split": ("object", "frames"),
-    "rename": ("object", "class"),
-    "delete": ("object",),
-}
-SPLIT_TRACKLETS = ("object", "visits")  # the keys of a split by tracklets
+KEYS = {  # of an edit besides `do` and `object`: one of these
+    "merge": ("with",), "split": ("frames", "visits"), "rename": ("class",), "delete": ("",),
+}  # fmt: skip
+Coordinate = Annotated[float, msgspec.Meta(ge=-COORDINATE_MAX, le=COORDINATE_MAX)]  # px
 
 # Two boxes of a merged object in one frame (chosen)
 DUPLICATE_IOU = 0.6  # above it they show the same (as in the association)
@@ -55,13 +55,18 @@ class BoxRef:
         id: of the object when the edit was made; 0: unknown.
     """
 
-    frame: int
-    box: tuple[float, ...]
-    id: int = 0
+    frame: NonNegativeInt
+    box: tuple[Coordinate, Coordinate, Coordinate, Coordinate]
+    id: NonNegativeInt = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Edit:
+class Edit(
+    msgspec.Struct,
+    frozen=True,
+    forbid_unknown_fields=True,
+    omit_defaults=True,
+    rename={"other": "with", "class_name": "class"},
+):
     """One correction.
 
     Attributes:
@@ -71,12 +76,32 @@ class Edit:
             box of each tracklet that is another object.
     """
 
-    do: str
+    do: Literal["merge", "split", "rename", "delete"]
     object: BoxRef
     other: BoxRef | None = None
     visits: tuple[BoxRef, ...] = ()
-    frames: tuple[int, int] | None = None
-    class_name: str = ""
+    frames: tuple[NonNegativeInt, NonNegativeInt] | None = None
+    class_name: Annotated[str, msgspec.Meta(max_length=CLASS_NAME_MAX)] = ""
+
+    def __post_init__(self) -> None:
+        """Check the keys of the kind of edit, the order of frames, and the class."""
+        msgspec.structs.force_setattr(self, "class_name", self.class_name.strip())
+        given = " and ".join(
+            key
+            for key, value in (
+                ("with", self.other), ("frames", self.frames), ("visits", self.visits),
+                ("class", self.class_name),
+            )
+            if value
+        )  # fmt: skip
+        if given not in KEYS[self.do]:
+            expected = " or ".join(KEYS[self.do]) or "nothing"
+            found = f"{given or 'nothing'} besides object"
+            raise ValueError(f"{self.do} has {found}, expected {expected}")
+        if self.frames is not None and self.frames[0] > self.frames[1]:
+            raise ValueError(f"frames {list(self.frames)} are not in order")
+        if not self.class_name.isprintable():
+            raise ValueError(f"class {self.class_name!r} has characters that cannot be printed")
 
     @property
     def text(self) -> str:
@@ -90,16 +115,26 @@ class Edits:
     """The edits of a file, in the order of their application.
 
     Attributes:
-        edits: parsed. entries: as in the file. path: of the file, for messages.
+        edits: parsed. path: of the file, for messages.
         kept: stored by an earlier fit; they may not match the current result.
         map_id: of the map whose numbers the edits' objects have; "": none.
     """
 
     edits: tuple[Edit, ...]
-    entries: list[dict[str, Any]]
     path: Path
     kept: bool = False
     map_id: str = ""
+
+    def to_json(self) -> Any:
+        """Return the list `edits` of the file."""
+        return msgspec.to_builtins(self.edits)
+
+
+class _EditsFile(msgspec.Struct):
+    """Content of a file of edits."""
+
+    edits: tuple[Edit, ...]
+    map_path: str = ""  # identifier of the map
 
 
 def read_edits(path: str | Path) -> Edits:
@@ -109,77 +144,15 @@ def read_edits(path: str | Path) -> Edits:
         ReobjError: another kind of file, or an invalid edit.
     """
     path = Path(path)
-    data = load_json(path)
-    form, version = HEADER.values()
-    if not isinstance(data, dict) or data.get("format") != form:
-        raise ReobjError(f'{path}: no edits; expected "format": "{form}", as scene.html saves it')
-    if data.get("version") != version or not isinstance(data.get("edits"), list):
-        expected = f'"version": {version} and a list "edits"'
-        raise ReobjError(f"{path}: version {data.get('version')}; expected {expected}")
-    edits = []
-    for number, entry in enumerate(data["edits"], 1):
-        try:
-            edits.append(_parse(entry))
-        except (KeyError, TypeError, ValueError) as error:
-            fault = f"{path}, edit {number}: {error if str(error) else 'cannot be read'}"
-            raise ReobjError(f"{fault}; expected {_expected(entry)}") from error
-    return Edits(tuple(edits), data["edits"], path, map_id=str(data.get("map", "")))
-
-
-def _expected(entry: Any) -> str:
-    """Return the keys of an edit of this kind, for messages."""
-    do = entry.get("do") if isinstance(entry, dict) else None
-    if not isinstance(do, str) or do not in FIELDS:
-        return f'"do": one of {", ".join(FIELDS)}'
-    keys = ", ".join(FIELDS[do])
-    keys += ' ([first, last], or "visits")' if do == "split" else ""
-    return keys + ' (an object or visit: "id", "frame", "box": [x1, y1, x2, y2])'
-
-
-def _parse(entry: Any) -> Edit:
-    do = entry["do"]
-    fields = SPLIT_TRACKLETS if do == "split" and "visits" in entry else FIELDS[do]
-    if set(entry) != {"do", *fields}:
-        raise ValueError(f"has {shortened(sorted(set(entry) - {'do'}))}")
-    name = entry.get("class", "")
-    if not isinstance(name, str) or ("class" in fields and not name.strip()):
-        raise ValueError(f"class {name!r} is no name")
-    if len(name) > CLASS_NAME_MAX:
-        raise ValueError(f"class of {len(name)} characters, at most {CLASS_NAME_MAX} are allowed")
-    if not name.isprintable():
-        raise ValueError(f"class {name!r} has characters that cannot be printed")
-    visits = tuple(_box_ref(item) for item in entry.get("visits", ()))
-    if "visits" in fields and not visits:
-        raise ValueError("visits is empty")
-    other = _box_ref(entry["with"]) if "with" in fields else None
-    frames = _frames(entry["frames"]) if "frames" in fields else None
-    return Edit(do, _box_ref(entry["object"]), other, visits, frames, name.strip())
-
-
-def _frames(item: Any) -> tuple[int, int]:
-    """Read the first and the last frame of a split."""
-    if not isinstance(item, list) or [type(frame) for frame in item] != [int, int]:
-        raise ValueError(f"frames {item} are not two whole numbers")
-    first, last = item
-    if not 0 <= first <= last:
-        raise ValueError(f"frames {item} are not in order")
-    return first, last
-
-
-def _box_ref(item: Any) -> BoxRef:
-    box = tuple(float(value) for value in item["box"])
-    if len(box) != 4 or not (np.abs(box) <= COORDINATE_MAX).all():  # refuses NaN too
-        raise ValueError(f"box {item['box']} is no box")
-    if type(item["frame"]) is not int or type(item.get("id", 0)) is not int:
-        raise ValueError(f"frame {item['frame']}, id {item.get('id')}: not whole numbers")
-    return BoxRef(item["frame"], box, item.get("id", 0))
+    content = read_json(_EditsFile, path, HEADER)
+    return Edits(content.edits, path, map_id=content.map_path)
 
 
 def write_edits(folder: Path, edits: Edits | None) -> None:
     """Write edits into a new folder of results, for later fits; no file for an empty list."""
     if edits is None or not edits.edits:
         return
-    data = HEADER | {"map": edits.map_id, "edits": edits.entries}
+    data = HEADER | {"map": edits.map_id, "edits": edits.to_json()}
     with atomic(folder / OutputFile.EDITS) as part:
         part.write_text(json.dumps(data, indent=1) + "\n")
 

@@ -2,35 +2,58 @@
 
 from __future__ import annotations
 
-import dataclasses
-import types
+import contextlib
+import json
+import re
 import typing
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
 
+import msgspec
 import numpy as np
 
 import quadrics
-from reobj.files import rounded, shortened
+from reobj import __version__
+from reobj.files import load_json, rounded, shortened
 from reobj.poses.floor import Floor
+from reobj.results.names import OutputFile
 from reobj.sources.video import Video
 from reobj.types import (
+    NUMBER_MAX,
     Array,
+    Covariance,
+    FiniteFloat,
     IntArray,
     LinkEvent,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    Quaternion,
     ReobjError,
+    Vector,
     counted,
     printable,
     visible_name,
 )
 
-# keys of objects.json and changes.json that differ from the names of our fields
-_JSON_KEYS = {
-    "class_name": "class", "tracklet_ids": "tracks", "visits": "frames",
-    "map_path": "map", "before": "from", "after": "to", "before_shape": "from_shape",
-}  # fmt: skip
+T = TypeVar("T")
+# first and last frame of each run of frames
+Spans = list[Annotated[list[NonNegativeInt], msgspec.Meta(min_length=2, max_length=2)]]
+
+# Names of fields that differ from the keys of objects.json and changes.json, by the key above
+_OF_CHANGE = {"class": "class_name", "from": "before", "to": "after", "from_shape": "before_shape"}
+_FIELD_NAMES = {
+    "objects": {"class": "class_name", "tracks": "tracklet_ids", "frames": "visits"},
+    "": {"map": "map_path"},
+    "changes": {"map": "map_path"},
+    **dict.fromkeys(("stayed", "moved", "gone", "new", "not_seen", "ambiguous"), _OF_CHANGE),
+}
+_KEYS = {name: key for names in _FIELD_NAMES.values() for key, name in names.items()}
+_FIELD_NAMES["links"] = {"look": "appearance_log_odds"}  # in version 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,32 +83,35 @@ class Object:
         part: component of the trajectory (`Poses.part`), whose world and units its lengths are in.
     """
 
-    id: int
+    id: PositiveInt
     class_name: str
-    score: float
-    status: str
+    score: FiniteFloat
+    status: Annotated[
+        str, msgspec.Meta(pattern="^(ok|prior_dominated|implausible|doubtful|rejected|tracked)$")
+    ]
     reason: str
     support: str | None = None
-    center: Array | None = None
-    half_axes: Array | None = None
-    quat_wxyz: Array | None = None
-    size: Array | None = None
-    size_m: Array | None = None
-    size_rel_sigma: Array | None = None
-    cov: Array | None = None
-    views: int = 0
-    frames_seen: int = 0
-    parallax_deg: float | None = None
-    dropped_boxes: int = 0
-    reprojection_iou_median: float | None = None
-    tracklet_ids: list[int] = field(default_factory=list)
-    visits: list[list[int]] = field(default_factory=list)
-    part: int = 0
-    confidence: float | None = None
-    classes: dict[str, float] = field(default_factory=dict)
+    center: Vector | None = None
+    half_axes: Vector | None = None
+    quat_wxyz: Quaternion | None = None
+    size: Vector | None = None
+    size_m: Vector | None = None
+    size_rel_sigma: Vector | None = None
+    cov: Covariance | None = None
+    views: NonNegativeInt = 0
+    frames_seen: NonNegativeInt = 0
+    parallax_deg: FiniteFloat | None = None
+    dropped_boxes: NonNegativeInt = 0
+    reprojection_iou_median: FiniteFloat | None = None
+    tracklet_ids: list[NonNegativeInt] = field(default_factory=list)
+    visits: Spans = field(default_factory=list)
+    part: NonNegativeInt = 0
+    confidence: FiniteFloat | None = None
+    classes: dict[str, FiniteFloat] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Remove a covariance that no 32-bit number can hold, as earlier versions wrote them."""
+        """Check the shape; remove a covariance beyond 32 bits, as earlier versions wrote them."""
+        check_shape(self.quat_wxyz, self.half_axes, self.size, self.size_m)
         if self.cov is not None and not np.abs(self.cov).max() <= NUMBER_MAX**2:
             object.__setattr__(self, "cov", None)
 
@@ -111,8 +137,21 @@ class Object:
 
     def to_json(self) -> dict[str, Any]:
         """Return the entry of objects.json."""
-        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        return {_JSON_KEYS.get(k, k): _plain(v) for k, v in values.items()}
+        values = msgspec.to_builtins(self, enc_hook=_plain)
+        return {_KEYS.get(k, k): v for k, v in values.items()}
+
+
+def check_shape(quat_wxyz: Array | None, *sizes: Array | None) -> None:
+    """Refuse a quaternion (4,) that is not of length 1, and sizes (3,) that are not positive.
+
+    Raises:
+        ReobjError: names the fault.
+    """
+    # rounded to six digits its length is off by 1e-6
+    if quat_wxyz is not None and abs(np.linalg.norm(quat_wxyz) - 1) > 1e-3:
+        raise ReobjError("quat_wxyz is not of length 1")
+    if any(size is not None and (size <= 0).any() for size in sizes):
+        raise ReobjError("a size or half axis is not positive")
 
 
 def found_text(objects: Iterable[Object], names: bool = False) -> str:
@@ -181,11 +220,11 @@ class Part:
         up_in_world, up_source, scale, floor, floor_reason: as in `World`.
     """
 
-    spans: list[list[int]]
-    frames: int
-    registered_frames: int
-    interpolated_frames: int = 0
-    up_in_world: Array | None = None
+    spans: Spans
+    frames: NonNegativeInt
+    registered_frames: NonNegativeInt
+    interpolated_frames: NonNegativeInt = 0
+    up_in_world: Vector | None = None
     up_source: str = "none"
     scale: quadrics.Scale | None = None
     floor: Floor | None = None
@@ -217,10 +256,10 @@ class World:
 
     units: str | None = None
     source: str = "none"
-    registered_frames: int = 0
-    interpolated_frames: int = 0
-    frames: int = 0
-    up_in_world: Array | None = None
+    registered_frames: NonNegativeInt = 0
+    interpolated_frames: NonNegativeInt = 0
+    frames: NonNegativeInt = 0
+    up_in_world: Vector | None = None
     up_source: str = "none"
     scale: quadrics.Scale | None = None
     links: tuple[LinkEvent, ...] = ()
@@ -231,37 +270,20 @@ class World:
 
     def to_json(self) -> dict[str, Any]:
         """Return the `world` of objects.json."""
-        values = _world_json(self) | {"parts": [_world_json(part) for part in self.parts]}
-        links = [dataclasses.asdict(event) for event in self.links]
-        for link in links:
+        values: dict[str, Any] = msgspec.to_builtins(self, enc_hook=_plain)
+        worlds: list[World | Part] = [self, *self.parts]
+        for world, entry in zip(worlds, (values, *values["parts"]), strict=True):
+            if world.scale is not None:
+                entry["scale"] = msgspec.to_builtins(_Scale(*world.scale))
+        for link in values["links"]:
             for key in ("place_iou", "appearance_log_odds"):
                 link[key] = rounded(link[key], 4)  # a box is measured to 1 in 100
-        return values | {"links": links}
-
-    @staticmethod
-    def from_json(entry: dict[str, Any]) -> World:
-        """Read the `world` of objects.json."""
-        world: World = decode(World, entry, "$.world")
-        return world
-
-
-def _world_json(world: World | Part) -> dict[str, Any]:
-    """Convert the fields of a world for JSON, except its links and components."""
-    values = {f.name: _plain(getattr(world, f.name)) for f in dataclasses.fields(world)}
-    if world.scale is not None:
-        values["scale"] = {
-            "metres_per_unit": world.scale.value,
-            "rel_sigma": world.scale.rel_sigma,
-            "source": world.scale.source,
-        }
-    if world.floor is not None:
-        values["floor"] = {k: _plain(v) for k, v in dataclasses.asdict(world.floor).items()}
-    return values
+        return values
 
 
 def _plain(value: Any) -> Any:
-    """Convert an array to nested lists; return any other value unchanged."""
-    return value.tolist() if isinstance(value, np.ndarray) else value
+    """Convert an array to nested lists, a number of a subclass of float to a float."""
+    return value.tolist() if isinstance(value, np.ndarray) else float(value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,9 +291,9 @@ class VideoInfo:
     """Path of a result's video, without password; native size in pixels; frame rate in Hz."""
 
     path: str
-    width: int
-    height: int
-    fps: float
+    width: PositiveInt
+    height: PositiveInt
+    fps: PositiveFloat
 
     @staticmethod
     def of(video: Video) -> VideoInfo:
@@ -281,111 +303,99 @@ class VideoInfo:
 
 # ---- From JSON ---------------------------------------------------------------------------------
 
-# fields whose numbers are above 0
-POSITIVE = ("id", "width", "height", "fps", "metres_per_unit", "half_axes", "size", "size_m")
-NUMBER_MAX = 1e12  # of lengths; products of a few stay within the range of doubles
+
+def read_json(
+    kind: type[T],
+    path: Path,
+    header: dict[str, Any] | None = None,
+    out: Path | None = None,
+    required: Sequence[str] = (),
+) -> T:
+    """Read a JSON file of ours.
+
+    Args:
+        kind: type of the content, as in `decode`. header: keys with their values: format, version.
+        out: output folder of the file, for the advice. required: keys of fields with a default.
+    Raises:
+        ReobjError: damaged, another kind of file, or of another version.
+    """
+    try:
+        data = load_json(path)
+        if header and not (isinstance(data, dict) and header.items() <= data.items()):
+            raise ReobjError(f"expected {json.dumps(header)}")
+        if missing := [key for key in required if key not in data]:
+            raise ReobjError(f"{missing[0]!r} is missing")
+        content: T = decode(kind, data)
+    except ReobjError as error:
+        fault = f"{path}: {str(error).removeprefix(f'{path}: ')}"
+        raise ReobjError(f"{fault}; {written_by(out)}" if out else fault) from error
+    return content
 
 
-def decode(kind: Any, value: Any, at: str = "$", name: str = "") -> Any:
-    """Convert a JSON value to a type: a dataclass, or the type of a field of our dataclasses.
+def written_by(out: Path) -> str:
+    """Explain why a file of an output folder is unreadable: damaged, or of another version."""
+    data: Any = None
+    with contextlib.suppress(ReobjError):
+        data = load_json(out / OutputFile.OBJECTS)
+    wrote = data.get("reobj_track") if isinstance(data, dict) else None
+    if wrote == __version__:
+        return "is damaged: run the video again"
+    by = f"written by reobj_track {wrote or 'before 0.2'}, this is {__version__}"
+    return f"{by}: run the video again"
+
+
+class _Scale(msgspec.Struct):
+    """A `quadrics.Scale` in JSON."""
+
+    metres_per_unit: PositiveFloat
+    rel_sigma: NonNegativeFloat
+    source: str
+
+
+def decode(kind: Any, value: Any, at: str = "$") -> Any:
+    """Convert a JSON value to a type made of our dataclasses.
 
     Missing fields get their default; unknown keys are ignored.
 
     Args:
-        at: JSON path of the value, for messages. name: of the field that it belongs to.
+        at: JSON path of the value, for messages.
     Raises:
         ReobjError: the value has another type or shape, or a number is out of range.
     """
-    if isinstance(kind, types.UnionType):  # T | None
-        kind, _ = typing.get_args(kind)
-        return None if value is None else decode(kind, value, at, name)
-    if kind == Array:
-        return _decode_array(value, at, name)
-    if dataclasses.is_dataclass(kind):
-        return _decode_record(kind, value, at)
-    if kind is quadrics.Scale:
-        names = {"metres_per_unit": float, "rel_sigma": float | None, "source": str}
-        entry = _checked(value, dict, at)
-        return quadrics.Scale(*(decode(k, entry.get(n), f"{at}.{n}", n) for n, k in names.items()))
-    origin = typing.get_origin(kind)
-    if origin in (list, tuple, Sequence):
-        item = typing.get_args(kind)[0]
-        values = [decode(item, v, f"{at}[{k}]") for k, v in enumerate(_checked(value, list, at))]
-        if name in ("visits", "spans") and any(len(pair) != 2 for pair in values):
-            raise ReobjError(f"{at}: expected pairs of frames")
-        return values if origin is list else tuple(values)
-    if origin is dict:
-        item = typing.get_args(kind)[1]
-        pairs = _checked(value, dict, at).items()
-        return {k: decode(item, v, f"{at}.{k[:60]}") for k, v in pairs}
-    if kind in (int, float):
-        return _decode_number(kind, value, at, name)
-    return _checked(value, kind, at)
-
-
-def _decode_record(kind: Any, value: Any, at: str) -> Any:
-    """Convert a JSON object to a dataclass."""
-    entry = _checked(value, dict, at)
-    hints = typing.get_type_hints(kind)
-    if kind is LinkEvent:
-        hints["appearance_log_odds"] = float | None  # infinity is written as null
-    values: dict[str, Any] = {}
-    for f in dataclasses.fields(kind):
-        key = _JSON_KEYS.get(f.name, f.name)
-        if key == "appearance_log_odds" and key not in entry:
-            key = "look"  # its name in version 0.1
-        if key in entry:
-            values[f.name] = decode(hints[f.name], entry[key], f"{at}.{key}", f.name)
-        elif f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING:
-            raise ReobjError(f"{at}: {key!r} is missing")
-    if "class_name" in values:
-        values["class_name"] = visible_name(values["class_name"])
-    return kind(**values)
-
-
-def _decode_array(value: Any, at: str, name: str) -> Array:
-    """Convert nested lists of numbers to the array of a field."""
-    shape = {"quat_wxyz": (4,), "cov": (9, 9)}.get(name, (3,))
     try:
-        array = np.array(_checked(value, list, at))
-    except ValueError:  # lists of different lengths
-        array = np.empty(0)
-    if array.shape != shape or array.dtype.kind not in "iuf" or not np.isfinite(array).all():
-        raise ReobjError(f"{at}: expected {' x '.join(map(str, shape))} finite numbers")
-    if name != "cov" and np.abs(array).max() > NUMBER_MAX:
-        raise ReobjError(f"{at}: expected numbers of at most {NUMBER_MAX:g}")
-    if name in POSITIVE and array.min() <= 0:
-        raise ReobjError(f"{at}: expected positive numbers")
-    return array.astype(np.float64)
+        value = _with_field_names(value, "", at)
+        return msgspec.convert(value, kind, dec_hook=_array, str_keys=True)
+    except (msgspec.ValidationError, UnicodeError, RecursionError) as error:
+        text = re.sub(r"[.`]\w+", lambda m: m[0][0] + _KEYS.get(m[0][1:], m[0][1:]), str(error))
+        fault, _, path = text.replace("`", "").rpartition(" - at ")
+        raise ReobjError(f"{at}{path[1:]}: {fault}" if fault else f"{at}: {path}") from error
 
 
-def _decode_number(kind: type, value: Any, at: str, name: str) -> int | float:
-    """Check an integer, which is never negative, or a finite number."""
-    if kind is int:
-        # up to 2**53 JSON parsers that use doubles are exact
-        valid = isinstance(value, int) and 0 <= value <= 2**53
-        expected = "an integer >= 0"
-    else:
-        valid = isinstance(value, int | float) and abs(value) <= NUMBER_MAX
-        expected = "a number"
-    if name in POSITIVE:
-        valid = valid and value > 0
-        expected = "an integer > 0" if kind is int else "a number > 0"
-    if not valid or isinstance(value, bool):
-        raise ReobjError(f"{at}: {_shown(value)}, expected {expected}")
-    return typing.cast(float, value)
+def _with_field_names(value: Any, key: str, at: str) -> Any:
+    """Return the JSON value of a key with the names of our fields as keys of objects."""
+    if isinstance(value, list):
+        return [_with_field_names(item, key, f"{at}[{k}]") for k, item in enumerate(value)]
+    if key == "scale" and value is not None:
+        return msgspec.structs.astuple(decode(_Scale, value, at=at))
+    if key == "class_name" and isinstance(value, str):
+        return visible_name(value)
+    if not isinstance(value, dict):
+        return value
+    names = _FIELD_NAMES.get(key, {})
+    return {
+        (name := str(names.get(k, k))): _with_field_names(v, name, f"{at}.{k}")
+        for k, v in value.items()
+    }
 
 
-def _checked(value: Any, kind: type, at: str) -> Any:
-    """Return a value of the Python type, or raise."""
-    if not isinstance(value, kind):
-        names = {list: "a list", dict: "an object", str: "a text", bool: "true or false"}
-        raise ReobjError(f"{at}: {_shown(value)}, expected {names[kind]}")
-    return value
-
-
-def _shown(value: Any) -> str:
-    """Format a value for a message, however large it is."""
-    if isinstance(value, list | dict):
-        return "a list" if isinstance(value, list) else "an object"
-    return repr(value[:60] if isinstance(value, str) else value)
+def _array(kind: Any, value: Any) -> Array:
+    """Convert nested lists of finite numbers to an array type, which has the shape."""
+    if isinstance(value, np.ndarray):  # of a map
+        return value
+    shape = tuple(typing.get_args(size)[0] for size in typing.get_args(typing.get_args(kind)[0]))
+    with contextlib.suppress(ValueError):  # lists of different lengths
+        array = np.array(value)
+        most = NUMBER_MAX if len(shape) == 1 else np.finfo(float).max
+        if array.shape == shape and array.dtype.kind in "iuf" and (np.abs(array) <= most).all():
+            return array.astype(np.float64)
+    raise ValueError(f"Expected {' x '.join(map(str, shape))} finite numbers")

@@ -18,7 +18,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
 import quadrics
-from reobj.files import load_npz, save_npz
+from reobj.files import columns_of, from_columns, load_npz, save_npz
 from reobj.types import Existence, IntArray, LinkEvent, ReobjError, Tracks
 
 if TYPE_CHECKING:
@@ -166,7 +166,7 @@ def _mapped(identity: IntArray, numbers: Mapping[int, int]) -> IntArray:
 def tracked_key(result: Result) -> str:
     """Hash the tracks before linking, and the cameras."""
     tables = (result.tracks, result.untracked)
-    arrays = [getattr(t, f.name) for t in tables for f in dataclasses.fields(Tracks)]
+    arrays = [array for t in tables for array in columns_of(t).values()]
     if result.poses is not None:
         arrays += [result.poses.cam_from_world, result.poses.part]
     digest = hashlib.sha256()
@@ -180,7 +180,7 @@ def tracked_key(result: Result) -> str:
 
 def save_links(links: Links, path: Path) -> None:
     """Write links as npz."""
-    arrays = {f.name: getattr(links.tracks, f.name) for f in dataclasses.fields(Tracks)}
+    arrays = columns_of(links.tracks)
     arrays |= {name: getattr(links, name) for name in ("source", "category", "number")}
     for name in ("confidence", "label_of"):
         arrays[f"{name}_id"] = np.array(list(getattr(links, name)), np.int64)
@@ -192,8 +192,7 @@ def save_links(links: Links, path: Path) -> None:
         floor = None if shapes is None else shapes.floor
         floors.append(None if floor is None else (floor.normal.tolist(), *floor[1:]))
         if shapes is not None:
-            columns = dataclasses.fields(quadrics.Ellipsoids)
-            arrays |= {f"{f.name}_{k}": getattr(shapes.ellipsoids, f.name) for f in columns}
+            arrays |= columns_of(shapes.ellipsoids, f"{{}}_{k}")
     facts = {name: getattr(links, name) for name in ("highest", "options", "key")}
     events = [dataclasses.asdict(event) for event in links.events]
     save_npz(path, arrays, events=events, floors=floors, in_map=sorted(links.in_map), **facts)
@@ -214,7 +213,6 @@ def load_links(path: Path) -> Links:
     """
     data, facts = load_npz(path, sealed=True)
     try:
-        tracks = Tracks(*(data[f.name] for f in dataclasses.fields(Tracks)))
         label_of = dict(zip(data["label_of_id"].tolist(), data["label_of"].tolist(), strict=True))
         confidence = {
             identity: row[0] if np.isnan(row[1]) else Existence(*row)
@@ -223,16 +221,15 @@ def load_links(path: Path) -> Links:
             )
         }
         shapes = list[ComponentShapes | None]()
-        columns = [f.name for f in dataclasses.fields(quadrics.Ellipsoids)]
         for k, values in enumerate(facts["floors"]):
             floor = values and quadrics.Floor(np.array(values[0]), *values[1:])
             shapes.append(None)
-            if f"{columns[0]}_{k}" in data:
-                ellipsoids = quadrics.Ellipsoids(*(data[f"{name}_{k}"] for name in columns))
+            if f"half_axes_{k}" in data:
+                ellipsoids = from_columns(quadrics.Ellipsoids, data, f"{{}}_{k}")
                 shapes[k] = ComponentShapes(floor, ellipsoids)
         events = [LinkEvent(**e | {"tracklets": tuple(e["tracklets"])}) for e in facts["events"]]
         return Links(
-            tracks,
+            from_columns(Tracks, data),
             data["source"],
             data["category"],
             events,

@@ -24,7 +24,9 @@ from reobj.cameras import Poses, load_poses, save_poses, write_tum
 from reobj.files import (
     atomic,
     check_places,
+    columns_of,
     cut,
+    from_columns,
     load_json,
     load_npz,
     part_path,
@@ -40,7 +42,7 @@ from reobj.results.changes import (
     write_earlier,
 )
 from reobj.results.edits import write_edits
-from reobj.results.entries import Object, VideoInfo, World, decode
+from reobj.results.entries import Object, VideoInfo, World, read_json, written_by
 from reobj.results.links import save_links
 from reobj.results.names import OutputFile
 from reobj.results.ply import write_ply
@@ -171,7 +173,7 @@ def load(kind: type[Result], out: Path) -> Result:
     if not path.is_file() or not (out / OutputFile.TRACKS).is_file():
         raise ReobjError(f"{out}: no objects.json and tracks.txt; make them first with `run`")
     poses = load_last_poses(out)
-    entries = read_objects(path)
+    entries = read_json(ObjectsFile, path, HEADER, out)
     if fault := _contradiction(entries, poses):
         raise ReobjError(f"{path}: {fault}; {written_by(out)}")
     class_names = tuple(dict.fromkeys(o.class_name for o in entries.objects))
@@ -217,18 +219,6 @@ def load_last_poses(out: Path) -> Poses | None:
         raise ReobjError(f"{path}: {written_by(out)}") from error
 
 
-def written_by(out: Path) -> str:
-    """Explain why a file of an output folder is unreadable: damaged, or of another version."""
-    data: dict[str, Any] = {}
-    with contextlib.suppress(ReobjError):
-        data = load_json(out / OutputFile.OBJECTS)
-    wrote = data.get("reobj_track") if isinstance(data, dict) else None
-    if wrote == __version__:
-        return "is damaged: run the video again"
-    by = f"written by reobj_track {wrote or 'before 0.2'}, this is {__version__}"
-    return f"{by}: run the video again"
-
-
 # ---- objects.json ------------------------------------------------------------------------------
 
 
@@ -236,8 +226,6 @@ def written_by(out: Path) -> str:
 class ObjectsFile:
     """Content of objects.json that is read back."""
 
-    format: str
-    version: int
     video: VideoInfo
     world: World
     objects: list[Object]
@@ -279,21 +267,8 @@ def write_objects(result: Result, path: Path) -> None:
         part.write_text(json.dumps(data, indent=1) + "\n")
 
 
-def read_objects(path: Path) -> ObjectsFile:
-    """Read objects.json, and check the types, shapes and ranges of its values."""
-    try:
-        entries: ObjectsFile = decode(ObjectsFile, load_json(path))
-    except ReobjError as error:
-        fault = str(error).removeprefix(f"{path}: ")
-        raise ReobjError(f"{path}: {fault}; {written_by(path.parent)}") from error
-    return entries
-
-
 def _contradiction(entries: ObjectsFile, poses: Poses | None) -> str:
     """Describe a contradiction between entries of objects.json, or to the poses; "" if none."""
-    form, number = HEADER.values()
-    if (entries.format, entries.version) != (form, number):
-        return f"expected format {form}, version {number}"
     ids = [o.id for o in entries.objects]
     if len(set(ids)) != len(ids):
         return "two objects of one id"
@@ -301,15 +276,10 @@ def _contradiction(entries: ObjectsFile, poses: Poses | None) -> str:
     described = len(entries.world.parts)
     if component_count not in (1, described):
         return f"{described} components of a trajectory that has {component_count}"
-    statuses = ("ok", "prior_dominated", "implausible", "doubtful", "rejected", "tracked")
     for o in entries.objects:
         shape = (o.center, o.half_axes, o.size, o.quat_wxyz)
-        has_shape = o.located or o.status == "implausible"
-        if o.status not in statuses or (has_shape and any(value is None for value in shape)):
+        if (o.located or o.status == "implausible") and any(value is None for value in shape):
             return f"object {o.id} is {o.status} without a shape"
-        # rounded to six digits its length is off by 1e-6
-        if o.quat_wxyz is not None and abs(np.linalg.norm(o.quat_wxyz) - 1) > 1e-3:
-            return f"quat_wxyz of object {o.id} is not of length 1"
         if o.part >= max(component_count, described):
             return f"object {o.id} is in component {o.part}, which does not exist"
     return ""
@@ -337,7 +307,7 @@ def validate_objects(path: Path) -> list[str]:
     lines = []
     for found in validator.iter_errors(load_json(path)):
         fault = cut(f"{found.json_path}: {found.message}", 200)  # it quotes the value
-        lines.append(f"{path}: {printable(fault)}")
+        lines.append(printable(f"{path}: {fault}"))
     return sorted(lines)
 
 
@@ -349,21 +319,18 @@ def _is_finite(_: Any, value: Any) -> bool:
 # ---- Tracks before linking ---------------------------------------------------------------------
 
 
-BOXES_3D_COLUMNS = tuple(f.name for f in dataclasses.fields(Boxes3D))
-
-
 def save_tracked(result: Result, path: Path) -> None:
     """Write tracks and embeddings, before they are linked and fitted, as npz."""
-    looked = {} if result.looked is None else {"looked": result.looked}
-    columns = {f.name: getattr(result.tracks, f.name) for f in dataclasses.fields(Tracks)}
-    columns |= {f"untracked_{n}": getattr(result.untracked, n) for n in columns}
-    columns |= {name: getattr(result.embeddings, name) for name in ("foreground", "background")}
+    columns = columns_of(result.tracks) | columns_of(result.untracked, "untracked_{}")
+    columns |= columns_of(result.embeddings) | {"embedding_row": result.embedding_row}
     if result.boxes_3d is not None:
-        columns |= {f"boxes_3d_{n}": getattr(result.boxes_3d, n) for n in BOXES_3D_COLUMNS}
+        columns |= columns_of(result.boxes_3d, "boxes_3d_{}")
+    if result.looked is not None:
+        columns["looked"] = result.looked
     facts = {"class_names": result.class_names, "warnings": result.warnings,
              "identities_given": result.identities_given,
              "video": dataclasses.asdict(result.video), "version": __version__}  # fmt: skip
-    save_npz(path, columns | looked | {"embedding_row": result.embedding_row}, **facts)
+    save_npz(path, columns, **facts)
 
 
 def load_tracked(kind: type[Result], path: Path) -> Result:
@@ -372,20 +339,18 @@ def load_tracked(kind: type[Result], path: Path) -> Result:
     Args:
         kind: `Result`, whose module imports this one.
     """
-    names = [f.name for f in dataclasses.fields(Tracks)]
     try:
         data, facts = load_npz(path, sealed=True)
+        boxes = "boxes_3d_frame" in data
         return kind(
-            Tracks(*(data[name] for name in names)),
+            from_columns(Tracks, data),
             tuple(facts["class_names"]),
             VideoInfo(**facts["video"]),
-            embeddings=Embeddings(data["foreground"], data["background"]),
+            embeddings=from_columns(Embeddings, data),
             embedding_row=data["embedding_row"],
-            untracked=Tracks(*(data[f"untracked_{name}"] for name in names)),
+            untracked=from_columns(Tracks, data, "untracked_{}"),
             looked=data.get("looked"),
-            boxes_3d=Boxes3D(*(data[f"boxes_3d_{n}"] for n in BOXES_3D_COLUMNS))
-            if "boxes_3d_frame" in data
-            else None,
+            boxes_3d=from_columns(Boxes3D, data, "boxes_3d_{}") if boxes else None,
             identities_given=bool(facts["identities_given"]),
             warnings=list(facts["warnings"]),
         )

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cv2
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
@@ -326,7 +327,7 @@ def write_scene(
         "doubtful": doubtful,
         "size": {"width": result.video.width, "height": result.video.height},
         "visit_gap": visit_gap(result.tracks.frame, result.video.fps),
-        "edits": [] if result.edits is None else result.edits.entries,
+        "edits": [] if result.edits is None else result.edits.to_json(),
         "map": "" if result.poses is None else result.poses.map_id,
         "why_flat": _why_flat(result),
         "steps": {
@@ -421,7 +422,7 @@ def served_page(
     text = read_text(path)
     found = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)
     try:
-        data = json.loads(found[1], parse_constant=_no_number) if found else None
+        data = msgspec.json.decode(found[1]) if found else None  # refuses NaN
     except (RecursionError, ValueError):
         data = None
     if not isinstance(data, dict) or data.get("version") != PAGE_VERSION:
@@ -431,11 +432,6 @@ def served_page(
     if others is not None and isinstance(changes, dict) and not changes.get("refused"):
         data["earlier"] = _earlier_sessions(others)
     return _page_of(data, served)
-
-
-def _no_number(text: str) -> None:
-    """Refuse NaN and Infinity, which the page's data never have."""
-    raise ValueError(text)
 
 
 def _is_file(video: Video) -> bool:

@@ -9,8 +9,11 @@ import json
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import msgspec
 
 from reobj import __version__
 from reobj.cameras import Poses, save_poses
@@ -19,12 +22,11 @@ from reobj.files import (
     LockedError,
     atomic,
     load_cached,
-    load_json,
     load_npz,
     locked,
     writing,
 )
-from reobj.results.entries import decode
+from reobj.results.entries import read_json, written_by
 from reobj.results.links import Links, links_of_results, load_links
 from reobj.results.names import OutputFile
 from reobj.results.result import Result
@@ -32,21 +34,22 @@ from reobj.results.saving import (
     check_results,
     load_last_poses,
     remove_stale,
-    written_by,
 )
 from reobj.sources.imageless import ImagelessVideo
 from reobj.sources.video import InputConfig, Video
-from reobj.types import COORDINATE_MAX, ReobjError
+from reobj.types import COORDINATE_MAX, FiniteFloat, Int32, ReobjError
+
+Side = Annotated[int, msgspec.Meta(ge=1, le=int(COORDINATE_MAX))]
 
 
 @dataclass(frozen=True, slots=True)
 class _Frames:
     """Frames of a video without images: the arguments of `ImagelessVideo`."""
 
-    size: list[int]
-    times_s: list[float] | None = None
+    size: tuple[Side, Side]
+    times_s: list[FiniteFloat] | None = None
     names: list[str] = field(default_factory=list)
-    count: int = 0
+    count: Int32 = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +57,7 @@ class _Binding:
     """Content of cache/source.json that is read back."""
 
     source: str
-    input: dict[str, int]
+    input: dict[str, Int32]
     content: str = ""
     frames: _Frames | None = None
 
@@ -134,12 +137,11 @@ class Workspace:
             "frames": video.facts() if isinstance(video, ImagelessVideo) else None,
         }
         if path.exists():
-            old = load_cached(path, load_json)
-            old = old if isinstance(old, dict) else {}
-            if old.get("content") != fingerprint["content"]:
+            old = load_cached(path, partial(read_json, _Binding)) or _Binding("another video", {})
+            if old.content != fingerprint["content"]:
                 if not overwrite and self._has_results():
-                    found = f"{old.get('source', 'another video')}, not of {video.source}"
-                    if old.get("source") == fingerprint["source"]:
+                    found = f"{old.source}, not of {video.source}"
+                    if old.source == fingerprint["source"]:
                         found = f"{video.source} as it was before it changed"
                     advice = "choose another -o, or add --overwrite"
                     raise ReobjError(f"{self.out}: holds the results of {found}; {advice}")
@@ -176,14 +178,7 @@ class Workspace:
         frames = self._read_binding().frames
         if frames is None:
             return Video(source, config)
-        return ImagelessVideo(
-            source,
-            frames.size,
-            config,
-            times_s=frames.times_s,
-            names=frames.names,
-            count=frames.count,
-        )
+        return ImagelessVideo(source, config=config, **dataclasses.asdict(frames))
 
     def video_or_frames(self, result: Result) -> tuple[Video, list[str]]:
         """Open the video, or its frames without images if it was moved or deleted since.
@@ -208,20 +203,7 @@ class Workspace:
 
     def _read_binding(self) -> _Binding:
         """Read what `bind` wrote."""
-        path = self._source_file
-        try:
-            binding: _Binding = decode(_Binding, load_json(path))
-        except ReobjError as error:
-            fault = str(error).removeprefix(f"{path}: ")
-            raise ReobjError(f"{path}: {fault}; {written_by(self.out)}") from error
-        frames = binding.frames
-        counts = [*binding.input.values(), 0 if frames is None else frames.count]
-        right_size = frames is None or (
-            len(frames.size) == 2 and 1 <= min(frames.size) <= max(frames.size) <= COORDINATE_MAX
-        )
-        if max(counts) >= 2**31 or not right_size:  # int32 of OpenCV
-            raise ReobjError(f"{path}: a number is out of range; {written_by(self.out)}")
-        return binding
+        return read_json(_Binding, self._source_file, out=self.out)
 
     def path(self, stage: str, *key: Any) -> Path:
         """Return the cache file of a stage's result.
