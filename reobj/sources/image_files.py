@@ -25,6 +25,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image as PillowImage
 
+from reobj.files import shortened
 from reobj.types import Array, ReobjError
 
 IMAGE_FPS = 30.0  # Hz, rate of images without times; chosen: most phones record at 30 Hz
@@ -66,7 +67,9 @@ def list_images(source: str) -> ImageList:
         suffix = path.suffix.lower()
         if suffix in unread and suffix != ".gif":  # .gif is read as a video
             raise ReobjError(f"{source}: {path.suffix} files are not read; convert it to .jpg")
-        return _sized(source, [path] if suffix in IMAGE_SUFFIXES else [], {path: header(path)}, [])
+        head = header(path) if suffix in IMAGE_SUFFIXES else None
+        is_video = suffix not in IMAGE_SUFFIXES or (head is not None and head.frames > 1)
+        return _sized(source, [] if is_video else [path], {path: head}, [])
     if not path.is_dir() and not re.search(r"[*?\[]", source):
         return ImageList([], [], [])
     paths = [p for p in _paths(path) if not p.name.startswith(".")]
@@ -81,6 +84,9 @@ def list_images(source: str) -> ImageList:
         fault = f"no images there (looked for {' '.join(IMAGE_SUFFIXES)})"
         raise ReobjError("; ".join([f"{source}: {fault}", *messages, *more]))
     headers = {p: header(p) for p in files}
+    if animated := [p.name for p in files if (h := headers[p]) is not None and h.frames > 1]:
+        messages.append(f"of {len(animated)} animated files only the first frame is read: "
+                        f"{shortened(animated)}")  # fmt: skip
     files, left_out = _only_pictures(files, headers, source if path.is_dir() else "")
     return _sized(source, files, headers, messages + left_out)
 
@@ -397,3 +403,11 @@ def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> npt.NDArray[Any] | 
     except (OSError, cv2.error):
         return None
     return None if image is None else np.asarray(image)
+
+
+def why_unreadable(path: Path) -> str:
+    """Say why `read_image` returns no image in colour."""
+    image = read_image(path, cv2.IMREAD_UNCHANGED)
+    if image is None:
+        return "damaged, or no image"
+    return f"pixels of type {image.dtype}; convert them to 8 bits a channel"
