@@ -7,24 +7,30 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Generator, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import dataclass
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import av
 import cv2
 import numpy as np
-from av.stream import Disposition
-from av.video.reformatter import VideoReformatter
 from PIL import Image as PillowImage
 
 from reobj.runtime import quiet_opencv
 from reobj.types import Array, Image, ReobjError
 
-Decoded = tuple[float, Any]  # time in s, NaN: none; frame of PyAV, None: undecodable, or none yet
-TURNS = {90: cv2.ROTATE_90_COUNTERCLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_CLOCKWISE}
+
+class Decoded(NamedTuple):
+    """A frame: time in s (NaN: none), its image in BGR (None: undecodable, or not yet there).
+
+    turned: rotation by metadata of the upright image against the stored one, deg anticlockwise.
+    """
+
+    time_s: float = math.nan
+    image: Callable[[], Image] | None = None
+    turned: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,19 +49,6 @@ class Opened:
     fps: float = 0.0
     count: int = 0
     pixel_aspect: Fraction = Fraction(1)
-    _reformatter: Any = field(default_factory=VideoReformatter)
-
-    def image(self, frame: Any) -> Image:
-        """Convert a frame to BGR, upright by the rotation in its metadata."""
-        # Bicubic: the pixels are those of OpenCV's VideoCapture
-        bgr = self._reformatter.reformat(frame, format="bgr24", interpolation="BICUBIC")
-        image = bgr.to_ndarray()
-        turn = TURNS.get(frame.rotation % 360)
-        return np.asarray(image if turn is None else cv2.rotate(image, turn), np.uint8)
-
-    def close(self) -> None:
-        """Free the camera or close the file."""
-        self.frames.close()
 
 
 def open_camera(number: int) -> Opened | None:
@@ -71,15 +64,14 @@ def _camera_frames(capture: Any) -> Generator[Decoded]:
     try:
         while True:
             ok, image = capture.read()
-            yield math.nan, av.VideoFrame.from_ndarray(image, "bgr24") if ok else None
+            yield Decoded(image=partial(np.asarray, image)) if ok else Decoded()
     finally:
         capture.release()
 
 
 def open_animation(path: Path) -> Opened:
-    """Open an animated image file."""
-    with PillowImage.open(path) as image:
-        return Opened(_animation_frames(path), pixels=math.prod(image.size))
+    """Open an animated image file, whose header can be read."""
+    return Opened(_animation_frames(path), path.suffix)
 
 
 def _animation_frames(path: Path) -> Generator[Decoded]:
@@ -88,46 +80,48 @@ def _animation_frames(path: Path) -> Generator[Decoded]:
         for k in range(getattr(image, "n_frames", 1)):
             try:
                 image.seek(k)
-                rgb = np.asarray(image.convert("RGB"))
+                bgr = np.asarray(image.convert("RGB"))[..., ::-1]
             except (OSError, ValueError, EOFError):
-                yield math.nan, None
+                yield Decoded()
                 continue
-            yield milliseconds / 1000, av.VideoFrame.from_ndarray(rgb, "rgb24")
+            yield Decoded(milliseconds / 1000, partial(np.ascontiguousarray, bgr))
             milliseconds += image.info.get("duration", 0)
 
 
 def _open_container(address: str, timeout_s: float | None) -> tuple[Any, Any] | None:
-    """Open a container and its first video stream that is no cover picture.
+    """Open a container and its first video stream that is no cover picture; None: no container.
 
     Raises:
         ReobjError: there is no such stream, or no decoder. The source is not named.
     """
+    import av
+
     try:  # tags in other encodings than UTF-8 are no error
         options = {"rtsp_flags": "prefer_tcp"}
         file = av.open(address, options=options, timeout=timeout_s, metadata_errors="replace")
     except (av.FFmpegError, OSError, ValueError):
         return None
-    streams = [s for s in file.streams.video if not s.disposition & Disposition.attached_pic]
+    cover = av.stream.Disposition.attached_pic
+    streams = [stream for stream in file.streams.video if not stream.disposition & cover]
     if streams and streams[0].codec_context is not None:
         return file, streams[0]
-    cover = "; its cover picture is none" if file.streams.video else ""
+    fault = "no video in it" + "; its cover picture is none" * bool(file.streams.video)
     file.close()
-    if streams:
-        raise ReobjError("its codec cannot be decoded here; convert it (ffmpeg -i IN OUT.mp4)")
-    raise ReobjError(f"no video in it{cover}")
+    decoder = "its codec cannot be decoded here; convert it (ffmpeg -i IN OUT.mp4)"
+    raise ReobjError(decoder if streams else fault)
 
 
 def open_file(address: str, timeout_s: float | None = None) -> Opened | None:
     """Open a video file, or with `timeout_s` the URL of a stream or file; None if it is no video.
 
     Raises:
-        ReobjError: as `_open_container`.
+        ReobjError: there is no video stream, or no decoder. The source is not named.
     """
     if (found := _open_container(address, timeout_s)) is None:
         return None
     file, stream = found
     fps = float(stream.guessed_rate or 0)
-    duration_s = float((stream.duration or 0) * stream.time_base) or _announced_s(file)
+    duration_s = float((stream.duration or 0) * stream.time_base) or (file.duration or 0) / 1e6
     count = stream.frames or round(duration_s * fps)
     # Several frames at a time delay those of a live stream
     stream.thread_type = "AUTO" if count or timeout_s is None else "SLICE"
@@ -136,12 +130,10 @@ def open_file(address: str, timeout_s: float | None = None) -> Opened | None:
     return Opened(_file_frames(file, stream), stream.name, pixels, fps, count, aspect)
 
 
-def _announced_s(file: Any) -> float:
-    return float((file.duration or 0) / av.time_base)
-
-
 def _packets(file: Any, streams: Any) -> Iterator[Any]:
     """Read the packets of a container, across damaged places."""
+    import av
+
     for _ in range(64):  # places; each missing packet at the end of an MP4 file is one
         try:
             yield from file.demux(*streams)
@@ -152,10 +144,10 @@ def _packets(file: Any, streams: Any) -> Iterator[Any]:
         return
 
 
-def _stamp(item: Any) -> int | None:
-    """Return the time of a packet or frame, in its time base."""
-    at: int | None = item.dts if item.pts is None else item.pts
-    return at
+def _stamp_s(item: Any) -> float:
+    """Return the time of a packet or frame in s, NaN: none."""
+    at = item.dts if item.pts is None else item.pts
+    return math.nan if at is None else float(at * item.time_base)
 
 
 def _is_cut(packet: Any, file: Any) -> bool:
@@ -164,7 +156,10 @@ def _is_cut(packet: Any, file: Any) -> bool:
 
 
 def _file_frames(file: Any, stream: Any) -> Generator[Decoded]:
-    start = stream.start_time or 0
+    import av
+
+    reformatter = av.video.reformatter.VideoReformatter()
+    start_s = float((stream.start_time or 0) * stream.time_base)
     with file:
         for packet in itertools.chain(_packets(file, [stream]), [None]):  # None: no more packets
             if packet is not None and _is_cut(packet, file):
@@ -172,11 +167,20 @@ def _file_frames(file: Any, stream: Any) -> Generator[Decoded]:
             try:
                 frames = stream.decode(packet)
             except av.FFmpegError:
-                yield math.nan, None
+                yield Decoded()
                 continue
             for frame in frames:
-                at = _stamp(frame)
-                yield math.nan if at is None else float((at - start) * frame.time_base), frame
+                image = partial(_bgr, reformatter, frame)
+                yield Decoded(_stamp_s(frame) - start_s, image, frame.rotation)
+
+
+def _bgr(reformatter: Any, frame: Any) -> Image:
+    """Convert a frame to BGR, upright by the rotation in its metadata."""
+    # Bicubic: the pixels are those of OpenCV's VideoCapture
+    image = reformatter.reformat(frame, format="bgr24", interpolation="BICUBIC").to_ndarray()
+    turns = {90: cv2.ROTATE_90_COUNTERCLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_CLOCKWISE}
+    turn = turns.get(frame.rotation % 360)
+    return np.asarray(image if turn is None else cv2.rotate(image, turn), np.uint8)
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,25 +202,24 @@ def stored_in(path: str) -> Stored:
     last_s = end_s = 0.0
     is_cut = False
     with file:
-        total = file.size
         for packet in _packets(file, file.streams):
-            if not packet.size:
-                continue
-            if _is_cut(packet, file):
-                is_cut = True
+            is_cut = is_cut or _is_cut(packet, file)
+            if not packet.size or is_cut:
                 continue
             size += packet.size
-            at_s = float((_stamp(packet) or 0) * packet.time_base)
-            end_s = max(end_s, at_s + float((packet.duration or 0) * packet.time_base))
+            at_s = _stamp_s(packet)
+            duration_s = float((packet.duration or 0) * packet.time_base)
+            end_s = max(end_s, at_s + duration_s)
             if packet.stream.index == video.index:
                 count += 1
                 last_s = max(last_s, at_s - start_s)
-        missing_s = _announced_s(file) - end_s
-        unread = total - size  # Matroska holds little beside packets: an index, tags
+        announced_s = (file.duration or 0) / 1e6
+        unread = file.size - size  # Matroska holds little beside packets: an index, tags
         if file.format.name.startswith("matroska") and unread > max(size, 1 << 14):
-            return Stored(count, last_s, f"is damaged, {size} of its {total} bytes are readable")
+            fault = f"is damaged, {size} of its {file.size} bytes are readable"
+            return Stored(count, last_s, fault)
     # Containers announce the end of the last frame, or its time
-    if is_cut or missing_s > max(0.02 * end_s, 2 * end_s / max(count, 1)):
+    if is_cut or announced_s - end_s > max(0.02 * end_s, 2 * end_s / max(count, 1)):
         return Stored(count, last_s, "ends early")
     return Stored(count, last_s)
 

@@ -296,18 +296,17 @@ class Video:
         start = self.config.start
         every = self.config.every
         raw_s = list[float]()
-        opened = self._open()
-        for index, (seconds, frame) in enumerate(self._decoded(opened)):
+        for index, (seconds, image, _) in enumerate(self._decoded()):
             if not seconds > max(raw_s[-1:], default=-math.inf):
                 self._measured()  # correcting this time needs all later ones
             raw_s.append(seconds)
             if index >= start and (index - start) % every == 0:
                 time_s = seconds if self._clock is None else float(self._clock.times_s[index])
-                yield index, time_s, None if frame is None else opened.image(frame)
+                yield index, time_s, None if image is None else image()
         if self._clock is None:
             self._keep(raw_s)
 
-    def _decoded(self, opened: Opened) -> Iterator[Decoded]:
+    def _decoded(self) -> Iterator[Decoded]:
         """Decode the frames before `config.stop` one by one.
 
         Undecodable frames count only if a later one can be decoded: at the end of the file they do
@@ -315,9 +314,9 @@ class Video:
         """
         index = 0
         failed = list[Decoded]()
-        for item in opened.frames:
+        for item in self._open().frames:
             failed.append(item)
-            if item[1] is not None:
+            if item.image is not None:
                 for each in failed:
                     yield each
                     index += 1
@@ -333,7 +332,7 @@ class Video:
             for stop in (0, self.config.stop):
                 self._clock = self._clock or _measured_clocks.get(self._key(stop))
         if self._clock is None:
-            self._clock = self._keep([time_s for time_s, _ in self._decoded(self._open())])
+            self._clock = self._keep([frame.time_s for frame in self._decoded()])
         return self._clock
 
     def _key(self, stop: int) -> tuple[str, str, int]:
@@ -438,12 +437,12 @@ class Video:
         """Read a live source until it ends or `stopped`; drop the oldest frame of a full queue."""
         last = time.monotonic()
         try:
-            for _, frame in opened.frames:
+            for frame in opened.frames:
                 if stopped.is_set() or time.monotonic() - last >= self._live.silent_s:
                     break  # also if the driver hung, and a new connection is in use
                 if 0 < self.config.stop <= self._seen:
                     break
-                if frame is None:
+                if frame.image is None:
                     time.sleep(0.01)
                     continue
                 self._last_frame_s = last = time.monotonic()
@@ -457,9 +456,9 @@ class Video:
                         frames.get_nowait()
                         self.dropped += 1
                 # No other thread puts: it does not block
-                frames.put((at, last - began, opened.image(frame)))
+                frames.put((at, last - began, frame.image()))
         finally:
-            opened.close()
+            opened.frames.close()
             while not stopped.is_set():  # None ends the iteration, after the waiting frames
                 with contextlib.suppress(queue.Full):
                     frames.put(None, timeout=0.1)
@@ -520,14 +519,14 @@ class Video:
             return (image.shape[1], image.shape[0]), IMAGE_FPS, len(self.files)
         opened = self._open()
         first = itertools.islice(opened.frames, MAX_UNREADABLE)
-        frame = next((frame for _, frame in first if frame is not None), None)
-        if frame is None:
+        frame = next((frame for frame in first if frame.image is not None), Decoded())
+        if frame.image is None:
             raise ReobjError(f"{self.source}: no frame can be decoded (codec {opened.codec})")
         self.is_live = self.is_live and not opened.count  # the URL of a file is not live
         self._opened = opened if self.is_live else None
         if not self.is_live:
-            self._set_aspect(opened.pixel_aspect, frame.rotation % 180 == 90)
-        height, width = opened.image(frame).shape[:2]
+            self._set_aspect(opened.pixel_aspect, frame.turned % 180 == 90)
+        height, width = frame.image().shape[:2]
         fps = opened.fps if 0 < opened.fps < math.inf else IMAGE_FPS
         return (width, height), fps, opened.count
 

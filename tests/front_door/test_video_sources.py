@@ -152,10 +152,10 @@ def test_only_the_requested_range_is_decoded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With --stop 10, not the whole hour of a video."""
-    path, grabs = write_video(tmp_path / "a.mkv", UNEVEN, rate=1000), list[float]()
+    path, grabs = write_video(tmp_path / "a.mkv", UNEVEN, rate=1000), list[Any]()
     whole = rt.Video._decoded
     monkeypatch.setattr(
-        rt.Video, "_decoded", lambda self, c: (grabs.append(t) or t for t in whole(self, c))
+        rt.Video, "_decoded", lambda self: (grabs.append(f) or f for f in whole(self))
     )
     video = rt.Video(path, rt.InputConfig(stop=10))
     assert video.fps == pytest.approx(9000 / UNEVEN[9], rel=0.01)
