@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import dataclasses
+import filecmp
 import functools
 import glob
 import hashlib
@@ -19,6 +20,7 @@ import queue
 import re
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -218,6 +220,20 @@ class Video:
         return max(math.ceil((stop - self.config.start) / self.config.every), 0)
 
     @functools.cached_property
+    def copies(self) -> dict[int, int]:
+        """Frame numbers of images with the same bytes as an earlier one, and of that one."""
+        first = dict[tuple[int, str], int]()
+        copies = {}
+        sizes = [path.stat().st_size for path in self.files]
+        usual = Counter(sizes)
+        for k, path in enumerate(self.files):
+            if usual[sizes[k]] > 1:
+                number = first.setdefault((sizes[k], content_fingerprint([path])), k)
+                if number != k and filecmp.cmp(path, self.files[number], shallow=False):
+                    copies[k] = number
+        return copies
+
+    @functools.cached_property
     def frame_count(self) -> int:
         if self.files or self.is_live:
             return len(self.files)
@@ -254,23 +270,17 @@ class Video:
     def __iter__(self) -> Iterator[Frame]:
         self.skipped.clear()
         decoded = self._from_images() if self.files else self._from_file()
-        left_out: dict[str, list[int]] = {"unreadable": [], "size": [], "copies": []}
-        copies = _Copies(self.files)
+        unreadable = list[int]()
+        other_size = list[int]()
         for index, time_s, image in self._from_live() if self.is_live else one_ahead(decoded):
-            fault = "unreadable" if image is None else ""
-            if image is not None and (image.shape[1], image.shape[0]) != self.size:
-                fault = "size"
-            elif image is not None and self.files and copies.has(index, image):
-                fault = "copies"
-            if fault or image is None:
-                left_out[fault].append(index)
+            if image is None or (image.shape[1], image.shape[0]) != self.size:
+                (unreadable if image is None else other_size).append(index)
                 self.skipped.append(index)
             elif index > self._after:
                 yield Frame(index, time_s, self._scaled(image))
-        width, height = self.size
         others = "most" if self.files else "the first"
-        whys = ("unreadable", f"not {width}x{height}, the size of {others}", "copies of others")
-        for skipped, why in zip(left_out.values(), whys, strict=True):
+        size = f"not {self.size[0]}x{self.size[1]}, the size of {others}"
+        for skipped, why in ((unreadable, "unreadable"), (other_size, size)):
             if skipped:
                 which = [self.name(index) or index for index in skipped]
                 self._warn(f"{len(skipped)} frames skipped ({why}): {shortened(which)}")
@@ -539,23 +549,6 @@ class Video:
             self._warn(f"its pixels are {wide}:{high}, not square, by its metadata: boxes are in "
                        "stored pixels, cameras have two focal lengths; if that is wrong, correct "
                        "its sample aspect ratio (ffmpeg -i IN -vf setsar=1 OUT)")  # fmt: skip
-
-
-class _Copies:
-    """Images of a folder with the same pixels as an earlier one; those of one colour are none."""
-
-    def __init__(self, files: Sequence[Path]) -> None:
-        self.files = files
-        self.earlier: dict[int, list[int]] = {}  # numbers by the hash of some pixels
-
-    def has(self, index: int, image: Image) -> bool:
-        """Test whether an image is a copy of an earlier one."""
-        same = self.earlier.setdefault(hash(image[::16, ::16].tobytes()), [])
-        is_copy = any(np.array_equal(image, np.asarray(read_image(self.files[k]))) for k in same)
-        is_copy = is_copy and image.min() < image.max()
-        if not is_copy:
-            same.append(index)
-        return is_copy
 
 
 def resized(image: Image, size: Sequence[int]) -> Image:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import fractions
 import functools
 import http.server
@@ -27,6 +28,7 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
+from simulated import tracks_of, unlinked, walk
 
 import reobj_track as rt
 from reobj import runtime
@@ -35,6 +37,7 @@ from reobj.maps.stage import session_key
 from reobj.poses.keyframes import ResizedVideo
 from reobj.poses.sfm import rescale
 from reobj.results.names import recording_name
+from reobj.results.workspace import Workspace
 from reobj.sources import video as sources
 from reobj.sources.decoding import settled_times
 from reobj.sources.image_files import exif_orientation, header, sorted_names, times_of_names
@@ -682,18 +685,32 @@ def test_time_stamps_of_unequal_length_are_times(tmp_path: Path) -> None:
     assert not counted.times_are_known
 
 
-def test_copies_of_a_photo_are_one_view(tmp_path: Path) -> None:
-    """Also stored in another format; images of one colour are no photos."""
-    rng = np.random.default_rng(0)
-    photos = [rng.integers(0, 256, (48, 64, 3), np.uint8) for _ in range(3)]
-    for k, photo in enumerate(photos):
-        cv2.imwrite(str(tmp_path / f"{k}.png"), photo)
-    cv2.imwrite(str(tmp_path / "0 (1).png"), photos[0], [cv2.IMWRITE_PNG_COMPRESSION, 9])
-    cv2.imwrite(str(tmp_path / "7.png"), photos[2])
-    for k in (8, 9):
-        cv2.imwrite(str(tmp_path / f"{k}.png"), picture(4))
-    video = read(tmp_path, 5, "2 frames skipped (copies of others): 0 (1).png, 7.png")
-    assert [f.index for f in video] == [0, 2, 3, 5, 6] and video.frame_count == 7
+def test_copies_of_a_photo_are_one_view(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Objects have as many views and the same sizes as without them."""
+    poses, found = walk(12), []
+    size = (poses.camera.width, poses.camera.height)
+    for name, count in (("once", 12), ("twice", 24)):
+        video = tmp_path / name
+        video.mkdir()
+        for k in range(count):
+            noise = np.random.default_rng(k % 12).integers(0, 256, (*size[::-1], 3), np.uint8)
+            cv2.imwrite(str(video / f"{k:02d}.jpg"), noise)
+        row = np.arange(count) % 12
+        all_poses = dataclasses.replace(
+            poses, frame=np.arange(count), time_s=np.arange(count) / 30, part=row * 0,
+            cam_from_world=poses.cam_from_world[row], status=poses.status[row],
+        )  # fmt: skip
+        workspace = Workspace(tmp_path / f"out_{name}")
+        workspace.bind(rt.Video(video))
+        tracks = tracks_of(all_poses, noise_px=0)
+        workspace.save_last(unlinked(all_poses, tracks), all_poses, [])
+        assert rt.main(["objects", str(workspace.out), "--set", "output.overlay=none"]) == 0
+        said = capsys.readouterr().err
+        assert ("12 images are copies of others" in said) == (name == "twice"), said
+        data = json.loads((workspace.out / "objects.json").read_text())["objects"]
+        found.append([(o["id"], o["views"], *np.round(o["size"], 3)) for o in data])
+        assert len((workspace.out / "poses.txt").read_text().splitlines()) >= count
+    assert found[0] == found[1] and len(found[0]) == 3
 
 
 def claiming(kind: str, width: int, height: int, folder: Path) -> bytes:
