@@ -121,13 +121,21 @@ def _sized(
 
 # ---- Which images are frames ---------------------------------------------------------------------
 
+# Of names of images that are no pictures: 7-Scenes, ScanNet, 3D Scanner App, NeRFCapture, DAVIS,
+# Replica, Hypersim, Record3D
+OTHER_WORDS = frozenset(
+    "depth depthmap disp disparity conf confidence mask masks matte alpha seg segm segmentation "
+    "semantic semantics label labels instance instances panoptic normal normals thumb thumbs "
+    "thumbnail preview ir infrared flow albedo uncertainty".split()
+)
+
 
 @dataclass(slots=True)
 class _Kind:
     """Images whose names differ only in their numbers."""
 
     files: list[Path]
-    words: set[str]
+    is_named_otherwise: bool
     numbers: set[tuple[int, ...]]
     color: bool
 
@@ -135,24 +143,6 @@ class _Kind:
         """Test whether more than half of the smaller (min) or larger (max) kind shares numbers."""
         count = least(len(self.numbers), len(other.numbers))
         return () not in self.numbers and 2 * len(self.numbers & other.numbers) > count
-
-    @property
-    def is_named_otherwise(self) -> bool:
-        """Test for a word for images that are no pictures.
-
-        Those of 7-Scenes, ScanNet, 3D Scanner App, NeRFCapture, DAVIS, Replica, Hypersim, Record3D.
-        """
-        words = (
-            "depth depthmap disp disparity conf confidence mask masks matte alpha seg segm "
-            "segmentation semantic semantics label labels instance instances panoptic normal "
-            "normals thumb thumbs thumbnail preview ir infrared flow albedo uncertainty"
-        )
-        return not self.words.isdisjoint(words.split())
-
-    def is_named_picture(self, other: _Kind) -> bool:
-        """Test whether these names have a word for pictures that the other names lack."""
-        pictures = {"color", "colour", "rgb", "image", "img", "frame", "photo"}
-        return bool((self.words - other.words) & pictures)
 
 
 def _only_pictures(
@@ -174,28 +164,21 @@ def _only_pictures(
         files = [p for p in files if p not in set(deep)]
         messages.append(_left_out(deep, "one channel with more than 8 bits, as depth maps have"))
     kinds = _kinds(files, headers)
-    any_color = any(kind.color for kind in kinds)
     for kind in list(kinds):
-        others = [k for k in kinds if k is not kind]
-        gray = any_color and not kind.color
+        beside = [k for k in kinds if k is not kind and kind.shares(k, min)]
         named = kind.is_named_otherwise
-        beside = [k for k in others if kind.shares(k, min)]
-        if gray and (named or any(k.color for k in beside)):
-            messages.append(_left_out(kind.files, "one channel, beside images in colour"))
-            kinds.remove(kind)
-        elif named and any(not k.is_named_otherwise for k in beside):
-            messages.append(_left_out(kind.files, "by its name; others have the same numbers"))
+        why = ""
+        if not kind.color and any(k.color for k in (kinds if named else beside)):
+            why = "one channel, beside images in colour"
+        elif named and not all(k.is_named_otherwise for k in beside):
+            why = "by its name; others have the same numbers"
+        if why:
+            messages.append(_left_out(kind.files, why))
             kinds.remove(kind)
     least = 3  # images of each of two kinds: the numbers of fewer may agree by chance
-    for kind in list(kinds) if folder else ():
-        rivals = [k for k in kinds if k is not kind and kind.shares(k, max)]
-        rivals = [k for k in rivals if min(len(k.files), len(kind.files)) >= least]
-        if any(k.is_named_picture(kind) and not kind.is_named_picture(k) for k in rivals):
-            messages.append(_left_out(kind.files, "by its name; others have the same numbers"))
-            kinds.remove(kind)
-    for kind, other in itertools.combinations(kinds if folder else (), 2):
-        if kind.shares(other, max) and min(len(kind.files), len(other.files)) >= least:
-            names = [min((p.name for p in k.files), key=by_number) for k in (kind, other)]
+    for pair in itertools.combinations(kinds if folder else (), 2):
+        if pair[0].shares(pair[1], max) and min(len(k.files) for k in pair) >= least:
+            names = [min((p.name for p in k.files), key=by_number) for k in pair]
             raise ReobjError(
                 f"{folder}: two kinds of images, {' and '.join(names)}; which are the frames? "
                 f"Give a glob in quotes, such as '{Path(folder) / _glob_of(names[0])}'"
@@ -216,11 +199,13 @@ def _kinds(files: Sequence[Path], headers: dict[Path, Header | None]) -> list[_K
         groups.setdefault(re.sub(r"\d+", "#", stem) + path.suffix.lower(), []).append((path, stem))
     kinds = []
     for text, members in groups.items():
-        numbers = {tuple(map(int, re.findall(r"\d+", stem))) for _, stem in members}
+        rows = np.array([re.findall(r"\d+", stem) for _, stem in members], object)
+        varied = [len(set(column)) > 1 for column in rows.T.tolist()] if len(rows) > 1 else ...
+        numbers = {tuple(map(int, row)) for row in rows[:, varied].tolist()}
         known = [h for path, _ in members if (h := headers[path]) is not None]
         color = 2 * sum(h.is_gray for h in known) <= len(known)
-        words = set(re.split(r"[^a-z]+", text.rpartition(".")[0]))
-        kinds.append(_Kind([path for path, _ in members], words, numbers, color))
+        named = not OTHER_WORDS.isdisjoint(re.split(r"[^a-z]+", text.rpartition(".")[0]))
+        kinds.append(_Kind([path for path, _ in members], named, numbers, color))
     return kinds
 
 

@@ -410,52 +410,47 @@ class Video:
         A thread reads all frames, so that the driver's queue does not fill with old ones.
         """
         # Two frames wait: the next one for the tracker, and the newest one
-        frames: queue.Queue[tuple[int, float, Image] | None] = queue.Queue(2)
+        frames: queue.Queue[tuple[int, float, Image]] = queue.Queue(2)
         stopped = threading.Event()
         self._last_frame_s = time.monotonic()
         thread = threading.Thread(
             target=self._read_live, args=(opened, frames, stopped, began), daemon=True
         )
         thread.start()
+        poll_s = 0.5  # longer than the reading thread takes to end
         try:
-            while (item := self._next_live(frames)) is not None:
-                yield item
+            while (reads := thread.is_alive() and self._silent_s < poll_s) or frames.qsize():
+                with contextlib.suppress(queue.Empty):
+                    yield frames.get(timeout=0.05)
+            if not reads and thread.is_alive():
+                self._warn(f"no frame came for {self._live.silent_s:g} s: taken as its end")
         finally:
             stopped.set()
-            hangs = time.monotonic() - self._last_frame_s > self._live.silent_s
-            thread.join(0.0 if hangs else self._live.silent_s / 2)  # a daemon thread may be left
+            # A thread that hangs in the driver is left
+            thread.join(0.0 if self._silent_s > 0 else self._live.silent_s / 2)
 
-    def _next_live(
-        self, frames: queue.Queue[tuple[int, float, Image] | None]
-    ) -> tuple[int, float, Image] | None:
-        """Wait for a frame of a live source; None at its end, or where the driver hangs."""
-        poll_s = 0.5  # longer than the reading thread takes to signal its end
-        timeout_s = self._live.silent_s + poll_s
-        while time.monotonic() - self._last_frame_s < timeout_s or not frames.empty():
-            with contextlib.suppress(queue.Empty):
-                return frames.get(timeout=poll_s)
-        self._warn(f"no frame came for {self._live.silent_s:g} s: taken as its end")
-        return None
+    @property
+    def _silent_s(self) -> float:
+        """Time since a live source has ended for lack of frames, s; negative: it has not."""
+        return time.monotonic() - self._last_frame_s - self._live.silent_s
 
     def _read_live(
         self,
         opened: Opened,
-        frames: queue.Queue[tuple[int, float, Image] | None],
+        frames: queue.Queue[tuple[int, float, Image]],
         stopped: threading.Event,
         began: float,
     ) -> None:
         """Read a live source until it ends or `stopped`; drop the oldest frame of a full queue."""
-        last = time.monotonic()
-        try:
+        with contextlib.closing(opened.frames):
             for frame in opened.frames:
-                if stopped.is_set() or time.monotonic() - last >= self._live.silent_s:
-                    break  # also if the driver hung, and a new connection is in use
-                if 0 < self.config.stop <= self._seen:
-                    break
+                # Stopped also if the driver hung, and a new connection is in use
+                if stopped.is_set() or self._silent_s >= 0 or 0 < self.config.stop <= self._seen:
+                    return
                 if frame.image is None:
                     time.sleep(0.01)
                     continue
-                self._last_frame_s = last = time.monotonic()
+                self._last_frame_s = time.monotonic()
                 at = self._seen
                 self._seen += 1
                 if at < self.config.start or (at - self.config.start) % self.config.every:
@@ -466,13 +461,7 @@ class Video:
                         frames.get_nowait()
                         self.dropped += 1
                 # No other thread puts: it does not block
-                frames.put((at, last - began, frame.image()))
-        finally:
-            opened.frames.close()
-            while not stopped.is_set():  # None ends the iteration, after the waiting frames
-                with contextlib.suppress(queue.Full):
-                    frames.put(None, timeout=0.1)
-                    break
+                frames.put((at, self._last_frame_s - began, frame.image()))
 
     def _open(self) -> Opened:
         """Open the source.

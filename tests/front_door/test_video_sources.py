@@ -588,7 +588,13 @@ def test_depth_maps_and_masks_beside_images_are_no_frames(tmp_path: Path) -> Non
 
     named = write(tmp_path / "named", numbered("rgb_%d.png"))
     write(named, numbered("edges_%d.png"))
-    assert read(named, 6, "by its name").names == numbered("rgb_%d.png")
+    with pytest.raises(rt.ReobjError, match=r"two kinds of images, .*edges_0\.png"):
+        rt.Video(named)
+
+    nerf = write(tmp_path / "synthetic", numbered("r_%d.png"))
+    for name in ("r_%d_depth_0000.png", "r_%d_normal_0000.png"):  # in colour
+        write(nerf, numbered(name))
+    read(nerf, 6, "6 images are no frames (by its name", "6 images are no frames (by its name")
 
 
 def test_images_of_a_single_kind_are_frames(tmp_path: Path) -> None:
