@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import enum
 import glob
-import io
 import itertools
 import math
 import re
@@ -103,7 +102,14 @@ def _paths(path: Path) -> list[Path]:
 def _sized(
     source: str, files: list[Path], headers: dict[Path, Header | None], messages: list[str]
 ) -> ImageList:
-    """Sort files, and select those of the most common size."""
+    """Sort files, and select those of the most common size.
+
+    Raises:
+        ReobjError: too many sizes; a header declares too many pixels (decompression bomb).
+    """
+    for path, head in headers.items():
+        if head is not None and (pixels := math.prod(head.size)) > PIXELS_MAX:
+            raise ReobjError(f"{path}: {pixels} pixels, at most {PIXELS_MAX} are allowed")
     sizes = Counter(head.size for p in files if (head := headers[p]) is not None)
     size, most = max(sizes.items(), key=lambda item: (item[1], math.prod(item[0])),
                      default=((0, 0), 0))  # fmt: skip
@@ -324,14 +330,14 @@ class Header:
 
 
 @contextlib.contextmanager
-def _opened(file: Path | io.BytesIO) -> Iterator[PillowImage.Image]:
+def _opened(path: Path) -> Iterator[PillowImage.Image]:
     """Open an image without Pillow's warnings, and its limit of pixels, below that of phones."""
     with _open_lock, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         limit = PillowImage.MAX_IMAGE_PIXELS
         PillowImage.MAX_IMAGE_PIXELS = None
         try:
-            with PillowImage.open(file) as image:
+            with PillowImage.open(path) as image:
                 yield image
         finally:
             PillowImage.MAX_IMAGE_PIXELS = limit
@@ -359,9 +365,9 @@ def exif_orientation(path: Path) -> int:
     return 1
 
 
-def header(file: Path | io.BytesIO) -> Header | None:
+def header(path: Path) -> Header | None:
     """Read the header of an image file; None if Pillow cannot."""
-    with contextlib.suppress(Exception), _opened(file) as image:
+    with contextlib.suppress(Exception), _opened(path) as image:
         turned = image.format != "TIFF" and _orientation(image) >= 5  # Pillow turns TIFF itself
         return Header(
             image.size[::-1] if turned else image.size,
@@ -374,16 +380,9 @@ def header(file: Path | io.BytesIO) -> Header | None:
 
 
 def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> npt.NDArray[Any] | None:
-    """Read an image file with OpenCV's `flags`, faster than Pillow; None if it is no image.
-
-    Raises:
-        ReobjError: the header declares more than PIXELS_MAX pixels (decompression bomb).
-    """
+    """Read an image file with OpenCV's `flags`, faster than Pillow; None if it is no image."""
     try:
         data = np.fromfile(path, np.uint8)
-        declared = header(io.BytesIO(data.tobytes()))
-        if declared is not None and (pixels := math.prod(declared.size)) > PIXELS_MAX:
-            raise ReobjError(f"{path}: {pixels} pixels, at most {PIXELS_MAX} are allowed")
         image = cv2.imdecode(data, flags) if len(data) else None
     except (OSError, cv2.error):
         return None

@@ -115,10 +115,6 @@ class Clock:
     known: bool
 
 
-# Clocks of this process by path, fingerprint and frame to stop before
-_measured_clocks: dict[tuple[str, str, int], Clock] = {}
-
-
 class Video:
     """Iterate over the frames of a video file, image folder, glob, camera index or stream URL.
 
@@ -337,16 +333,8 @@ class Video:
                 return
 
     def _measured(self) -> Clock:
-        """Return the times of the frames; a file is decoded once per process."""
-        if self._clock is None:
-            for stop in (0, self.config.stop):
-                self._clock = self._clock or _measured_clocks.get(self._key(stop))
-        if self._clock is None:
-            self._clock = self._keep([frame.time_s for frame in self._decoded()])
-        return self._clock
-
-    def _key(self, stop: int) -> tuple[str, str, int]:
-        return os.path.abspath(self._address), self.fingerprint, stop
+        """Return the times of the frames; a file is decoded once."""
+        return self._clock or self._keep([frame.time_s for frame in self._decoded()])
 
     def _keep(self, raw_s: Sequence[float]) -> Clock:
         """Correct the times of the container, with warnings, and store them."""
@@ -360,14 +348,12 @@ class Video:
         if complete and not self._is_url and (text := self._missing_end(times_s)):
             self._warn(text)
         self._clock = Clock(times_s, complete, known)
-        if not self._is_url:
-            _measured_clocks[self._key(0 if complete else self.config.stop)] = self._clock
         return self._clock
 
     def _missing_end(self, times_s: Array) -> str:
         """Describe missing frames at the end of a file; "": none, or no evidence."""
         stored = self._stored()
-        last_s = float(times_s[-1]) if len(times_s) else 0.0
+        last_s = times_s.max(initial=0.0)
         fault = stored.fault
         if stored.last_s - last_s > max(2 / self._announced_fps, 0.02 * stored.last_s):
             fault = f"is damaged, frames up to {stored.last_s:.2f} s are stored"

@@ -139,16 +139,11 @@ def test_frame_count_and_times_are_those_of_the_decoded_frames(what: str, tmp_pa
         assert len(kept) == count and kept.messages == []
         said = {"the clock begins again": "clock restarts 1 time", "bare H.264": "no times"}
         assert len(video.messages) == (what in said) and said.get(what, "") in str(video.messages)
-        video_module_cache_cleared()
     late = rt.Video(path, rt.InputConfig(start=count - 2))
     assert [f.index for f in late] == [count - 2, count - 1]
     np.testing.assert_allclose([f.time_s for f in late], times_ms[-2:] / 1000, atol=2e-3)
     with pytest.raises(rt.ReobjError, match=f"--start {count}, but it has only {count} frames"):
         rt.Video(path, rt.InputConfig(start=count))
-
-
-def video_module_cache_cleared() -> None:
-    sources._measured_clocks.clear()
 
 
 def test_only_the_requested_range_is_decoded(
