@@ -85,7 +85,16 @@ from reobj.commands import (
     short_help,
     with_streams,
 )
-from reobj.files import Progress, atomic, load_cached, load_npz, part_path, save_npz, wrapped
+from reobj.files import (
+    Progress,
+    atomic,
+    load_cached,
+    load_npz,
+    part_path,
+    save_npz,
+    shortened,
+    wrapped,
+)
 from reobj.maps.corrections import corrected
 from reobj.maps.folder_map import FolderMap
 from reobj.maps.fusion import object_state
@@ -1803,16 +1812,29 @@ def _fit_objects(job: _Job, result: Result, links: Links | None = None) -> Resul
     edits = result.edits or kept_edits(job.workspace.out)
     with job.progress("objects", PhasesOfFit.TOTAL, counted=False) as line:
         phases = PhasesOfFit(line, result.poses)
-        result = dataclasses.replace(result, edits=edits)
-        fitted = link_and_fit(result, config.objects, phases, links)
+        views, warnings = _views_once(result.poses, job.video)
+        result = dataclasses.replace(result, edits=edits, warnings=[*result.warnings, *warnings])
+        once = dataclasses.replace(result, poses=views)
+        fitted = link_and_fit(once, config.objects, phases, links)
         gap = 0 if result.identities_given else config.output.fill_gaps
         tracks = fill(fitted, job.video.size, gap)
         detected = np.flatnonzero(tracks.detection_index >= 0)  # rows that were not filled in
         return dataclasses.replace(
             solve_again(fitted, config.objects),
+            poses=result.poses,
             tracks=tracks,
             embedding_row=detected[fitted.embedding_row],
         )
+
+
+def _views_once(poses: Poses | None, video: Video) -> tuple[Poses | None, list[str]]:
+    """Return the poses without those of copied images, and a warning about these."""
+    if poses is None:
+        return None, []
+    views = poses.without_copies(video.copies)
+    names = [video.name(frame) for frame in views.frame[poses.known & ~views.known].tolist()]
+    text = f"{len(names)} images are copies of others, of which each is one view: "
+    return views, [text + shortened(names)] if names else []
 
 
 def _warnings(config: Config, result: Result) -> list[str]:

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Make the pictures of docs/gallery.md: one frame of the overlay video of five real recordings.
 
-    python benchmarks/gallery.py DATA -o docs/img    # 5 minutes; needs PyAV (pip install av)
+    python benchmarks/gallery.py DATA -o docs/img    # 5 minutes
 
 Each recording is run as recordings.py does it, with recorded boxes of YOLOv8s or the small
 detector. The frame with the largest number of listed objects in view is taken. The scores are
@@ -50,7 +50,7 @@ def picture(out: Path, case: Case) -> Image:
     capture.set(cv2.CAP_PROP_POS_FRAMES, frame // case.every)
     known, image = capture.read()
     if not known:
-        raise SystemExit(f"{out}/overlay.mp4 has no frame {frame}; is PyAV installed?")
+        raise SystemExit(f"{out}/overlay.mp4 has no frame {frame}")
     scale = WIDTH / image.shape[1]
     method = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
     return np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=method), np.uint8)

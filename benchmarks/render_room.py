@@ -136,7 +136,7 @@ def build_parser() -> argparse.ArgumentParser:
         help="motion blur as a fraction of the frame interval",
     )
     add("--texels", type=float, default=base.texels_per_m, help="texture resolution per metre")
-    add("--crf", type=int, help="write H.264 of this quality with PyAV (pip install av), e.g. 26")
+    add("--crf", type=int, help="write H.264 of this quality with PyAV, e.g. 26")
     add("--own-world", action="store_true", help="poses in a world that begins at the first camera")
     add("--png", action="store_true", help="also write every frame as PNG")
     return parser

@@ -69,7 +69,7 @@ def build_parser() -> argparse.ArgumentParser:
         help="exact: boxes and scores without noise, no false positives; strongly occluded "
         "objects are still missed")  # fmt: skip
     add("--texels", type=float, default=base.texels_per_m, help="texture resolution per metre")
-    add("--crf", type=int, help="write H.264 of this quality with PyAV (pip install av), e.g. 26")
+    add("--crf", type=int, help="write H.264 of this quality with PyAV, e.g. 26")
     add("--png", action="store_true", help="also write every frame as PNG")
     return parser
 

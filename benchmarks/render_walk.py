@@ -17,9 +17,8 @@ On a machine with N cores, N processes (I = 1 .. N) and then one more:
 
 Frames depend on the options of the clip and their number only, so the parts fit; give all commands
 the same options. Each process builds the flat first (a minute, 1.1 GB) and then needs about a
-second per frame. Packets of the videos are copied with PyAV (pip install av); without it, the
-joined video is encoded a second time. `--stride 10` renders each tenth frame of the same path: a
-preview, whose video has a tenth of the frame rate. Conventions are those of render_room.py.
+second per frame. `--stride 10` renders each tenth frame of the same path: a preview, whose video
+has a tenth of the frame rate. Conventions are those of render_room.py.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ def build_parser() -> argparse.ArgumentParser:
         help="WIDTHxHEIGHT in pixels (default %(default)s)",
     )
     add("--texels", type=float, default=base.texels_per_m, help="texture resolution per metre")
-    add("--crf", type=int, help="write H.264 of this quality with PyAV (pip install av), e.g. 26")
+    add("--crf", type=int, help="write H.264 of this quality with PyAV, e.g. 26")
     either = parser.add_mutually_exclusive_group()
     either.add_argument("--part", metavar="I/N", help="render the I-th of N equal parts only")
     either.add_argument("--join", type=int, metavar="N", help="join N rendered parts")

@@ -14,7 +14,7 @@ import dataclasses
 import functools
 import signal
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -391,6 +391,27 @@ class Poses:
             visibility=np.column_stack([row_of[seen[:, 0]], np.searchsorted(kept, seen[:, 1])]),
             part=np.zeros(len(rows), np.int64),
             messages=(),
+        )
+
+    def without_copies(self, copies: Mapping[int, int]) -> Poses:
+        """Return the poses without those of copies of an image, which show nothing new.
+
+        Args:
+            copies: numbers of frames, and of the frame that each is a copy of. Images to which the
+                user gave different poses are no copies.
+        """
+        row_of = {number: row for row, number in enumerate(self.frame.tolist())}
+        lost = np.zeros(len(self.frame), bool)
+        for copy, first in copies.items():
+            if copy in row_of and first in row_of:
+                pair = self.cam_from_world[[row_of[copy], row_of[first]]]
+                is_same = self.source != "user" or np.allclose(*pair)
+                lost[row_of[copy]] = np.isfinite(pair).all() and is_same
+        return dataclasses.replace(
+            self,
+            cam_from_world=np.where(lost[:, None, None], np.nan, self.cam_from_world),
+            status=np.where(lost, "none", self.status),
+            visibility=self.visibility[~lost[self.visibility[:, 0]]],
         )
 
     @property

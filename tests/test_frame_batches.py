@@ -296,7 +296,7 @@ def test_a_live_source_is_not_delayed(clip: Path) -> None:
     noted = Noted()
     video = Counted(clip)
     video.is_live = True
-    video.__dict__["_from_live"] = video._from_capture
+    video.__dict__["_from_live"] = video._from_images
     for frame, _ in rt.track(video, noted.source, rt.Tracker()):
         assert noted.batches[-1] == [frame.index] and Counted.read == frame.index + 1
     assert len(noted.batches) == 6

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import av
 import cv2
 import numpy as np
 
@@ -190,17 +190,11 @@ def join_detections(paths: Sequence[Path], firsts: Sequence[int], out: Path) -> 
 def join_videos(
     paths: Sequence[Path], target: Path, config: RoomConfig, firsts: Sequence[int]
 ) -> None:
-    """Copy the packets of all videos to one with PyAV; encode again with OpenCV where there is
-    none.
+    """Copy the packets of all videos to one.
 
     Raises: ValueError if the joined video lacks frames.
     """
-    try:
-        av: Any = importlib.import_module("av")
-    except ImportError:
-        encode_again(paths, target, config)
-    else:
-        copy_packets(av, paths, target, config, firsts)
+    copy_packets(paths, target, config, firsts)
     capture = cv2.VideoCapture(str(target))
     count = 0
     while capture.grab():
@@ -210,22 +204,8 @@ def join_videos(
         raise ValueError(f"{target}: {count} frames instead of {firsts[-1]}")
 
 
-def encode_again(paths: Sequence[Path], target: Path, config: RoomConfig) -> None:
-    """Decode all videos and write their frames to one."""
-    writer = VideoSink(target, config)
-    for path in paths:
-        capture = cv2.VideoCapture(str(path))
-        while True:
-            good, image = capture.read()
-            if not good:
-                break
-            writer.write(np.asarray(image, np.uint8))
-        capture.release()
-    writer.close()
-
-
 def copy_packets(
-    av: Any, paths: Sequence[Path], target: Path, config: RoomConfig, firsts: Sequence[int]
+    paths: Sequence[Path], target: Path, config: RoomConfig, firsts: Sequence[int]
 ) -> None:
     """Write the packets of all videos, which have the same codec and settings, to one video."""
     with av.open(str(target), "w", options={"movflags": "+faststart"}) as joined:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import sys
 from collections.abc import Callable, Sequence
@@ -11,6 +10,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import av
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -173,11 +173,7 @@ class VideoSink:
             if not self._file.isOpened():
                 raise OSError(f"{path}: this OpenCV cannot write MPEG-4 video")
             return
-        try:
-            self._av = importlib.import_module("av")
-        except ImportError as error:
-            raise ImportError("--crf needs PyAV: pip install av") from error
-        self._file = self._av.open(str(path), "w", options={"movflags": "+faststart"})
+        self._file = av.open(str(path), "w", options={"movflags": "+faststart"})
         options = {"crf": str(crf), "preset": "veryslow", "threads": "1"}
         rate = Fraction(config.fps).limit_denominator(1000)
         self._stream = self._file.add_stream("libx264", rate=rate, options=options)
@@ -190,7 +186,7 @@ class VideoSink:
         if self._stream is None:
             self._file.write(image)
             return
-        frame = self._av.VideoFrame.from_ndarray(image, format="bgr24")
+        frame = av.VideoFrame.from_ndarray(image, format="bgr24")
         self._file.mux(self._stream.encode(frame))
 
     def close(self) -> None:

@@ -55,9 +55,14 @@ def film_layers(text: str) -> frozenset[str]:
 
 # ---- Boxes and labels --------------------------------------------------------------------------
 
-FONT = (cv2.FONT_HERSHEY_SIMPLEX, 0.45)  # and its scale: readable at 640 px width
+FONT = cv2.FONT_HERSHEY_SIMPLEX
 SMALL_AREA = 4  # relative to that of a label: a label would cover a quarter of the box or more
 DIRECTIONS = np.array([[0, -1], [0, 1], [1, 0], [-1, 0], [1, -1], [-1, -1], [1, 1], [-1, 1]])
+
+
+def _width_of(image: Image) -> int:
+    """Return the width of a thin line, px: large frames are shown shrunk to some 1280 px."""
+    return max(1, int(max(image.shape)) // 1280)
 
 
 def draw_tracks(
@@ -92,12 +97,13 @@ def draw_tracks(
     for obj, box, score in zip(ids, boxes, scores, strict=True):
         _draw_box(image, box, object_color(obj), 1 if obj in thin else 2, dashed=score == 0)
         if obj in marks:  # 1 px between both outlines
-            _draw_box(image, box + np.array([-4, -4, 4, 4]), marks[obj], 2, dashed=False)
+            margin = 4 * _width_of(image) * np.array([-1, -1, 1, 1])
+            _draw_box(image, box + margin, marks[obj], 2, dashed=False)
     ids = [*ids, *former]
     boxes = np.array([*boxes, *former.values()], int).reshape(-1, 4)
     positions = {} if positions is None else positions
     texts = [labels.get(obj, str(obj)) for obj in ids]
-    sizes = np.array([_text_size(text) for text in texts], int).reshape(-1, 2)
+    sizes = np.array([_text_size(image, text) for text in texts], int).reshape(-1, 2)
     spots = place_labels(ids, sizes, boxes, (image.shape[1], image.shape[0]), positions)
     for obj, text, spot, size, box in zip(ids, texts, spots, sizes, boxes, strict=True):
         if spot is not None:
@@ -109,7 +115,8 @@ def draw_tracks(
 def _draw_box(image: Image, box: IntArray, color: Color, thickness: int, dashed: bool) -> None:
     x1, y1, x2, y2 = box.tolist()
     if not dashed:
-        cv2.rectangle(image, (x1, y1), (x2, y2), color, thickness, cv2.LINE_AA)
+        width = thickness * _width_of(image)
+        cv2.rectangle(image, (x1, y1), (x2, y2), color, width, cv2.LINE_AA)
         return
     corners = np.array([[x1, y1], [x2, y1], [x2, y2], [x1, y2], [x1, y1]])
     for side in itertools.pairwise(corners):
@@ -117,31 +124,39 @@ def _draw_box(image: Image, box: IntArray, color: Color, thickness: int, dashed:
 
 
 def _draw_dashes(image: Image, line: Array | IntArray, color: Color, thickness: int) -> None:
-    """Draw a polyline (n, 2), pixels, with dashes and gaps of 6 px."""
+    """Draw a polyline (n, 2), pixels, with dashes and gaps of 6 px (small frames)."""
     length = np.linalg.norm(np.diff(line, axis=0), axis=1)
     along = np.concatenate([[0.0], length.cumsum()])  # (n,)
-    steps = max(1, int(along[-1] / 6))
+    width = _width_of(image)
+    steps = max(1, int(along[-1] / (6 * width)))
     at = np.linspace(0, along[-1], steps + 1)
     points = np.column_stack([np.interp(at, along, line[:, k]) for k in (0, 1)])
     points = points.round().astype(np.int32)  # (steps + 1, 2)
     dashes = [points[i : i + 2] for i in range(0, steps, 2)]
-    cv2.polylines(image, dashes, False, color, thickness, cv2.LINE_AA)
+    cv2.polylines(image, dashes, False, color, thickness * width, cv2.LINE_AA)
 
 
-def _text_size(text: str) -> tuple[int, int]:
+def _text_size(image: Image, text: str) -> tuple[int, int]:
     """Return the width and height of a label."""
-    (width, height), base = cv2.getTextSize(text, *FONT, 1)
-    return width + 4, height + base + 2
+    width = _width_of(image)
+    (wide, high), base = cv2.getTextSize(text, FONT, 0.45 * width, width)
+    return wide + 4 * width, high + base + 2 * width
+
+
+def _draw_text(image: Image, text: str, left: int, bottom: int, color: Color) -> None:
+    width = _width_of(image)
+    scale = 0.45 * width  # readable in a frame of 640 px
+    base = cv2.getTextSize(text, FONT, scale, width)[1]
+    cv2.putText(image, text, (left, bottom - base), FONT, scale, color, width, cv2.LINE_AA)
 
 
 def _draw_label(image: Image, text: str, spot: tuple[int, int], color: Color) -> None:
     """Draw text on a filled rectangle with its top-left corner at `spot`."""
     x, y = spot
-    width, height = _text_size(text)
+    width, height = _text_size(image, text)
     cv2.rectangle(image, (x, y), (x + width - 1, y + height - 1), color, -1)
     ink = (0,) * 3 if sum(color) > 380 else (255,) * 3  # black on light colours
-    _, base = cv2.getTextSize(text, *FONT, 1)
-    cv2.putText(image, text, (x + 2, y + height - base), *FONT, ink, 1, cv2.LINE_AA)
+    _draw_text(image, text, x + 2 * _width_of(image), y + height, ink)
 
 
 def place_labels(
@@ -202,7 +217,7 @@ def _draw_leader(image: Image, label: IntArray, box: IntArray, color: Color) -> 
     end = nearest.clip(box[:2], box[2:])
     if np.abs(nearest - end).max() > 2:
         start, stop = (tuple(p.round().astype(int).tolist()) for p in (nearest, end))
-        cv2.line(image, start, stop, color, 1, cv2.LINE_AA)
+        cv2.line(image, start, stop, color, _width_of(image), cv2.LINE_AA)
 
 
 # ---- Ellipses ----------------------------------------------------------------------------------
@@ -220,7 +235,8 @@ def draw_ellipses(
     for conic, wanted, obj in zip(dual_c, drawn, object_id, strict=True):
         shape = ellipse_of_dual_conic(conic) if wanted else None
         if shape is not None and max(shape[1]) < _max_outline(image):
-            cv2.ellipse(image, shape, object_color(obj), 2 if obj in seen else 1, cv2.LINE_AA)
+            width = _width_of(image) * (2 if obj in seen else 1)
+            cv2.ellipse(image, shape, object_color(obj), width, cv2.LINE_AA)
 
 
 def _max_outline(image: Image) -> int:
@@ -409,9 +425,10 @@ def draw_wireframes(
         shown = front[rows][within[rows]]
         color = object_color(obj)
         dim = tuple(int(0.6 * c) for c in color)
+        width = _width_of(image)
         if obj in seen:
-            cv2.polylines(image, list(lines[~shown]), False, dim, 1, cv2.LINE_AA, shift)
-        width = 2 if obj in seen else 1
+            cv2.polylines(image, list(lines[~shown]), False, dim, width, cv2.LINE_AA, shift)
+        width *= 2 if obj in seen else 1
         cv2.polylines(image, list(lines[shown]), False, color, width, cv2.LINE_AA, shift)
 
 
@@ -589,7 +606,7 @@ class Overlay:
     """
 
     def __init__(self, result: Result, path: Path, video: Video, layers: str = "solids") -> None:
-        """Open the video; the suffix of `path` is replaced by that of the available format."""
+        """Open the video."""
         self.fps = film_fps(video)
         self.writer = FilmWriter(path, self.fps, video.size)
         self.path = self.writer.path
@@ -680,7 +697,8 @@ class Overlay:
             trail.append((now, box.reshape(2, 2).mean(0)))
             trail[:] = [step for step in trail if step[0] >= now - self.fps]
             line = np.array([center for _, center in trail]).round().astype(np.int32)  # (n, 2)
-            cv2.polylines(image, [line], False, object_color(obj), 2, cv2.LINE_AA)
+            width = 2 * _width_of(image)
+            cv2.polylines(image, [line], False, object_color(obj), width, cv2.LINE_AA)
 
     def close(self, complete: bool) -> None:
         """Finish the video; the file appears only if it is complete."""
@@ -773,29 +791,29 @@ def _legend(result: Result, layers: frozenset[str], former: set[int]) -> list[tu
 
 def draw_legend(image: Image, lines: Sequence[tuple[str, str]]) -> None:
     """Draw a legend on a dark panel at the bottom left, in place."""
-    line_px = 20  # height of a line
-    sample_px = 30  # width of the sample beside its text
+    px = _width_of(image)
+    line_px = 20 * px  # height of a line
+    sample_px = 30 * px  # width of the sample beside its text
     color = object_color(1)
-    width = sample_px + 16 + max(_text_size(text)[0] for _, text in lines)
-    height = line_px * len(lines) + 8
-    top = max(0, image.shape[0] - height - 6)
-    panel = image[top : top + height, 6 : 6 + width]
+    width = sample_px + 16 * px + max(_text_size(image, text)[0] for _, text in lines)
+    height = line_px * len(lines) + 8 * px
+    top = max(0, image.shape[0] - height - 6 * px)
+    panel = image[top : top + height, 6 * px : 6 * px + width]
     panel[:] = panel // 4
     for k, (kind, text) in enumerate(lines):
-        x = 12
-        y = top + 4 + line_px * k
-        box = np.array([x, y + 4, x + sample_px - 8, y + line_px - 5])
+        x = 12 * px
+        y = top + 4 * px + line_px * k
+        right = x + sample_px - 8 * px
+        box = np.array([x, y + 4 * px, right, y + line_px - 5 * px])
         if kind in ("box", "dashed"):
             _draw_box(image, box, color, 1 + (len(lines) == 1), kind == "dashed")
         elif kind in ("moved", "new"):
-            _draw_box(image, box + np.array([3, 3, -3, -3]), color, 1, dashed=False)
+            _draw_box(image, box + 3 * px * np.array([1, 1, -1, -1]), color, 1, dashed=False)
             _draw_box(image, box, CHANGE_COLORS[kind], 2, dashed=False)
         elif kind in ("was", "gone"):
             _draw_box(image, box, CHANGE_COLORS[kind], 2, dashed=True)
         else:
             middle = y + line_px // 2
-            thickness = 1 if kind == "thin" else 2
-            cv2.line(image, (x, middle), (x + sample_px - 8, middle), color, thickness,
-                     cv2.LINE_AA)  # fmt: skip
-        at = (x + sample_px, y + line_px - 6)
-        cv2.putText(image, text, at, *FONT, (255, 255, 255), 1, cv2.LINE_AA)
+            thickness = px if kind == "thin" else 2 * px
+            cv2.line(image, (x, middle), (right, middle), color, thickness, cv2.LINE_AA)
+        _draw_text(image, text, x + sample_px, y + line_px, (255, 255, 255))

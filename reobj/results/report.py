@@ -32,7 +32,7 @@ def summary(result: Result) -> str:
     if result.changes is not None:
         lines += _wrapped(result.changes.summary())
     if result.out is not None:
-        names = ("scene.html", "overlay.mp4", "overlay.webm", "objects.json")
+        names = ("scene.html", "overlay.mp4", "objects.json")
         files = [result.out / name for name in names]
         lines.append("look at: " + ", ".join(str(file) for file in files if file.exists()))
     if counted:

@@ -11,9 +11,10 @@ import glob
 import itertools
 import math
 import re
-import struct
+import threading
+import warnings
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,9 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
+from PIL import Image as PillowImage
 
+from reobj.files import shortened
 from reobj.types import Array, ReobjError
 
 IMAGE_FPS = 30.0  # Hz, rate of images without times; chosen: most phones record at 30 Hz
@@ -63,7 +66,9 @@ def list_images(source: str) -> ImageList:
         suffix = path.suffix.lower()
         if suffix in unread and suffix != ".gif":  # .gif is read as a video
             raise ReobjError(f"{source}: {path.suffix} files are not read; convert it to .jpg")
-        return _sized(source, [path] if suffix in IMAGE_SUFFIXES else [], {path: header(path)}, [])
+        head = header(path) if suffix in IMAGE_SUFFIXES else None
+        is_video = suffix not in IMAGE_SUFFIXES or (head is not None and head.frames > 1)
+        return _sized(source, [] if is_video else [path], {path: head}, [])
     if not path.is_dir() and not re.search(r"[*?\[]", source):
         return ImageList([], [], [])
     paths = [p for p in _paths(path) if not p.name.startswith(".")]
@@ -78,6 +83,9 @@ def list_images(source: str) -> ImageList:
         fault = f"no images there (looked for {' '.join(IMAGE_SUFFIXES)})"
         raise ReobjError("; ".join([f"{source}: {fault}", *messages, *more]))
     headers = {p: header(p) for p in files}
+    if animated := [p.name for p in files if (h := headers[p]) is not None and h.frames > 1]:
+        messages.append(f"of {len(animated)} animated files only the first frame is read: "
+                        f"{shortened(animated)}")  # fmt: skip
     files, left_out = _only_pictures(files, headers, source if path.is_dir() else "")
     return _sized(source, files, headers, messages + left_out)
 
@@ -94,7 +102,14 @@ def _paths(path: Path) -> list[Path]:
 def _sized(
     source: str, files: list[Path], headers: dict[Path, Header | None], messages: list[str]
 ) -> ImageList:
-    """Sort files, and select those of the most common size."""
+    """Sort files, and select those of the most common size.
+
+    Raises:
+        ReobjError: too many sizes; a header declares too many pixels (decompression bomb).
+    """
+    for path, head in headers.items():
+        if head is not None and (pixels := math.prod(head.size)) > PIXELS_MAX:
+            raise ReobjError(f"{path}: {pixels} pixels, at most {PIXELS_MAX} are allowed")
     sizes = Counter(head.size for p in files if (head := headers[p]) is not None)
     size, most = max(sizes.items(), key=lambda item: (item[1], math.prod(item[0])),
                      default=((0, 0), 0))  # fmt: skip
@@ -112,13 +127,21 @@ def _sized(
 
 # ---- Which images are frames ---------------------------------------------------------------------
 
+# Of names of images that are no pictures: 7-Scenes, ScanNet, 3D Scanner App, NeRFCapture, DAVIS,
+# Replica, Hypersim, Record3D
+OTHER_WORDS = frozenset(
+    "depth depthmap disp disparity conf confidence mask masks matte alpha seg segm segmentation "
+    "semantic semantics label labels instance instances panoptic normal normals thumb thumbs "
+    "thumbnail preview ir infrared flow albedo uncertainty".split()
+)
+
 
 @dataclass(slots=True)
 class _Kind:
     """Images whose names differ only in their numbers."""
 
     files: list[Path]
-    words: set[str]
+    is_named_otherwise: bool
     numbers: set[tuple[int, ...]]
     color: bool
 
@@ -126,24 +149,6 @@ class _Kind:
         """Test whether more than half of the smaller (min) or larger (max) kind shares numbers."""
         count = least(len(self.numbers), len(other.numbers))
         return () not in self.numbers and 2 * len(self.numbers & other.numbers) > count
-
-    @property
-    def is_named_otherwise(self) -> bool:
-        """Test for a word for images that are no pictures.
-
-        Those of 7-Scenes, ScanNet, 3D Scanner App, NeRFCapture, DAVIS, Replica, Hypersim, Record3D.
-        """
-        words = (
-            "depth depthmap disp disparity conf confidence mask masks matte alpha seg segm "
-            "segmentation semantic semantics label labels instance instances panoptic normal "
-            "normals thumb thumbs thumbnail preview ir infrared flow albedo uncertainty"
-        )
-        return not self.words.isdisjoint(words.split())
-
-    def is_named_picture(self, other: _Kind) -> bool:
-        """Test whether these names have a word for pictures that the other names lack."""
-        pictures = {"color", "colour", "rgb", "image", "img", "frame", "photo"}
-        return bool((self.words - other.words) & pictures)
 
 
 def _only_pictures(
@@ -157,7 +162,7 @@ def _only_pictures(
         the pictures, and messages.
     """
     messages = []
-    deep = [p for p in files if (h := headers[p]) is not None and h.channels == 1 and h.bits > 8]
+    deep = [p for p in files if (h := headers[p]) is not None and h.is_deep]
     if len(deep) == len(files):
         messages.append("images of one channel with more than 8 bits are taken as pictures; are "
                         "they depth maps? Then give those in colour")  # fmt: skip
@@ -165,28 +170,21 @@ def _only_pictures(
         files = [p for p in files if p not in set(deep)]
         messages.append(_left_out(deep, "one channel with more than 8 bits, as depth maps have"))
     kinds = _kinds(files, headers)
-    any_color = any(kind.color for kind in kinds)
     for kind in list(kinds):
-        others = [k for k in kinds if k is not kind]
-        gray = any_color and not kind.color
+        beside = [k for k in kinds if k is not kind and kind.shares(k, min)]
         named = kind.is_named_otherwise
-        beside = [k for k in others if kind.shares(k, min)]
-        if gray and (named or any(k.color for k in beside)):
-            messages.append(_left_out(kind.files, "one channel, beside images in colour"))
-            kinds.remove(kind)
-        elif named and any(not k.is_named_otherwise for k in beside):
-            messages.append(_left_out(kind.files, "by its name; others have the same numbers"))
+        why = ""
+        if not kind.color and any(k.color for k in (kinds if named else beside)):
+            why = "one channel, beside images in colour"
+        elif named and not all(k.is_named_otherwise for k in beside):
+            why = "by its name; others have the same numbers"
+        if why:
+            messages.append(_left_out(kind.files, why))
             kinds.remove(kind)
     least = 3  # images of each of two kinds: the numbers of fewer may agree by chance
-    for kind in list(kinds) if folder else ():
-        rivals = [k for k in kinds if k is not kind and kind.shares(k, max)]
-        rivals = [k for k in rivals if min(len(k.files), len(kind.files)) >= least]
-        if any(k.is_named_picture(kind) and not kind.is_named_picture(k) for k in rivals):
-            messages.append(_left_out(kind.files, "by its name; others have the same numbers"))
-            kinds.remove(kind)
-    for kind, other in itertools.combinations(kinds if folder else (), 2):
-        if kind.shares(other, max) and min(len(kind.files), len(other.files)) >= least:
-            names = [min((p.name for p in k.files), key=by_number) for k in (kind, other)]
+    for pair in itertools.combinations(kinds if folder else (), 2):
+        if pair[0].shares(pair[1], max) and min(len(k.files) for k in pair) >= least:
+            names = [min((p.name for p in k.files), key=by_number) for k in pair]
             raise ReobjError(
                 f"{folder}: two kinds of images, {' and '.join(names)}; which are the frames? "
                 f"Give a glob in quotes, such as '{Path(folder) / _glob_of(names[0])}'"
@@ -207,11 +205,13 @@ def _kinds(files: Sequence[Path], headers: dict[Path, Header | None]) -> list[_K
         groups.setdefault(re.sub(r"\d+", "#", stem) + path.suffix.lower(), []).append((path, stem))
     kinds = []
     for text, members in groups.items():
-        numbers = {tuple(map(int, re.findall(r"\d+", stem))) for _, stem in members}
+        rows = np.array([re.findall(r"\d+", stem) for _, stem in members], object)
+        varied = [len(set(column)) > 1 for column in rows.T.tolist()] if len(rows) > 1 else ...
+        numbers = {tuple(map(int, row)) for row in rows[:, varied].tolist()}
         known = [h for path, _ in members if (h := headers[path]) is not None]
-        color = 2 * sum(h.channels == 1 for h in known) <= len(known)
-        words = set(re.split(r"[^a-z]+", text.rpartition(".")[0]))
-        kinds.append(_Kind([path for path, _ in members], words, numbers, color))
+        color = 2 * sum(h.is_gray for h in known) <= len(known)
+        named = not OTHER_WORDS.isdisjoint(re.split(r"[^a-z]+", text.rpartition(".")[0]))
+        kinds.append(_Kind([path for path, _ in members], named, numbers, color))
     return kinds
 
 
@@ -309,111 +309,89 @@ def times_of_names(names: Sequence[str]) -> Array | None:
 # ---- Reading -------------------------------------------------------------------------------------
 
 PIXELS_MAX = 1 << 28  # pixels of an image; chosen: above the 200 megapixels of phones; 800 MB (BGR)
+_open_lock = threading.Lock()  # of the settings of Pillow and of warnings
+# suppress(Exception) below: Pillow raises ten types of errors for damaged files
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """Header of an image file.
+
+    Attributes:
+        size: (w, h) in px, upright. frames: of an animated file, else 1.
+        is_gray: one channel; also with a palette: masks use palettes, photos do not.
+        is_deep: one channel of more than 8 bits.
+    """
+
+    size: tuple[int, int]
+    is_gray: bool = False
+    is_deep: bool = False
+    frames: int = 1
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[PillowImage.Image]:
+    """Open an image without Pillow's warnings, and its limit of pixels, below that of phones."""
+    with _open_lock, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        limit = PillowImage.MAX_IMAGE_PIXELS
+        PillowImage.MAX_IMAGE_PIXELS = None
+        try:
+            with PillowImage.open(path) as image:
+                yield image
+        finally:
+            PillowImage.MAX_IMAGE_PIXELS = limit
+
+
+def _orientation(image: PillowImage.Image) -> int:
+    """Return EXIF's orientation; 1 (upright) where there is none, or damaged EXIF."""
+    exif = PillowImage.Exif()
+    with contextlib.suppress(Exception):
+        # Not getexif(): of a PNG it decodes the pixels, and it reads XMP, which OpenCV does not
+        exif.load(image.info.get("exif", b""))
+        value: Any = exif.get(274) or (image.getexif().get(274) if image.format == "TIFF" else 1)
+        return int(value) if value in range(1, 9) else 1
+    return 1
+
+
+def exif_orientation(path: Path) -> int:
+    """Return the EXIF orientation of a photo, 1 to 8; 1 (upright) where there is none.
+
+    `read_image` returns images upright: 2 to 4 are mirrored or turned by 180 deg, 5 to 8 have width
+    and height exchanged. 6 turns the stored pixels clockwise, 8 anticlockwise.
+    """
+    with contextlib.suppress(Exception), _opened(path) as image:
+        return _orientation(image)
+    return 1
+
+
+def header(path: Path) -> Header | None:
+    """Read the header of an image file; None if Pillow cannot."""
+    with contextlib.suppress(Exception), _opened(path) as image:
+        turned = image.format != "TIFF" and _orientation(image) >= 5  # Pillow turns TIFF itself
+        return Header(
+            image.size[::-1] if turned else image.size,
+            image.mode[0] in "1LPIF" and image.mode != "LAB",
+            image.mode[0] in "IF",
+            # The second picture of a JPEG (MPO) is a preview or a gain map
+            1 if image.format == "MPO" else getattr(image, "n_frames", 1),
+        )
+    return None
 
 
 def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> npt.NDArray[Any] | None:
-    """Read an image file with OpenCV's `flags`; None if it is no image.
-
-    Raises:
-        ReobjError: the header declares more than PIXELS_MAX pixels (decompression bomb).
-    """
+    """Read an image file with OpenCV's `flags`, faster than Pillow; None if it is no image."""
     try:
         data = np.fromfile(path, np.uint8)
-        declared = header_of(data.tobytes())
-        if declared is not None and (pixels := math.prod(declared.size)) > PIXELS_MAX:
-            raise ReobjError(f"{path}: {pixels} pixels, at most {PIXELS_MAX} are allowed")
         image = cv2.imdecode(data, flags) if len(data) else None
     except (OSError, cv2.error):
         return None
     return None if image is None else np.asarray(image)
 
 
-@dataclass(frozen=True, slots=True)
-class Header:
-    """Header of an image file: (w, h) in px, upright; channels without alpha; bits of each.
-
-    Images with a palette have one channel: masks use palettes, photos do not.
-    """
-
-    size: tuple[int, int]
-    channels: int = 3
-    bits: int = 8
-
-
-def header(path: Path) -> Header | None:
-    """Read the header of an image file; None for unknown formats."""
-    with contextlib.suppress(OSError), path.open("rb") as file:
-        data = b""
-        # Bytes of headers without, and of those with a photo's thumbnail; the whole file
-        for count in (1 << 12, 1 << 17, -1):
-            data += file.read(count)
-            head = header_of(data)
-            if head is not None and min(head.size) > 0:
-                return head
-    return None
-
-
-def header_of(data: bytes) -> Header | None:
-    """Read the header of an image of IMAGE_SUFFIXES; None if truncated or of another format."""
-    with contextlib.suppress(struct.error, IndexError):
-        if data.startswith(b"\x89PNG"):
-            width, height, bits, kind = struct.unpack_from(">IIBB", data, 16)
-            return Header((width, height), 3 if kind in (2, 6) else 1, bits)
-        if data.startswith(b"BM"):
-            width, height, _, bits = struct.unpack_from("<iiHH", data, 18)
-            return Header((abs(width), abs(height)), 3 if bits > 8 else 1)
-        if data.startswith(b"\xff\xd8"):
-            return _jpeg_header(data)
-        if data[:4] in (b"II*\0", b"MM\0*"):
-            tags = _tiff_tags(data)
-            channels = tags.get(277, 1)
-            bits = tags.get(258, 1)
-            bits = bits if channels == 1 else 8
-            return Header(_upright((tags.get(256, 0), tags.get(257, 0)), tags), channels, bits)
-        if data[8:15] == b"WEBPVP8":
-            return Header(_webp_size(data))
-    return None
-
-
-def _upright(size: tuple[int, int], tags: dict[int, int]) -> tuple[int, int]:
-    """Rotate (w, h) by EXIF's orientation, tag 274: 5 to 8 are quarter turns."""
-    return size[::-1] if 5 <= tags.get(274, 1) <= 8 else size
-
-
-def _jpeg_header(data: bytes) -> Header:
-    """Read the first start-of-frame segment, and the EXIF segment before it."""
-    at = 2
-    tags = dict[int, int]()
-    others = (0xC4, 0xC8, 0xCC)  # within the range of start-of-frame markers: tables
-    while data[at] == 0xFF and not (0xC0 <= data[at + 1] <= 0xCF and data[at + 1] not in others):
-        length = struct.unpack_from(">H", data, at + 2)[0]
-        if data[at + 4 : at + 10] == b"Exif\0\0":
-            with contextlib.suppress(struct.error, IndexError):  # EXIF is optional
-                tags = _tiff_tags(data[at + 10 : at + 2 + length])
-        at += 2 + length
-    bits, height, width, channels = struct.unpack_from(">BHHB", data, at + 4)
-    return Header(_upright((width, height), tags), channels, bits)
-
-
-def _tiff_tags(data: bytes) -> dict[int, int]:
-    """Read the tags of the first directory whose value is a single number."""
-    order = "<" if data[:1] == b"I" else ">"
-    (start,) = struct.unpack_from(order + "I", data, 4)
-    (count,) = struct.unpack_from(order + "H", data, start)
-    tags = [struct.unpack_from(order + "HHII", data, start + 2 + 12 * i) for i in range(count)]
-    return {
-        tag: value >> 16 * (kind == 3 and order == ">") for tag, kind, n, value in tags if n == 1
-    }
-
-
-def _webp_size(data: bytes) -> tuple[int, int]:
-    """Return (w, h) of an extended, lossless or lossy WebP image."""
-    if data[15:16] == b"X":
-        width, height = (int.from_bytes(data[i : i + 3], "little") + 1 for i in (24, 27))
-    elif data[15:16] == b"L":
-        (bits,) = struct.unpack_from("<I", data, 21)
-        width = (bits & 0x3FFF) + 1
-        height = (bits >> 14 & 0x3FFF) + 1
-    else:
-        width, height = (side & 0x3FFF for side in struct.unpack_from("<HH", data, 26))
-    return width, height
+def why_unreadable(path: Path) -> str:
+    """Say why `read_image` returns no image in colour."""
+    image = read_image(path, cv2.IMREAD_UNCHANGED)
+    if image is None:
+        return "damaged, or no image"
+    return f"pixels of type {image.dtype}; convert them to 8 bits a channel"

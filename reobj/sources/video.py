@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import dataclasses
+import filecmp
 import functools
 import glob
 import hashlib
@@ -19,9 +20,11 @@ import queue
 import re
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -30,14 +33,25 @@ import numpy as np
 
 from reobj.files import shortened
 from reobj.runtime import check_versions, guard_forks, quiet_opencv
-from reobj.sources.container_files import holds_pictures_only, missing_bytes, settled_times
+from reobj.sources.decoding import (
+    Decoded,
+    Opened,
+    Stored,
+    open_animation,
+    open_camera,
+    open_file,
+    settled_times,
+    stored_in,
+)
 from reobj.sources.image_files import (
     IMAGE_FPS,
+    IMAGE_SUFFIXES,
     PIXELS_MAX,
     ImageList,
     list_images,
     read_image,
     times_of_names,
+    why_unreadable,
 )
 from reobj.types import (
     Array,
@@ -77,8 +91,7 @@ class LiveTimes:
     Attributes:
         silent_s: s without a frame after which it has ended. Lower: a short break of the network
             ends the run; higher: a run waits longer for a camera that was switched off.
-        open_s: s to open a stream, and to read from it. Cameras answer within 2 s; OpenCV's
-            default is 30 s.
+        open_s: s to open a stream, and to read from it. Cameras answer within 2 s.
         first_wait_s, longest_wait_s: s before the first attempt to reconnect, doubled for each next
             one, and its maximum. Lower: more load on a server that is down; higher: more frames are
             lost after a short break.
@@ -100,10 +113,6 @@ class Clock:
     times_s: Array
     complete: bool
     known: bool
-
-
-# Clocks of this process by path, fingerprint and frame to stop before
-_measured_clocks: dict[tuple[str, str, int], Clock] = {}
 
 
 class Video:
@@ -155,7 +164,7 @@ class Video:
         self.skipped: list[int] = []
         self.messages: list[str] = []
         self.read = self.dropped = self._seen = 0
-        self._opened: Any = None  # capture of a live source, until it is iterated
+        self._opened: Opened | None = None  # a live source, until it is iterated
         self._is_url = _is_stream_url(self._address)
         self.fingerprint = source_fingerprint(source)
         images = ImageList([], [], []) if self._is_url else list_images(self.source)
@@ -207,11 +216,27 @@ class Video:
         return max(math.ceil((stop - self.config.start) / self.config.every), 0)
 
     @functools.cached_property
+    def copies(self) -> dict[int, int]:
+        """Frame numbers of images with the same bytes as an earlier one, and of that one."""
+        first = dict[tuple[int, str], int]()
+        copies = {}
+        sizes = [path.stat().st_size for path in self.files]
+        usual = Counter(sizes)
+        for k, path in enumerate(self.files):
+            if usual[sizes[k]] > 1:
+                number = first.setdefault((sizes[k], content_fingerprint([path])), k)
+                if number != k and filecmp.cmp(path, self.files[number], shallow=False):
+                    copies[k] = number
+        return copies
+
+    @functools.cached_property
     def frame_count(self) -> int:
         if self.files or self.is_live:
             return len(self.files)
         clock = self._measured()
-        return len(clock.times_s) if clock.complete else max(len(clock.times_s), self._packets()[0])
+        return (
+            len(clock.times_s) if clock.complete else max(len(clock.times_s), self._stored().count)
+        )
 
     @functools.cached_property
     def fps(self) -> float:
@@ -240,84 +265,76 @@ class Video:
 
     def __iter__(self) -> Iterator[Frame]:
         self.skipped.clear()
-        decoded = self._from_live() if self.is_live else self._from_capture()
-        if self.files:
-            stop = min(self.config.stop or self.frame_count, self.frame_count)
-            numbers = range(self.config.start, stop, self.config.every)
-            times_s = np.arange(stop) / IMAGE_FPS if self.times_s is None else self.times_s
-            decoded = ((i, float(times_s[i]), read_image(self.files[i])) for i in numbers)
+        decoded = self._from_images() if self.files else self._from_file()
         unreadable = list[int]()
         other_size = list[int]()
-        for index, time_s, image in decoded if self.is_live else one_ahead(decoded):
+        for index, time_s, image in self._from_live() if self.is_live else one_ahead(decoded):
             if image is None or (image.shape[1], image.shape[0]) != self.size:
                 (unreadable if image is None else other_size).append(index)
                 self.skipped.append(index)
-                continue
-            if index <= self._after:
-                continue
-            if self.working_size != self.size:
-                small = cv2.resize(image, self.working_size, interpolation=cv2.INTER_AREA)
-                image = np.asarray(small, np.uint8)
-            yield Frame(index, time_s, image)
-        most = f"not {self.size[0]}x{self.size[1]}, the size of most"
-        for skipped, why in ((unreadable, "unreadable"), (other_size, most)):
+            elif index > self._after:
+                yield Frame(index, time_s, self._scaled(image))
+        others = "most" if self.files else "the first"
+        size = f"not {self.size[0]}x{self.size[1]}, the size of {others}"
+        for skipped, why in ((unreadable, "unreadable"), (other_size, size)):
             if skipped:
                 which = [self.name(index) or index for index in skipped]
                 self._warn(f"{len(skipped)} frames skipped ({why}): {shortened(which)}")
+
+    def _scaled(self, image: Image) -> Image:
+        if self.working_size == self.size:
+            return image
+        small = cv2.resize(image, self.working_size, interpolation=cv2.INTER_AREA)
+        return np.asarray(small, np.uint8)
 
     def _warn(self, text: str) -> None:
         if (text := f"{self.source}: {text}") not in self.messages:
             self.messages.append(text)
 
-    def _from_capture(self) -> Iterator[tuple[int, float, Image | None]]:
-        """Decode a file: yield number, time in s and image (None: unreadable) of its frames."""
+    def _from_images(self) -> Iterator[tuple[int, float, Image | None]]:
+        stop = min(self.config.stop or self.frame_count, self.frame_count)
+        times_s = np.arange(stop) / IMAGE_FPS if self.times_s is None else self.times_s
+        for index in range(self.config.start, stop, self.config.every):
+            yield index, float(times_s[index]), read_image(self.files[index])
+
+    def _from_file(self) -> Iterator[tuple[int, float, Image | None]]:
+        """Decode a file: yield number, time in s and image (None: undecodable) of its frames."""
         start = self.config.start
         every = self.config.every
         raw_s = list[float]()
-        capture = self._open()
-        for index, seconds in enumerate(self._grabbed(capture)):
+        for index, (seconds, image, _) in enumerate(self._decoded()):
             if not seconds > max(raw_s[-1:], default=-math.inf):
                 self._measured()  # correcting this time needs all later ones
             raw_s.append(seconds)
             if index >= start and (index - start) % every == 0:
-                ok, image = (False, None) if math.isnan(seconds) else capture.retrieve()
                 time_s = seconds if self._clock is None else float(self._clock.times_s[index])
-                yield index, time_s, image if ok else None
+                yield index, time_s, None if image is None else image()
         if self._clock is None:
             self._keep(raw_s)
 
-    def _grabbed(self, capture: Any) -> Iterator[float]:
-        """Decode the frames before `config.stop` one by one; yield their times in s, NaN: none.
+    def _decoded(self) -> Iterator[Decoded]:
+        """Decode the frames before `config.stop` one by one.
 
         Undecodable frames count only if a later one can be decoded: at the end of the file they do
         not exist.
         """
-        index = failed = 0
-        while failed < MAX_UNREADABLE and not 0 < self.config.stop <= index:
-            if not capture.grab():
-                failed += 1
-                continue
-            for _ in range(failed):
-                index += 1
-                yield math.nan
-            index = index + 1
-            failed = 0
-            # After the grab this is the frame's presentation time, also at a variable rate
-            seconds = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
-            # Without a time FFmpeg has -9e18 units (AV_NOPTS_VALUE); 1e9 s are 30 years
-            yield seconds if abs(seconds) < 1e9 else math.nan
+        index = 0
+        failed = list[Decoded]()
+        for item in self._open().frames:
+            failed.append(item)
+            if item.image is not None:
+                for each in failed:
+                    yield each
+                    index += 1
+                    if index == self.config.stop:
+                        return
+                failed.clear()
+            elif len(failed) == MAX_UNREADABLE:
+                return
 
     def _measured(self) -> Clock:
-        """Return the times of the frames; a file is decoded once per process."""
-        if self._clock is None:
-            for stop in (0, self.config.stop):
-                self._clock = self._clock or _measured_clocks.get(self._key(stop))
-        if self._clock is None:
-            self._clock = self._keep(list(self._grabbed(self._open())))
-        return self._clock
-
-    def _key(self, stop: int) -> tuple[str, str, int]:
-        return os.path.abspath(self._address), self.fingerprint, stop
+        """Return the times of the frames; a file is decoded once."""
+        return self._clock or self._keep([frame.time_s for frame in self._decoded()])
 
     def _keep(self, raw_s: Sequence[float]) -> Clock:
         """Correct the times of the container, with warnings, and store them."""
@@ -331,62 +348,36 @@ class Video:
         if complete and not self._is_url and (text := self._missing_end(times_s)):
             self._warn(text)
         self._clock = Clock(times_s, complete, known)
-        if not self._is_url:
-            _measured_clocks[self._key(0 if complete else self.config.stop)] = self._clock
         return self._clock
 
     def _missing_end(self, times_s: Array) -> str:
-        """Describe missing frames at the end of a file; "": none, or no evidence.
+        """Describe missing frames at the end of a file; "": none, or no evidence."""
+        stored = self._stored()
+        last_s = times_s.max(initial=0.0)
+        fault = stored.fault
+        if stored.last_s - last_s > max(2 / self._announced_fps, 0.02 * stored.last_s):
+            fault = f"is damaged, frames up to {stored.last_s:.2f} s are stored"
+        readable = f"{len(times_s)} frames up to {last_s:.2f} s can be read"
+        return f"the file {fault}: {readable}" if fault else ""
 
-        The container's metadata alone are no evidence: Matroska's duration includes the audio, and
-        the announced rate may be wrong. But in a file without audio most bytes are those of the
-        frames.
-        """
-        read = len(times_s)
-        last_s = float(times_s[-1])
-        tolerated = 0.02  # fraction of missing frames: containers count a few too many
-        if self._announced - read <= max(1.0, tolerated * self._announced):
-            return ""
-        readable = f"{read} frames up to {last_s:.2f} s can be read"
-        file = Path(self._address)
-        if lost := missing_bytes(file):
-            return f"the file ends early: {lost} bytes are missing at its end; {readable}"
-        _, stored_s, size = self._packets()
-        if stored_s - last_s > max(1 / self._announced_fps, tolerated * stored_s):
-            return f"the file is damaged: {readable}, frames up to {stored_s:.2f} s are stored"
-        total = file.stat().st_size
-        if 2 * size < total and holds_pictures_only(file):
-            return f"the file is damaged: {readable}, {size} of its {total} bytes"
-        return ""
-
-    def _packets(self) -> tuple[int, float, int]:
-        """Return the number of stored frames, also undecodable ones, last time in s, and bytes."""
-        capture = self._open([cv2.CAP_PROP_FORMAT, -1])
-        count = 0
-        last_s = 0.0
-        size = 0
-        while capture.grab():
-            count += 1
-            last_s = max(last_s, capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
-            data = capture.retrieve()[1]
-            size += 0 if data is None else data.size
-        return count, last_s, size
+    def _stored(self) -> Stored:
+        return Stored() if self._is_animation else stored_in(self._path)
 
     def _from_live(self) -> Iterator[tuple[int, float, Image | None]]:
         """Yield number, time in s since the start and image of the newest frames of a live source.
 
         When it ends, reconnect up to `config.reconnect` times; frame numbers continue.
         """
-        capture = self._opened or self._open()
+        opened: Opened | None = self._opened or self._open()
         self._opened = None
         self.read = self.dropped = self._seen = attempts = 0
         began = time.monotonic()
-        while capture is not None:
+        while opened is not None:
             before = self._seen
-            yield from self._from_connection(capture, began)
+            yield from self._from_connection(opened, began)
             attempts = attempts if self._seen == before else 0  # consecutive, without a frame
-            capture = None
-            while capture is None and attempts < self.config.reconnect:
+            opened = None
+            while opened is None and attempts < self.config.reconnect:
                 if 0 < self.config.stop <= self._seen:
                     break
                 wait_s = self._live.first_wait_s * 2.0 ** min(attempts, 9)
@@ -395,65 +386,57 @@ class Video:
                 log.warning("%s: ended; reconnecting in %g s", self.source, wait_s)
                 time.sleep(wait_s)
                 with contextlib.suppress(ReobjError):
-                    capture = self._open()
+                    opened = self._open()
 
     def _from_connection(
-        self, capture: Any, began: float
+        self, opened: Opened, began: float
     ) -> Iterator[tuple[int, float, Image | None]]:
         """Yield the newest frames until a connection ends.
 
         A thread reads all frames, so that the driver's queue does not fill with old ones.
         """
         # Two frames wait: the next one for the tracker, and the newest one
-        frames: queue.Queue[tuple[int, float, Image] | None] = queue.Queue(2)
+        frames: queue.Queue[tuple[int, float, Image]] = queue.Queue(2)
         stopped = threading.Event()
         self._last_frame_s = time.monotonic()
         thread = threading.Thread(
-            target=self._read_live, args=(capture, frames, stopped, began), daemon=True
+            target=self._read_live, args=(opened, frames, stopped, began), daemon=True
         )
         thread.start()
+        poll_s = 0.5  # longer than the reading thread takes to end
         try:
-            while (item := self._next_live(frames)) is not None:
-                yield item
+            while (reads := thread.is_alive() and self._silent_s < poll_s) or frames.qsize():
+                with contextlib.suppress(queue.Empty):
+                    yield frames.get(timeout=0.05)
+            if not reads and thread.is_alive():
+                self._warn(f"no frame came for {self._live.silent_s:g} s: taken as its end")
         finally:
             stopped.set()
-            hangs = time.monotonic() - self._last_frame_s > self._live.silent_s
-            thread.join(0.0 if hangs else self._live.silent_s / 2)
-            if not thread.is_alive():  # else it hangs in the driver; a daemon thread may be left
-                capture.release()
+            # A thread that hangs in the driver is left
+            thread.join(0.0 if self._silent_s > 0 else self._live.silent_s / 2)
 
-    def _next_live(
-        self, frames: queue.Queue[tuple[int, float, Image] | None]
-    ) -> tuple[int, float, Image] | None:
-        """Wait for a frame of a live source; None at its end, or where the driver hangs."""
-        poll_s = 0.5  # longer than the reading thread takes to signal its end
-        timeout_s = self._live.silent_s + poll_s
-        while time.monotonic() - self._last_frame_s < timeout_s or not frames.empty():
-            with contextlib.suppress(queue.Empty):
-                return frames.get(timeout=poll_s)
-        self._warn(f"no frame came for {self._live.silent_s:g} s: taken as its end")
-        return None
+    @property
+    def _silent_s(self) -> float:
+        """Time since a live source has ended for lack of frames, s; negative: it has not."""
+        return time.monotonic() - self._last_frame_s - self._live.silent_s
 
     def _read_live(
         self,
-        capture: Any,
-        frames: queue.Queue[tuple[int, float, Image] | None],
+        opened: Opened,
+        frames: queue.Queue[tuple[int, float, Image]],
         stopped: threading.Event,
         began: float,
     ) -> None:
         """Read a live source until it ends or `stopped`; drop the oldest frame of a full queue."""
-        last = time.monotonic()
-        try:
-            while not stopped.is_set() and time.monotonic() - last < self._live.silent_s:
-                if 0 < self.config.stop <= self._seen:
-                    break
-                ok, image = capture.read()
-                if not ok:
+        with contextlib.closing(opened.frames):
+            for frame in opened.frames:
+                # Stopped also if the driver hung, and a new connection is in use
+                if stopped.is_set() or self._silent_s >= 0 or 0 < self.config.stop <= self._seen:
+                    return
+                if frame.image is None:
                     time.sleep(0.01)
                     continue
-                if stopped.is_set():  # the driver hung, and a new connection is in use
-                    break
-                self._last_frame_s = last = time.monotonic()
+                self._last_frame_s = time.monotonic()
                 at = self._seen
                 self._seen += 1
                 if at < self.config.start or (at - self.config.start) % self.config.every:
@@ -463,40 +446,47 @@ class Video:
                     with contextlib.suppress(queue.Empty):  # the tracker took it first
                         frames.get_nowait()
                         self.dropped += 1
-                frames.put((at, last - began, image))  # no other thread puts: it does not block
-        finally:
-            while not stopped.is_set():  # None ends the iteration, after the waiting frames
-                with contextlib.suppress(queue.Full):
-                    frames.put(None, timeout=0.1)
-                    break
+                # No other thread puts: it does not block
+                frames.put((at, self._last_frame_s - began, frame.image()))
 
-    def _open(self, params: Sequence[int] = ()) -> Any:
-        """Open the source with OpenCV, which rotates frames by the file's rotation tag."""
-        if any("\ud800" <= letter <= "\udfff" for letter in self._address):  # OpenCV crashes
-            raise ReobjError(f"{self.source!r}: the name is not UTF-8; rename the file")
-        if not self.is_live and not self._is_url and not Path(self.source).is_file():
+    def _open(self) -> Opened:
+        """Open the source.
+
+        Raises:
+            ReobjError: it is missing, unreadable, no video, or has too large frames.
+        """
+        path = Path(self.source)
+        if self.is_live and self._address.isdecimal():
+            if (camera := open_camera(int(self._address))) is None:
+                raise ReobjError(f"{self.source}: cannot be opened as a camera (is it connected?)")
+            return camera
+        if not self._is_url and not path.is_file():
             raise ReobjError(f"{self.source}: no such file or folder")
-        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # its messages do not name the file
-        is_camera = self.is_live and self._address.isdecimal()
-        with quiet_opencv():
-            if self._is_url:
-                timeout_ms = round(1000 * self._live.open_s)
-                timeouts = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, timeout_ms]
-                timeouts += [cv2.CAP_PROP_READ_TIMEOUT_MSEC, timeout_ms]
-                capture = cv2.VideoCapture(self._address, cv2.CAP_ANY, [*timeouts, *params])
-            elif is_camera:
-                capture = cv2.VideoCapture(int(self._address))
-            else:  # absolute path: FFmpeg reads the name 12:30.mp4 as a protocol
-                path = os.path.abspath(self._address)
-                capture = cv2.VideoCapture(path, cv2.CAP_FFMPEG if params else cv2.CAP_ANY, params)
-        if not capture.isOpened():
-            kind = "video (damaged, or no video)"
-            if self.is_live:
-                kind = "camera (is it connected?)" if is_camera else "stream (is it there?)"
-            elif not os.access(self.source, os.R_OK):
-                raise ReobjError(f"{self.source}: you may not read it; allow it (chmod u+r)")
+        if not self._is_url and not os.access(path, os.R_OK):
+            raise ReobjError(f"{self.source}: you may not read it; allow it (chmod u+r)")
+        try:
+            opened = (
+                open_animation(path) if self._is_animation
+                else open_file(self._path, self._live.open_s if self._is_url else None)
+            )  # fmt: skip
+        except ReobjError as error:
+            raise ReobjError(f"{self.source}: {error}") from None
+        if opened is None:
+            kind = "stream (is it there?)" if self._is_url else "video (damaged, or no video)"
             raise ReobjError(f"{self.source}: cannot be opened as a {kind}")
-        return capture
+        if opened.pixels > PIXELS_MAX:
+            raise ReobjError(f"{self.source}: frames of {opened.pixels} pixels, at most "
+                             f"{PIXELS_MAX} are allowed")  # fmt: skip
+        return opened
+
+    @property
+    def _path(self) -> str:
+        """Absolute path, as FFmpeg reads the name 12:30.mp4 as a protocol; or the URL."""
+        return self._address if self._is_url else os.path.abspath(self._address)
+
+    @property
+    def _is_animation(self) -> bool:
+        return not self._is_url and Path(self.source).suffix.lower() in IMAGE_SUFFIXES
 
     def _probe(self, usual: Sequence[Path]) -> tuple[tuple[int, int], float, int]:
         """Read the first readable frame; of images: the first of the `usual` ones.
@@ -504,35 +494,33 @@ class Video:
         Returns:
             (w, h) in px, announced frame rate in Hz and number of frames (0: unknown).
         """
-        images: Iterator[Image | None] = map(read_image, [*usual, *self.files])
-        fps = IMAGE_FPS
-        count = len(self.files)
-        if not self.files:
-            capture = self._open()
-            images = (capture.read()[1] for _ in range(MAX_UNREADABLE))
-            fps = float(capture.get(cv2.CAP_PROP_FPS))
-            pixels = capture.get(cv2.CAP_PROP_FRAME_WIDTH) * capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
-            if pixels > PIXELS_MAX:
-                raise ReobjError(f"{self.source}: frames of {pixels:.0f} pixels, at most "
-                                 f"{PIXELS_MAX} are allowed")  # fmt: skip
-            if not self._address.isdecimal():
-                count = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
-            self.is_live = self.is_live and not count  # the URL of a file is not live
-            self._opened = capture if self.is_live else None
-        image = next((image for image in images if image is not None), None)
-        if image is None:
-            raise ReobjError(f"{self.source}: no frame can be decoded")
-        if not self.files and not self.is_live:
-            self._check_pixels(capture)
-        return (image.shape[1], image.shape[0]), fps if 0 < fps < math.inf else IMAGE_FPS, count
+        if self.files:
+            images = (read_image(path) for path in [*usual, *self.files])
+            with quiet_opencv():
+                image = next((image for image in images if image is not None), None)
+            if image is None:
+                why = why_unreadable(self.files[0])
+                raise ReobjError(f"{self.source}: no frame can be decoded ({why})")
+            return (image.shape[1], image.shape[0]), IMAGE_FPS, len(self.files)
+        opened = self._open()
+        first = itertools.islice(opened.frames, MAX_UNREADABLE)
+        frame = next((frame for frame in first if frame.image is not None), Decoded())
+        if frame.image is None:
+            raise ReobjError(f"{self.source}: no frame can be decoded (codec {opened.codec})")
+        self.is_live = self.is_live and not opened.count  # the URL of a file is not live
+        self._opened = opened if self.is_live else None
+        if not self.is_live:
+            self._set_aspect(opened.pixel_aspect, frame.turned % 180 == 90)
+        height, width = frame.image().shape[:2]
+        fps = opened.fps if 0 < opened.fps < math.inf else IMAGE_FPS
+        return (width, height), fps, opened.count
 
-    def _check_pixels(self, capture: Any) -> None:
+    def _set_aspect(self, aspect: Fraction, turned: bool) -> None:
         """Set the aspect ratio of the pixels; warn if they are not square."""
-        wide, high = (round(capture.get(p)) for p in (cv2.CAP_PROP_SAR_NUM, cv2.CAP_PROP_SAR_DEN))
-        turned = round(capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 180 == 90
-        wide, high = (high, wide) if turned else (wide, high)
-        if wide > 0 and high > 0 and abs(wide / high - 1) > 0.01:  # less is not visible
-            self.pixel_aspect = wide / high
+        aspect = 1 / aspect if turned else aspect
+        if abs(aspect - 1) > 0.01:  # less is not visible
+            self.pixel_aspect = float(aspect)
+            wide, high = aspect.as_integer_ratio()
             self._warn(f"its pixels are {wide}:{high}, not square, by its metadata: boxes are in "
                        "stored pixels, cameras have two focal lengths; if that is wrong, correct "
                        "its sample aspect ratio (ffmpeg -i IN -vf setsar=1 OUT)")  # fmt: skip

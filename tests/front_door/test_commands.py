@@ -65,7 +65,7 @@ def out(room: Path, tmp_path: Path) -> Path:
 def test_readmes_first_command(example: Path) -> None:
     assert_example_right(example)
     names = {path.name for path in example.iterdir()}
-    assert names - {"overlay.mp4", "overlay.webm", "eval.json"} == FILES
+    assert names - {"overlay.mp4", "eval.json"} == FILES
     scale = info(example)["world"]["scale"]
     ours = scores.Output.read(example).centres
     points = np.array([ours[f] for f in range(240)])

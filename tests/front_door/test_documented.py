@@ -78,7 +78,6 @@ ELSEWHERE = {
     "pip install -r requirements.txt -e .": ".ci/run",
     "pip install torch matplotlib onnx": ".ci/run installs them with the extras",
     'pip install -e ".[detectors]"': ".ci/run, on a CPU build of PyTorch",
-    "pip install av": "in the extra dev, which .ci/run installs",
     "pip install trimesh rerun-sdk": "in the extra dev, which .ci/run installs",
     "pip install jsonschema": "in the extra dev, which .ci/run installs",
     "python -m pytest benchmarks/tests": "it takes minutes",
