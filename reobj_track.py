@@ -1330,7 +1330,7 @@ def track(
     batch = 1 if video.is_live else source.batch
     motion = tracker.state.camera_motion
     for frames in motion.ahead(video, batch) if ahead else in_batches(video, batch):
-        for frame, found in zip(frames, source.look_at(frames), strict=True):
+        for frame, found in zip(frames, source.detect(frames), strict=True):
             tracks = tracker.update(found, frame.image, looked=looked, **cameras(frame.index))
             yield frame, dataclasses.replace(tracks, frame=np.full(len(tracks), frame.index))
 

@@ -10,13 +10,14 @@ import dataclasses
 import importlib
 import importlib.metadata
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from reobj.sources.class_names import names_by_number
 from reobj.types import Image, ReobjError
 
 
@@ -98,7 +99,7 @@ def _ultralytics(options: LibraryOptions) -> LibraryDetector:
             images, conf=options.min_score, device=options.device, retina_masks=True, verbose=False
         )
 
-    return LibraryDetector(run, names_by_id(model.names))
+    return LibraryDetector(run, names_by_number(model.names))
 
 
 def _rfdetr(options: LibraryOptions) -> LibraryDetector:
@@ -182,7 +183,7 @@ def _transformers(options: LibraryOptions) -> LibraryDetector:
         answers = processor.post_process_grounded_object_detection(outputs, **asked)
         return (_with_words(found, words) for found in answers)
 
-    return LibraryDetector(run, options.words or names_by_id(model.config.id2label))
+    return LibraryDetector(run, options.words or names_by_number(model.config.id2label))
 
 
 def _with_words(image: Any, words: list[str]) -> dict[str, Any]:
@@ -287,12 +288,6 @@ def user_function(detector: str) -> Any:
     if not callable(found):
         raise ReobjError(f"--detector {detector}: it is no function image -> detections")
     return found
-
-
-def names_by_id(names: Mapping[Any, Any]) -> tuple[str, ...]:
-    """Return the names of ids 0, 1, ...; ids without a name get a number."""
-    of_id = {int(i): str(name) for i, name in names.items()}
-    return tuple(of_id.get(i, f"class {i}") for i in range(max(of_id, default=-1) + 1))
 
 
 def fixed_classes(detector: str) -> ReobjError:

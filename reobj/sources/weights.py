@@ -36,7 +36,7 @@ class Weights:
             unknown.
         note: for the table; AP on 164 images of COCO val2017, ms an image with one thread.
         verified: what was run here before it was listed; "": nothing to say of bundled weights.
-        layout: prefix of the name of a detector's layout in `onnx_layouts`.
+        layout: of a detector, in `onnx_layouts`.
     """
 
     name: str
@@ -79,7 +79,7 @@ def _deimv2(
     source = "https://github.com/Kazuhito00/DEIMv2-ONNX-Sample/raw/"
     url = f"{source}f88d4382abca74edb26ed4c7f46190ac40da0ea5/model/{file}"
     return Weights(f"deimv2-{name}", "detector", file, url, digest, size, "Apache-2.0", note,
-                   "DEIM", alias, verified)  # fmt: skip
+                   "detr", alias, verified)  # fmt: skip
 
 
 NOT_RUN = "not run here; the layout of its family is verified"
@@ -97,12 +97,12 @@ WEIGHTS: tuple[Weights, ...] = (
             "https://github.com/Kazuhito00/YOLOX-ONNX-TFLite-Sample/raw/"
             "3d4f1119d0694200671c08069ecb847aa0d8495a/model/yolox_nano.onnx",
             "695e750a5d5754bb5a8d5325643b59282191a7e7a564e435a415fd3c578eab14", 3660092,
-            "Apache-2.0", "COCO, AP 28.6, 27 ms", "YOLOX", verified=ON_IMAGES),
+            "Apache-2.0", "COCO, AP 28.6, 27 ms", "yolox", verified=ON_IMAGES),
     Weights("picodet-s-416", "detector", "picodet_s_416_coco.onnx",
             "https://github.com/hpc203/picodet-onnxruntime/raw/"
             "dfe4d6cd0a18cd4126ee381e81df8a0b1e6ad97b/coco/picodet_s_416_coco.onnx",
             "cdab77bdde16e4f76bec734c4e5791801d1739e4c7ec1995e0e110e04300d0c2", 4040573,
-            "Apache-2.0", "COCO, AP 33.5, 46 ms", "PicoDet", verified=ON_IMAGES),
+            "Apache-2.0", "COCO, AP 33.5, 46 ms", "picodet", verified=ON_IMAGES),
     Weights("reobj", "backbone", "reobj.onnx", "",
             "a8abc894869a29b63c244aaeff0a96bd9521fc3146bd2a1f4ac495b2bcfc39a5", 392965,
             "MIT", "ours, bundled: foreground and background, trained with its head"),
