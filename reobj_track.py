@@ -2001,8 +2001,7 @@ def _cmd_models(args: argparse.Namespace) -> int:
             w = row.weights
             size = f"{w.size / 1e6:.1f}" if w.size else "?"
             facts = f"{w.name:<15} {w.role:<9} {size:>5} MB  {w.licence:<11}"
-            note = "; ".join(filter(None, (w.note, w.verified)))
-            print("\n".join(wrapped(f"{facts} {row.state:<9} {note}")))
+            print("\n".join(wrapped(f"{facts} {row.state:<9} {w.note}")))
     return 0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -54,19 +55,17 @@ def parse_yaml(text: str, where: str) -> Any:
         raise ReobjError(f"{where}{line}: invalid YAML ({reason})") from error
 
 
-def parse_class_names(text: str, where: str, first: int = 0) -> tuple[str, ...]:
+def parse_class_names(text: str, where: str) -> tuple[str, ...]:
     """Read class names of a model's metadata, as Python, JSON or YAML write lists and maps."""
     try:
         names = ast.literal_eval(text.strip())
     except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
         names = parse_yaml(text, where)
-    return names_by_number(names, where, first)
+    return names_by_number(names, where)
 
 
-def names_by_number(
-    names: Any, where: str = "class names of the detector", first: int = 0
-) -> tuple[str, ...]:
-    """Return the names of the classes `first`, `first` + 1, ...; one without a name is `class N`.
+def names_by_number(names: Any, where: str = "class names of the detector") -> tuple[str, ...]:
+    """Return the names of the classes 0, 1, ...; one without a name is `class N`.
 
     Args:
         names: a list, or a map from numbers. where: begins an error.
@@ -75,17 +74,17 @@ def names_by_number(
             characters.
     """
     if not isinstance(names, Mapping):
-        names = dict(enumerate(names, first)) if isinstance(names, list | tuple) else {}
+        names = dict(enumerate(names)) if isinstance(names, list | tuple) else {}
     if not names or not all(isinstance(name, str | int | float) for name in names.values()):
         raise ReobjError(f"{where}: expected class names, a list or a map from numbers")
     named = dict[int, str]()
     for number, name in names.items():
-        if not str(number).isdecimal() or not first <= int(number) <= CLASS_MAX:
-            expected = f"expected a whole number from {first} to {CLASS_MAX}"
+        if not re.fullmatch(r"\d{1,5}", str(number)) or int(number) > CLASS_MAX:
+            expected = f"expected a whole number from 0 to {CLASS_MAX}"
             raise ReobjError(f"{where}: class number {number!r}, {expected}")
         check_length(str(name), where)
         named[int(number)] = str(name)
-    return tuple(named.get(i, f"class {i}") for i in range(first, max(named) + 1))
+    return tuple(named.get(i, f"class {i}") for i in range(max(named) + 1))
 
 
 def check_length(name: str, where: str) -> None:

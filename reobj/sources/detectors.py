@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from reobj.cameras import Poses
@@ -35,7 +34,7 @@ from reobj.sources.detection_files import (
 )
 from reobj.sources.libraries import (
     LibraryDetector,
-    at_once,
+    failing,
     fixed_classes,
     is_function,
     library_detector,
@@ -51,6 +50,7 @@ from reobj.sources.onnx_layouts import (
     best_rows,
     find_layout,
     fit_image,
+    nms,
 )
 from reobj.sources.recorded import RecordedDetections, pack_detections, read_npz
 from reobj.sources.tiles import detect_in_tiles, parse_tiles
@@ -147,12 +147,8 @@ class OnnxDetector:
         for size, group in itertools.groupby(images, lambda a: self._input_size(*a.shape[1::-1])):
             for batch in in_batches(group, self.batch):
                 fitted = [fit_image(image, size, self._layout.fit) for image in batch]
-                try:
+                with failing(str(self.path), len(batch)):
                     each = self._run(fitted, self._layout.pixels)
-                except Exception as error:  # no memory on the device, a shape that is refused
-                    reason = str(error).partition("\n")[0]
-                    text = f"{self.path} failed{at_once(len(batch))}: {reason}"
-                    raise ReobjError(text) from error
                 for outputs, (_, geometry) in zip(each, fitted, strict=True):
                     yield self._decoded(outputs, geometry)
 
@@ -161,7 +157,7 @@ class OnnxDetector:
         assert self._layout.read is not None
         decoded = self._layout.read(outputs, geometry, self._model)
         boxes = np.clip(decoded.xyxy, 0, np.tile(geometry.image_size, 2))
-        label = decoded.class_id - self._layout.first
+        label = decoded.class_id
         use = label >= 0 if self._allowed is None else np.isin(label, self._allowed)
         keep = _best(boxes, decoded.score, use, self.config)
         if self._layout.nms_iou is not None:
@@ -251,33 +247,30 @@ class OnnxDetector:
 
         declared: layout of known weights.
         """
-        names = self._names(0)
+        names: tuple[str, ...] = ()
+        names_of = f"of COCO, as the model names none; {NAMES}"
+        if self.config.class_names:
+            names_of = self.config.class_names
+            names = load_class_names(names_of)
+        elif text := self._model.metadata.get("names", "").strip():
+            names_of = "of its metadata"
+            names = parse_class_names(text, f"{self.path}: metadata `names`; {NAMES}")
         self._model.count = len(names or COCO_NAMES)
         declared = self.config.layout or declared
-        layout = find_layout(self._model, declared)
-        if layout.first:
-            names = self._names(layout.first)
+        layout = find_layout(self._model, declared, names_of)
         count = layout.classes(self._model)
-        if count is None or count == len(names or COCO_NAMES):
-            names = names or COCO_NAMES
-        elif names:
-            raise ReobjError(f"{self.path}: {len(names)} class names, but {count} classes: {NAMES}")
-        else:
+        if names and count not in (None, len(names)):
+            raise ReobjError(f"{self.path}: {len(names)} class names ({names_of}), but layout "
+                             f"{layout.name} has {count} classes")  # fmt: skip
+        if not names and count not in (None, len(COCO_NAMES)):
             log.warning("%s: %d classes without names: %s", self.path, count, NAMES)
-            names = tuple(f"class {i}" for i in range(count))
-        self._model.count = count or len(names)
+            names = tuple(f"class {i}" for i in range(count or 0))
+        names = names or COCO_NAMES
+        self._model.count = len(names)
         unread = f"; not read: {layout.unread}" if layout.unread else ""
         text = f"{NOTE_START}{self.path}: read as {layout.name} ({layout.title}){unread}"
         self.message = "" if declared else text
         return layout, names
-
-    def _names(self, first: int) -> tuple[str, ...]:
-        """Return the names that the user or the model gives to classes `first`, ...; () if none."""
-        if self.config.class_names:
-            return load_class_names(self.config.class_names)
-        text = self._model.metadata.get("names", "")
-        where = f"{self.path}: metadata `names`"
-        return parse_class_names(text, where, first) if text.strip() else ()
 
 
 NAMES = "give a file of names with --set detect.class_names=FILE"
@@ -288,20 +281,6 @@ def _best(xyxy: Array, score: Array, use: BoolArray, config: DetectConfig) -> In
     use = use & (score >= config.min_score) & (xyxy[:, 2:] > xyxy[:, :2]).all(1)
     rows = np.flatnonzero(use)
     return rows[best_rows(score[rows])]
-
-
-def nms(xyxy: Array, class_id: IntArray, max_iou: float) -> IntArray:
-    """Suppress boxes that overlap a better one of their class (greedy NMS).
-
-    Args:
-        xyxy: (N, 4), best first. max_iou: largest IoU of two remaining boxes of a class.
-    Returns:
-        remaining rows, ascending.
-    """
-    xywh = np.hstack([xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]])
-    rank = np.arange(len(xyxy), 0, -1)
-    kept = cv2.dnn.NMSBoxesBatched(xywh.tolist(), rank.tolist(), class_id.tolist(), 0.0, max_iou)
-    return np.sort(np.array(kept, np.int64))
 
 
 class DetectionCache:
@@ -481,7 +460,8 @@ def open_detections(
     words = tuple(word.strip() for word in config.words.split(",") if word.strip())
     if library_of(config.model):
         opened, version = library_detector(config.model, words, config.min_score, device)
-        key = _cache_key(config, version, _file_key(config.model), device)
+        file = config.model.partition(":")[2] or config.model
+        key = _cache_key(config, version, file, device)
         source = _filtered(as_source(opened), config)
         batch = frames_at_once(config.batch, device)
         return dataclasses.replace(source, key=key, slow=True, always_looks=True, batch=batch)
@@ -491,10 +471,9 @@ def open_detections(
         function = user_function(config.model)
         is_open = not (names or _stated_names(function))  # its labels are the class names
         return _filtered(as_source(function, names), config, is_open)
-    path = model_path(config.model, offline)
-    source = as_source(OnnxDetector("", config, threads, offline, device))
-    key = _cache_key(config, path.name, path.stat().st_size, device)
-    return dataclasses.replace(source, key=key, slow=True)
+    detector = OnnxDetector("", config, threads, offline, device)
+    key = _cache_key(config, detector.path, device)
+    return dataclasses.replace(as_source(detector), key=key, slow=True)
 
 
 def _filtered(
@@ -527,12 +506,6 @@ def _filtered(
     return dataclasses.replace(source, run=run)
 
 
-def _file_key(model: str) -> str:
-    """Identify the file of a library's model; "": it is no file."""
-    path = Path(model.partition(":")[2] or model).expanduser()
-    return source_fingerprint(str(path)) if path.is_file() else ""
-
-
 def with_detector(config: DetectConfig, detections: Any) -> tuple[DetectConfig, Any]:
     """Move the name of a detector from the argument `detections` to the option `model`.
 
@@ -557,15 +530,16 @@ def with_detector(config: DetectConfig, detections: Any) -> tuple[DetectConfig, 
     return config, detections
 
 
-def _cache_key(config: DetectConfig, *source: str | int) -> str:
-    """Make a cache key from the identity of a source, the options and the class names' file.
+def _cache_key(config: DetectConfig, *source: str | Path) -> str:
+    """Make a cache key from the identity of a source, the options, and the files of both.
 
     The size of the batches is left out: it does not change the detections.
     """
-    names = source_fingerprint(config.class_names) if config.class_names else ""
+    files = [Path(text).expanduser() for text in (*source, config.class_names) if text]
+    contents = [source_fingerprint(file) for file in files if file.is_file()]
     options = dataclasses.asdict(config)
     del options["batch"]
-    return json.dumps([*source, options, names])
+    return json.dumps([*map(str, source), options, contents])
 
 
 def as_source(detector: Any, class_names: Sequence[str] = ()) -> DetectionSource:

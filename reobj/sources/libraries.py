@@ -6,6 +6,7 @@ its own.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import importlib
 import importlib.metadata
@@ -51,23 +52,29 @@ class LibraryDetector:
     name: str = ""
 
     def detect(self, images: list[Image]) -> Iterator[Any]:
-        """Detect the objects in each of several images, all at once.
-
-        Raises:
-            ReobjError: the library failed; with its message.
-        """
-        try:
+        """Detect the objects in each of several images, all at once."""
+        with failing(f"--detector {self.name}", len(images)):
             yield from self.run(images)
-        except ReobjError:
-            raise
-        except Exception as error:  # libraries raise any kind
-            text = f"--detector {self.name} failed{at_once(len(images))}: {_message(error)}"
-            raise ReobjError(text) from error
 
 
-def at_once(count: int) -> str:
-    """Return the part of a message about a network's failure that names the size of the batch."""
-    return f" on {count} images at once (detect.batch)" if count > 1 else ""
+@contextlib.contextmanager
+def failing(name: str, count: int = 0) -> Iterator[None]:
+    """Convert any error of a network's library to one line.
+
+    Args:
+        count: images that it gets at once; 0: it is being opened.
+    """
+    try:
+        yield
+    except ReobjError:
+        raise
+    except Exception as error:  # no memory on the device, no such file, no download, ...
+        at_once = f" on {count} images at once (detect.batch)" if count > 1 else ""
+        text = next((line.strip() for line in str(error).splitlines() if line.strip()), "")
+        if not text or not isinstance(error, OSError | RuntimeError):
+            text = f"{type(error).__name__}: {text}"
+        failed = f" failed{at_once}" if count else ""
+        raise ReobjError(f"{name}{failed}: {text}") from error
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,28 +250,18 @@ def library_detector(
         raise fixed_classes(detector)
     if device.partition(":")[0] not in ("cpu", "cuda", "mps"):
         raise ReobjError(f"--device {device}: detectors of {name} run on cpu, cuda or mps")
-    try:
-        found = library.open(LibraryOptions(model, words, min_score, device))
-    except ImportError as error:
-        remedy = f"it needs: pip install {library.install}"
-        missing = (error.name or "").partition(".")[0]
-        if missing not in ("", "torch", *library.install.split()):  # of one model alone, as CLIP
-            remedy = f"{name} needs it for this model; its documentation says how to install it"
-        raise ReobjError(f"--detector {detector}: {error}; {remedy}") from error
-    except ReobjError:
-        raise
-    except Exception as error:  # no such file, no download, no such device, no model
-        raise ReobjError(f"--detector {detector}: {_message(error)}") from error
-    found = dataclasses.replace(found, name=detector)
-    package = "transformers" if name == "hf" else name
-    return found, f"{package} {importlib.metadata.version(package)}"
-
-
-def _message(error: Exception) -> str:
-    """Return the first line of an error, with its kind where that line says little."""
-    text = next((line.strip() for line in str(error).splitlines() if line.strip()), "")
-    kind = type(error).__name__
-    return text if isinstance(error, OSError | RuntimeError) and text else f"{kind}: {text}"
+    with failing(f"--detector {detector}"):
+        try:
+            found = library.open(LibraryOptions(model, words, min_score, device))
+        except ImportError as error:
+            remedy = f"it needs: pip install {library.install}"
+            missing = (error.name or "").partition(".")[0]
+            if missing not in ("", "torch", *library.install.split()):  # of one model, as CLIP
+                remedy = f"{name} needs it for this model; its documentation says how to install it"
+            raise ReobjError(f"--detector {detector}: {error}; {remedy}") from error
+    package = library.install.partition(" ")[0]
+    version = f"{package} {importlib.metadata.version(package)}"
+    return dataclasses.replace(found, name=detector), version
 
 
 def is_function(detector: str) -> bool:

@@ -5,7 +5,6 @@ LAYOUTS is the registry; docs/input_formats.md has its table. `OnnxDetector` run
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import math
 import re
@@ -118,7 +117,6 @@ class Layout(Format[Decode]):
             the top left) or "centre".
         nms_iou: IoU above which two boxes of a class are duplicates (NanoDet: .6); None: the model
             has selected its boxes.
-        first: label of the first class.
     """
 
     shape: str = ""
@@ -126,7 +124,6 @@ class Layout(Format[Decode]):
     pixels: Pixels = UNIT_RGB
     fit: str = "stretch"
     nms_iou: float | None = 0.6
-    first: int = 0
 
 
 def fit_image(image: Image, size: tuple[int, int], fit: str) -> tuple[Image, Geometry]:
@@ -162,24 +159,30 @@ def best_rows(score: Array, most: int = 1000) -> IntArray:
     return np.argsort(-score, kind="stable")[:most]
 
 
+def nms(xyxy: Array, class_id: IntArray, max_iou: float) -> IntArray:
+    """Suppress boxes that overlap a better one of their class (greedy NMS).
+
+    Args:
+        xyxy: (N, 4), best first. max_iou: largest IoU of two remaining boxes of a class.
+    Returns:
+        remaining rows, ascending.
+    """
+    xywh = np.hstack([xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]])
+    rank = np.arange(len(xyxy), 0, -1)
+    kept = cv2.dnn.NMSBoxesBatched(xywh.tolist(), rank.tolist(), class_id.tolist(), 0.0, max_iou)
+    return np.sort(np.array(kept, np.int64))
+
+
 def _best_class(scores: Array) -> tuple[Array, IntArray]:
     """Return the best score (N,) in each row of (N, C), and its class (N,)."""
     return scores.max(1).astype(np.float64), scores.argmax(1).astype(np.int64)
 
 
-def _pick_outputs(outs: Sequence[Any]) -> tuple[Array, Array, IntArray]:
-    """Find boxes, scores and labels among the outputs of a model with its own selection.
-
-    Returns:
-        boxes (N, 4), scores (N,), integer labels (N,).
-    Raises:
-        StopIteration: one of them is missing.
-    """
-    boxes = next(o for o in outs if o.ndim in (2, 3) and o.shape[-1] == 4).reshape(-1, 4)
-    flat = [o.ravel() for o in outs if o.ndim < 3 and o.size == len(boxes)]
-    labels = next(o for o in flat if o.dtype.kind == "i")
-    scores = next(o for o in flat if o.dtype.kind == "f")
-    return boxes.astype(np.float64), scores.astype(np.float64), labels.astype(np.int64)
+def _decode_detr(outs: Sequence[Any], geometry: Geometry, model: ModelProbe) -> Decoded:
+    """Decode labels, boxes and scores; the model selects the boxes and scales them to the image."""
+    of = dict(zip(model.outputs, outs, strict=True))
+    boxes, score = (of[name].astype(np.float64) for name in ("boxes", "scores"))
+    return Decoded(boxes.reshape(-1, 4), score.ravel(), of["labels"].ravel().astype(np.int64))
 
 
 def _decode_yolox(outs: Sequence[Any], geometry: Geometry, model: ModelProbe) -> Decoded:
@@ -213,9 +216,7 @@ def _decode_yolo(outs: Sequence[Any], geometry: Geometry, model: ModelProbe) -> 
 
     def masks(chosen: IntArray) -> BoolArray:
         maps = np.tensordot(rows[chosen, end:], proto, 1)  # (K, h, w)
-        scale = ratio * geometry.scale
-        pad = ratio * geometry.pad
-        return _paste(maps, boxes[chosen], geometry.image_size, scale, pad, 0.0)
+        return _paste(maps, boxes[chosen], geometry, ratio)
 
     return Decoded(boxes, score, label, masks)
 
@@ -262,56 +263,32 @@ def _decode_gfl(outs: Sequence[Any], geometry: Geometry, _: ModelProbe) -> Decod
     return Decoded(geometry.to_image(boxes), score[keep], label[keep])
 
 
-def _decode_selected(outs: Sequence[Any], geometry: Geometry, model: ModelProbe) -> Decoded:
-    """Decode boxes, labels, scores[, masks] after the model's own NMS."""
-    boxes, scores, labels = _pick_outputs(outs)
-    if "bboxes" in model.outputs:  # SSD: in 0..1
-        boxes = boxes * np.tile(geometry.input_size, 2)
-    boxes = geometry.to_image(boxes)
-    maps = [o[:, 0] for o in outs if o.ndim == 4]  # (N, h, w) probabilities
-
-    def masks(chosen: IntArray) -> BoolArray:
-        low = boxes[chosen, :2]
-        high = boxes[chosen, 2:]
-        ratio = np.array(maps[0].shape[:0:-1]) / np.maximum(high - low, 1e-6)  # (K, 2)
-        return _paste(maps[0][chosen], boxes[chosen], geometry.image_size, ratio, -low * ratio, 0.5)
-
-    return Decoded(boxes, scores, labels, masks if maps else None)
-
-
-def _paste(maps: Any, boxes: Array, size: tuple[int, int], ratio: Array, offset: Array,
-           threshold: float) -> BoolArray:  # fmt: skip
+def _paste(maps: Any, boxes: Array, geometry: Geometry, ratio: Array) -> BoolArray:
     """Resample the maps of masks inside their boxes.
 
     Args:
-        maps: (K, h, w). boxes: (K, 4) in px of the image of (w, h) `size`.
-        ratio, offset: (2,) or (K, 2): map = image * ratio + offset, both (x, y) from the corner.
-        threshold: a pixel belongs to the mask where the map is above.
+        maps: (K, h, w), positive in the mask. boxes: (K, 4) in px of the image.
+        ratio: (2,) map / input of the network, x and y.
     Returns:
         (K, H, W) masks, False outside the boxes.
     """
+    size = geometry.image_size
     masks = np.zeros((len(maps), size[1], size[0]), bool)  # (K, H, W)
-    ratio, offset = (np.broadcast_to(v, (len(maps), 2)) for v in (ratio, offset))
+    scale = ratio * geometry.scale  # map = image * scale + pad, from the corner
+    pad = ratio * geometry.pad
     low = np.clip(np.floor(boxes[:, :2]), 0, size).astype(int)
     high = np.clip(np.ceil(boxes[:, 2:]), 0, size).astype(int)
     for k in np.flatnonzero((high > low).all(1)):
         (x1, y1) = low[k].tolist()
         (x2, y2) = high[k].tolist()
-        shift = ratio[k] * (low[k] + 0.5) + offset[k] - 0.5  # pixel centres on pixel centres
-        affine = np.column_stack([np.diag(ratio[k]), shift])  # (2, 3)
+        shift = scale * (low[k] + 0.5) + pad - 0.5  # pixel centres on pixel centres
+        affine = np.column_stack([np.diag(scale), shift])  # (2, 3)
         values = cv2.warpAffine(
             np.ascontiguousarray(maps[k], np.float32), affine, (x2 - x1, y2 - y1),
             flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE,
         )  # fmt: skip
-        masks[k, y1:y2, x1:x2] = values > threshold
+        masks[k, y1:y2, x1:x2] = values > 0
     return masks
-
-
-def _is_selected(model: ModelProbe) -> bool:
-    """Test whether the outputs have boxes (.., N, 4), integer labels and scores of the same N."""
-    with contextlib.suppress(StopIteration):
-        return len(_pick_outputs(list(model.outputs.values()))) == 3
-    return False
 
 
 def _keypoint_values(model: ModelProbe) -> int:
@@ -340,23 +317,22 @@ def _layout(
 IMAGENET_RGB = Pixels("RGB, ImageNet", True, IMAGENET_MEAN, IMAGENET_STD)
 IMAGENET_BGR = Pixels("BGR, ImageNet", False, IMAGENET_MEAN[::-1], IMAGENET_STD[::-1])
 BYTES_BGR = Pixels("BGR, 0..255", False, std=(1.0, 1.0, 1.0))
-CAFFE_BGR = Pixels("BGR, less the mean", False, (102.9801, 115.9465, 122.7717), (1.0, 1.0, 1.0))
 YOLO = "YOLOv8, YOLO11"
 
 LAYOUTS: Registry[Decode] = Registry("detector outputs", "--detector-layout", [
     _layout("detr", "DEIM, D-FINE, RT-DETR", "labels, boxes, scores",
-            lambda m: None if "orig_target_sizes" in m.inputs and _is_selected(m) else 0,
-            lambda outs, *_: Decoded(*_pick_outputs(outs)),  # the model scales its boxes
-            nms_iou=None),
+            lambda m: None if "orig_target_sizes" in m.inputs
+            and {"labels", "boxes", "scores"} <= m.outputs.keys() else 0,
+            _decode_detr, nms_iou=None),
     _layout("yolo", f"{YOLO}, also -seg", "(1, 4 + classes [+ 32], cells)[, (1, 32, h, w)]",
-            lambda m: m.values(0) - 4 - sum(shape[1] for shape in m.shapes[1:]),
+            lambda m: m.values(0) - 4 - sum(shape[1] for shape in m.shapes[1:] if len(shape) == 4),
             _decode_yolo, ("", "detect", "segment"), fit="centre"),
     _layout("yolo-rows", f"{YOLO}, transposed", "(1, cells, 4 + classes)",
             lambda m: m.values(1) - 4,
             lambda outs, *more: _decode_yolo([outs[0].swapaxes(1, 2)], *more), fit="centre"),
-    _layout("yolo-obb", f"{YOLO}, rotated boxes", "(1, 4 + classes + 1, cells)",
-            lambda m: m.values(0) - 5, _decode_rotated, ("obb",), fit="centre",
-            unread="the angle: a box is the upright one around it"),
+    _layout("yolo-obb", f"{YOLO}, rotated boxes: the upright one around each",
+            "(1, 4 + classes + 1, cells)", lambda m: m.values(0) - 5, _decode_rotated, ("obb",),
+            fit="centre"),
     _layout("yolo-pose", f"{YOLO}, key points", "(1, 4 + classes + key points, cells)",
             lambda m: m.values(0) - 4 - _keypoint_values(m), _decode_yolo, ("pose",),
             fit="centre", unread="the key points"),
@@ -370,20 +346,16 @@ LAYOUTS: Registry[Decode] = Registry("detector outputs", "--detector-layout", [
     _layout("nanodet", "NanoDet-Plus", "(1, cells, classes + 32)",
             lambda m: m.values(1, levels=4) - 4 * GFL_BINS, _decode_gfl, pixels=IMAGENET_BGR),
     _layout("picodet", "PicoDet", "of each level (1, cells, classes), then (1, cells, 32)",
-            lambda m: m.shapes[0][-1] if len(m.shapes) in (6, 8)
-            and m.shapes[-1][2:] == (4 * GFL_BINS,) else 0,
+            lambda m: m.shapes[0][2] if [*map(len, m.shapes)] in ([3] * 6, [3] * 8)
+            and m.shapes[-1][2] == 4 * GFL_BINS else 0,
             _decode_gfl, pixels=IMAGENET_RGB),
-    _layout("mask-rcnn", "Mask R-CNN of ONNX' model zoo", "boxes, labels, scores, 28x28 masks",
-            lambda m: None if _is_selected(m) and m.shapes[-1][2:] == (28, 28) else 0,
-            _decode_selected, fit="corner", pixels=CAFFE_BGR, nms_iou=None, first=1),
-    _layout("ssd", "SSD of ONNX' model zoo", "bboxes, labels, scores",
-            lambda m: None if _is_selected(m) and "bboxes" in m.outputs else 0,
-            _decode_selected, pixels=IMAGENET_RGB, nms_iou=None, first=1),
 ])  # fmt: skip
 
 
-def find_layout(model: ModelProbe, declared: str) -> Layout:
+def find_layout(model: ModelProbe, declared: str, names_of: str) -> Layout:
     """Find the layout of a model, by its name if it is declared.
+
+    names_of: who gives the class names, for messages.
 
     Raises:
         ReobjError: its outputs fit no layout, or several, or not the declared one.
@@ -397,8 +369,9 @@ def find_layout(model: ModelProbe, declared: str) -> Layout:
             raise ReobjError(f"{model.path}: {shapes}: not the outputs of layout {declared}, "
                              f"{entry.shape}")  # fmt: skip
         near += [f"{entry.name} with {count} classes"] if count and count > 0 else []
-    model.found = (f": {shapes}; class names: {model.count} (of detect.class_names, the model or "
-                   f"COCO); by its shape {' or '.join(near) or 'none'}")  # fmt: skip
+    task = f" and task {task}" if (task := model.metadata.get("task")) else ""
+    model.found = (f": {shapes} with {model.count} class names ({names_of}){task}; by its shape "
+                   f"{' or '.join(near) or 'none'}")  # fmt: skip
     layout = LAYOUTS.choose(model, declared)
     assert isinstance(layout, Layout)
     return layout
