@@ -1949,7 +1949,7 @@ def _cmd_eval(args: argparse.Namespace) -> int:
     try:
         if args.out.is_dir():
             with atomic(args.out / "eval.json") as part:
-                part.write_text(json.dumps(scores, indent=1))
+                part.write_text(json.dumps(scores, indent=1), encoding="utf-8")
     finally:
         print(score_report(scores))
     return 0

@@ -230,7 +230,7 @@ def _quiet() -> Iterator[None]:
     """Discard FFmpeg's remark on the codec's tag, which C code prints on stderr."""
     sys.stderr.flush()
     stderr_copy = os.dup(2)
-    with open(os.devnull, "w") as null:
+    with open(os.devnull, "w", encoding="utf-8") as null:
         os.dup2(null.fileno(), 2)
     try:
         yield

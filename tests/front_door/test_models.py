@@ -205,8 +205,8 @@ def test_names_in_a_model_go_by_number(
 
 def test_the_table_of_layouts_is_that_of_the_registry() -> None:
     text = (ROOT / "docs/input_formats.md").read_text(encoding="utf-8")
-    start = text.index("layouts_table -->\n") + len("layouts_table -->\n")
-    assert text[start : text.index("<!-- end of layouts -->")] == layouts_table()
+    begin = "<!-- layouts: docs/make_formats.py -->\n"
+    assert text.partition(begin)[2].partition("<!-- end -->")[0] == layouts_table()
 
 
 # ---- Names in any language -----------------------------------------------------------------------
