@@ -1339,7 +1339,7 @@ def track(
     batch = 1 if video.is_live else source.batch
     motion = tracker.state.camera_motion
     for frames in motion.ahead(video, batch) if ahead else in_batches(video, batch):
-        for frame, found in zip(frames, source.look_at(frames), strict=True):
+        for frame, found in zip(frames, source.detect(frames), strict=True):
             tracks = tracker.update(found, frame.image, looked=looked, **cameras(frame.index))
             yield frame, dataclasses.replace(tracks, frame=np.full(len(tracks), frame.index))
 
@@ -1971,7 +1971,7 @@ def _cmd_eval(args: argparse.Namespace) -> int:
     try:
         if args.out.is_dir():
             with atomic(args.out / "eval.json") as part:
-                part.write_text(json.dumps(scores, indent=1))
+                part.write_text(json.dumps(scores, indent=1), encoding="utf-8")
     finally:
         print(score_report(scores))
     return 0
@@ -2023,8 +2023,7 @@ def _cmd_models(args: argparse.Namespace) -> int:
             w = row.weights
             size = f"{w.size / 1e6:.1f}" if w.size else "?"
             facts = f"{w.name:<15} {w.role:<9} {size:>5} MB  {w.licence:<11}"
-            note = "; ".join(filter(None, (w.note, w.verified)))
-            print("\n".join(wrapped(f"{facts} {row.state:<9} {note}")))
+            print("\n".join(wrapped(f"{facts} {row.state:<9} {w.note}")))
     return 0
 
 

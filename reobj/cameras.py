@@ -592,7 +592,7 @@ def write_tum(path: Path, poses: Poses) -> None:
     rows = [" ".join([f"{row[0]:.9f}", *(f"{v:.12g}" for v in row[1:])]) for row in table]
     header = f"# t tx ty tz qx qy qz qw (world_from_cam, seconds, {units})"
     with atomic(path) as part:
-        part.write_text("\n".join([header, *rows]) + "\n")
+        part.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
 
 
 def write_colmap(path: Path, poses: Poses, image_names: Sequence[str]) -> None:
@@ -611,7 +611,7 @@ def write_colmap(path: Path, poses: Poses, image_names: Sequence[str]) -> None:
     camera = poses.camera
     numbers = " ".join(repr(float(p)) for p in camera.params)
     facts = f"1 {camera.model} {camera.width} {camera.height} {numbers}\n"
-    (path / "cameras.txt").write_text(facts)
+    (path / "cameras.txt").write_text(facts, encoding="utf-8")
     known = poses.cam_from_world[poses.known]
     values = np.column_stack([quat_wxyz_from_matrix(known[:, :, :3]), known[:, :, 3]])  # (N, 7)
     lines = [
@@ -621,7 +621,7 @@ def write_colmap(path: Path, poses: Poses, image_names: Sequence[str]) -> None:
     (path / "images.txt").write_text("".join(lines), "utf-8", "surrogateescape")
     points = zip(poses.points.tolist(), poses.colors.tolist(), strict=True)
     rows = [" ".join(map(repr, (i, *xyz, *rgb, 0))) for i, (xyz, rgb) in enumerate(points, 1)]
-    (path / "points3D.txt").write_text("".join(f"{row}\n" for row in rows))
+    (path / "points3D.txt").write_text("".join(f"{row}\n" for row in rows), encoding="utf-8")
 
 
 @dataclass(frozen=True, slots=True)

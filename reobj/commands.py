@@ -114,10 +114,13 @@ def _open_streams() -> None:
             while os.open(os.devnull, os.O_RDWR) < number:
                 pass
         if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, "r+"))
+            setattr(sys, name, open(os.devnull, "r+", encoding="utf-8"))
     for stream in (sys.stdout, sys.stderr):  # an unusual name of a class or file must not end a run
-        # "surrogateescape" in the locale C
-        if isinstance(stream, io.TextIOWrapper) and stream.errors in ("strict", "surrogateescape"):
+        if not isinstance(stream, io.TextIOWrapper):
+            continue
+        if sys.getfilesystemencoding() == "ascii":  # LC_ALL=C: names of files are passed as bytes
+            stream.reconfigure(encoding="utf-8", errors="surrogateescape")
+        elif stream.errors in ("strict", "surrogateescape"):  # the latter in the locale C.UTF-8
             stream.reconfigure(errors="backslashreplace")
 
 

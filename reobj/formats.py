@@ -25,6 +25,8 @@ HEAD_BYTES = 65536
 class Probe:
     """What `recognise` looks at: names, the first lines, and top-level keys of a file or folder."""
 
+    found: str = ""  # for the error of a file that fits no format
+
     def __init__(self, path: Path) -> None:
         self.path = path
         self.suffix = path.suffix.lower()
@@ -95,7 +97,7 @@ class Format(Generic[R]):
 
     name: str
     title: str
-    recognise: Callable[[Probe], bool]
+    recognise: Callable[[Any], bool]
     read: R | None
     frames: str = ""
     units: str = ""
@@ -132,22 +134,25 @@ class Registry(Generic[R]):
         """Return the format of a file, as `reader` does."""
         if not path.exists():
             raise ReobjError(f"{path}: no such file of {self.what}")
+        return self.choose(Probe(path), name)
+
+    def choose(self, probe: Probe, name: str = AUTO) -> Format[R]:
+        """Return the format that the user names, or that a probe fits, as `reader` does."""
         known = {entry.name: entry for entry in self.readable}
         if name not in ("", AUTO):
             if name not in known:
                 close = did_you_mean(name, known) or f"; expected {AUTO}, {', '.join(known)}"
                 raise ReobjError(f"{self.flag} {name}: no such format{close}")
             return known[name]
-        probe = Probe(path)
         fits = [entry for entry in self.formats if entry.recognise(probe)]
         if len(fits) == 1:
             return fits[0]
         names = [entry.name for entry in fits if entry.read is not None]
         if fits:
-            raise ReobjError(f"{path}: fits {len(fits)} formats of {self.what}: "
+            raise ReobjError(f"{probe.path}: fits {len(fits)} formats of {self.what}: "
                              f"{', '.join(names)}; name one with {self.flag}")  # fmt: skip
-        raise ReobjError(f"{path}: no known format of {self.what}; expected one of "
-                         f"{', '.join(known)} ({self.flag}; docs/input_formats.md)")  # fmt: skip
+        raise ReobjError(f"{probe.path}: no known format of {self.what}{probe.found}; expected one "
+                         f"of {', '.join(known)} ({self.flag}; docs/input_formats.md)")  # fmt: skip
 
     def table(self) -> str:
         """Return the Markdown table of docs/input_formats.md."""

@@ -26,7 +26,7 @@ def canonical(name: str) -> str:
     >>> canonical("Sofa"), canonical("mobile_phone"), canonical("Espresso-Machine")
     ('couch', 'cell phone', 'espresso machine')
     """
-    return _table().canonical([name])[0]
+    return _table().canonical([typed(name)])[0]
 
 
 def meant(word: str, names: Sequence[str]) -> list[int]:
@@ -35,7 +35,12 @@ def meant(word: str, names: Sequence[str]) -> list[int]:
     >>> meant("sofa", ["chair", "couch"]), meant("sofa", ["couch", "sofa"])
     ([1], [1])
     """
-    return _table().meant(word, names)
+    return _table().meant(typed(word), names)
+
+
+def typed(word: str) -> str:
+    """Decode a word of the command line in a locale without UTF-8 (LC_ALL=C)."""
+    return word.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
 
 
 def among(names: Iterable[str], words: Iterable[str]) -> BoolArray:

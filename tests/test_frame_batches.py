@@ -187,7 +187,7 @@ def test_masks_of_a_batch_are_not_held_together(tmp_path: Path, monkeypatch: Any
     decoded = []
     decode = detector._decoded
     monkeypatch.setattr(detector, "_decoded", lambda *a: decoded.append(1) or decode(*a))
-    steps = as_source(detector).look_at([rt.Frame(i, 0.0, plain(40)) for i in range(4)])
+    steps = as_source(detector).detect([rt.Frame(i, 0.0, plain(40)) for i in range(4)])
     for count in (1, 2, 3, 4):
         next(steps)
         assert len(decoded) == count
@@ -203,7 +203,7 @@ def test_a_batch_that_fails_names_its_size(tmp_path: Path, monkeypatch: Any) -> 
     monkeypatch.setattr(detector, "_session", Full())
     frames = [rt.Frame(i, 0.0, plain(40)) for i in (7, 8)]
     with pytest.raises(rt.ReobjError) as caught:
-        next(as_source(detector).look_at(frames))
+        next(as_source(detector).detect(frames))
     text = "failed on 2 images at once (detect.batch): CUDA failure 2: out of memory"
     assert str(caught.value) == f"frame 7: {detector.path} {text}"
 
@@ -236,7 +236,7 @@ class Noted:
     def __init__(self) -> None:
         self.batches: list[list[int]] = []
         self.read: list[int] = []
-        self.source = rt.DetectionSource(self.one, detect_batch=self.several, batch=2)
+        self.source = rt.DetectionSource(self.several, batch=2)
 
     def one(self, frame: rt.Frame) -> rt.Detections:
         return rt.Detections.from_array([[9, 9, 50, 40 + frame.index, 0.9, 56]])
@@ -283,8 +283,9 @@ def test_tracking_is_in_batches(clip: Path, camera_motion: bool) -> None:
     config = rt.TrackerConfig(camera_motion=camera_motion)
     steps = list(rt.track(Counted(clip, FIVE), noted.source, rt.Tracker(config)))
     assert noted.batches == [[0, 1], [2, 3], [4]] and few_ahead(noted)
+    one_by_one = lambda frames: map(noted.one, frames)  # noqa: E731
     plain_steps = list(
-        rt.track(rt.Video(clip, FIVE), rt.DetectionSource(noted.one), rt.Tracker(config))
+        rt.track(rt.Video(clip, FIVE), rt.DetectionSource(one_by_one), rt.Tracker(config))
     )
     for (a, found), (b, expected) in zip(steps, plain_steps, strict=True):
         assert a.index == b.index and np.array_equal(found.xyxy, expected.xyxy)
@@ -325,10 +326,10 @@ def test_a_subclass_decides_what_a_call_returns(tmp_path: Path) -> None:
 def test_cached_frames_are_not_in_the_batch(tmp_path: Path) -> None:
     noted = Noted()
     cache = DetectionCache(tmp_path, (96, 64))
-    source = rt.DetectionSource(noted.one, detect_batch=noted.several, batch=4, cache=cache)
+    source = rt.DetectionSource(noted.several, batch=4, cache=cache)
     frames = [rt.Frame(i, 0.0, plain(40)) for i in range(4)]
     assert source(frames[2]).xyxy[0, 3] == 42
-    steps = source.look_at(frames)
+    steps = source.detect(frames)
     next(steps)
     assert noted.batches == [[2], [0, 1, 3]] and 0 in cache and 1 not in cache
     assert [found.xyxy[0, 3] for found in steps if found is not None] == [41, 42, 43]

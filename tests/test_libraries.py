@@ -65,7 +65,7 @@ def batches_are_like_single_frames(folder: Path, model: str, **config: Any) -> N
         source = opened(video, rt.DetectConfig(model=model, batch=batch, **config))
         assert source.batch == batch
         frames = list(video)
-        found.append([*source.look_at(frames[:batch]), *source.look_at(frames[batch:])])
+        found.append([*source.detect(frames[:batch]), *source.detect(frames[batch:])])
     for one, several in zip(*found, strict=True):
         assert one is not None and several is not None and len(one) == len(several) > 0
         np.testing.assert_allclose(one.score, several.score, atol=1e-4)

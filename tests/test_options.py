@@ -528,6 +528,20 @@ def _(lab: Lab) -> None:
     assert [len(by_file(lab, value)[0]) for value in (3, 120, 0)] == [3, 120, 140]  # 0: all
 
 
+@shows("detect.layout")
+def _(lab: Lab) -> None:
+    """With a class less and an angle, of 0, in place of its score."""
+    names = lab.path / "names.txt"
+    names.write_text("mouse\nchair\n")
+    config = dataclasses.replace(lab.config("yolo-obb").detect, class_names=str(names))
+    lab.patch.setattr(detectors, "onnx_session", Session)
+    detector = rt.OnnxDetector(lab.path / "names.txt", config)
+    found = detector(np.full((64, 64, 3), 128, np.uint8))
+    assert detector.layout == "yolo-obb" and found.xyxy.tolist() == [[22, 22, 42, 42]]
+    with pytest.raises(rt.ReobjError, match=r"--detector-layout yoloo: .* did you mean yolo"):
+        rt.OnnxDetector(lab.path / "names.txt", lab.config("yoloo").detect)
+
+
 @shows("detect.batch")
 def _(lab: Lab) -> None:
     """The most images of a run of the network; 0: by the device."""

@@ -1,4 +1,4 @@
-"""Detection in tiles: tiling, merging, and the published fusion."""
+"""Detection in tiles: tiling and merging."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ from reobj.sources.tiles import (
     detect_in_tiles,
     parse_tiles,
     tile_boxes,
-    weighted_box_fusion,
 )
-from reobj.types import Image, box_iou
+from reobj.types import Image
 
 SIZE = (640, 480)  # (w, h)
 
@@ -116,31 +115,3 @@ def test_no_detections() -> None:
     for masks in (False, True):
         found = in_tiles(painter(masks=masks)[1], picture())
         assert len(found) == 0 and found.xyxy.shape == (0, 4)
-
-
-def test_fusion_weighs_by_score_within_a_class() -> None:
-    xyxy = np.array([[0.0, 0, 10, 10], [2, 0, 12, 10], [0, 0, 10, 10], [50, 50, 60, 60]])
-    boxes, best = weighted_box_fusion(xyxy, np.array([0.3, 0.9, 0.8, 0.1]), np.array([1, 1, 2, 1]))
-    assert best.tolist() == [1, 2, 3]
-    np.testing.assert_allclose(boxes, [[1.5, 0, 11.5, 10], [0, 0, 10, 10], [50, 50, 60, 60]])
-    boxes, best = weighted_box_fusion(np.empty((0, 4)), np.empty(0), np.empty(0, np.int64))
-    assert boxes.shape == (0, 4) and len(best) == 0
-
-
-def test_fusion_equals_the_published_one() -> None:
-    other = pytest.importorskip("ensemble_boxes", reason="pip install ensemble-boxes")
-    rng = np.random.default_rng(0)
-    corner = np.repeat(rng.random((40, 2)) * 0.8, 3, 0) + rng.normal(0, 0.01, (120, 2))
-    xyxy = np.hstack([corner, corner + rng.uniform(0.08, 0.12, (120, 2))]).clip(0, 1)
-    score, label = rng.uniform(0.1, 1, 120), rng.integers(0, 2, 120)
-    boxes, best = weighted_box_fusion(xyxy, score, label)
-    views = np.arange(120) % 5
-    expected = other.weighted_boxes_fusion(
-        *([column[views == v] for v in range(5)] for column in (xyxy, score, label)),
-        iou_thr=0.55, conf_type="max",
-    )  # fmt: skip
-    assert 40 < len(boxes) < 100
-    np.testing.assert_allclose(score[best], expected[1], atol=1e-6)
-    np.testing.assert_allclose(boxes, expected[0], atol=1e-6)
-    assert label[best].tolist() == expected[2].tolist()
-    assert box_iou(boxes, expected[0]).max(1).min() > 0.999

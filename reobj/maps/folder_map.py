@@ -116,7 +116,7 @@ def _digests_path(copy: Path) -> Path:
 def _digests(copy: Path) -> list[str]:
     """Read the digests of a copy."""
     path = _digests_path(copy)
-    return path.read_text().split() if path.is_file() else []
+    return path.read_text(encoding="utf-8").split() if path.is_file() else []
 
 
 def _write(path: Path, content: bytes) -> None:

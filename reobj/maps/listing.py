@@ -195,7 +195,7 @@ def _write_json(room: RoomMap, path: Path) -> None:
         "merged": {str(old): kept for old, kept in sorted(room.merged.items())},
     }  # fmt: skip
     with atomic(path) as part:
-        part.write_text(json.dumps(data, indent=1) + "\n")
+        part.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
 
 
 def _write_csv(room: RoomMap, path: Path) -> None:

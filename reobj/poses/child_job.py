@@ -77,12 +77,12 @@ def write_job(folder: Path, job: dict[str, Any], images: ImageFile) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     file = {"path": str(images.path), "shape": images.shape, "slots": images.slots}
     with atomic(folder / "job.json") as part:
-        part.write_text(json.dumps(job | {"image_file": file}))
+        part.write_text(json.dumps(job | {"image_file": file}), encoding="utf-8")
 
 
 def read_job(folder: Path) -> tuple[dict[str, Any], ImageFile]:
     """Read a job and its keyframes (BGR)."""
-    job = json.loads((folder / "job.json").read_text())
+    job = json.loads((folder / "job.json").read_text(encoding="utf-8"))
     return job, ImageFile(**job["image_file"] | {"path": Path(job["image_file"]["path"])})
 
 

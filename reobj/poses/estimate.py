@@ -324,7 +324,7 @@ class KeyframeStore:
             "times_s": video.times_s,
         }
         with atomic(self.table) as part:
-            part.write_text(json.dumps(table))
+            part.write_text(json.dumps(table), encoding="utf-8")
 
     def load(self, video: ResizedVideo) -> list[Keyframe] | None:
         """Read the keyframes that an interrupted run chose; None if there are none.

@@ -153,7 +153,7 @@ def match_pairs(
                 for pair, match in zip(chunk, matches, strict=True):
                     if not db.exists_matches(*pair):
                         db.write_matches(*pair, match)
-            listed.write_text("".join(f"{i:06d} {j:06d}\n" for i, j in chunk))
+            listed.write_text("".join(f"{i:06d} {j:06d}\n" for i, j in chunk), encoding="utf-8")
             pc.verify_matches(str(database), str(listed), verification)
             if stage:
                 send_progress(stage, start + len(chunk), len(todo))

@@ -150,7 +150,7 @@ def reconstruct(
         model.replace(work_dir / model.name)
         for model in sorted(folder.glob("sparse*"), key=lambda p: (len(p.name), p.name))
     ]
-    result = json.loads((folder / "messages.json").read_text())
+    result = json.loads((folder / "messages.json").read_text(encoding="utf-8"))
     return Mapped(models, result["messages"], frozenset(result["unmatched"]))
 
 
@@ -322,7 +322,7 @@ def _map_job(folder: Path, job: dict[str, Any], images: ImageFile) -> None:
     before = {int(i): view for i, view in before.items() if {int(i), view} <= known}
     view_of = find_repeated(database, ids, extract, size[0], seed, job["is_video"], before)
     with atomic(folder / "views.json") as part:
-        part.write_text(json.dumps(view_of))
+        part.write_text(json.dumps(view_of), encoding="utf-8")
     mapped = sorted({view for view in view_of.values() if view})
     vlad = vlad_vectors(database, mapped, visual_words(database, mapped, seed))
     path = [view_of[number] for number in ids if view_of[number]]
@@ -350,7 +350,7 @@ def _map_job(folder: Path, job: dict[str, Any], images: ImageFile) -> None:
     matched = np.unique(every_pair.image_ids[every_pair.enough])
     unmatched = sorted(set(ids) - set(matched.tolist()))
     result = {"messages": messages, "unmatched": unmatched}
-    (folder / "messages.json").write_text(json.dumps(result))
+    (folder / "messages.json").write_text(json.dumps(result), encoding="utf-8")
 
 
 def _write_native_model(model: Any, images: ImageFile, folder: Path, job: dict[str, Any]) -> None:

@@ -217,7 +217,7 @@ def _kept(
         (folder / f"model{k}").mkdir(exist_ok=True)
         model.write(str(folder / f"model{k}"))
     with atomic(path) as part:
-        part.write_text(json.dumps({"ids": ids, "models": len(models)} | found))
+        part.write_text(json.dumps({"ids": ids, "models": len(models)} | found), encoding="utf-8")
     return models, found
 
 

@@ -246,7 +246,7 @@ def write_earlier(path: Path, sessions: Sequence[EarlierSession]) -> None:
         for session in sessions
     ]  # fmt: skip
     with atomic(path) as part:
-        part.write_text(json.dumps({"sessions": data}) + "\n")
+        part.write_text(json.dumps({"sessions": data}) + "\n", encoding="utf-8")
 
 
 @dataclass(frozen=True, slots=True)
@@ -275,7 +275,7 @@ def _moved_text(change: Change) -> str:
 def write_changes(path: Path, changes: Changes) -> None:
     """Write changes.json."""
     with atomic(path) as part:
-        part.write_text(json.dumps(changes.to_json(), indent=1) + "\n")
+        part.write_text(json.dumps(changes.to_json(), indent=1) + "\n", encoding="utf-8")
 
 
 def read_changes(path: Path) -> Changes:

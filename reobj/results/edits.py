@@ -154,7 +154,7 @@ def write_edits(folder: Path, edits: Edits | None) -> None:
         return
     data = HEADER | {"map": edits.map_id, "edits": edits.to_json()}
     with atomic(folder / OutputFile.EDITS) as part:
-        part.write_text(json.dumps(data, indent=1) + "\n")
+        part.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
 
 
 def kept_edits(folder: Path) -> Edits | None:

@@ -128,7 +128,7 @@ def export_coco_vid(result: Result, path: Path) -> None:
         "annotations": annotations,
     }
     with atomic(path) as part:
-        part.write_text(json.dumps(data) + "\n")
+        part.write_text(json.dumps(data) + "\n", encoding="utf-8")
 
 
 def export_cvat(result: Result, path: Path) -> None:
@@ -287,7 +287,7 @@ def _write_nerfstudio(poses: Poses, origin: Array, video: Video, path: Path, fol
     if len(poses.points):
         write_point_ply(folder / "sparse_pc.ply", poses.points, poses.colors)
         data["ply_file_path"] = "sparse_pc.ply"
-    (folder / path.name).write_text(json.dumps(data, indent=1) + "\n")
+    (folder / path.name).write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
 
 
 def _nerf_camera(camera: Camera, path: Path) -> dict[str, Any]:

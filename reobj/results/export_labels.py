@@ -53,10 +53,10 @@ def export_yolo(result: Result, path: Path) -> None:
             ]  # fmt: skip
             label = folder / "labels" / f"{labels[frame]}.txt"
             label.parent.mkdir(parents=True, exist_ok=True)
-            label.write_text("".join(lines))
+            label.write_text("".join(lines), encoding="utf-8")
         entries = "".join(f"  {i}: {json.dumps(name)}\n" for i, name in enumerate(names))
         head = "path: .\ntrain: images\nval: images\n"
-        (folder / path.name).write_text(f"{head}names:\n{entries}")
+        (folder / path.name).write_text(f"{head}names:\n{entries}", encoding="utf-8")
 
 
 def export_labelme(result: Result, path: Path) -> None:
@@ -99,7 +99,7 @@ def export_labelme(result: Result, path: Path) -> None:
                 "imageWidth": result.video.width,
             }  # fmt: skip
             label.parent.mkdir(parents=True, exist_ok=True)
-            label.write_text(json.dumps(data, indent=1) + "\n")
+            label.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
         classes = "".join(f"{name}\n" for name in names)
         (folder / path.name).write_text(classes, encoding="utf-8")
 

@@ -34,7 +34,7 @@ def export_ros(result: Result, path: Path) -> None:
     """
     world = upright_world(result, path)
     with atomic(path) as part:
-        part.write_text(json.dumps(_detections_3d(world, 0), indent=1) + "\n")
+        part.write_text(json.dumps(_detections_3d(world, 0), indent=1) + "\n", encoding="utf-8")
 
 
 def export_mcap(result: Result, path: Path) -> None:

@@ -264,7 +264,7 @@ def write_objects(result: Result, path: Path) -> None:
         "warnings": result.warnings,
     }
     with atomic(path) as part:
-        part.write_text(json.dumps(data, indent=1) + "\n")
+        part.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
 
 
 def _contradiction(entries: ObjectsFile, poses: Poses | None) -> str:
@@ -287,7 +287,7 @@ def _contradiction(entries: ObjectsFile, poses: Poses | None) -> str:
 
 def objects_schema() -> Any:
     """Read the JSON schema of objects.json."""
-    return json.loads(Path(__file__).with_name("objects.schema.json").read_text())
+    return json.loads(Path(__file__).with_name("objects.schema.json").read_text(encoding="utf-8"))
 
 
 def validate_objects(path: Path) -> list[str]:

@@ -64,7 +64,7 @@ def detect_all(
     try:
         with progress("detect", video.expected) as line:
             for batch in one_ahead(in_batches(video, source.batch)):  # a thread decodes the next
-                for frame, found in zip(batch, source.look_at(batch), strict=True):
+                for frame, found in zip(batch, source.detect(batch), strict=True):
                     detected = Detections.empty() if found is None else found
                     frames += [frame.index] * len(detected)
                     steps.append((detected.xyxy / video.scale, detected.score, detected.class_id))

@@ -150,7 +150,7 @@ class Workspace:
                 for name in (*others, OutputFile.LAST_TRACKS, OutputFile.LAST_POSES):
                     (self.out / name).unlink(missing_ok=True)
         with atomic(path) as part:
-            part.write_text(json.dumps(fingerprint))
+            part.write_text(json.dumps(fingerprint), encoding="utf-8")
 
     def _has_results(self) -> bool:
         """Check for results of a run; cached stages are keyed by their video and do not count."""

@@ -61,7 +61,7 @@ def has_boxes_3d(path: Path) -> bool:
     """Test whether a file is a table of boxes in 3D."""
     if path.suffix.lower() not in (".csv", ".txt") or not path.is_file():
         return False
-    with path.open(errors="replace") as file:
+    with path.open(encoding="utf-8", errors="replace") as file:
         return "tx_world_object" in file.readline(1000)
 
 

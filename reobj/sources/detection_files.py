@@ -87,6 +87,12 @@ class DetectConfig:
         "frames that a network gets at once (0: 8 on cuda and tensorrt, else 1; a live source: 1); "
         "lower: less memory of the device",
     )
+    layout: str = option(
+        "",
+        "layout of the ONNX model's outputs, as docs/input_formats.md lists them (default: the one "
+        "that agrees with its shapes, class names and task)",
+        "--detector-layout",
+    )
 
 
 def unnamed_class(class_id: int, count: int) -> str:

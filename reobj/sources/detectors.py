@@ -7,7 +7,6 @@ files of detections: `detection_files`.
 
 from __future__ import annotations
 
-import ast
 import dataclasses
 import itertools
 import json
@@ -17,12 +16,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from reobj.cameras import Poses
-from reobj.files import did_you_mean, save_npz, spans
-from reobj.sources.class_names import Vocabulary, check_length, load_class_names
+from reobj.files import did_you_mean, save_npz
+from reobj.sources.class_names import (
+    Vocabulary,
+    load_class_names,
+    names_by_number,
+    parse_class_names,
+)
 from reobj.sources.detection_files import (
     DetectConfig,
     class_filter,
@@ -31,23 +34,25 @@ from reobj.sources.detection_files import (
 )
 from reobj.sources.libraries import (
     LibraryDetector,
-    at_once,
+    failing,
     fixed_classes,
     is_function,
     library_detector,
     library_of,
-    names_by_id,
     user_function,
 )
 from reobj.sources.onnx_layouts import (
-    LAYOUTS,
+    UNIT_RGB,
     Geometry,
     Layout,
-    Trial,
+    ModelProbe,
+    Pixels,
     best_rows,
+    find_layout,
     fit_image,
+    nms,
 )
-from reobj.sources.recorded import NORMALISED_MAX, RecordedDetections, pack_detections, read_npz
+from reobj.sources.recorded import RecordedDetections, pack_detections, read_npz
 from reobj.sources.tiles import detect_in_tiles, parse_tiles
 from reobj.sources.video import Video, in_batches, source_fingerprint
 from reobj.sources.weights import (
@@ -59,7 +64,9 @@ from reobj.sources.weights import (
 )
 from reobj.types import (
     COCO_NAMES,
+    NOTE_START,
     Array,
+    BoolArray,
     Detections,
     Frame,
     Image,
@@ -75,7 +82,7 @@ from reobj.words import among
 
 
 class OnnxDetector:
-    """Detect objects with an ONNX model, whose layout is inferred from its inputs and outputs.
+    """Detect objects with an ONNX model of one of the `onnx_layouts`.
 
         detector = OnnxDetector("fast")
         detections = detector(image)  # BGR; boxes in its pixels
@@ -85,10 +92,12 @@ class OnnxDetector:
         threads: of onnxruntime (0: all cores). offline: never download.
         device: cpu, cuda, coreml, ... (`onnx_session`).
     Attributes:
-        class_names: names by class id. layout: name of the inferred layout. path: of the file.
-        batch: most images that `detect` gives the network at once.
+        class_names: names by class id. layout: name of the layout. path: of the file.
+        batch: most images that `detect` gives the network at once. message: which layout was
+            recognised; "": it is declared.
     Raises:
-        ReobjError: no such file, or an unknown layout.
+        ReobjError: no such file; outputs of no layout, or of several; or names of the classes that
+            are not as many as the layout has.
     """
 
     def __init__(
@@ -109,26 +118,16 @@ class OnnxDetector:
         self._inputs = [(i.name, list(i.shape), i.type) for i in self._session.get_inputs()]
         _, shape, kind = self._inputs[0]
         if kind != "tensor(float)" or len(shape) not in (3, 4) or shape[-3] != 3:
-            raise self._refusal(f"input is {kind} {shape}, expected an image (1, 3, H, W)")
+            raise ReobjError(f"{self.path}: no known object detector: input is {kind} {shape}, "
+                             "expected an image (1, 3, H, W)")  # fmt: skip
         axis = shape[0] if len(shape) == 4 else 1
         self._fixed = axis if isinstance(axis, int) else 0  # images of every run; 0: any number
-        trial = self._trial_run()
-        accepting = [layout for layout in LAYOUTS if layout.accepts(trial)]
-        if not accepting:
-            outputs = zip(self._session.get_outputs(), trial.outputs, strict=True)
-            shapes = ", ".join(f"{output.name} {array.shape}" for output, array in outputs)
-            known = "; ".join(layout.name for layout in LAYOUTS)
-            text = f"outputs {shapes}; known layouts: {known}{weights.fallback if weights else ''}"
-            raise self._refusal(text)
-        self._layout = accepting[0]
+        self._model = self._trial_run()
+        self._layout, self.class_names = self._recognise(weights.layout if weights else "")
         self.layout = self._layout.name
-        self.class_names = self._names(self._layout.classes(trial))
-        if weights is not None and (fault := self._fault(trial, weights.layout)):
-            text = f"{self.path} does not behave like a detector of the layout {weights.layout}"
-            raise ReobjError(f"{text}: {fault}{weights.fallback}")
         wanted = self.config.classes
         self._allowed = class_filter(wanted, self.class_names) if wanted else None
-        self.batch = self._accepted(frames_at_once(self.config.batch, device), trial)
+        self.batch = self._accepted(frames_at_once(self.config.batch, device))
 
     def __call__(self, image: Image) -> Detections:
         """Detect the objects in one BGR image (H, W, 3); best first, boxes clipped to the image."""
@@ -148,57 +147,27 @@ class OnnxDetector:
         for size, group in itertools.groupby(images, lambda a: self._input_size(*a.shape[1::-1])):
             for batch in in_batches(group, self.batch):
                 fitted = [fit_image(image, size, self._layout.fit) for image in batch]
-                try:
-                    each = self._run(fitted, self._layout)
-                except Exception as error:  # no memory on the device, a shape that is refused
-                    reason = str(error).partition("\n")[0]
-                    text = f"{self.path} failed{at_once(len(batch))}: {reason}"
-                    raise ReobjError(text) from error
+                with failing(str(self.path), len(batch)):
+                    each = self._run(fitted, self._layout.pixels)
                 for outputs, (_, geometry) in zip(each, fitted, strict=True):
                     yield self._decoded(outputs, geometry)
 
     def _decoded(self, outputs: list[Any], geometry: Geometry) -> Detections:
         """Decode and select the detections of one image."""
-        decoded = self._layout.decode(outputs, geometry)
+        assert self._layout.read is not None
+        decoded = self._layout.read(outputs, geometry, self._model)
         boxes = np.clip(decoded.xyxy, 0, np.tile(geometry.image_size, 2))
-        label = decoded.class_id - self._layout.first
-        keep = self._select(boxes, decoded.score, label)
+        label = decoded.class_id
+        use = label >= 0 if self._allowed is None else np.isin(label, self._allowed)
+        keep = _best(boxes, decoded.score, use, self.config)
+        if self._layout.nms_iou is not None:
+            keep = keep[nms(boxes[keep], label[keep], self._layout.nms_iou)]
+        keep = keep[: self._most]
         if len(keep) and label[keep].max() >= len(self.class_names):
             text = unnamed_class(label[keep].max(), len(self.class_names))
             raise ReobjError(f"{self.path}: {text}")
         masks = decoded.masks(keep) if decoded.masks is not None else None
         return Detections(boxes[keep], decoded.score[keep], label[keep], masks)
-
-    def _refusal(self, reason: str) -> ReobjError:
-        """Make the error for a file that is no known detector."""
-        return ReobjError(f"{self.path}: no known object detector: {reason}")
-
-    def _fault(self, trial: Trial, expected: str) -> str:
-        """Find why the outputs of a trial run are not those of layout `expected`; "": they are."""
-        if not self.layout.startswith(expected):
-            return f"its layout is {self.layout}"
-        _, identity = self._grey()
-        decoded = self._layout.decode(trial.outputs, identity)
-        score = decoded.score
-        if not np.isfinite(decoded.xyxy).all() or not ((score >= 0) & (score <= 1)).all():
-            return "boxes that are not finite, or scores outside 0..1"
-        if len(decoded.xyxy) and np.abs(decoded.xyxy).max() <= NORMALISED_MAX:
-            return "boxes that are not in pixels"
-        labels = decoded.class_id - self._layout.first
-        count = len(self.class_names)
-        return f"classes beyond its {count}" if labels.max(initial=0) >= count else ""
-
-    def _select(self, boxes: Array, score: Array, label: IntArray) -> IntArray:
-        """Select rows by score, area, class and NMS; best first."""
-        use = (score >= self.config.min_score) & (boxes[:, 2:] > boxes[:, :2]).all(1)
-        use &= label >= 0
-        if self._allowed is not None:
-            use &= np.isin(label, self._allowed)
-        rows = np.flatnonzero(use)
-        rows = rows[best_rows(score[rows])]
-        if self._layout.nms_iou is not None:
-            rows = rows[nms(boxes[rows], label[rows], self._layout.nms_iou)]
-        return rows[: self._most]
 
     def _input_size(self, width: int, height: int) -> tuple[int, int]:
         """Return the input (w, h) for an image: the model's, or, if dynamic, the image's shape."""
@@ -210,7 +179,7 @@ class OnnxDetector:
         w, h = (a if isinstance(a, int) else b for a, b in zip(fixed, scaled, strict=True))
         return w, h
 
-    def _run(self, fitted: list[tuple[Image, Geometry]], layout: Layout) -> list[list[Any]]:
+    def _run(self, fitted: list[tuple[Image, Geometry]], pixels: Pixels) -> list[list[Any]]:
         """Run the model on fitted BGR images; return the outputs of each, with a batch axis of 1.
 
         A fixed batch is filled up with the last image.
@@ -218,9 +187,9 @@ class OnnxDetector:
         count = len(fitted)
         fitted = fitted + fitted[-1:] * (self._fixed - count)
         name, shape, _ = self._inputs[0]
-        mean, std = np.array([layout.mean, layout.std], np.float32)
+        mean, std = np.array([pixels.mean, pixels.std], np.float32)
         canvases = np.stack([canvas for canvas, _ in fitted])
-        blob = (canvases[..., ::-1] if layout.rgb else canvases).astype(np.float32)
+        blob = (canvases[..., ::-1] if pixels.rgb else canvases).astype(np.float32)
         blob = np.ascontiguousarray(((blob - mean) / std).transpose(0, 3, 1, 2))  # (B, 3, H, W)
         sizes = np.array([geometry.image_size for _, geometry in fitted])
         feeds = {name: blob if len(shape) == 4 else blob[0]}
@@ -230,23 +199,29 @@ class OnnxDetector:
             return [outputs]  # some have no batch axis
         return [[output[i : i + 1] for output in outputs] for i in range(count)]
 
-    def _grey(self) -> tuple[Image, Geometry]:
-        """Make a square image in the grey of the borders of fitted images, for trial runs."""
+    def _run_grey(self, count: int) -> list[list[Any]]:
+        """Run the model on square images in the grey of the borders of fitted images."""
         size = self._input_size(1, 1)
         grey = np.full((size[1], size[0], 3), 114, np.uint8)
-        return grey, Geometry(size, size, (1.0, 1.0), (0, 0))
+        return self._run([(grey, Geometry(size, size, (1.0, 1.0), (0, 0)))] * count, UNIT_RGB)
 
-    def _trial_run(self) -> Trial:
-        """Run the model on a grey image to get the shapes of its outputs."""
-        grey, geometry = self._grey()
+    def _trial_run(self) -> ModelProbe:
+        """Run the model to get the shapes of its outputs."""
         try:
-            (outputs,) = self._run([(grey, geometry)], LAYOUTS[0])
+            (outputs,) = self._run_grey(1)
         except Exception as error:
             reason = f"a trial run with {self._inputs} failed: {str(error).splitlines()[0]}"
-            raise self._refusal(reason) from error
-        return Trial(outputs, len(self._inputs), geometry.input_size)
+            raise ReobjError(f"{self.path}: no known object detector: {reason}") from error
+        names = (output.name for output in self._session.get_outputs())
+        return ModelProbe(
+            self.path,
+            [name for name, _, _ in self._inputs],
+            dict(zip(names, outputs, strict=True)),
+            self._input_size(1, 1),
+            self._session.get_modelmeta().custom_metadata_map,
+        )
 
-    def _accepted(self, wanted: int, trial: Trial) -> int:
+    def _accepted(self, wanted: int) -> int:
         """Return how many images the model takes at once: `wanted`, or its fixed number, or 1.
 
         Exports exist whose batch axis is dynamic only by name.
@@ -256,8 +231,8 @@ class OnnxDetector:
         reason = "its batch axis is 1"
         if not self._fixed:
             try:
-                *_, last = self._run([self._grey()] * wanted, self._layout)
-                if [a.shape for a in last] == [a.shape for a in trial.outputs]:
+                *_, last = self._run_grey(wanted)
+                if [a.shape for a in last] == self._model.shapes:
                     return wanted
                 reason = "its outputs have no batch axis"
             except Exception as error:
@@ -267,51 +242,45 @@ class OnnxDetector:
                         self.path, wanted, reason)  # fmt: skip
         return 1
 
-    def _names(self, count: int) -> tuple[str, ...]:
-        """Name `count` classes (0: unknown) by option, metadata of the model, COCO, or numbers."""
+    def _recognise(self, declared: str) -> tuple[Layout, tuple[str, ...]]:
+        """Find the layout, and the names of its classes: by option, metadata, COCO, or numbers.
+
+        declared: layout of known weights.
+        """
+        names: tuple[str, ...] = ()
+        names_of = f"of COCO, as the model names none; {NAMES}"
         if self.config.class_names:
-            return load_class_names(self.config.class_names)
-        names = self._session.get_modelmeta().custom_metadata_map.get("names", "").strip()
-        if names.startswith(("{", "[")):
-            return self._names_in_model(names, count)
-        if count in (0, len(COCO_NAMES)):
-            return COCO_NAMES
-        log.warning("%s: %d classes without names: give a file of names with --set "
-                    "detect.class_names=FILE", self.path, count)  # fmt: skip
-        return tuple(f"class {i}" for i in range(count))
-
-    def _names_in_model(self, text: str, count: int) -> tuple[str, ...]:
-        """Read class names from a list, or a map from numbers, with one for each of the classes."""
-        first = self._layout.first
-        try:
-            table = ast.literal_eval(text)
-            entries = table.items() if isinstance(table, dict) else enumerate(table, first)
-            named = {int(number): str(name) for number, name in entries}
-            numbers = spans(sorted(named)) or "none"
-        except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
-            named = {}
-            numbers = f"unreadable ({text:.40})"
-        last = first + (count or max(len(named), 1)) - 1
-        if sorted(named) == list(range(first, last + 1)):
-            return tuple(named[number] for number in sorted(named))
-        raise ReobjError(
-            f"{self.path}: the numbers of the class names in it are {numbers}, expected "
-            f"{first}-{last}: give a file of names with --set detect.class_names=FILE"
-        )
+            names_of = self.config.class_names
+            names = load_class_names(names_of)
+        elif text := self._model.metadata.get("names", "").strip():
+            names_of = "of its metadata"
+            names = parse_class_names(text, f"{self.path}: metadata `names`; {NAMES}")
+        self._model.count = len(names or COCO_NAMES)
+        declared = self.config.layout or declared
+        layout = find_layout(self._model, declared, names_of)
+        count = layout.classes(self._model)
+        if names and count not in (None, len(names)):
+            raise ReobjError(f"{self.path}: {len(names)} class names ({names_of}), but layout "
+                             f"{layout.name} has {count} classes")  # fmt: skip
+        if not names and count not in (None, len(COCO_NAMES)):
+            log.warning("%s: %d classes without names: %s", self.path, count, NAMES)
+            names = tuple(f"class {i}" for i in range(count or 0))
+        names = names or COCO_NAMES
+        self._model.count = len(names)
+        unread = f"; not read: {layout.unread}" if layout.unread else ""
+        text = f"{NOTE_START}{self.path}: read as {layout.name} ({layout.title}){unread}"
+        self.message = "" if declared else text
+        return layout, names
 
 
-def nms(xyxy: Array, class_id: IntArray, max_iou: float) -> IntArray:
-    """Suppress boxes that overlap a better one of their class (greedy NMS).
+NAMES = "give a file of names with --set detect.class_names=FILE"
 
-    Args:
-        xyxy: (N, 4), best first. max_iou: largest IoU of two remaining boxes of a class.
-    Returns:
-        remaining rows, ascending.
-    """
-    xywh = np.hstack([xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]])
-    rank = np.arange(len(xyxy), 0, -1)
-    kept = cv2.dnn.NMSBoxesBatched(xywh.tolist(), rank.tolist(), class_id.tolist(), 0.0, max_iou)
-    return np.sort(np.array(kept, np.int64))
+
+def _best(xyxy: Array, score: Array, use: BoolArray, config: DetectConfig) -> IntArray:
+    """Select rows, among those to `use`, by score and area; best first."""
+    use = use & (score >= config.min_score) & (xyxy[:, 2:] > xyxy[:, :2]).all(1)
+    rows = np.flatnonzero(use)
+    return rows[best_rows(score[rows])]
 
 
 class DetectionCache:
@@ -337,9 +306,8 @@ class DetectionCache:
         self.image_size = image_size
         self._file_frames = file_frames
         self._mask_bytes = mask_bytes
-        self._stored: dict[int, RecordedDetections] = {}  # by frame
+        self._stored: dict[int, RecordedDetections | None] = {}  # by frame; None: skipped
         self._pending: dict[int, Detections] = {}  # by frame, not on disk yet
-        self._skipped: set[int] = set()  # frames of this run on which the detector was not run
         chunks = sorted(p for p in self.folder.glob("chunk_*.npz") if p.stem[6:].isdecimal())
         self._next = 1 + max((int(path.stem[6:]) for path in chunks), default=-1)
         for path in chunks:
@@ -356,18 +324,19 @@ class DetectionCache:
 
     def __contains__(self, index: int) -> bool:
         """Test whether `put` was called for a frame."""
-        return index in self._pending or index in self._stored or index in self._skipped
+        return index in self._pending or index in self._stored
 
     def get(self, index: int) -> Detections | None:
         """Return the detections of a frame; None if the detector was not run on it."""
         if index in self._pending:
             return self._pending[index]
-        return self._stored[index].at(index) if index in self._stored else None
+        chunk = self._stored.get(index)
+        return None if chunk is None else chunk.at(index)
 
     def put(self, index: int, detections: Detections | None) -> None:
         """Store the detections of a frame; None: the detector was not run on it."""
         if detections is None:
-            self._skipped.add(index)
+            self._stored[index] = None
             return
         self._pending[index] = detections
         masks = (d.masks.nbytes for d in self._pending.values() if d.masks is not None)
@@ -389,10 +358,11 @@ class DetectionCache:
 
 @dataclass(frozen=True, slots=True)
 class DetectionSource:
-    """Source of the detections of a frame: `source(frame)`.
+    """Source of the detections of a video: `source.detect(frames)`, or `source(frame)`.
 
     Attributes:
-        detect: Frame -> Detections in px of its image; None: the detector was not run on it.
+        run: several frames -> Detections of each in px of its image; None: the detector was not
+            run on it.
         class_names: by class id; a `Vocabulary` grows with the labels of an open-vocabulary
             detector.
         key: cache key of all inputs of the detections besides the video; "": unknown, so results
@@ -402,11 +372,10 @@ class DetectionSource:
         recorded: detections of a file, all available in advance.
         always_looks: zero detections mean an empty frame, and only None a frame on which the
             detector was not run.
-        detect_batch: `detect` for several frames, whose detections it yields in order; None:
-            `detect` is called for each. batch: most frames that it should be given.
+        batch: most frames that `run` should be given.
     """
 
-    detect: Callable[[Frame], Detections | None]
+    run: Callable[[Sequence[Frame]], Iterator[Detections | None]]
     class_names: Sequence[str] = COCO_NAMES
     key: str = ""
     messages: Sequence[str] = ()
@@ -414,7 +383,6 @@ class DetectionSource:
     cache: DetectionCache | None = None
     recorded: RecordedDetections | None = None
     always_looks: bool = False
-    detect_batch: Callable[[Sequence[Frame]], Iterator[Detections | None]] | None = None
     batch: int = 1
 
     def __post_init__(self) -> None:
@@ -423,23 +391,23 @@ class DetectionSource:
 
     def __call__(self, frame: Frame) -> Detections:
         """Return the detections of a frame; zero if the detector was not run on it."""
-        detections = self.look(frame)
-        return Detections.empty() if detections is None else detections
+        return next(self.detect([frame])) or Detections.empty()
 
-    def look(self, frame: Frame) -> Detections | None:
-        """Return the detections of a frame, cached if possible; None: the detector was not run."""
-        return next(self.look_at([frame]))
+    def detect(self, frames: Sequence[Frame]) -> Iterator[Detections | None]:
+        """Yield the detections of each frame, cached if possible; None: the detector was not run.
 
-    def look_at(self, frames: Sequence[Frame]) -> Iterator[Detections | None]:
-        """Yield `look` of several frames; those that are not cached are detected together."""
+        Frames that are not cached are detected together.
+        """
         cache = self.cache
-        new = [frame for frame in frames if cache is None or frame.index not in cache]
-        found = map(self.detect, new) if self.detect_batch is None else self.detect_batch(new)
+        found = self.run([frame for frame in frames if cache is None or frame.index not in cache])
         for frame in frames:
             if cache is not None and frame.index in cache:
                 yield cache.get(frame.index)
                 continue
-            detections = next(found)
+            try:
+                detections = next(found)
+            except ReobjError as error:
+                raise ReobjError(f"frame {frame.index}: {error}") from error
             if cache is not None:
                 cache.put(frame.index, detections)
             yield detections
@@ -483,29 +451,29 @@ def open_detections(
     """
     config, detections = with_detector(config, detections)
     names = load_class_names(config.class_names) if config.class_names else ()
-    if detections is None or detections == "":
-        words = tuple(word.strip() for word in config.words.split(",") if word.strip())
-        if library_of(config.model):
-            opened, version = library_detector(config.model, words, config.min_score, device)
-            key = _cache_key(config, version, _file_key(config.model), device)
-            source = _filtered(as_source(opened), config)
-            batch = frames_at_once(config.batch, device)
-            return dataclasses.replace(source, key=key, slow=True, always_looks=True, batch=batch)
-        if words:
-            raise fixed_classes(config.model)
-        if is_function(config.model):
-            function = user_function(config.model)
-            is_open = not (names or _stated_names(function))  # its labels are the class names
-            return _filtered(as_source(function, names), config, is_open)
-        path = model_path(config.model, offline)
-        detector = OnnxDetector("", config, threads, offline, device)
-        key = _cache_key(config, path.name, path.stat().st_size, device)
-        return dataclasses.replace(as_source(detector), key=key, slow=True)
-    if isinstance(detections, str | Path):
+    if detections and isinstance(detections, str | Path):
         recorded = read_detections(detections, video, config, poses)
         key = _cache_key(config, recorded.fingerprint())
         return dataclasses.replace(as_source(recorded), key=key)
-    return as_source(detections, names)
+    if detections not in (None, ""):
+        return as_source(detections, names)
+    words = tuple(word.strip() for word in config.words.split(",") if word.strip())
+    if library_of(config.model):
+        opened, version = library_detector(config.model, words, config.min_score, device)
+        file = config.model.partition(":")[2] or config.model
+        key = _cache_key(config, version, file, device)
+        source = _filtered(as_source(opened), config)
+        batch = frames_at_once(config.batch, device)
+        return dataclasses.replace(source, key=key, slow=True, always_looks=True, batch=batch)
+    if words:
+        raise fixed_classes(config.model)
+    if is_function(config.model):
+        function = user_function(config.model)
+        is_open = not (names or _stated_names(function))  # its labels are the class names
+        return _filtered(as_source(function, names), config, is_open)
+    detector = OnnxDetector("", config, threads, offline, device)
+    key = _cache_key(config, detector.path, device)
+    return dataclasses.replace(as_source(detector), key=key, slow=True)
 
 
 def _filtered(
@@ -523,33 +491,19 @@ def _filtered(
 
     def select(frame: Frame, found: Detections) -> Detections:
         boxes = np.clip(found.xyxy, 0, np.tile(frame.image.shape[1::-1], 2))
-        use = (found.score >= config.min_score) & (boxes[:, 2:] > boxes[:, :2]).all(1)
+        use = np.ones(len(boxes), bool)
         if allowed is not None:
-            use &= np.isin(found.class_id, allowed)
+            use = np.isin(found.class_id, allowed)
         elif wanted:
-            use &= among(source.class_names, wanted.split(","))[found.class_id]
-        rows = np.flatnonzero(use)
-        rows = rows[best_rows(found.score[rows])][: config.max_detections or None]
+            use = among(source.class_names, wanted.split(","))[found.class_id]
+        rows = _best(boxes, found.score, use, config)[: config.max_detections or None]
         return dataclasses.replace(found, xyxy=boxes)[rows]
 
-    def detect(frames: Sequence[Frame]) -> Iterator[Detections | None]:
-        for frame, found in zip(frames, source.look_at(frames), strict=True):
+    def run(frames: Sequence[Frame]) -> Iterator[Detections | None]:
+        for frame, found in zip(frames, source.run(frames), strict=True):
             yield None if found is None else select(frame, found)
 
-    return dataclasses.replace(source, detect=_of_one(detect), detect_batch=detect)
-
-
-def _of_one(
-    detect: Callable[[Sequence[Frame]], Iterator[Detections | None]],
-) -> Callable[[Frame], Detections | None]:
-    """Make a function of one frame from one of several frames."""
-    return lambda frame: next(detect([frame]))
-
-
-def _file_key(model: str) -> str:
-    """Identify the file of a library's model; "": it is no file."""
-    path = Path(model.partition(":")[2] or model).expanduser()
-    return source_fingerprint(str(path)) if path.is_file() else ""
+    return dataclasses.replace(source, run=run)
 
 
 def with_detector(config: DetectConfig, detections: Any) -> tuple[DetectConfig, Any]:
@@ -576,15 +530,16 @@ def with_detector(config: DetectConfig, detections: Any) -> tuple[DetectConfig, 
     return config, detections
 
 
-def _cache_key(config: DetectConfig, *source: str | int) -> str:
-    """Make a cache key from the identity of a source, the options and the class names' file.
+def _cache_key(config: DetectConfig, *source: str | Path) -> str:
+    """Make a cache key from the identity of a source, the options, and the files of both.
 
     The size of the batches is left out: it does not change the detections.
     """
-    names = source_fingerprint(config.class_names) if config.class_names else ""
+    files = [Path(text).expanduser() for text in (*source, config.class_names) if text]
+    contents = [source_fingerprint(file) for file in files if file.is_file()]
     options = dataclasses.asdict(config)
     del options["batch"]
-    return json.dumps([*source, options, names])
+    return json.dumps([*map(str, source), options, contents])
 
 
 def as_source(detector: Any, class_names: Sequence[str] = ()) -> DetectionSource:
@@ -601,23 +556,25 @@ def as_source(detector: Any, class_names: Sequence[str] = ()) -> DetectionSource
         return detector
     if isinstance(detector, RecordedDetections):
         return _recorded_source(detector)
-    names = tuple(class_names) or _stated_names(detector)
-    if type(detector) is OnnxDetector:  # a subclass may change the result of a call
-        source = _answer_source(detector.detect, names, bool(class_names))
-        return dataclasses.replace(source, always_looks=True, batch=detector.batch)
-    if isinstance(detector, LibraryDetector):
-        return _answer_source(detector.detect, names, bool(class_names))
-    if not callable(detector):
+    several = type(detector) in (OnnxDetector, LibraryDetector)  # a subclass may change a call
+    if not several and not callable(detector):
         raise ReobjError(f"{detector!r:.80} is no detector: expected a function image -> detections"
                          "; a file is opened by read_detections(path, video)")  # fmt: skip
-    source = _answer_source(lambda images: map(detector, images), names, bool(class_names))
-    return dataclasses.replace(source, always_looks=isinstance(detector, OnnxDetector))
+    answer = detector.detect if several else lambda images: map(detector, images)
+    names = tuple(class_names) or _stated_names(detector)
+    source = DetectionSource(
+        *_checked(answer, names, bool(class_names)),
+        batch=getattr(detector, "batch", 1) if several else 1,
+        always_looks=isinstance(detector, OnnxDetector),
+        messages=[text] if (text := getattr(detector, "message", "")) else (),
+    )
+    return source
 
 
-def _answer_source(
+def _checked(
     answer: Callable[[list[Image]], Iterator[Any]], class_names: Sequence[str], numbered: bool
-) -> DetectionSource:
-    """Make a source from the answers of a detector, which are checked.
+) -> tuple[Callable[[Sequence[Frame]], Iterator[Detections | None]], Vocabulary]:
+    """Check the answers of a detector; return `run` and `class_names` of its source.
 
     Args:
         answer: BGR images -> what the detector returns for each. class_names: () if it states none.
@@ -625,27 +582,16 @@ def _answer_source(
     """
     names = Vocabulary(class_names or COCO_NAMES)
     silent = bool(class_names)
-    for name in names:
-        check_length(name, "class names of the detector")
 
-    def detect(frames: Sequence[Frame]) -> Iterator[Detections | None]:
-        answers = answer([frame.image for frame in frames])
-        return (checked(frame, answers) for frame in frames)
-
-    def checked(frame: Frame, answers: Iterator[Any]) -> Detections | None:
+    def checked(found: Any) -> Detections | None:
         nonlocal silent
-        try:
-            found = next(answers)
-            if found is None:
-                return None
-            labels = None if numbered else text_labels(found)
-            kinds = None if labels is None else np.array(names.numbers(labels), np.int64)
-            detections = as_detections(found, kinds)
-        except ReobjError as error:
-            raise ReobjError(f"frame {frame.index}: {error}") from error
+        if found is None:
+            return None
+        labels = None if numbered else text_labels(found)
+        kinds = None if labels is None else np.array(names.numbers(labels), np.int64)
+        detections = as_detections(found, kinds)
         if len(detections) and detections.class_id.max() >= len(names):
-            text = unnamed_class(int(detections.class_id.max()), len(names))
-            raise ReobjError(f"frame {frame.index}: {text}")
+            raise ReobjError(unnamed_class(int(detections.class_id.max()), len(names)))
         if isinstance(found, Mapping) and kinds is None and not silent and len(detections):
             log.warning(
                 "the detector has no class names: its numbers are read as COCO's 80 classes, from "
@@ -655,25 +601,25 @@ def _answer_source(
             silent = True  # one warning is enough
         return detections
 
-    return DetectionSource(_of_one(detect), names, detect_batch=detect)
+    return lambda frames: map(checked, answer([frame.image for frame in frames])), names
 
 
 def _recorded_source(recorded: RecordedDetections) -> DetectionSource:
     """Make a source from the detections of a file; None for frames without detector output."""
     looked = None if recorded.looked is None else set(recorded.looked.tolist())
 
-    def detect(frame: Frame) -> Detections | None:
-        return recorded.at(frame.index) if looked is None or frame.index in looked else None
+    def run(frames: Sequence[Frame]) -> Iterator[Detections | None]:
+        for index in (frame.index for frame in frames):
+            yield recorded.at(index) if looked is None or index in looked else None
 
-    names = recorded.class_names
     return DetectionSource(
-        detect, names, "", recorded.messages, recorded=recorded, always_looks=True
+        run, recorded.class_names, "", recorded.messages, recorded=recorded, always_looks=True
     )
 
 
 def _stated_names(detector: Any) -> tuple[str, ...]:
     """Return the class names in a detector's attributes, a list or a dict by id; () if none."""
     names = getattr(detector, "class_names", None) or getattr(detector, "names", None)
-    if isinstance(names, Mapping):
-        return names_by_id(names)
-    return tuple(map(str, names)) if isinstance(names, list | tuple) else ()
+    if names and isinstance(names, Mapping | list | tuple):
+        return names_by_number(names)
+    return ()

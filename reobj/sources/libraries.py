@@ -6,17 +6,19 @@ its own.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import importlib
 import importlib.metadata
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from reobj.sources.class_names import names_by_number
 from reobj.types import Image, ReobjError
 
 
@@ -50,23 +52,29 @@ class LibraryDetector:
     name: str = ""
 
     def detect(self, images: list[Image]) -> Iterator[Any]:
-        """Detect the objects in each of several images, all at once.
-
-        Raises:
-            ReobjError: the library failed; with its message.
-        """
-        try:
+        """Detect the objects in each of several images, all at once."""
+        with failing(f"--detector {self.name}", len(images)):
             yield from self.run(images)
-        except ReobjError:
-            raise
-        except Exception as error:  # libraries raise any kind
-            text = f"--detector {self.name} failed{at_once(len(images))}: {_message(error)}"
-            raise ReobjError(text) from error
 
 
-def at_once(count: int) -> str:
-    """Return the part of a message about a network's failure that names the size of the batch."""
-    return f" on {count} images at once (detect.batch)" if count > 1 else ""
+@contextlib.contextmanager
+def failing(name: str, count: int = 0) -> Iterator[None]:
+    """Convert any error of a network's library to one line.
+
+    Args:
+        count: images that it gets at once; 0: it is being opened.
+    """
+    try:
+        yield
+    except ReobjError:
+        raise
+    except Exception as error:  # no memory on the device, no such file, no download, ...
+        at_once = f" on {count} images at once (detect.batch)" if count > 1 else ""
+        text = next((line.strip() for line in str(error).splitlines() if line.strip()), "")
+        if not text or not isinstance(error, OSError | RuntimeError):
+            text = f"{type(error).__name__}: {text}"
+        failed = f" failed{at_once}" if count else ""
+        raise ReobjError(f"{name}{failed}: {text}") from error
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +106,7 @@ def _ultralytics(options: LibraryOptions) -> LibraryDetector:
             images, conf=options.min_score, device=options.device, retina_masks=True, verbose=False
         )
 
-    return LibraryDetector(run, names_by_id(model.names))
+    return LibraryDetector(run, names_by_number(model.names))
 
 
 def _rfdetr(options: LibraryOptions) -> LibraryDetector:
@@ -182,7 +190,7 @@ def _transformers(options: LibraryOptions) -> LibraryDetector:
         answers = processor.post_process_grounded_object_detection(outputs, **asked)
         return (_with_words(found, words) for found in answers)
 
-    return LibraryDetector(run, options.words or names_by_id(model.config.id2label))
+    return LibraryDetector(run, options.words or names_by_number(model.config.id2label))
 
 
 def _with_words(image: Any, words: list[str]) -> dict[str, Any]:
@@ -242,28 +250,18 @@ def library_detector(
         raise fixed_classes(detector)
     if device.partition(":")[0] not in ("cpu", "cuda", "mps"):
         raise ReobjError(f"--device {device}: detectors of {name} run on cpu, cuda or mps")
-    try:
-        found = library.open(LibraryOptions(model, words, min_score, device))
-    except ImportError as error:
-        remedy = f"it needs: pip install {library.install}"
-        missing = (error.name or "").partition(".")[0]
-        if missing not in ("", "torch", *library.install.split()):  # of one model alone, as CLIP
-            remedy = f"{name} needs it for this model; its documentation says how to install it"
-        raise ReobjError(f"--detector {detector}: {error}; {remedy}") from error
-    except ReobjError:
-        raise
-    except Exception as error:  # no such file, no download, no such device, no model
-        raise ReobjError(f"--detector {detector}: {_message(error)}") from error
-    found = dataclasses.replace(found, name=detector)
-    package = "transformers" if name == "hf" else name
-    return found, f"{package} {importlib.metadata.version(package)}"
-
-
-def _message(error: Exception) -> str:
-    """Return the first line of an error, with its kind where that line says little."""
-    text = next((line.strip() for line in str(error).splitlines() if line.strip()), "")
-    kind = type(error).__name__
-    return text if isinstance(error, OSError | RuntimeError) and text else f"{kind}: {text}"
+    with failing(f"--detector {detector}"):
+        try:
+            found = library.open(LibraryOptions(model, words, min_score, device))
+        except ImportError as error:
+            remedy = f"it needs: pip install {library.install}"
+            missing = (error.name or "").partition(".")[0]
+            if missing not in ("", "torch", *library.install.split()):  # of one model, as CLIP
+                remedy = f"{name} needs it for this model; its documentation says how to install it"
+            raise ReobjError(f"--detector {detector}: {error}; {remedy}") from error
+    package = library.install.partition(" ")[0]
+    version = f"{package} {importlib.metadata.version(package)}"
+    return dataclasses.replace(found, name=detector), version
 
 
 def is_function(detector: str) -> bool:
@@ -287,12 +285,6 @@ def user_function(detector: str) -> Any:
     if not callable(found):
         raise ReobjError(f"--detector {detector}: it is no function image -> detections")
     return found
-
-
-def names_by_id(names: Mapping[Any, Any]) -> tuple[str, ...]:
-    """Return the names of ids 0, 1, ...; ids without a name get a number."""
-    of_id = {int(i): str(name) for i, name in names.items()}
-    return tuple(of_id.get(i, f"class {i}") for i in range(max(of_id, default=-1) + 1))
 
 
 def fixed_classes(detector: str) -> ReobjError:

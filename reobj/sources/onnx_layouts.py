@@ -1,22 +1,24 @@
 """Layouts of ONNX detectors: how each family is recognised, fed and decoded.
 
-LAYOUTS lists the families. `OnnxDetector` runs the models.
+LAYOUTS is the registry; docs/input_formats.md has its table. `OnnxDetector` runs the models.
 """
 
 from __future__ import annotations
 
-import contextlib
+import functools
 import math
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from reobj.sources.recorded import NORMALISED_MAX
+from reobj.formats import Format, Probe, Registry
 from reobj.sources.weights import IMAGENET_MEAN, IMAGENET_STD
-from reobj.types import Array, BoolArray, Image, IntArray, xyxy_from_cxcywh
+from reobj.types import Array, BoolArray, Image, IntArray, ReobjError, xyxy_from_cxcywh
 
 GFL_BINS = 8  # bins of a distance, 0 to 7 strides (NanoDet-Plus, PicoDet: reg_max 7)
 
@@ -48,49 +50,80 @@ class Decoded:
     masks: Callable[[IntArray], BoolArray] | None = None
 
 
+class ModelProbe(Probe):
+    """What a layout is recognised by.
+
+    Attributes:
+        inputs: their names. outputs: of a trial run, by name. size: (w, h) of the input.
+        metadata: of the file. count: number of class names, then of classes of the layout.
+    """
+
+    def __init__(self, path: Path, inputs: Sequence[str], outputs: Mapping[str, Any],
+                 size: tuple[int, int], metadata: Mapping[str, str]) -> None:  # fmt: skip
+        super().__init__(path)
+        self.inputs = inputs
+        self.outputs = outputs
+        self.size = size
+        self.metadata = metadata
+        self.count = 0
+        self.shapes = [output.shape for output in outputs.values()]
+
+    def values(self, axis: int, levels: int = 3, boxes: int = 1) -> int:
+        """Return the length of axis 1 + `axis` of the first output, the other one being its cells.
+
+        Args:
+            levels: of cells, of 8, 16, 32, ... px. boxes: of each cell.
+        Returns:
+            0: the output has other axes, or there are others than prototypes of masks.
+        """
+        first, *others = self.shapes
+        if len(first) != 3 or not all(len(shape) == 4 for shape in others):
+            return 0
+        cells = sum(math.prod(math.ceil(v / (8 << k)) for v in self.size) for k in range(levels))
+        return int(first[1 + axis] if first[2 - axis] == boxes * cells else 0)
+
+    @functools.cached_property
+    def in_px(self) -> bool:
+        """Whether rows begin with centres in px, across the input; else with offsets in cells."""
+        first = next(iter(self.outputs.values()))
+        return bool(np.median(np.abs(first[0, :, :2])) >= 8)  # offsets: below 2
+
+
+Decode = Callable[[Sequence[Any], Geometry, ModelProbe], Decoded]
+
+
 @dataclass(frozen=True, slots=True)
-class Trial:
-    """Outputs of a trial run, the number of inputs and the input's (w, h)."""
+class Pixels:
+    """Pixels of a network's input: order of the channels, mean and deviation of 0..255."""
 
-    outputs: list[Any]
-    inputs: int
-    size: tuple[int, int]
+    title: str
+    rgb: bool
+    mean: tuple[float, ...] = (0.0, 0.0, 0.0)
+    std: tuple[float, ...] = (255.0, 255.0, 255.0)
 
-    @property
-    def rows(self) -> tuple[int, int]:
-        """Return the (rows, columns) of a single output, besides masks; (0, 0) for several."""
-        first, *others = (output.shape for output in self.outputs)
-        single = len(first) == 3 and all(len(shape) == 4 for shape in others)
-        return (first[1], first[2]) if single else (0, 0)
 
-    def anchors(self, levels: int) -> int:
-        """Count the cells of all levels, of 8, 16, 32, ... px."""
-        return sum(math.prod(math.ceil(v / (8 << k)) for v in self.size) for k in range(levels))
+UNIT_RGB = Pixels("RGB, 0..1", True)
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class Layout(Format[Decode]):
     """Family of detectors: how it is recognised, fed and decoded.
 
     Attributes:
+        shape: of the outputs, for the table.
+        classes: number of classes that the outputs have in this layout, by their shapes; None:
+            these leave it open; less than 1: their shapes are others.
         fit: "stretch" the image to the input, or keep its aspect ratio and pad: "corner" (image at
             the top left) or "centre".
-        rgb: channel order of the network. mean, std: of the pixels, 0..255, in that order.
         nms_iou: IoU above which two boxes of a class are duplicates (NanoDet: .6); None: the model
             has selected its boxes.
-        first: label of the first class. classes: number of classes (0: unknown from the outputs).
     """
 
-    name: str
-    accepts: Callable[[Trial], bool]
-    decode: Callable[[list[Any], Geometry], Decoded]
+    shape: str = ""
+    classes: Callable[[ModelProbe], int | None] = lambda model: 0
+    pixels: Pixels = UNIT_RGB
     fit: str = "stretch"
-    rgb: bool = True
-    mean: tuple[float, ...] = (0.0, 0.0, 0.0)
-    std: tuple[float, ...] = (255.0, 255.0, 255.0)
     nms_iou: float | None = 0.6
-    first: int = 0
-    classes: Callable[[Trial], int] = lambda trial: 0
 
 
 def fit_image(image: Image, size: tuple[int, int], fit: str) -> tuple[Image, Geometry]:
@@ -126,33 +159,39 @@ def best_rows(score: Array, most: int = 1000) -> IntArray:
     return np.argsort(-score, kind="stable")[:most]
 
 
+def nms(xyxy: Array, class_id: IntArray, max_iou: float) -> IntArray:
+    """Suppress boxes that overlap a better one of their class (greedy NMS).
+
+    Args:
+        xyxy: (N, 4), best first. max_iou: largest IoU of two remaining boxes of a class.
+    Returns:
+        remaining rows, ascending.
+    """
+    xywh = np.hstack([xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]])
+    rank = np.arange(len(xyxy), 0, -1)
+    kept = cv2.dnn.NMSBoxesBatched(xywh.tolist(), rank.tolist(), class_id.tolist(), 0.0, max_iou)
+    return np.sort(np.array(kept, np.int64))
+
+
 def _best_class(scores: Array) -> tuple[Array, IntArray]:
     """Return the best score (N,) in each row of (N, C), and its class (N,)."""
     return scores.max(1).astype(np.float64), scores.argmax(1).astype(np.int64)
 
 
-def _pick_outputs(outs: list[Any]) -> tuple[Array, Array, IntArray]:
-    """Find boxes, scores and labels among the outputs of a model with its own selection.
-
-    Returns:
-        boxes (N, 4), scores (N,), integer labels (N,).
-    Raises:
-        StopIteration: one of them is missing.
-    """
-    boxes = next(o for o in outs if o.ndim in (2, 3) and o.shape[-1] == 4).reshape(-1, 4)
-    flat = [o.ravel() for o in outs if o.ndim < 3 and o.size == len(boxes)]
-    labels = next(o for o in flat if o.dtype.kind == "i")
-    scores = next(o for o in flat if o.dtype.kind == "f")
-    return boxes.astype(np.float64), scores.astype(np.float64), labels.astype(np.int64)
+def _decode_detr(outs: Sequence[Any], geometry: Geometry, model: ModelProbe) -> Decoded:
+    """Decode labels, boxes and scores; the model selects the boxes and scales them to the image."""
+    of = dict(zip(model.outputs, outs, strict=True))
+    boxes, score = (of[name].astype(np.float64) for name in ("boxes", "scores"))
+    return Decoded(boxes.reshape(-1, 4), score.ravel(), of["labels"].ravel().astype(np.int64))
 
 
-def _decode_yolox(outs: list[Any], geometry: Geometry) -> Decoded:
+def _decode_yolox(outs: Sequence[Any], geometry: Geometry, model: ModelProbe) -> Decoded:
     """Decode centre, log size, objectness and class scores of each cell, or of decoded boxes.
 
     Ref: YOLOX (Ge et al. 2021), whose exports are raw or with the decoder included.
     """
     rows = outs[0][0].astype(np.float64)  # (A, 5 + C)
-    if np.median(np.abs(rows[:, :2])) < 8:  # raw: below 2; decoded: half of the image, px
+    if not model.in_px:
         cells, stride = _grid(geometry.input_size, 3)
         rows[:, :2] = (rows[:, :2] + cells) * stride
         rows[:, 2:4] = np.exp(rows[:, 2:4]) * stride
@@ -160,29 +199,45 @@ def _decode_yolox(outs: list[Any], geometry: Geometry) -> Decoded:
     return Decoded(geometry.to_image(xyxy_from_cxcywh(rows)), score * rows[:, 4], label)
 
 
-def _decode_yolo(outs: list[Any], geometry: Geometry) -> Decoded:
+def _decode_yolo(outs: Sequence[Any], geometry: Geometry, model: ModelProbe) -> Decoded:
     """Decode columns of centre, size, class scores[, mask coefficients]; and mask prototypes.
 
     A mask is the region of positive sums of the prototypes, weighted by the coefficients (YOLACT,
     Bolya et al. 2019).
     """
     rows = outs[0][0].T  # (A, 4 + C [+ 32])
-    proto = next((o[0] for o in outs[1:]), np.empty((0, 1, 1)))  # (32, h, w)
-    end = rows.shape[1] - len(proto)
+    end = 4 + model.count
     score, label = _best_class(rows[:, 4:end])
     boxes = geometry.to_image(xyxy_from_cxcywh(rows))
+    if len(outs) == 1:
+        return Decoded(boxes, score, label)
+    proto = outs[1][0]  # (32, h, w)
     ratio = np.divide(proto.shape[:0:-1], geometry.input_size)  # (2,) map / input
 
     def masks(chosen: IntArray) -> BoolArray:
         maps = np.tensordot(rows[chosen, end:], proto, 1)  # (K, h, w)
-        scale = ratio * geometry.scale
-        pad = ratio * geometry.pad
-        return _paste(maps, boxes[chosen], geometry.image_size, scale, pad, 0.0)
+        return _paste(maps, boxes[chosen], geometry, ratio)
 
-    return Decoded(boxes, score, label, masks if len(proto) else None)
+    return Decoded(boxes, score, label, masks)
 
 
-def _decode_gfl(outs: list[Any], geometry: Geometry) -> Decoded:
+def _decode_rotated(outs: Sequence[Any], geometry: Geometry, model: ModelProbe) -> Decoded:
+    """Decode columns of centre, size, class scores and angle: the upright box around each."""
+    rows = outs[0][0].T.copy()  # (A, 4 + C + 1)
+    cos, sin = np.abs(np.cos(rows[:, -1])), np.abs(np.sin(rows[:, -1]))
+    w, h = rows[:, 2:4].T
+    rows[:, 2:4] = np.stack([cos * w + sin * h, sin * w + cos * h], 1)
+    return _decode_yolo([rows.T[None]], geometry, model)
+
+
+def _decode_yolov5(outs: Sequence[Any], geometry: Geometry, model: ModelProbe) -> Decoded:
+    """Decode rows of centre, size, objectness and class scores, in px."""
+    rows = outs[0][0]  # (A, 5 + C)
+    rows = np.hstack([rows[:, :4], rows[:, 5:] * rows[:, 4:5]])
+    return _decode_yolo([rows.T[None]], geometry, model)
+
+
+def _decode_gfl(outs: Sequence[Any], geometry: Geometry, _: ModelProbe) -> Decoded:
     """Decode class scores and, for each side, the distribution of its distance from the cell.
 
     The distance is the expectation over the bins, in strides (Generalized Focal Loss, Li et al.
@@ -208,82 +263,125 @@ def _decode_gfl(outs: list[Any], geometry: Geometry) -> Decoded:
     return Decoded(geometry.to_image(boxes), score[keep], label[keep])
 
 
-def _decode_with_nms(outs: list[Any], geometry: Geometry) -> Decoded:
-    """Decode boxes, labels, scores[, masks] after the model's own NMS."""
-    boxes, scores, labels = _pick_outputs(outs)
-    if len(boxes) and boxes.max() <= NORMALISED_MAX:
-        boxes = boxes * np.tile(geometry.input_size, 2)
-    boxes = geometry.to_image(boxes)
-    maps = [o[:, 0] for o in outs if o.ndim == 4]  # (N, h, w) probabilities
-
-    def masks(chosen: IntArray) -> BoolArray:
-        low = boxes[chosen, :2]
-        high = boxes[chosen, 2:]
-        ratio = np.array(maps[0].shape[:0:-1]) / np.maximum(high - low, 1e-6)  # (K, 2)
-        return _paste(maps[0][chosen], boxes[chosen], geometry.image_size, ratio, -low * ratio, 0.5)
-
-    return Decoded(boxes, scores, labels, masks if maps else None)
-
-
-def _paste(maps: Any, boxes: Array, size: tuple[int, int], ratio: Array, offset: Array,
-           threshold: float) -> BoolArray:  # fmt: skip
+def _paste(maps: Any, boxes: Array, geometry: Geometry, ratio: Array) -> BoolArray:
     """Resample the maps of masks inside their boxes.
 
     Args:
-        maps: (K, h, w). boxes: (K, 4) in px of the image of (w, h) `size`.
-        ratio, offset: (2,) or (K, 2): map = image * ratio + offset, both (x, y) from the corner.
-        threshold: a pixel belongs to the mask where the map is above.
+        maps: (K, h, w), positive in the mask. boxes: (K, 4) in px of the image.
+        ratio: (2,) map / input of the network, x and y.
     Returns:
         (K, H, W) masks, False outside the boxes.
     """
+    size = geometry.image_size
     masks = np.zeros((len(maps), size[1], size[0]), bool)  # (K, H, W)
-    ratio, offset = (np.broadcast_to(v, (len(maps), 2)) for v in (ratio, offset))
+    scale = ratio * geometry.scale  # map = image * scale + pad, from the corner
+    pad = ratio * geometry.pad
     low = np.clip(np.floor(boxes[:, :2]), 0, size).astype(int)
     high = np.clip(np.ceil(boxes[:, 2:]), 0, size).astype(int)
     for k in np.flatnonzero((high > low).all(1)):
         (x1, y1) = low[k].tolist()
         (x2, y2) = high[k].tolist()
-        shift = ratio[k] * (low[k] + 0.5) + offset[k] - 0.5  # pixel centres on pixel centres
-        affine = np.column_stack([np.diag(ratio[k]), shift])  # (2, 3)
+        shift = scale * (low[k] + 0.5) + pad - 0.5  # pixel centres on pixel centres
+        affine = np.column_stack([np.diag(scale), shift])  # (2, 3)
         values = cv2.warpAffine(
             np.ascontiguousarray(maps[k], np.float32), affine, (x2 - x1, y2 - y1),
             flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE,
         )  # fmt: skip
-        masks[k, y1:y2, x1:x2] = values > threshold
+        masks[k, y1:y2, x1:x2] = values > 0
     return masks
 
 
-def _has_nms(trial: Trial) -> bool:
-    """Test whether the outputs have boxes (.., N, 4), integer labels and scores of the same N."""
-    with contextlib.suppress(StopIteration):
-        return len(_pick_outputs(trial.outputs)) == 3
-    return False
+def _keypoint_values(model: ModelProbe) -> int:
+    """Return how many values a pose model has for the key points of a box; default: COCO's."""
+    return math.prod(map(int, re.findall(r"\d+", model.metadata.get("kpt_shape", "17, 3"))))
 
 
-LAYOUTS: tuple[Layout, ...] = (  # the first that accepts a model is used
-    Layout("DEIM, D-FINE, RT-DETR (labels, boxes, scores)",
-            lambda t: t.inputs == 2 and _has_nms(t),  # the second is the image size: no scaling
-            lambda outs, geometry: Decoded(*_pick_outputs(outs)), nms_iou=None),
-    Layout("PicoDet",
-            lambda t: len(t.outputs) in (6, 8) and t.outputs[-1].shape[2:] == (4 * GFL_BINS,),
-            _decode_gfl, mean=IMAGENET_MEAN, std=IMAGENET_STD,
-            classes=lambda t: int(t.outputs[0].shape[2])),
-    Layout("NanoDet-Plus",
-            lambda t: t.rows[0] == t.anchors(4) and t.rows[1] > 4 * GFL_BINS,
-            _decode_gfl, rgb=False, mean=IMAGENET_MEAN[::-1], std=IMAGENET_STD[::-1],
-            classes=lambda t: t.rows[1] - 4 * GFL_BINS),
-    Layout("YOLOX", lambda t: t.rows[0] == t.anchors(3) and t.rows[1] > 5,
-            _decode_yolox, "corner", rgb=False, std=(1.0, 1.0, 1.0),
-            classes=lambda t: t.rows[1] - 5),
-    Layout("YOLOv8, YOLO11 (and -seg)",
-            lambda t: t.rows[1] == t.anchors(3) and t.rows[0] > 4,
-            _decode_yolo, "centre",
-            classes=lambda t: t.rows[0] - 4 - sum(o.shape[1] for o in t.outputs[1:])),
-    Layout("Mask R-CNN",
-            lambda t: _has_nms(t) and any(o.shape[2:] == (28, 28) for o in t.outputs),
-            _decode_with_nms, "corner", rgb=False,
-            mean=(102.9801, 115.9465, 122.7717), std=(1.0, 1.0, 1.0),  # as maskrcnn-benchmark
-            nms_iou=None, first=1),
-    Layout("SSD with built-in NMS", _has_nms, _decode_with_nms, mean=IMAGENET_MEAN,
-            std=IMAGENET_STD, nms_iou=None, first=1),
-)  # fmt: skip
+def _layout(
+    name: str, title: str, shape: str, classes: Callable[[ModelProbe], int | None],
+    decode: Decode, tasks: Sequence[str] = ("", "detect"),
+    also: Callable[[ModelProbe], bool] = lambda model: True, **fields: Any,
+) -> Layout:  # fmt: skip
+    """Make an entry, recognised where number of names and task agree with the outputs' shapes.
+
+    Args:
+        tasks: in the metadata, as ultralytics writes it; "": none. also: what else is required.
+    """
+
+    def recognise(model: ModelProbe) -> bool:
+        agree = model.metadata.get("task", "") in tasks and classes(model) in (None, model.count)
+        return agree and also(model)
+
+    return Layout(name, title, recognise, decode, shape=shape, classes=classes, **fields)
+
+
+IMAGENET_RGB = Pixels("RGB, ImageNet", True, IMAGENET_MEAN, IMAGENET_STD)
+IMAGENET_BGR = Pixels("BGR, ImageNet", False, IMAGENET_MEAN[::-1], IMAGENET_STD[::-1])
+BYTES_BGR = Pixels("BGR, 0..255", False, std=(1.0, 1.0, 1.0))
+YOLO = "YOLOv8, YOLO11"
+
+LAYOUTS: Registry[Decode] = Registry("detector outputs", "--detector-layout", [
+    _layout("detr", "DEIM, D-FINE, RT-DETR", "labels, boxes, scores",
+            lambda m: None if "orig_target_sizes" in m.inputs
+            and {"labels", "boxes", "scores"} <= m.outputs.keys() else 0,
+            _decode_detr, nms_iou=None),
+    _layout("yolo", f"{YOLO}, also -seg", "(1, 4 + classes [+ 32], cells)[, (1, 32, h, w)]",
+            lambda m: m.values(0) - 4 - sum(shape[1] for shape in m.shapes[1:] if len(shape) == 4),
+            _decode_yolo, ("", "detect", "segment"), fit="centre"),
+    _layout("yolo-rows", f"{YOLO}, transposed", "(1, cells, 4 + classes)",
+            lambda m: m.values(1) - 4,
+            lambda outs, *more: _decode_yolo([outs[0].swapaxes(1, 2)], *more), fit="centre"),
+    _layout("yolo-obb", f"{YOLO}, rotated boxes: the upright one around each",
+            "(1, 4 + classes + 1, cells)", lambda m: m.values(0) - 5, _decode_rotated, ("obb",),
+            fit="centre"),
+    _layout("yolo-pose", f"{YOLO}, key points", "(1, 4 + classes + key points, cells)",
+            lambda m: m.values(0) - 4 - _keypoint_values(m), _decode_yolo, ("pose",),
+            fit="centre", unread="the key points"),
+    _layout("yolov5", "YOLOv5, YOLOv7, YOLOv6", "(1, cells or 3 * cells, 5 + classes)",
+            lambda m: max(m.values(1), m.values(1, boxes=3)) - 5, _decode_yolov5,
+            also=lambda m: m.in_px and ("output" not in m.outputs or not m.values(1)),
+            fit="centre"),
+    _layout("yolox", "YOLOX", "(1, cells, 5 + classes)", lambda m: m.values(1) - 5, _decode_yolox,
+            also=lambda m: not m.in_px or "outputs" not in m.outputs,  # which YOLOv6 has
+            fit="corner", pixels=BYTES_BGR),
+    _layout("nanodet", "NanoDet-Plus", "(1, cells, classes + 32)",
+            lambda m: m.values(1, levels=4) - 4 * GFL_BINS, _decode_gfl, pixels=IMAGENET_BGR),
+    _layout("picodet", "PicoDet", "of each level (1, cells, classes), then (1, cells, 32)",
+            lambda m: m.shapes[0][2] if [*map(len, m.shapes)] in ([3] * 6, [3] * 8)
+            and m.shapes[-1][2] == 4 * GFL_BINS else 0,
+            _decode_gfl, pixels=IMAGENET_RGB),
+])  # fmt: skip
+
+
+def find_layout(model: ModelProbe, declared: str, names_of: str) -> Layout:
+    """Find the layout of a model, by its name if it is declared.
+
+    names_of: who gives the class names, for messages.
+
+    Raises:
+        ReobjError: its outputs fit no layout, or several, or not the declared one.
+    """
+    shapes = ", ".join(f"{name} {output.shape}" for name, output in model.outputs.items())
+    near = []
+    for entry in LAYOUTS.formats:
+        assert isinstance(entry, Layout)
+        count = entry.classes(model)
+        if entry.name == declared and count is not None and count < 1:
+            raise ReobjError(f"{model.path}: {shapes}: not the outputs of layout {declared}, "
+                             f"{entry.shape}")  # fmt: skip
+        near += [f"{entry.name} with {count} classes"] if count and count > 0 else []
+    task = f" and task {task}" if (task := model.metadata.get("task")) else ""
+    model.found = (f": {shapes} with {model.count} class names ({names_of}){task}; by its shape "
+                   f"{' or '.join(near) or 'none'}")  # fmt: skip
+    layout = LAYOUTS.choose(model, declared)
+    assert isinstance(layout, Layout)
+    return layout
+
+
+def layouts_table() -> str:
+    """Return the Markdown table of docs/input_formats.md."""
+    rows = [("layout", "models", "outputs", "image", "not read"), ("---",) * 5]
+    for entry in LAYOUTS.formats:
+        assert isinstance(entry, Layout)
+        image = f"{entry.fit}, {entry.pixels.title}"
+        rows.append((f"`{entry.name}`", entry.title, entry.shape, image, entry.unread))
+    return "".join(f"| {' | '.join(row)} |\n" for row in rows)

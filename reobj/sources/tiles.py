@@ -1,8 +1,6 @@
 """Detection in overlapping tiles, which enlarge small objects at the network's input.
 
-Start at `detect_in_tiles`. Weighted box fusion is implemented here: the package ensemble-boxes
-gives the same boxes (a test compares), but lacks masks and depends on numba, llvmlite and pandas,
-290 MB, for a function that is plain numpy.
+Start at `detect_in_tiles`.
 """
 
 from __future__ import annotations
@@ -12,7 +10,8 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from reobj.types import Array, Detections, Image, IntArray, ReobjError, box_iou
+from reobj.sources.onnx_layouts import nms
+from reobj.types import Detections, Image, IntArray, ReobjError
 
 
 def parse_tiles(text: str) -> tuple[int, int]:
@@ -21,12 +20,10 @@ def parse_tiles(text: str) -> tuple[int, int]:
     >>> parse_tiles("3x2")
     (3, 2)
     """
-    match = re.fullmatch(r"(\d+)x(\d+)", text or "1x1")
-    columns, rows = (int(n) for n in match.groups()) if match else (0, 0)
-    if not (1 <= columns <= 8 and 1 <= rows <= 8):  # each tile costs a run of the network per frame
-        expected = "COLUMNSxROWS of 1 to 8, such as 2x2"
-        raise ReobjError(f"--detector-tiles {text!r}: expected {expected}")
-    return columns, rows
+    text = text or "1x1"
+    if not re.fullmatch("[1-8]x[1-8]", text):  # each tile costs a run of the network per frame
+        raise ReobjError(f"--detector-tiles {text!r}: expected COLUMNSxROWS of 1 to 8, such as 2x2")
+    return int(text[0]), int(text[2])
 
 
 def tile_boxes(size: tuple[int, int], grid: tuple[int, int], overlap: float = 0.25) -> IntArray:
@@ -46,67 +43,37 @@ def tile_boxes(size: tuple[int, int], grid: tuple[int, int], overlap: float = 0.
     return corners[:, [0, 2, 1, 3]].astype(np.int64)
 
 
-def weighted_box_fusion(
-    xyxy: Array, score: Array, class_id: IntArray, min_iou: float = 0.55
-) -> tuple[Array, IntArray]:
-    """Fuse boxes of a class that overlap into their mean, weighted by the scores.
-
-    Ref: Solovyev et al., Image and Vision Computing 2021. The score of a fused box is the highest,
-    not the mean over the views: most tiles do not show the object.
-
-    Args:
-        xyxy: (N, 4). score, class_id: (N,).
-        min_iou: IoU above which boxes of a class are fused (.55 in the paper).
-    Returns:
-        boxes (K, 4), by descending score; row (K,) of the best box of each.
-    """
-    fused = np.empty_like(xyxy)  # (N, 4), of which the first K count
-    groups: list[list[int]] = []
-    for row in np.argsort(-score, kind="stable").tolist():
-        best = np.array([group[0] for group in groups], np.int64)  # (K,)
-        iou = box_iou(xyxy[[row]], fused[: len(groups)])[0] * (class_id[best] == class_id[row])
-        if iou.max(initial=0) > min_iou:
-            groups[k := int(iou.argmax())].append(row)
-        else:
-            k = len(groups)
-            groups.append([row])
-        weights = np.maximum(score[groups[k]], 1e-9)
-        fused[k] = np.average(xyxy[groups[k]], 0, weights)
-    return fused[: len(groups)], np.array([group[0] for group in groups], np.int64)
-
-
 def detect_in_tiles(
     detect: Callable[[list[Image]], Iterable[Detections]], image: Image, grid: tuple[int, int]
 ) -> Detections:
-    """Detect in the whole image and in its tiles, and fuse the boxes; best first.
-
-    detect: images -> the detections of each.
+    """Detect in the whole image and in its tiles; best first, without duplicates.
 
     Boxes cut by an edge of their tile are dropped: the object is complete in the whole image or in
-    the next tile. The mask of fused boxes is that of the best one.
+    the next tile.
+
+    Args:
+        detect: images -> the detections of each.
     """
     height, width = image.shape[:2]
     tiles = np.vstack([[0, 0, width, height], tile_boxes((width, height), grid)])  # (V, 4)
     parts = [np.ascontiguousarray(image[y1:y2, x1:x2]) for x1, y1, x2, y2 in tiles.tolist()]
-    per_tile = []
-    for tile, detections in zip(tiles, detect(parts), strict=True):
-        x1, y1, x2, y2 = tile.tolist()
-        xyxy = detections.xyxy
+    found = []
+    for (x1, y1, x2, y2), one in zip(tiles.tolist(), detect(parts), strict=True):
         inside = np.array([x1 > 0, y1 > 0, x2 < width, y2 < height])  # edges inside the image
-        margin = 0.01 * np.array([x2 - x1, y2 - y1])  # boxes nearer to an edge count as cut
-        gap = np.hstack([xyxy[:, :2], (x2 - x1, y2 - y1) - xyxy[:, 2:]])  # (D, 4) to the edges
-        per_tile.append(detections[~((gap <= np.tile(margin, 2)) & inside).any(1)])
-    view = np.repeat(np.arange(len(tiles)), [len(detections) for detections in per_tile])  # (N,)
-    xyxy, score, class_id = (
-        np.concatenate([getattr(detections, name) for detections in per_tile])
-        for name in ("xyxy", "score", "class_id")
-    )
-    boxes, best = weighted_box_fusion(xyxy + tiles[view][:, [0, 1, 0, 1]], score, class_id)
+        size = np.array([x2 - x1, y2 - y1])
+        gap = np.hstack([one.xyxy[:, :2], size - one.xyxy[:, 2:]])  # (D, 4) to the edges
+        cut = (gap <= np.tile(0.01 * size, 2)) & inside  # boxes nearer to an edge count as cut
+        found.append(one[~cut.any(1)])
+    view = np.repeat(np.arange(len(tiles)), list(map(len, found)))  # (N,)
+    xyxy = np.concatenate([one.xyxy for one in found]) + tiles[view][:, [0, 1, 0, 1]]
+    score = np.concatenate([one.score for one in found])
+    class_id = np.concatenate([one.class_id for one in found])
+    rows = np.argsort(-score, kind="stable")
+    rows = rows[nms(xyxy[rows], class_id[rows], 0.55)]  # as weighted box fusion (.55): RESULTS.md
     masks = None
-    if any(detections.masks is not None for detections in per_tile):
-        masks = np.zeros((len(best), height, width), bool)
-        row = best - np.searchsorted(view, view[best])  # (K,) in the view
-        for k, v in enumerate(view[best].tolist()):
+    if any(one.masks is not None for one in found):
+        masks = np.zeros((len(rows), height, width), bool)
+        for mask, row, v in zip(masks, rows.tolist(), view[rows].tolist(), strict=True):
             x1, y1, x2, y2 = tiles[v].tolist()
-            masks[k, y1:y2, x1:x2] = per_tile[v].masks[row[k]]
-    return Detections(boxes, score[best], class_id[best], masks)
+            mask[y1:y2, x1:x2] = found[v].masks[row - np.searchsorted(view, v)]
+    return Detections(xyxy[rows], score[rows], class_id[rows], masks)

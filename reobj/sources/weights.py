@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from reobj.files import LockedError, Progress, atomic, locked
+from reobj.files import Progress, atomic, locked
 from reobj.types import NOTE, ReobjError, log
 
 # Mean and standard deviation of the pixels of ImageNet, RGB, 0..255 (torchvision: .485, .456, .406
@@ -34,9 +34,9 @@ class Weights:
         url: of the download, pinned at a commit; "": bundled in reobj/models.
         digest: of the file, hex: sha256 (64 digits) or git blob id (40 digits). size: bytes; 0:
             unknown.
-        note: for the table; AP on 164 images of COCO val2017, ms an image with one thread.
-        verified: what was run here before it was listed; "": nothing to say of bundled weights.
-        layout: prefix of the name of a detector's layout in `onnx_layouts`.
+        note: for the table; AP on 164 images of COCO val2017, ms an image with one thread; what
+            was run here before it was listed.
+        layout: of a detector, in `onnx_layouts`.
     """
 
     name: str
@@ -49,7 +49,6 @@ class Weights:
     note: str = ""
     layout: str = ""
     alias: str = ""
-    verified: str = ""
 
     @property
     def digest_kind(self) -> str:
@@ -71,38 +70,35 @@ class Weights:
         return "; or take the small detector: --detector fast" if other else ""
 
 
-def _deimv2(
-    name: str, digest: str, size: int, note: str, verified: str, alias: str = ""
-) -> Weights:
+def _deimv2(name: str, digest: str, size: int, note: str, alias: str = "") -> Weights:
     """Describe one size of DEIMv2."""
     file = f"deimv2_hgnetv2_{name}_coco.onnx"
     source = "https://github.com/Kazuhito00/DEIMv2-ONNX-Sample/raw/"
     url = f"{source}f88d4382abca74edb26ed4c7f46190ac40da0ea5/model/{file}"
     return Weights(f"deimv2-{name}", "detector", file, url, digest, size, "Apache-2.0", note,
-                   "DEIM", alias, verified)  # fmt: skip
+                   "detr", alias)  # fmt: skip
 
 
-NOT_RUN = "not run here; the layout of its family is verified"
-ON_IMAGES = "run here on 164 images"
+NOT_RUN = "by its authors; not run here; the layout of its family is verified"
 WEIGHTS: tuple[Weights, ...] = (
     _deimv2("femto", "c6ad358f750132b891165e034c2ba507abefc5ebe1c1d2732a0acbcacc47e52c", 4116144,
-            "default; COCO, AP 33.2, 39 ms", "run here on 6 recordings"),
+            "default; COCO, AP 33.2, 39 ms; run here on 6 recordings"),
     _deimv2("atto", "b114aa6610ac7c2bd9b3186ffb001afa872430db957407ef2473f7148d00646e", 2248408,
-            "`--detector fast`; COCO, AP 25.5, 21 ms", "run here on 1 recording", "fast"),
+            "`--detector fast`; COCO, AP 25.5, 21 ms; run here on 1 recording", "fast"),
     _deimv2("n", "facaa27741d600e993b80f981b86997adbf7d556", 0,
-            "the largest; COCO, AP 43.0 by its authors", NOT_RUN),
+            f"the largest; COCO, AP 43.0 {NOT_RUN}"),
     _deimv2("pico", "e049f81944cdb9a4e0fd07de741abadcce9de516", 0,
-            "COCO, AP 38.5 by its authors", NOT_RUN),
+            f"COCO, AP 38.5 {NOT_RUN}"),
     Weights("yolox-nano", "detector", "yolox_nano_416.onnx",
             "https://github.com/Kazuhito00/YOLOX-ONNX-TFLite-Sample/raw/"
             "3d4f1119d0694200671c08069ecb847aa0d8495a/model/yolox_nano.onnx",
             "695e750a5d5754bb5a8d5325643b59282191a7e7a564e435a415fd3c578eab14", 3660092,
-            "Apache-2.0", "COCO, AP 28.6, 27 ms", "YOLOX", verified=ON_IMAGES),
+            "Apache-2.0", "COCO, AP 28.6, 27 ms; run here on 164 images", "yolox"),
     Weights("picodet-s-416", "detector", "picodet_s_416_coco.onnx",
             "https://github.com/hpc203/picodet-onnxruntime/raw/"
             "dfe4d6cd0a18cd4126ee381e81df8a0b1e6ad97b/coco/picodet_s_416_coco.onnx",
             "cdab77bdde16e4f76bec734c4e5791801d1739e4c7ec1995e0e110e04300d0c2", 4040573,
-            "Apache-2.0", "COCO, AP 33.5, 46 ms", "PicoDet", verified=ON_IMAGES),
+            "Apache-2.0", "COCO, AP 33.5, 46 ms; run here on 164 images", "picodet"),
     Weights("reobj", "backbone", "reobj.onnx", "",
             "a8abc894869a29b63c244aaeff0a96bd9521fc3146bd2a1f4ac495b2bcfc39a5", 392965,
             "MIT", "ours, bundled: foreground and background, trained with its head"),
@@ -193,25 +189,21 @@ def model_path(name_or_path: str | Path, offline: bool = False, role: str = "det
 
 def _fetch(weights: Weights, offline: bool) -> Path:
     """Download weights into the first writable folder; keep the file if its digest matches."""
-    missing = f"model {weights.name} is not in {' nor '.join(map(str, _model_folders()))},"
-    by_hand = f"put it at {_model_folders()[0] / weights.file}, or set REOBJ_MODELS to its folder"
+    folders = _model_folders()
+    missing = f"model {weights.name} is not in {' nor '.join(map(str, folders))},"
+    by_hand = f"put it at {folders[0] / weights.file}, or set REOBJ_MODELS to its folder"
     if offline:
-        raise ReobjError(f"{missing} and --offline forbids the download: "
-                         f"fetch {weights.url} elsewhere and {by_hand}{weights.fallback}"
-                         )  # fmt: skip
+        raise ReobjError(f"{missing} and --offline forbids the download: fetch {weights.url} "
+                         f"elsewhere and {by_hand}{weights.fallback}")  # fmt: skip
     target = _writable_folder() / weights.file
-    lock = target.with_name(".lock")
-    with contextlib.suppress(LockedError), locked(lock):
-        return _fetch_alone(weights, target, missing, by_hand)
-    log.log(NOTE, "another process is fetching weights into %s: waiting for it", target.parent)
-    with locked(lock, wait_s=600.0):  # 100 MB at 1.3 Mbit/s
-        return _fetch_alone(weights, target, missing, by_hand)
+    with locked(target.with_name(".lock"), wait_s=600.0):  # 100 MB at 1.3 Mbit/s
+        if not (target.is_file() and weights.digest_of(target) == weights.digest):
+            _fetch_alone(weights, target, missing, by_hand)
+    return target
 
 
-def _fetch_alone(weights: Weights, target: Path, missing: str, by_hand: str) -> Path:
-    """Download weights to `target`, unless another process has done so."""
-    if target.is_file() and weights.digest_of(target) == weights.digest:
-        return target
+def _fetch_alone(weights: Weights, target: Path, missing: str, by_hand: str) -> None:
+    """Download weights to `target`."""
     expected = f"{weights.digest_kind} {weights.digest}"
     size = f"{weights.size / 1e6:.1f} MB" if weights.size else "size unknown"
     log.log(
@@ -230,10 +222,8 @@ def _fetch_alone(weights: Weights, target: Path, missing: str, by_hand: str) -> 
     except (OSError, http.client.HTTPException) as error:  # the server, the network or the disk
         raise ReobjError(
             f"{missing} and {weights.url}: download failed ({error}): run again, or get a file "
-            f"with {expected} on another machine and {by_hand}"
-            f"{weights.fallback}"
+            f"with {expected} on another machine and {by_hand}{weights.fallback}"
         ) from error
-    return target
 
 
 def _writable_folder() -> Path:
@@ -250,37 +240,29 @@ def _writable_folder() -> Path:
 class StaysEncrypted(urllib.request.HTTPRedirectHandler):
     """Follow redirects, but not from an encrypted to an unencrypted connection."""
 
-    def redirect_request(
-        self, req: Any, fp: Any, code: Any, msg: Any, headers: Any, to: Any
-    ) -> Any:
+    def redirect_request(self, req: Any, *more: Any) -> Any:
         """Return the request for a redirect."""
-        if req.full_url.startswith("https:") and not to.startswith("https:"):
-            raise ConnectionError(f"redirected to {to}, which is not encrypted")
-        return super().redirect_request(req, fp, code, msg, headers, to)
+        if req.full_url.startswith("https:") and not more[-1].startswith("https:"):
+            raise ConnectionError(f"redirected to {more[-1]}, which is not encrypted")
+        return super().redirect_request(req, *more)
 
 
 def _download(weights: Weights, part: Path, most: int = 100_000_000) -> None:
-    """Download the file to `part`; an incomplete download is an error.
-
-    most: bytes of a file of unknown size; several times the largest.
-    """
+    """Download the file to `part`, little more than its size, or `most` bytes if it is unknown."""
     request = urllib.request.Request(weights.url, headers={"User-Agent": "reobj_track"})
-    opener = urllib.request.build_opener(StaysEncrypted)
     with (
-        opener.open(request, timeout=30) as response,  # s without data
+        urllib.request.build_opener(StaysEncrypted).open(request, timeout=30) as response,  # s
         part.open("wb") as file,
+        Progress("fetch kB", weights.size // 1000) as progress,
     ):
-        if response.headers.get_content_type() in ("text/html", "application/xhtml+xml"):
+        if response.headers.get_content_type() == "text/html":
             raise ConnectionError("a web page came instead: must you log in to this network first?")
         size = weights.size or min(response.length or 0, most)
-        done = 0
-        with Progress("fetch kB", size // 1000) as progress:
-            while done < (size or most) and (chunk := response.read(1 << 16)):
-                file.write(chunk)
-                done += len(chunk)
-                progress.step(done // 1000 - progress.done)
-            if done < size:
-                raise ConnectionError(f"connection cut after {done} of {size} bytes")
+        while file.tell() <= (weights.size or most) and (chunk := response.read(1 << 16)):
+            file.write(chunk)
+            progress.step(file.tell() // 1000 - progress.done)
+        if file.tell() < size:
+            raise ConnectionError(f"connection cut after {file.tell()} of {size} bytes")
 
 
 def frames_at_once(asked: int, device: str) -> int:

@@ -182,7 +182,7 @@ def test_lists_of_images_define_the_processed_frames(images: Path, tmp_path: Pat
         assert found.looked is not None and found.looked.tolist() == seen
         assert sum("lists 6 frames only (0, 1, 7, 30, 31, ...)" in m for m in found.messages) == 1
         source = rt.open_detections(clip, rt.DetectConfig(), tmp_path / name)
-        answers = [source.look(frame) for frame in clip]
+        answers = [*source.detect(list(clip))]
         assert [f for f, a in enumerate(answers) if a is not None] == seen
         assert [len(a) for a in answers if a is not None] == [1, 0, 0, 2, 2, 0]
 
@@ -218,7 +218,7 @@ def test_the_cache_stores_the_unprocessed_frames(images: Path, tmp_path: Path) -
     made = as_source(lambda image: calls.append(0))  # returns None
     source = dataclasses.replace(made, cache=DetectionCache(tmp_path / "cache", (640, 480)))
     frame = next(iter(rt.Video(images)))
-    assert source.look(frame) is None and source.look(frame) is None and len(calls) == 1
+    assert [*source.detect([frame]), *source.detect([frame])] == [None, None] and len(calls) == 1
     assert len(source(frame)) == 0
 
 
