@@ -17,6 +17,7 @@ from scipy.optimize import linear_sum_assignment
 
 from reobj import __version__
 from reobj.files import wrapped
+from reobj.formats import AUTO
 from reobj.results.evaluation_3d import score_objects
 from reobj.results.names import OutputFile
 from reobj.results.result import Result
@@ -372,6 +373,7 @@ def evaluate(
     truth_poses: str | Path | None = None,
     classes: Sequence[str] = (),
     min_visibility: float = 0.0,
+    gt_format: str = AUTO,
 ) -> dict[str, Any]:
     """Evaluate an output folder of `run`, or a tracks.txt, against ground truth.
 
@@ -381,7 +383,8 @@ def evaluate(
 
     Args:
         out: output folder, or MOT rows; tracks.txt of an output folder means the folder.
-        gt: MOTChallenge gt.txt, KITTI tracking labels, CVAT for video, COCO-VID.
+        gt: a file with identities in one of the formats `truth.TRUTH`; gt_format: its name, or
+            auto.
         solids: gt_objects.json; truth_poses: TUM, or a 4x4 world_from_cam a line. classes: to
             evaluate, (): all. min_visibility: true boxes of lower visibility are ignored.
     Returns:
@@ -404,7 +407,7 @@ def evaluate(
         tracked = workspace.load_last()
         names = tracked.class_names
     size = (0, 0) if tracked is None else (tracked.video.width, tracked.video.height)
-    truth = read_truth(Path(gt), names, min_visibility, notes, size)
+    truth = read_truth(Path(gt), names, min_visibility, notes, size, gt_format)
     check_counts(truth, Path(gt))
     if tracked is not None:
         read = truth[_was_read(truth.frame - 1, workspace.source[1])]

@@ -1,14 +1,15 @@
-"""Recorded detections and tracks of other tools: one table of readers, one validation.
+"""Recorded detections and tracks of other tools: one registry of readers, one validation.
 
-Start at `read_detections` and `read_tracks`. Every reader returns a `RecordedDetections`, which is
-then validated: invalid content raises an error with the line number; unusable rows are dropped and
-counted in a message.
+Start at `read_detections` and `read_tracks`. Every reader (`detection_formats`) returns a
+`RecordedDetections`, which is then validated: invalid content raises an error with the line number;
+unusable rows are dropped and counted in a message.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
+import re
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,19 +19,14 @@ import numpy as np
 
 from reobj.cameras import Poses
 from reobj.files import did_you_mean, last_name, load_json, shortened
+from reobj.formats import AUTO, Registry
 from reobj.sources import coco, tables
-from reobj.sources.boxes_3d import has_boxes_3d, read_boxes_3d
 from reobj.sources.class_names import check_length, load_class_names
-from reobj.sources.cvat import read_cvat
-from reobj.sources.label_folders import label_files, read_label_folder
+from reobj.sources.detection_formats import DETECTIONS, Reader
+from reobj.sources.label_folders import label_files
 from reobj.sources.looked import frames_looked_at, looked_message
-from reobj.sources.recorded import (
-    NORMALISED_MAX,
-    RecordedDetections,
-    npz_image_size,
-    read_npz,
-)
-from reobj.sources.tables import read_cells, read_table, recorded_table, seconds, table_of_records
+from reobj.sources.recorded import NORMALISED_MAX, RecordedDetections, Source, npz_image_size
+from reobj.sources.tables import read_cells, read_cells_3d, seconds
 from reobj.sources.video import Video
 from reobj.types import (
     CLASS_NAME_MAX,
@@ -76,9 +72,19 @@ class DetectConfig:
     class_names: str = option(
         "", "file of class names that are not COCO's: text, one a line, or a data.yaml"
     )
+    format: str = option(
+        AUTO, "format of the file of detections or identities: auto, or a name of the table in "
+        "docs/input_formats.md", "--detections-format",
+    )  # fmt: skip
     first_frame: str = option(
-        "", "number of the first frame in a file of detections, 0 or 1 (default: inferred)"
-    )
+        "", "number of the first frame in a file of detections, 0 or 1 (default: as the format "
+        "says); order: the images that a COCO dataset lists are the frames, in this order",
+    )  # fmt: skip
+    image_size: str = option(
+        "", "WIDTHxHEIGHT of the frames that a file of detections was made for, if it does not "
+        "say so; boxes are scaled",
+    )  # fmt: skip
+    score_max: float = option(1.0, "largest possible score in a file of detections")
     max_detections: int = option(
         0, "most detections per frame, by score (0: 100 of a model, all of a file)"
     )
@@ -125,84 +131,53 @@ def read_detections(
 
     Args:
         path: the file, or a folder of YOLO labels; boxes in px and frame numbers of the source.
-        config: min_score, classes, class_names, first_frame and max_detections apply.
+        config: all options but the detector's apply.
         poses: cameras that project boxes in 3D (Boxer's CSV).
     Raises:
         ReobjError: the file, the line and what was expected.
     """
     path = Path(path)
     config = config or DetectConfig()
-    if poses is not None and has_boxes_3d(path):
-        recorded = read_boxes_3d(path, video, [poses], _names(config))[0]
-    else:
-        recorded = _read(path, video, config)
-    _note_looked(recorded, video.frame_count)
+    recorded = _read(path, video, config, poses)
+    listed = recorded.looked is not None
+    if recorded.looked is None:
+        recorded.looked = frames_looked_at(recorded.frame, video.frame_count)
+    elif not 0 < len(recorded.looked) < (video.frame_count or sys.maxsize):
+        recorded.looked = None
+    if recorded.looked is not None:
+        recorded.messages.append(looked_message(recorded.looked, listed))
+    _check_scores(recorded, config.score_max, path)
     _check(recorded, path, config, video.frame_count)
     return recorded
 
 
-def _read(path: Path, video: Video, config: DetectConfig) -> RecordedDetections:
+def _read(
+    path: Path, video: Video, config: DetectConfig, poses: Poses | None = None
+) -> RecordedDetections:
     """Read a file of any format without validation."""
-    if not path.exists():
-        raise ReobjError(f"{path}: no such file of detections")
-    if config.first_frame not in ("", "0", "1"):
-        raise ReobjError(f"detect.first_frame {config.first_frame}: expected 0 or 1")
+    if config.first_frame not in ("", "0", "1", "order"):
+        raise ReobjError(f"detect.first_frame {config.first_frame}: expected 0, 1 or order")
+    names = load_class_names(config.class_names) if config.class_names else ()
+    source = Source(path, video, names, config.first_frame, [poses] if poses else [])
+    return read_source(source, DETECTIONS, config.format)
+
+
+def read_source(source: Source, formats: Registry[Reader], name: str) -> RecordedDetections:
+    """Read a file with the reader of its format; name: of the format, or auto."""
+    reader = formats.reader(source.path, name)
     try:
-        return _read_kind(path, _names(config), video, config.first_frame)
+        return reader(source)
     except ReobjError:
         raise
     except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
-        raise ReobjError(f"{path}: an entry cannot be read: {error!r}") from error
+        raise ReobjError(f"{source.path}: an entry cannot be read: {error!r}") from error
 
 
-def _names(config: DetectConfig) -> tuple[str, ...]:
-    return load_class_names(config.class_names) if config.class_names else ()
-
-
-def _note_looked(recorded: RecordedDetections, frame_count: int) -> None:
-    """Set the frames on which the detector was run: as the file lists them, else inferred."""
-    listed = recorded.looked is not None
-    if recorded.looked is None:
-        recorded.looked = frames_looked_at(recorded.frame, frame_count)
-    elif not 0 < len(recorded.looked) < (frame_count or sys.maxsize):
-        recorded.looked = None
-    if recorded.looked is not None:
-        recorded.messages.append(looked_message(recorded.looked, listed))
-
-
-def _read_kind(path: Path, names: Sequence[str], video: Video, first: str) -> RecordedDetections:
-    """Read a file with the reader of its format."""
-    match _kind(path):
-        case "npz":
-            return read_npz(path, video.size, video.working_size)[0]
-        case "json":
-            return _read_json(path, names, video, first)
-        case "cvat":
-            return read_cvat(path, video, first)
-        case "folder":
-            return read_label_folder(path, names, video, first)
-        case _:
-            return read_table(path, names, video, first)
-
-
-def _read_json(path: Path, names: Sequence[str], video: Video, first: str) -> RecordedDetections:
-    """Read a table of records, or a COCO or OA-SLAM file."""
-    data = load_json(path)
-    table = table_of_records(path, data)
-    if table is not None:
-        return recorded_table(table, names, video, first)
-    return coco.read_coco(path, data, names, video, first)
-
-
-def _kind(path: Path) -> str:
-    """Return the format of a file: npz, json, cvat, folder (of YOLO labels) or table."""
-    kinds = {".npz": "npz", ".json": "json", ".xml": "cvat", ".zip": "cvat"}
-    return "folder" if path.is_dir() else kinds.get(path.suffix.lower(), "table")
-
-
-def recorded_times(path: Path) -> Array | None:
+def recorded_times(path: Path, config: DetectConfig) -> Array | None:
     """Return the distinct times in s, ascending, of a table with times and without frames."""
-    if _kind(path) != "table":
+    if DETECTIONS.find(path, config.format).name == "boxer-3d":
+        return np.unique(seconds(read_cells_3d(path)))
+    if DETECTIONS.find(path, config.format).name != "csv":
         return None
     table = read_cells(path)
     if "time" not in table.cells or "frame" in table.cells or "image" in table.cells:
@@ -210,22 +185,25 @@ def recorded_times(path: Path) -> Array | None:
     return np.unique(seconds(table))
 
 
-def image_size(path: Path) -> tuple[int, int] | None:
+def image_size(path: Path, config: DetectConfig) -> tuple[int, int] | None:
     """Return the (w, h) of the images of a file of detections; None if the file lacks it."""
-    kind = _kind(path)
-    if kind == "npz":
+    name = DETECTIONS.find(path, config.format).name
+    if name == "npz":
         return npz_image_size(path)
-    return coco.image_size_of(coco.dataset_of(path, load_json(path))) if kind == "json" else None
+    is_coco = name in ("coco", "coco-results")
+    return coco.image_size_of(coco.dataset_of(path, load_json(path))) if is_coco else None
 
 
-def image_names(path: Path) -> list[str]:
+def image_names(path: Path, config: DetectConfig) -> list[str]:
     """List the image names in a file of detections or a dataset beside it; [] if there are none."""
-    kind = _kind(path)
-    if kind == "json":
-        return coco.image_names_of(path, load_json(path))
-    if kind == "folder":
-        return [str(file.relative_to(path)) for file in label_files(path)]
-    return tables.image_names_of(read_cells(path)) if kind == "table" else []
+    match DETECTIONS.find(path, config.format).name:
+        case "coco" | "coco-results" | "oa-slam":
+            return coco.image_names_of(path, load_json(path))
+        case "yolo":
+            return [str(file.relative_to(path)) for file in label_files(path)]
+        case "csv":
+            return tables.image_names_of(read_cells(path))
+    return []
 
 
 def _check(
@@ -235,9 +213,13 @@ def _check(
 
     Invalid content is an error; dropped rows are counted in a message.
     """
-    _check_rows(recorded, path)
-    keep = _usable(recorded, path, frame_count)
-    _check_scores(recorded)
+    check_rows(recorded, path)
+    if ignored := int(recorded.ignored.sum()):
+        recorded.messages.append(f"{ignored} ignored regions of the file left out")
+        recorded.select(np.flatnonzero(~recorded.ignored))
+    if config.image_size:
+        recorded.xyxy = recorded.xyxy * _stated_scale(config.image_size, recorded.size)
+    keep = _usable(recorded, path, frame_count, not config.image_size)
     if (low := keep & (recorded.score < config.min_score)).any():
         text = f"{low.sum()} of {len(recorded)} boxes have a score below {config.min_score:g}"
         recorded.messages.append(f"{text} (detect.min_score): left out")
@@ -259,7 +241,14 @@ def _check(
     recorded.messages[:] = [f"{last_name(path)}: {text}" for text in recorded.messages]
 
 
-def _check_rows(recorded: RecordedDetections, path: Path) -> None:
+def _stated_scale(text: str, size: tuple[int, int]) -> Array:
+    """Return the factors (4,) from frames of WIDTHxHEIGHT to those of the video."""
+    if not (match := re.fullmatch(r"([1-9]\d{0,5})x([1-9]\d{0,5})", text)):
+        raise ReobjError(f"detect.image_size {text}: expected WIDTHxHEIGHT, such as 640x480")
+    return np.tile(np.divide(size, [int(match[1]), int(match[2])]), 2)
+
+
+def check_rows(recorded: RecordedDetections, path: Path) -> None:
     """Refuse invalid values and masks; the error names the first such row."""
     with np.errstate(invalid="ignore", over="ignore"):  # inf - inf
         finite = np.isfinite(recorded.xyxy.sum(1) + recorded.score)  # (N,)
@@ -286,23 +275,19 @@ def _check_rows(recorded: RecordedDetections, path: Path) -> None:
         check_length(name, f"{path}, class names")
 
 
-def _check_scores(recorded: RecordedDetections) -> None:
-    """Convert scores to [0, 1]: -1 for all, percentages, or clipped; with a message."""
-    low = recorded.score.min(initial=0)
-    high = recorded.score.max(initial=0)
-    if len(recorded) and (recorded.score == -1).all():
+def _check_scores(recorded: RecordedDetections, most: float, path: Path) -> None:
+    """Convert scores of up to `most` to [0, 1]: -1 for all is no score; below 0 is 0."""
+    score = recorded.score
+    if len(score) and (score == -1).all():
         recorded.messages.append("scores are all -1: taken as 1")
-        recorded.score = -recorded.score
-    elif 2 < high <= 100 and low >= 0:  # a best score of 2 % is implausible
-        recorded.messages.append(
-            f"scores from {recorded.score.min():g} to {high:g} are taken as percent"
-        )
-        recorded.score = recorded.score / 100.0
-    elif low < 0 or high > 1:
-        outside = (recorded.score < 0) | (recorded.score > 1)
-        text = f"scores from {recorded.score.min():g} to {high:g} clipped to [0, 1]"
-        recorded.messages.append(f"{text}: {outside.sum()} of {len(recorded)} boxes")
-        recorded.score = np.clip(recorded.score, 0, 1)
+        recorded.score = -score
+        return
+    if (high := score.max(initial=0)) > most * 1.01:  # rounded
+        raise ReobjError(f"{path}: scores up to {high:g}, expected 0 to {most:g}; name the largest "
+                         "with --set detect.score_max=N, e.g. 100 for percent")  # fmt: skip
+    if (low := score < 0).any():
+        recorded.messages.append(f"{low.sum()} scores below 0, from {score.min():g}, count as 0")
+    recorded.score = np.clip(score / most, 0, 1)
 
 
 def _best_per_frame(
@@ -322,7 +307,9 @@ def _best_per_frame(
     return rows
 
 
-def _usable(recorded: RecordedDetections, path: Path, frame_count: int) -> BoolArray:
+def _usable(
+    recorded: RecordedDetections, path: Path, frame_count: int, checks_size: bool
+) -> BoolArray:
     """Test which boxes (N,) have an area, overlap the image and belong to a frame of the video."""
     count = len(recorded)
     low = recorded.xyxy[:, :2]
@@ -333,6 +320,8 @@ def _usable(recorded: RecordedDetections, path: Path, frame_count: int) -> BoolA
     if count and recorded.xyxy.max() <= NORMALISED_MAX:
         raise ReobjError(f"{path}: no coordinate above {NORMALISED_MAX}: normalised to 0..1? "
                          "Multiply them by the image size")  # fmt: skip
+    if checks_size and (made_for := _other_size(recorded.xyxy[~empty], recorded.size)):
+        raise ReobjError(f"{path}: {made_for}")
     if reading := _other_reading(recorded.xyxy, recorded.size):
         raise ReobjError(f"{path}: {reading}")
     if 2 * (empty | outside).sum() > count:  # the format is wrong, not a few boxes
@@ -351,6 +340,30 @@ def _usable(recorded: RecordedDetections, path: Path, frame_count: int) -> BoolA
             first = f"{recorded.unit} {recorded.line[bad][0]}"
             recorded.messages.append(f"{bad.sum()} boxes {fault} dropped, the first at {first}")
     return np.logical_not(empty | outside | missing)
+
+
+def _other_size(xyxy: Array, size: tuple[int, int]) -> str:
+    """Describe the frames of another size that boxes (N, 4) were made for; "" if there are none.
+
+    Boxes of a detector end at the borders of its frame: there are several with the largest x2 (y2),
+    of objects whose other side differs. If this border is not that of the image, and boxes begin
+    at its other border, the frames had another size.
+    """
+    border = np.zeros(2)
+    for axis, length in enumerate(size):
+        low = xyxy[:, axis]
+        high = xyxy[:, axis + 2]
+        most = high.max(initial=0)
+        cut = low[high >= most - 1]  # px, rounded
+        moved = abs(most - length) > 0.02 * length and low.min(initial=0) <= 0.02 * most
+        if moved and len(np.unique(cut // (0.02 * most))) >= 4:
+            border[axis] = most
+    if not border.any():
+        return ""
+    ends = " and ".join(f"{axis} = {v:.0f}" for axis, v in zip("xy", border, strict=True) if v)
+    return (f"boxes end at {ends}, as at the border of the image, which is {size[0]}x{size[1]}: "
+            "boxes of frames of another size? Name it with --set detect.image_size=WIDTHxHEIGHT"
+            )  # fmt: skip
 
 
 def _other_reading(xyxy: Array, size: tuple[int, int]) -> str:
@@ -405,6 +418,7 @@ def read_tracks(
     config = config or DetectConfig()
     limit = dataclasses.replace(config, min_score=0.0, max_detections=0)
     recorded = _read(path, video, limit)
+    recorded.score = np.clip(np.where(recorded.score == -1, 1, recorded.score), 0, 1)
     _check(recorded, path, limit, video.frame_count)
     if len(recorded):
         _check_identities(recorded, path)

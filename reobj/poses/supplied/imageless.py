@@ -70,7 +70,8 @@ def open_video(
     unknown = (1, 1)
     if not path.exists():
         raise ReobjError(f"{path}: no such file of detections")
-    size = image_size(path)
+    detect = detect or DetectConfig()
+    size = image_size(path, detect)
     stated = stated_camera(poses.camera, size)
     size = size or (unknown if stated is None else (stated.width, stated.height))
     pose_file = read_pose_file(Path(poses.mode), poses.fmt, size)
@@ -80,7 +81,7 @@ def open_video(
         raise ReobjError(
             f"{poses.mode}: no image size in it; give --camera MODEL WIDTH HEIGHT PARAMS"
         )
-    video = _frames_of(pose_file, path, size, poses.mode, config, detect or DetectConfig())
+    video = _frames_of(pose_file, path, size, poses.mode, config, detect)
     video.messages.append(
         f"{NOTE_START}no images: {video.frame_count} frames of {size[0]}x{size[1]} from "
         f"{poses.mode} and {path}; tracked by motion and cameras alone, without appearance and "
@@ -104,9 +105,9 @@ def _frames_of(
     frames, by these numbers. Poses without names: evenly spaced times from 0 on are numbers;
     otherwise each row is one frame.
     """
-    if (times_s := recorded_times(boxes)) is not None:
+    if (times_s := recorded_times(boxes, detect)) is not None:
         return ImagelessVideo(source, size, config, times_s=times_s)
-    named = {Path(name.replace("\\", "/")).name for name in image_names(boxes)}
+    named = {Path(name.replace("\\", "/")).name for name in image_names(boxes, detect)}
     posed = {Path(name).name for name in pose_file.names}
     if named and posed and (frames_by_name(sorted(named), sorted(posed))[0] >= 0).all():
         named = posed  # all of the detections' images and more, with suffixes
