@@ -324,16 +324,22 @@ def _usable(
         raise ReobjError(f"{path}: {made_for}")
     if reading := _other_reading(recorded.xyxy, recorded.size):
         raise ReobjError(f"{path}: {reading}")
-    if 2 * (empty | outside).sum() > count:  # the format is wrong, not a few boxes
+    if 2 * (empty | outside).sum() > count or outside.sum() > max(10, 0.05 * count):
         raise ReobjError(
             f"{path}: {empty.sum()} of {count} boxes have no area and {outside.sum()} lie outside "
-            f"the image of {recorded.size}: x, y, w, h where x1, y1, x2, y2 is expected, or "
-            "another video?"
+            f"the image of {recorded.size}: x, y, w, h where x1, y1, x2, y2 is expected, "
+            "frames of another size (--set detect.image_size=WIDTHxHEIGHT), or another video?"
         )
     numbers = shortened(np.unique(recorded.frame[missing]).tolist())
     text = f"of frames that the video lacks (0-based: {numbers}; it has {frame_count or 'some'})"
     if count and missing.all():
         raise ReobjError(f"{path}: all detections are {text}: detections of another video?")
+    reach = recorded.xyxy[:, 2:].max(0, initial=0)
+    if checks_size and count >= 50 and (reach < np.multiply(0.9, recorded.size)).all():
+        recorded.messages.append(
+            f"no box of {count} ends beyond x = {reach[0]:.0f} or y = {reach[1]:.0f} in images of "
+            f"{recorded.size}: boxes of frames of another size (detect.image_size)?"
+        )
     for bad, fault in ((empty, "without area"), (outside, "wholly outside the image"),
                        (missing, text)):  # fmt: skip
         if bad.any():
@@ -345,25 +351,22 @@ def _usable(
 def _other_size(xyxy: Array, size: tuple[int, int]) -> str:
     """Describe the frames of another size that boxes (N, 4) were made for; "" if there are none.
 
-    Boxes of a detector end at the borders of its frame: there are several with the largest x2 (y2),
-    of objects whose other side differs. If this border is not that of the image, and boxes begin
-    at its other border, the frames had another size.
+    Boxes of a detector begin at 0 and end at the borders of its frame: several have the largest x2
+    (y2), and differ in x1 (y1). If these borders are not those of the image, the frames had another
+    size. One border is enough if boxes reach the same share of the image in the other direction.
     """
-    border = np.zeros(2)
-    for axis, length in enumerate(size):
-        low = xyxy[:, axis]
-        high = xyxy[:, axis + 2]
-        most = high.max(initial=0)
-        cut = low[high >= most - 1]  # px, rounded
-        moved = abs(most - length) > 0.02 * length and low.min(initial=0) <= 0.02 * most
-        if moved and len(np.unique(cut // (0.02 * most))) >= 4:
-            border[axis] = most
-    if not border.any():
+    most = xyxy[:, 2:].max(0, initial=1)  # (2,)
+    share = most / size
+    begins = xyxy[:, :2].min(0, initial=np.inf) <= 0.02 * most  # of the largest corner
+    cut = [xyxy[xyxy[:, k + 2] >= most[k] - 1, k] // (0.02 * most[k]) for k in (0, 1)]
+    ends = np.array([len(np.unique(starts)) >= 4 for starts in cut])  # chosen: not one object
+    moved = np.abs(share - 1) > 0.02
+    similar = abs(share[0] - share[1]) <= 0.02
+    if not ((moved & begins).any() and (ends.all() or (ends.any() and similar))):
         return ""
-    ends = " and ".join(f"{axis} = {v:.0f}" for axis, v in zip("xy", border, strict=True) if v)
-    return (f"boxes end at {ends}, as at the border of the image, which is {size[0]}x{size[1]}: "
-            "boxes of frames of another size? Name it with --set detect.image_size=WIDTHxHEIGHT"
-            )  # fmt: skip
+    where = f"x = {most[0]:.0f}, y = {most[1]:.0f}, and the image is {size[0]}x{size[1]}"
+    return (f"boxes are cut off at {where}: boxes of frames of another size? Name it with --set "
+            "detect.image_size=WIDTHxHEIGHT")  # fmt: skip
 
 
 def _other_reading(xyxy: Array, size: tuple[int, int]) -> str:
