@@ -202,8 +202,8 @@ def _columns(path: Path, roles: Sequence[str] = (), least: int = 0) -> Table:
     for cells, at in zip(rows, line.tolist(), strict=True):
         if len(cells) != count or not fits:
             expected = str(count) if fits else f"{least} to {len(names)}"
-            more = DECIMAL_COMMAS * (not comma and len(cells) > (count if fits else len(names)))
-            text = f"{len(cells)} columns, expected {expected}{more}"
+            why = DECIMAL_COMMAS * (not comma and not any("." in cell for cell in cells))
+            text = f"{len(cells)} columns, expected {expected}{why}"
             raise ReobjError(f"{path}, line {at}: {text}")
     columns = zip(*rows, strict=True) if rows else [()] * len(names)
     by_name = {name: list(column) for name, column in zip(names, columns, strict=False)}
