@@ -335,7 +335,8 @@ def _usable(
     if count and missing.all():
         raise ReobjError(f"{path}: all detections are {text}: detections of another video?")
     reach = recorded.xyxy[:, 2:].max(0, initial=0)
-    if checks_size and count >= 50 and (reach < np.multiply(0.9, recorded.size)).all():
+    begins = bool(count) and (low.min(0) <= 0.02 * reach).any()
+    if checks_size and count >= 50 and begins and (reach < np.multiply(0.9, recorded.size)).all():
         recorded.messages.append(
             f"no box of {count} ends beyond x = {reach[0]:.0f} or y = {reach[1]:.0f} in images of "
             f"{recorded.size}: boxes of frames of another size (detect.image_size)?"
