@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from reobj.files import did_you_mean, load_json
+from reobj.files import did_you_mean, load_json, shortened
 from reobj.types import ReobjError
 
 R = TypeVar("R", bound=Callable[..., Any])
@@ -146,7 +146,10 @@ class Registry(Generic[R]):
         if fits:
             raise ReobjError(f"{path}: fits {len(fits)} formats of {self.what}: "
                              f"{', '.join(names)}; name one with {self.flag}")  # fmt: skip
-        raise ReobjError(f"{path}: no known format of {self.what}; expected one of "
+        keys, root = shortened(sorted(probe.keys())), probe.root
+        found = f" (JSON with {keys})" if keys else ""
+        found = found if root is None else f" (XML <{root.tag}>)"
+        raise ReobjError(f"{path}: no known format of {self.what}{found}; expected one of "
                          f"{', '.join(known)} ({self.flag}; docs/input_formats.md)")  # fmt: skip
 
     def table(self) -> str:

@@ -203,8 +203,10 @@ def _read_mot(
         return labelled(
             rows, _names_of(number, stated, class_names), (flagged | hidden) * Role.IGNORED
         )
-    if benchmark := _benchmark(sequence.get("name", ""), path, number, flagged):
-        notes.append(f"classes are {benchmark}'s: pedestrians count, boxes on distractors do not")
+    benchmark, why = _benchmark(sequence.get("name", ""), path, number, flagged)
+    if benchmark:
+        text = "pedestrians count, boxes on distractors do not"
+        notes.append(f"classes are {benchmark}'s, by {why}: {text}")
         pedestrian = number == MotClass.PEDESTRIAN
         role = np.where(flagged | ~pedestrian, Role.ABSENT, hidden * Role.IGNORED)
         only_mot20 = {MotClass.NON_MOTORISED_VEHICLE} if benchmark != "MOT20" else set()
@@ -212,7 +214,8 @@ def _read_mot(
         role[np.isin(number, list(distractors))] = Role.IGNORED
         return labelled(rows, "", role)
     if (number < 0).all() or (sequence and (number == MotClass.PEDESTRIAN).all()):
-        notes.append("the truth has one class without a name: classes do not count")
+        by = " (class 1, by seqinfo.ini)" if sequence else ""
+        notes.append(f"the truth has one class without a name{by}: classes do not count")
         return labelled(rows, "", np.where(flagged, Role.ABSENT, hidden * Role.IGNORED))
     notes.append("class numbers of the truth are those of the detector (COCO's), from 0")
     unnamed = number < 0
@@ -262,18 +265,19 @@ def _check_length(rows: Array, path: Path, sequence: dict[str, str]) -> None:
         raise ReobjError(f"{path}: frame {last:.0f}, but {known}: truth of another sequence?")
 
 
-def _benchmark(name: str, path: Path, number: IntArray, flagged: BoolArray) -> str:
-    """Return the MOTChallenge benchmark whose classes a file has, "": none.
+def _benchmark(name: str, path: Path, number: IntArray, flagged: BoolArray) -> tuple[str, str]:
+    """Return the MOTChallenge benchmark whose classes a file has, "": none, and what shows it.
 
     By the name of the sequence or of its folder; else by the rows: all have classes 1 to 13, and
     exactly those of other classes than pedestrians have flag 0.
     """
-    for text in (name, path.resolve().parent.parent.name):
+    folder = path.resolve().parent.parent.name
+    for text, why in ((name, "seqinfo.ini"), (folder, f"the folder {folder}")):
         if match := re.match(r"(MOT16|MOT17|MOT20)-\d+", text):
-            return match[1]
+            return match[1], why
     other = number != MotClass.PEDESTRIAN
     known = ((number >= 1) & (number <= 13)).all()
-    return "MOT17" if known and other.any() and (flagged == other).all() else ""
+    return ("MOT17" if known and other.any() and (flagged == other).all() else ""), "its rows"
 
 
 def _by_line(number: IntArray, labels: Path, path: Path) -> list[str]:

@@ -31,7 +31,7 @@ from reobj.sources.tables import (
     text_classes,
 )
 from reobj.sources.video import Video
-from reobj.types import Array, IntArray, ReobjError, Tracks
+from reobj.types import COCO_NAMES, Array, IntArray, ReobjError, Tracks
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,8 +114,8 @@ def read_boxes_3d(
                          "world of --poses, at the times of its frames")  # fmt: skip
     source = Source(path, video, names)
     recorded = source.recorded(
-        frame, xyxy, text_classes(table, source), table.numbers("score"), line=table.line,
-        unit=table.unit, boxes_3d=box,
+        frame, xyxy, text_classes(table, source, COCO_NAMES), table.numbers("score"),
+        line=table.line, unit=table.unit, boxes_3d=box,
     )  # fmt: skip
     without = (frame < 0).sum()
     if without:

@@ -126,15 +126,7 @@ def read_dataset(path: Path, data: Any, kind: type[D]) -> D:
     return dataset
 
 
-def dataset_of(path: Path, data: Any) -> Dataset | None:
-    """Return the dataset in the content of a JSON file, or the matching one beside the file."""
-    if isinstance(data, dict):
-        return read_dataset(path, data, Dataset)
-    entries = converted(data, list[Annotation], path)
-    return _beside(path, entries)[0] if entries else None
-
-
-def _beside(path: Path, entries: Sequence[Annotation]) -> tuple[Dataset | None, str]:
+def _beside(path: Path, entries: Sequence[Annotation]) -> tuple[str, Dataset | None]:
     """Find the dataset beside a file of results that has all ids of the results, and its name.
 
     Raises:
@@ -143,37 +135,32 @@ def _beside(path: Path, entries: Sequence[Annotation]) -> tuple[Dataset | None, 
     """
     ids = {entry.image_id for entry in entries}
     kinds = {entry.category_id for entry in entries}
-    faults: list[str] = []
-    matches: list[tuple[Dataset, str, dict[Any, Any]]] = []
+    fault = ""
+    matches: list[tuple[str, Dataset]] = []
+    used: list[list[Any]] = []
     for other in sorted(path.parent.glob("*.json")):
         data = None
         with contextlib.suppress(ValueError, OSError):  # an invalid JSON file is no dataset
             data = load_json(other) if other != path else None
         if not isinstance(data, dict) or not data.get("images"):
             continue
-        try:
-            dataset: Dataset = read_dataset(other, data, Dataset)
-        except ReobjError as error:
-            faults.append(str(error))
-            continue
+        dataset = read_dataset(other, data, Dataset)
         images = {image.id: image.name for image in dataset.images}
         names = {category.id: category.name for category in dataset.categories}
         missing = [*ids.difference(images), *(kinds.difference(names) if names else ())]
         if missing:
-            faults.append(f"{path}: id {missing[0]} is not in the dataset JSON {other.name} beside "
-                          "this file; put its own dataset there, or remove the other")  # fmt: skip
+            fault = f"id {missing[0]} is not in the dataset JSON {other.name} beside this file"
             continue
-        used = {("image", i): images[i] for i in ids} | {("class", k): names.get(k) for k in kinds}
-        matches.append((dataset, other.name, used))
-    if any(used != matches[0][2] for *_, used in matches):
-        both = " and ".join(name for _, name, _ in matches[:2])
+        matches.append((other.name, dataset))
+        used.append([{i: images[i] for i in ids}, {k: names.get(k) for k in kinds}])
+    if any(one != used[0] for one in used):
+        both = " and ".join(name for name, _ in matches[:2])
         raise ReobjError(f"{path}: {both} beside it both have the ids of its images, for other "
                          "images or classes; keep only the dataset of this file")  # fmt: skip
-    if matches:
-        return matches[0][:2]
-    if faults and not all(e.file_name or isinstance(e.image_id, str) for e in entries):
-        raise ReobjError(faults[0])
-    return None, ""
+    by_name = all(entry.file_name or isinstance(entry.image_id, str) for entry in entries)
+    if fault and not matches and not by_name:
+        raise ReobjError(f"{path}: {fault}; put its own dataset there, or remove the other")
+    return matches[0] if matches else ("", None)
 
 
 def read_coco(source: Source) -> RecordedDetections:
@@ -188,7 +175,7 @@ def read_coco(source: Source) -> RecordedDetections:
 def read_coco_results(source: Source) -> RecordedDetections:
     """Read COCO results with ids of a dataset beside them, or with names or numbers of images."""
     entries = converted(load_json(source.path), list[Annotation], source.path)
-    dataset, name = _beside(source.path, entries) if entries else (None, "")
+    name, dataset = _beside(source.path, entries) if entries else ("", None)
     source.say(f"images and classes of {name} beside it" * bool(name))
     return _read(source, entries, dataset)
 
@@ -352,19 +339,23 @@ def read_oa_slam(source: Source) -> RecordedDetections:
     )  # fmt: skip
 
 
-def image_size_of(dataset: Dataset | None) -> tuple[int, int] | None:
-    """Return the (w, h) common to all images of a dataset; None where they differ or lack it."""
-    sizes = {(image.width, image.height) for image in dataset.images} if dataset else set()
-    width, height = sizes.pop() if len(sizes) == 1 else (None, None)
-    return (int(width), int(height)) if width and height else None
+def described_images(path: Path, name: str) -> tuple[tuple[int, int] | None, list[str]]:
+    """Return the common (w, h) and the names of the images of a format; as in the dataset beside.
 
-
-def image_names_of(path: Path, data: Any) -> list[str]:
-    """List the image names in a JSON file's dataset or entries; [] where there are none."""
-    entries = data
-    if not isinstance(data, list) or not any("detections" in e for e in data[:1]):
-        dataset = dataset_of(path, data)
-        entries = dataset.images if dataset else converted(data, list[Annotation], path)
+    The size is None where images differ or lack it.
+    """
+    data = load_json(path)
+    if name == "oa-slam":
+        return None, [image.file_name for image in converted(data, list[_OaImage], path)]
+    if name == "coco":
+        dataset: Dataset | None = read_dataset(path, data, Dataset)
     else:
-        entries = converted(data, list[_OaImage], path)
-    return [entry.file_name for entry in entries if entry.file_name]
+        entries = converted(data, list[Annotation], path)
+        dataset = _beside(path, entries)[1] if entries else None
+        if dataset is None:
+            return None, [entry.file_name for entry in entries if entry.file_name]
+    images = dataset.images if dataset else []
+    sizes = {(image.width, image.height) for image in images}
+    width, height = sizes.pop() if len(sizes) == 1 else (None, None)
+    size = (int(width), int(height)) if width and height else None
+    return size, [image.file_name for image in images if image.file_name]

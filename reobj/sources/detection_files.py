@@ -18,15 +18,15 @@ from pathlib import Path
 import numpy as np
 
 from reobj.cameras import Poses
-from reobj.files import did_you_mean, last_name, load_json, shortened
+from reobj.files import did_you_mean, last_name, shortened
 from reobj.formats import AUTO, Registry
-from reobj.sources import coco, tables
+from reobj.sources import coco
 from reobj.sources.class_names import check_length, load_class_names
 from reobj.sources.detection_formats import DETECTIONS, Reader
 from reobj.sources.label_folders import label_files
 from reobj.sources.looked import frames_looked_at, looked_message
 from reobj.sources.recorded import NORMALISED_MAX, RecordedDetections, Source, npz_image_size
-from reobj.sources.tables import read_cells, read_cells_3d, seconds
+from reobj.sources.tables import are_numbers, read_cells, read_cells_3d, seconds
 from reobj.sources.video import Video
 from reobj.types import (
     CLASS_NAME_MAX,
@@ -173,37 +173,30 @@ def read_source(source: Source, formats: Registry[Reader], name: str) -> Recorde
         raise ReobjError(f"{source.path}: an entry cannot be read: {error!r}") from error
 
 
-def recorded_times(path: Path, config: DetectConfig) -> Array | None:
-    """Return the distinct times in s, ascending, of a table with times and without frames."""
-    if DETECTIONS.find(path, config.format).name == "boxer-3d":
-        return np.unique(seconds(read_cells_3d(path)))
-    if DETECTIONS.find(path, config.format).name != "csv":
-        return None
-    table = read_cells(path)
-    if "time" not in table.cells or "frame" in table.cells or "image" in table.cells:
-        return None
-    return np.unique(seconds(table))
+def described_images(
+    path: Path, config: DetectConfig
+) -> tuple[tuple[int, int] | None, list[str], Array | None]:
+    """Return what a file of detections, or a dataset beside it, says about its images.
 
-
-def image_size(path: Path, config: DetectConfig) -> tuple[int, int] | None:
-    """Return the (w, h) of the images of a file of detections; None if the file lacks it."""
-    name = DETECTIONS.find(path, config.format).name
-    if name == "npz":
-        return npz_image_size(path)
-    is_coco = name in ("coco", "coco-results")
-    return coco.image_size_of(coco.dataset_of(path, load_json(path))) if is_coco else None
-
-
-def image_names(path: Path, config: DetectConfig) -> list[str]:
-    """List the image names in a file of detections or a dataset beside it; [] if there are none."""
+    Returns:
+        their common (w, h), None: not stated or they differ; their names; their times in s,
+        ascending, None: frames are not found by times.
+    """
     match DETECTIONS.find(path, config.format).name:
-        case "coco" | "coco-results" | "oa-slam":
-            return coco.image_names_of(path, load_json(path))
+        case "npz":
+            return npz_image_size(path), [], None
+        case "coco" | "coco-results" | "oa-slam" as name:
+            return *coco.described_images(path, name), None
         case "yolo":
-            return [str(file.relative_to(path)) for file in label_files(path)]
-        case "csv":
-            return tables.image_names_of(read_cells(path))
-    return []
+            return None, [str(file.relative_to(path)) for file in label_files(path)], None
+        case "boxer-3d":
+            return None, [], np.unique(seconds(read_cells_3d(path)))
+        case "csv" if "frame" not in (table := read_cells(path)).cells:
+            if "image" not in table.cells:
+                return None, [], np.unique(seconds(table))
+            names = list(dict.fromkeys(table.cells["image"]))
+            return None, [] if are_numbers(names) else names, None
+    return None, [], None
 
 
 def _check(
@@ -250,29 +243,27 @@ def _stated_scale(text: str, size: tuple[int, int]) -> Array:
 
 def check_rows(recorded: RecordedDetections, path: Path) -> None:
     """Refuse invalid values and masks; the error names the first such row."""
+    names = recorded.class_names
     with np.errstate(invalid="ignore", over="ignore"):  # inf - inf
         finite = np.isfinite(recorded.xyxy.sum(1) + recorded.score)  # (N,)
     finite &= (np.abs(recorded.xyxy) <= COORDINATE_MAX).all(1)
-    named = np.isin(recorded.class_id, np.arange(len(recorded.class_names)))
-    lengths = np.array([*map(len, recorded.class_names), 0])
-    short = lengths[np.where(named, recorded.class_id, -1)] <= CLASS_NAME_MAX
+    named = (recorded.class_id >= 0) & (recorded.class_id < len(names))
     pixels = np.array([runs.sum() for runs in recorded.runs], np.int64)  # (N,)
     masked = np.array([len(runs) > 0 for runs in recorded.runs], bool)
-    fits = ~masked | (pixels == math.prod(recorded.size))
-    for row in np.flatnonzero(~(finite & named & short & fits))[:1]:
-        where = f"{path}, {recorded.unit} {recorded.line[row]}"
+    unfit = masked & (pixels != math.prod(recorded.size))
+    for row in np.flatnonzero(~finite | ~named | unfit)[:1]:
         text = f"mask of {pixels[row]} pixels in a video of {recorded.size}"
         if not finite[row]:
-            text = (
-                f"{recorded.xyxy[row]}, {recorded.score[row]}: NaN, infinite or beyond 1e7 pixels"
-            )
+            values = f"{recorded.xyxy[row]}, {recorded.score[row]}"
+            text = f"{values}: NaN, infinite or beyond 1e7 pixels"
         elif not named[row]:
-            text = unnamed_class(int(recorded.class_id[row]), len(recorded.class_names))
-        elif not short[row]:
-            check_length(recorded.class_names[recorded.class_id[row]], where)
-        raise ReobjError(f"{where}: {text}")
-    for name in recorded.class_names:
-        check_length(name, f"{path}, class names")
+            text = unnamed_class(int(recorded.class_id[row]), len(names))
+        raise ReobjError(f"{path}, {recorded.unit} {recorded.line[row]}: {text}")
+    long = [number for number, name in enumerate(names) if len(name) > CLASS_NAME_MAX]
+    for number in long:
+        rows = np.flatnonzero(recorded.class_id == number)[:1]
+        where = f"{recorded.unit} {recorded.line[rows[0]]}" if len(rows) else "class names"
+        check_length(names[number], f"{path}, {where}")
 
 
 def _check_scores(recorded: RecordedDetections, most: float, path: Path) -> None:
@@ -376,26 +367,23 @@ def _other_reading(xyxy: Array, size: tuple[int, int]) -> str:
     Corners are invalid if the second is before the first or the centre lies outside the image.
     Then common mistakes are tried; one is the cause if all boxes fit the image with it.
     """
-    image = np.array(size, np.float64)
-    centre = (xyxy[:, :2] + xyxy[:, 2:]) / 2
-    inverted = (xyxy[:, 2:] < xyxy[:, :2]).any(1)
-    beyond = ((centre < 0) | (centre > image)).any(1)
+    low, high = xyxy[:, :2], xyxy[:, 2:]
+    centre = (low + high) / 2
+    inverted = (high < low).any(1)
+    beyond = ((centre < 0) | (centre > size)).any(1)
     if not (inverted | beyond).any():
         return ""
     why = f"{inverted.sum()} of {len(xyxy)} boxes have x2 < x1 or y2 < y1 and {beyond.sum()} have "
     why += f"their centre outside the image of {size}"
-    from_sizes = np.hstack([xyxy[:, :2], xyxy[:, :2] + xyxy[:, 2:]])
-    from_corners = np.hstack([xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]])
-    for box, limit, cause in (
-        (xyxy, image[::-1], f"all fit the frame turned by 90 deg, {size[::-1]}: made on frames "
-                            "that were not turned upright? Detect on upright frames"),
-        (from_sizes, image, "all fit it as x, y, w, h: name the columns so, or give corners"),
-        (from_corners, image,
-         "all fit it if w and h are the corner x2, y2: name them so, or give sizes"),
+    for end, limit, cause in (
+        (high, size[::-1], f"all fit the frame turned by 90 deg, {size[::-1]}: made on frames that "
+                           "were not turned upright? Detect on upright frames"),
+        (low + high, size, "all fit it as x, y, w, h: name the columns so, or give corners"),
+        (high - low, size, "all fit it if w and h are the corner x2, y2: name them so, or give "
+                           "sizes"),
     ):  # fmt: skip
         # Tolerance of 1 px: detectors round boxes to whole pixels
-        inside = (box >= -1).all(1) & (box[:, :2] <= box[:, 2:]).all(1)
-        if (inside & (box[:, 2:] <= limit + 1).all(1)).all():
+        if (low >= -1).all() and (low <= end).all() and (end <= np.add(limit, 1)).all():
             return f"{why}; {cause}"
     return ""
 

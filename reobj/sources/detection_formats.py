@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 
 from reobj.formats import Format, Probe, Registry
 from reobj.sources import boxes_3d, coco, cvat, label_folders, tables
 from reobj.sources.recorded import RecordedDetections, Source, read_npz
+from reobj.types import ReobjError
 
 Reader = Callable[[Source], RecordedDetections]
 
@@ -50,6 +52,12 @@ def _is_cvat(probe: Probe) -> bool:
     return _root("annotations")(probe) or "annotations.xml" in probe.names
 
 
+def _keypoints(probe: Probe) -> bool | None:
+    with contextlib.suppress(ReobjError):
+        return label_folders.keypoints(probe.path)
+    return False
+
+
 def _is_labels(probe: Probe) -> bool:
     return probe.is_dir and not _is_voc(probe)
 
@@ -82,8 +90,12 @@ DETECTIONS: Registry[Reader] = Registry("detections", "--detections-format", [
            "keypoints"),
     Format("oa-slam", "OA-SLAM, VOOM", _has("file_name", "detections", listed=True),
            coco.read_oa_slam, NAMED, "px"),
-    Format("yolo", "a folder of YOLO labels, with polygons or keypoints too", _is_labels,
-           label_folders.read_label_folder, f"{NAMED}; VIDEO_N.txt from 1", "fractions",
+    Format("yolo", "a folder of YOLO labels, boxes or polygons",
+           lambda probe: _is_labels(probe) and not _keypoints(probe),
+           label_folders.read_label_folder, f"{NAMED}; VIDEO_N.txt from 1", "fractions"),
+    Format("yolo-pose", "a folder of YOLO labels, boxes with keypoints",
+           lambda probe: _is_labels(probe) and _keypoints(probe) is not False,
+           label_folders.read_pose_folder, f"{NAMED}; VIDEO_N.txt from 1", "fractions",
            "keypoints"),
     Format("cvat", "CVAT for video 1.1 and for images 1.1, XML or zip", _is_cvat, cvat.read_cvat,
            f"from 0; images {NAMED}", "px", "skeletons"),

@@ -1,7 +1,6 @@
 """Folders of YOLO labels: a text file an image, `class cx cy w h [conf] [id]` or polygons.
 
-Coordinates are fractions of the image size. Also `class cx cy w h` with keypoints, which are not
-read.
+Coordinates are fractions of the image size. Keypoints after `class cx cy w h` are not read.
 """
 
 from __future__ import annotations
@@ -48,12 +47,12 @@ def names_file(path: Path) -> Path | None:
     return None
 
 
-def read_label_folder(source: Source) -> RecordedDetections:
+def read_label_folder(source: Source, pose: bool = False) -> RecordedDetections:
     """Read a folder of YOLO labels.
 
     NAME.txt belongs to the image of that name; NAME_N.txt to frame N of a video (from 1, as in
     ultralytics, if NAME is that of the video). Class names are the user's, or those of a file
-    beside the labels, else COCO's.
+    beside the labels, else COCO's. pose: keypoints lie between boxes and confidence.
     """
     path, video = source.path, source.video
     files = label_files(path)
@@ -68,7 +67,7 @@ def read_label_folder(source: Source) -> RecordedDetections:
     beside = None if names else names_file(path)
     if beside is not None:
         names = load_class_names(beside)
-        source.say(f"class names of {beside.name}")
+        source.say(f"class names of {beside}")
     elif not names:
         source.say("no class names beside it: class numbers are taken as COCO's 80")
     rows = list[list[float]]()
@@ -82,7 +81,9 @@ def read_label_folder(source: Source) -> RecordedDetections:
                 of_file.append(at)
         if len(rows) > LINES_MAX:
             raise ReobjError(f"{path}: more than {LINES_MAX} boxes; take fewer frames")
-    rows = _without_keypoints(rows, source)
+    if pose:
+        rows = [row[:5] + row[len(row) - (len(row) - 5) % 3 :] for row in rows]
+        source.say("keypoints after class cx cy w h are not read")
     box, score, identity, polygons = _columns(rows, [f"{path}, line {line}" for line in lines])
     stems = [str(file.relative_to(path)) for file in files]
     frame = frames_of_names(stems, source, 1 if video_files else None)
@@ -114,15 +115,25 @@ def _row(cells: Sequence[str], where: str) -> list[float]:
     return row
 
 
-def _without_keypoints(rows: list[list[float]], source: Source) -> list[list[float]]:
-    """Cut off keypoints x y visibility (0, 1 or 2) after boxes, if all rows have as many."""
+def keypoints(path: Path) -> bool | None:
+    """Test the first label files for keypoints x y visibility after boxes; None: open.
+
+    Visibilities are 0, 1 or 2. Where they are confidences, polygons of as many corners each are
+    possible too.
+    """
+    lines = [line for file in label_files(path)[:50] for line in read_lines(file)]
+    rows = [line.split() for line in lines if line.strip()]
     count = len(rows[0]) if rows else 0
-    if count < 8 or count % 3 != 2 or any(len(row) != count for row in rows):
-        return rows
-    if not all(visibility in (0, 1, 2) for row in rows for visibility in row[7::3]):
-        return rows
-    source.say(f"{count - 5} columns of keypoints, after class cx cy w h, are not read")
-    return [row[:5] for row in rows]
+    if count < 8 or any(len(row) != count for row in rows):
+        return False
+    if count % 3 == 2 and all(cell in ("0", "1", "2") for row in rows for cell in row[7::3]):
+        return True
+    return None if count >= 14 and count % 3 != 1 and len(rows) > 1 else False
+
+
+def read_pose_folder(source: Source) -> RecordedDetections:
+    """Read a folder of YOLO labels with keypoints, which are not read."""
+    return read_label_folder(source, True)
 
 
 def _columns(

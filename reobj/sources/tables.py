@@ -19,13 +19,12 @@ import numpy as np
 
 from reobj.files import load_json, read_lines, shortened
 from reobj.formats import HEAD_BYTES, Probe
-from reobj.sources.class_names import check_length, load_class_names
+from reobj.sources.class_names import load_class_names
 from reobj.sources.image_files import TimeUnit, is_date
 from reobj.sources.image_frames import frames_of_names, frames_of_numbers
 from reobj.sources.recorded import RecordedDetections, Source
 from reobj.types import (
     CLASS_MAX,
-    CLASS_NAME_MAX,
     COCO_NAMES,
     COORDINATE_MAX,
     Array,
@@ -60,14 +59,15 @@ ALIASES: dict[str, str] = {  # names of columns; the first one with values is us
     "y2": "y2 y_max ymax bottom bb_bottom bbox_bottom box_bottom y_bottom ybr bbox_y2 bbox_ymax",
     "w": "w bb_width bbox_width box_width bbox_w bb_w width",
     "h": "h bb_height bbox_height box_height bbox_h bb_h height",
-    "image w": "img_width image_width img_w image_w frame_width width",
-    "image h": "img_height image_height img_h image_h frame_height height",
+    "image w": "img_width image_width img_w image_w frame_width original_width width",
+    "image h": "img_height image_height img_h image_h frame_height original_height height",
     "cx": "cx xc x_center x_centre center_x xcenter bbox_cx",
     "cy": "cy yc y_center y_centre center_y ycenter bbox_cy",
     "score": "score confidence conf prob probability detection_score",
     "class": "class_name category_name class_label label name category type class class_id cls "
              "category_id label_id coco80_class",
 }  # fmt: skip
+NONE = np.empty(0, bool)
 BOX_FORMS = (("x1", "y1", "x2", "y2"), ("x1", "y1", "w", "h"), ("cx", "cy", "w", "h"))
 
 
@@ -93,12 +93,6 @@ class Table:
     def where(self, row: int) -> str:
         """Return the position of a row, for messages."""
         return f"{self.path}, {self.unit} {self.line[row]}"
-
-    def select(self, keep: BoolArray) -> None:
-        """Keep some of the N rows."""
-        rows = np.flatnonzero(keep)
-        self.cells = {role: [cells[i] for i in rows] for role, cells in self.cells.items()}
-        self.line = self.line[rows]
 
     def numbers(self, role: str) -> Array:
         """Convert a column to finite numbers (N,); an error names the line."""
@@ -144,7 +138,7 @@ def _number(cell: str, comma: bool = True) -> float:
         return math.nan
 
 
-def _are_numbers(cells: Sequence[str]) -> bool:
+def are_numbers(cells: Sequence[str]) -> bool:
     return not any(math.isnan(_number(cell)) for cell in cells)
 
 
@@ -159,12 +153,8 @@ def _separator(line: str) -> str:
 
 def _is_comment(line: str) -> bool:
     """Test whether a line begins with # and is no header."""
-    if line[:1] != "#":
-        return False
-    words = set(re.split(r"[^a-z0-9]+", line.lower())) | set(re.split(r"\W+", line.lower()))
-    return not words & {
-        name for role in ("frame", "image", "time") for name in ALIASES[role].split()
-    }
+    header = re.search(r"(^|[^a-z])(frame|image|file|time)(stamp|_?[a-z]+)?\b", line.lower())
+    return line[:1] == "#" and not header
 
 
 def split(lines: Sequence[str]) -> tuple[list[list[str]], IntArray, bool]:
@@ -284,7 +274,7 @@ def _unread(
 
     Left out are empty ones, and other names of the same classes and identities.
     """
-    kinds = r"class|label|categor|type|track|inst|object|obj|ident|width|height|size|(^|_)id($|_)"
+    kinds = r"class|label|categor|type|track|inst|obj|ident|width|height|size|(^|_)(id|w|h)($|_)"
     read = [cells[role] for role in ("class", "id") if role in cells]
     names = [name for name in by_name if name not in used and re.search(kinds, name)]
     names = [name for name in names if len(set(by_name[name]) - {"-1", ""}) > 0]
@@ -320,13 +310,13 @@ def head(probe: Probe) -> list[list[str]]:
 def has_header(probe: Probe) -> bool:
     """Test whether the first cell of a table is no number."""
     rows = head(probe)
-    return bool(rows) and not _are_numbers(rows[0][:1])
+    return bool(rows) and not are_numbers(rows[0][:1])
 
 
 def is_kitti(probe: Probe) -> bool:
     """Test for 17 or 18 columns of which the third is text."""
     rows = head(probe)
-    return bool(rows) and len(rows[0]) in (17, 18) and not _are_numbers(rows[0][2:3])
+    return bool(rows) and len(rows[0]) in (17, 18) and not are_numbers(rows[0][2:3])
 
 
 def _values(probe: Probe, count: int) -> Array:
@@ -391,40 +381,38 @@ def read_mot(source: Source) -> RecordedDetections:
         source.say("columns 8 to 10 are x, y, z in the world, which are not read")
     elif "class" in table.cells:
         number = table.whole("class")
-    names = source.names
     labels = source.path.with_name("labels.txt")
-    if not names and labels.exists() and (number >= 0).any():
-        names = load_class_names(labels)
+    if not source.names and labels.exists() and (number >= 0).any():
+        source.names = load_class_names(labels)
         source.say("class names of labels.txt beside it, from 1")
-    first = 0 if (number == 0).any() and not (names and number.max() == len(names)) else 1
+    first = int((number != 0).all() or 0 < len(source.names) == number.max())
     if (number == 0).any():
         text = "count from 1; 0: no class" if first else "are taken as 0-based, as there is a 0"
         source.say(f"class numbers {text}")
-    return _recorded(table, source, 1, _numbered(number - first, names, first, source))
+    return _recorded(table, source, 1, _numbered(number - first, first, source))
 
 
 def read_boxmot(source: Source) -> RecordedDetections:
     """Read results of boxmot: columns 7 to 9 are 1, class from 0, score."""
     table = _mot_table(source)
-    classes = _numbered(table.whole("class"), source.names or COCO_NAMES, 0, source)
-    table.cells["score"] = table.cells.pop("extra")
+    table.cells["score"] = table.cells["extra"]
     source.say("read as boxmot's results: columns 7 to 9 are 1, class from 0, score")
-    return _recorded(table, source, 1, classes)
+    return _recorded(table, source, 1, _numbered(table.whole("class"), 0, source))
 
 
 def read_visdrone(source: Source) -> RecordedDetections:
     """Read VisDrone's annotations: class 0 is an ignored region."""
     table = _mot_table(source)
     number = table.whole("class")
-    classes = _numbered(np.maximum(number, 1) - 1, source.names or VISDRONE.split(), 1, source)
-    return _recorded(table, source, 1, classes, ignored=number == 0)
+    classes = _numbered(np.maximum(number, 1) - 1, 1, source, VISDRONE.split())
+    return _recorded(table, source, 1, classes, number == 0)
 
 
 def read_kitti(source: Source) -> RecordedDetections:
     """Read KITTI's tracking labels or results; DontCare is an ignored region."""
     table = _columns(source.path, KITTI, 17)
     care = np.array(table.cells["class"]) == "DontCare"
-    return _recorded(table, source, 0, text_classes(table, source, True), ignored=care)
+    return _recorded(table, source, 0, text_classes(table, source, ()), care)
 
 
 def read_csv(source: Source) -> RecordedDetections:
@@ -459,7 +447,7 @@ def _read_named(table: Table, source: Source) -> RecordedDetections:
         table.cells["id"] = ["-1" if _is_empty(cell) else cell for cell in table.cells["id"]]
     # MOTChallenge counts frames from 1; its names of columns begin with bb_
     usual = 1 if any(name.startswith("bb_") for name in table.header) else 0
-    return _recorded(table, source, usual, text_classes(table, source))
+    return _recorded(table, source, usual, text_classes(table, source, COCO_NAMES))
 
 
 def _mot_table(source: Source) -> Table:
@@ -475,7 +463,7 @@ def _recorded(
     source: Source,
     usual: int,
     classes: tuple[IntArray, Sequence[str]],
-    ignored: BoolArray | None = None,
+    ignored: BoolArray = NONE,
 ) -> RecordedDetections:
     """Convert a table to detections; usual: number of the first frame."""
     xyxy = table.boxes()
@@ -486,9 +474,8 @@ def _recorded(
             xyxy = xyxy * source.scale(size, frame >= 0)
     return source.recorded(
         frame, xyxy, classes, table.numbers("score") if "score" in table.cells else None,
-        line=table.line, unit=table.unit,
+        line=table.line, unit=table.unit, ignored=ignored,
         identity=table.whole("id") if "id" in table.cells else np.empty(0, np.int64),
-        ignored=np.empty(0, bool) if ignored is None else ignored,
     )  # fmt: skip
 
 
@@ -499,25 +486,22 @@ def _drop_empty(table: Table, source: Source) -> None:
     if none.any():
         first = f"{table.unit} {table.line[none][0]}"
         source.say(f"{none.sum()} rows without a box left out, the first at {first}")
-        table.select(~none)
+        rows = np.flatnonzero(~none)
+        table.cells = {role: [cells[i] for i in rows] for role, cells in table.cells.items()}
+        table.line = table.line[rows]
 
 
 def _frames(table: Table, source: Source, usual: int) -> IntArray:
     """Return the frames of the source (N,), -1: none."""
-    if "frame" in table.cells and _are_numbers(table.cells["frame"]):
+    names = table.cells.get("frame", table.cells.get("image"))
+    if "frame" in table.cells and are_numbers(table.cells["frame"]):
         return frames_of_numbers(table.whole("frame"), source, usual)
-    for role in ("frame", "image"):
-        if role in table.cells:
-            return frames_of_names(table.cells[role], source, 0)
-    return _frames_at(seconds(table), source)
-
-
-def image_names_of(table: Table) -> list[str]:
-    """Return the distinct names of images in a table, [] if it has numbers or times."""
-    if "frame" in table.cells or "image" not in table.cells:
-        return []
-    names = list(dict.fromkeys(table.cells["image"]))
-    return [] if _are_numbers(names) else names
+    if names is not None:
+        return frames_of_names(names, source, 0)
+    if source.video.times_s is None:
+        raise ReobjError(f"{source.path}, line 1: no column frame; time stamps can be used only if "
+                         "the names of the images are time stamps too")  # fmt: skip
+    return nearest_times(source.video.times_s, seconds(table), 0.0)
 
 
 def seconds(table: Table) -> Array:
@@ -532,15 +516,6 @@ def seconds(table: Table) -> Array:
     if not units and len(values):
         units = [unit for unit in TimeUnit if is_date(float(values.min()) / unit.value)]
     return values / (units[0].value if units else 1.0)
-
-
-def _frames_at(time_s: Array, source: Source) -> IntArray:
-    """Find the frames nearest to times (N,) in s, -1 if none is within half a frame interval."""
-    times_s = source.video.times_s
-    if times_s is None:
-        raise ReobjError(f"{source.path}, line 1: no column frame; time stamps can be used only if "
-                         "the names of the images are time stamps too")  # fmt: skip
-    return nearest_times(times_s, time_s, 0.0)
 
 
 def nearest_times(times_s: Array, time_s: Array, alone_s: float) -> IntArray:
@@ -561,32 +536,35 @@ def nearest_times(times_s: Array, time_s: Array, alone_s: float) -> IntArray:
 # ---- Classes -------------------------------------------------------------------------------------
 
 
-def text_classes(table: Table, source: Source, own: bool = False) -> tuple[IntArray, list[str]]:
+def text_classes(table: Table, source: Source, base: Sequence[str]) -> tuple[IntArray, list[str]]:
     """Read a column of class names or of numbers from 0; empty cells and -1: no class.
 
-    own: names of the file go without COCO's.
+    base: names by number, if the user gives none; other names in the file follow them.
     """
     cells = table.cells.get("class", [""] * len(table.line))
-    blank = np.array([_is_empty(cell) or cell == "-1" for cell in cells], bool)
-    filled = [cell for cell, none in zip(cells, blank.tolist(), strict=True) if not none]
-    class_id = np.full(len(cells), -1)
-    names = list(source.names or (() if own else COCO_NAMES))
-    if not filled:
-        return np.zeros(len(cells), np.int64), ["object"]
-    if all(re.fullmatch(r"[0-9]{1,18}(\.0*)?", cell) for cell in filled):
-        class_id[~blank] = [int(cell.partition(".")[0]) for cell in filled]
+    names = list(source.names or base)
+    texts = {cell for cell in cells if not _is_empty(cell) and cell != "-1"}
+    if all(re.fullmatch(r"[0-9]{1,18}(\.0*)?", cell) for cell in texts):
+        index = {cell: int(cell.partition(".")[0]) for cell in texts}
     else:
-        for name in set(filled):
-            if len(name) > CLASS_NAME_MAX:
-                check_length(name, table.where(cells.index(name)))
-        new = sorted(set(filled) - set(names))
+        new = sorted(texts - set(names))
         if new and source.names:
             text = f"{len(new)} class names that detect.class_names does not have"
             source.say(f"{text}: {printable(shortened(new))}")
         names += new
         index = {name: i for i, name in reversed(list(enumerate(names)))}
-        class_id[~blank] = [index[cell] for cell in filled]
-    return _with_unnamed(class_id, names, source)
+    return _with_unnamed(np.array([index.get(cell, -1) for cell in cells], np.int64), names, source)
+
+
+def _numbered(
+    class_id: IntArray, first: int, source: Source, names: Sequence[str] = ()
+) -> tuple[IntArray, list[str]]:
+    """Name classes (N,) by number, which the file counts from `first`; below 0: no class."""
+    last = int(class_id.max(initial=-1)) + first
+    if last > CLASS_MAX:
+        raise ReobjError(f"{source.path}: class number {last}, expected at most {CLASS_MAX}")
+    known = list(source.names or names) or [f"class {i}" for i in range(first, last + 1)]
+    return _with_unnamed(class_id, known, source)
 
 
 def _with_unnamed(
@@ -594,25 +572,9 @@ def _with_unnamed(
 ) -> tuple[IntArray, list[str]]:
     """Name the class of rows without one, below 0, `object`, and count them."""
     blank = class_id < 0
+    if blank.all():
+        return np.zeros(len(class_id), np.int64), ["object"]
     if not blank.any():
         return class_id, names
-    source.say(f"{blank.sum()} boxes without a class are called object" * bool(names))
+    source.say(f"{blank.sum()} boxes without a class are called object")
     return np.where(blank, len(names), class_id), [*names, "object"]
-
-
-def _numbered(
-    class_id: IntArray, names: Sequence[str], first: int, source: Source
-) -> tuple[IntArray, list[str]]:
-    """Name classes (N,) by numbers, which the file counts from `first`; below 0: no class."""
-    known = list(names)
-    most = int(class_id.max(initial=-1))
-    if most + first > CLASS_MAX:
-        text = f"class number {most + first}, expected at most {CLASS_MAX}"
-        raise ReobjError(f"{source.path}: {text}")
-    if most < 0:
-        return np.zeros(len(class_id), np.int64), ["object"]
-    if most >= len(known):
-        text = f"class numbers up to {most + first}, but only {len(known)} class names"
-        source.say(f"{text}: the others are called by their numbers" * bool(known))
-        known += [f"class {i + first}" for i in range(len(known), most + 1)]
-    return _with_unnamed(class_id, known, source)

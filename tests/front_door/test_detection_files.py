@@ -1014,7 +1014,23 @@ def test_labels_with_keypoints(tmp_path: Path, tracked: Callable[..., Tracked]) 
     )
     (labels / "classes.txt").write_text("chair\n")
     made = tracked(write_clip(tmp_path / "v.avi"), "--detections", labels)
-    assert is_truth(made) and "6 columns of keypoints" in made.said
+    assert is_truth(made) and "keypoints after class cx cy w h are not read" in made.said
+
+
+def test_labels_with_keypoints_and_confidences(
+    tmp_path: Path, tracked: Callable[..., Tracked]
+) -> None:
+    """Polygons have the same form: the user says which."""
+    points = " .1 .2 .9 .3 .4 .8 .5 .6 .7 .95"
+    labels = yolo_folder(tmp_path / "labels", lambda f: yolo(f, 0, points), "v_{}.txt", 1)
+    (labels / "classes.txt").write_text("chair\n")
+    source = write_clip(tmp_path / "v.avi")
+    made = tracked(source, "--detections", labels)
+    assert made.code == 2 and "yolo, yolo-pose; name one with" in made.said
+    made = tracked(source, "--detections", labels, "--detections-format", "yolo-pose")
+    assert is_truth(made) and "keypoints" in made.said
+    found = rt.read_detections(labels, rt.Video(source), rt.DetectConfig(format="yolo-pose"))
+    assert set(found.score.tolist()) == {0.95}
 
 
 def test_identities_at_the_end_of_label_rows(

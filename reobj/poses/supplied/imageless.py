@@ -25,10 +25,8 @@ from reobj.poses.supplied.pose_formats import PoseFile
 from reobj.poses.supplied.readers import read_pose_file
 from reobj.sources.detection_files import (
     DetectConfig,
-    image_names,
-    image_size,
+    described_images,
     read_detections,
-    recorded_times,
 )
 from reobj.sources.image_files import TimeUnit, sorted_names
 from reobj.sources.imageless import ImagelessVideo
@@ -71,7 +69,7 @@ def open_video(
     if not path.exists():
         raise ReobjError(f"{path}: no such file of detections")
     detect = detect or DetectConfig()
-    size = image_size(path, detect)
+    size = described_images(path, detect)[0]
     stated = stated_camera(poses.camera, size)
     size = size or (unknown if stated is None else (stated.width, stated.height))
     pose_file = read_pose_file(Path(poses.mode), poses.fmt, size)
@@ -105,9 +103,10 @@ def _frames_of(
     frames, by these numbers. Poses without names: evenly spaced times from 0 on are numbers;
     otherwise each row is one frame.
     """
-    if (times_s := recorded_times(boxes, detect)) is not None:
+    _, given, times_s = described_images(boxes, detect)
+    if times_s is not None:
         return ImagelessVideo(source, size, config, times_s=times_s)
-    named = {Path(name.replace("\\", "/")).name for name in image_names(boxes, detect)}
+    named = {Path(name.replace("\\", "/")).name for name in given}
     posed = {Path(name).name for name in pose_file.names}
     if named and posed and (frames_by_name(sorted(named), sorted(posed))[0] >= 0).all():
         named = posed  # all of the detections' images and more, with suffixes
