@@ -273,7 +273,7 @@ def _check_scores(recorded: RecordedDetections, most: float, path: Path) -> None
         recorded.messages.append("scores are all -1: taken as 1")
         recorded.score = -score
         return
-    if (high := score.max(initial=0)) > most * 1.01:  # rounded
+    if (high := score.max(initial=0)) > most * 1.01 or not most:  # rounded
         raise ReobjError(f"{path}: scores up to {high:g}, expected 0 to {most:g}; name the largest "
                          "with --set detect.score_max=N, e.g. 100 for percent")  # fmt: skip
     if (low := score < 0).any():
