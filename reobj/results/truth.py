@@ -11,7 +11,7 @@ import configparser
 import dataclasses
 import enum
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -25,10 +25,12 @@ from reobj.formats import AUTO, Format, Registry
 from reobj.results.result import Result
 from reobj.sources.detection_files import check_rows, read_source
 from reobj.sources.detection_formats import DETECTIONS, FROM_1, Reader
-from reobj.sources.recorded import RecordedDetections, Source
+from reobj.sources.recorded import Source
 from reobj.sources.tables import is_boxmot, is_mot, read_mot_rows
 from reobj.types import CLASS_MAX, Array, BoolArray, IntArray, ReobjError, counted
 from reobj.words import among, canonical
+
+TruthReader = Callable[..., "LabelledBoxes"]
 
 
 class Role(enum.IntEnum):
@@ -95,50 +97,40 @@ def read_truth(
         ReobjError: the file cannot be read, or an identity has two boxes in a frame.
     """
     notes = [] if notes is None else notes
-    if TRUTH.find(path, fmt).name == "mot":
-        truth = _read_mot(path, class_names, min_visibility, notes)
-    else:
-        truth = _read_tracks(path, fmt, notes, size)
+    reader = TRUTH.reader(path, fmt)
+    truth = reader(path, class_names, min_visibility, notes, size)
     _check_identities(truth, path)
     return truth
 
 
-def _mot_rows(source: Source) -> RecordedDetections:
-    raise NotImplementedError("`_read_mot` reads the columns of ground truth")
+def _with_roles(entry: Format[Reader]) -> Format[TruthReader]:
+    """Return a format of detections with identities as one of ground truth."""
 
+    def read(
+        path: Path, _: Sequence[str], __: float, notes: list[str], size: tuple[int, int]
+    ) -> LabelledBoxes:
+        video = SimpleNamespace(size=size, working_size=size, names=[], files=[], frame_count=0,
+                                times_s=None, source=path.stem)  # fmt: skip
+        source = Source(path, video, messages=notes, advice="expected frame_id, or names from 0")
+        recorded = read_source(source, entry)
+        check_rows(recorded, path)
+        if not len(recorded.identity):
+            raise ReobjError(f"{path}: boxes without identities; expected tracks")
+        names = np.array([*recorded.class_names, ""], str)[recorded.class_id]
+        role = np.full(len(recorded), Role.SCORED)
+        if len(recorded.ignored):
+            role[recorded.ignored] = Role.IGNORED
+        if entry.name == "kitti":
+            names[recorded.ignored] = ""
+            notes.append("KITTI's labels: frames from 0; boxes on DontCare do not count; KITTI's "
+                         "rules of distractors, occlusion and height are not applied"
+                         )  # fmt: skip
+        listed = None if recorded.looked is None else recorded.looked + 1
+        ids = recorded.identity
+        return LabelledBoxes(recorded.frame + 1, ids, recorded.xyxy, names, role, listed)
 
-def _truth_formats() -> Iterator[Format[Reader]]:
-    """Yield the formats of detections that hold identities."""
-    yield Format("mot", "MOTChallenge, CVAT's MOT 1.1, DanceTrack: rows of 6 to 10 numbers",
-                 lambda probe: is_mot(probe) or is_boxmot(probe), _mot_rows,
-                 FROM_1, "px", "x, y, z in ten columns")  # fmt: skip
-    for entry in DETECTIONS.formats:
-        if entry.read is None or entry.name in ("visdrone", "kitti", "csv", "records", "coco",
-                                                "cvat"):  # fmt: skip
-            yield entry
-
-
-TRUTH = Registry("ground truth", "--gt-format", list(_truth_formats()))
-
-
-def _read_tracks(path: Path, fmt: str, notes: list[str], size: tuple[int, int]) -> LabelledBoxes:
-    """Read true boxes with a reader of detections."""
-    video = SimpleNamespace(size=size, working_size=size, names=[], files=[], frame_count=0,
-                            times_s=None, source=path.stem)  # fmt: skip
-    source = Source(path, video, messages=notes, advice="expected frame_id, or names from 0")
-    recorded = read_source(source, TRUTH, fmt)
-    check_rows(recorded, path)
-    if not len(recorded.identity):
-        raise ReobjError(f"{path}: boxes without identities; expected tracks")
-    names = np.array([*recorded.class_names, ""], str)[recorded.class_id]
-    if TRUTH.find(path, fmt).name == "kitti":
-        notes.append("KITTI's labels: frames from 0; boxes on DontCare do not count; KITTI's rules "
-                     "of distractors, occlusion and height are not applied")  # fmt: skip
-        names[recorded.ignored] = ""
-    role = np.full(len(recorded), Role.SCORED)
-    role[recorded.ignored if len(recorded.ignored) else slice(0)] = Role.IGNORED
-    listed = None if recorded.looked is None else recorded.looked + 1
-    return LabelledBoxes(recorded.frame + 1, recorded.identity, recorded.xyxy, names, role, listed)
+    return Format(entry.name, entry.title, entry.recognise, entry.read and read, entry.frames,
+                  entry.units, entry.unread, entry.advice)  # fmt: skip
 
 
 def read_result(out: Path, notes: list[str] | None = None) -> LabelledBoxes:
@@ -177,7 +169,11 @@ class MotClass(enum.IntEnum):
 
 
 def _read_mot(
-    path: Path, class_names: Sequence[str], min_visibility: float, notes: list[str]
+    path: Path,
+    class_names: Sequence[str],
+    min_visibility: float,
+    notes: list[str],
+    _: tuple[int, int],
 ) -> LabelledBoxes:
     """Read MOTChallenge rows.
 
@@ -224,6 +220,16 @@ def _read_mot(
         notes.append(f"{boxes} without a class (below 0) do not count, nor do boxes on them")
     names = np.where(unnamed, "", _names_of(number, None, class_names))
     return labelled(rows, names, (flagged | hidden | unnamed) * Role.IGNORED)
+
+
+WITH_IDENTITIES = "visdrone kitti csv records coco cvat".split()
+TRUTH: Registry[TruthReader] = Registry("ground truth", "--gt-format", [
+    Format("mot", "MOTChallenge, CVAT's MOT 1.1, DanceTrack: rows of 6 to 10 numbers",
+           lambda probe: is_mot(probe) or is_boxmot(probe), _read_mot, FROM_1, "px",
+           "x, y, z in ten columns"),
+    *(_with_roles(entry) for entry in DETECTIONS.formats
+      if entry.name in WITH_IDENTITIES or entry.read is None),
+])  # fmt: skip
 
 
 def _from_one(rows: Array, path: Path, notes: list[str]) -> Array:

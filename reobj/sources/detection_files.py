@@ -19,7 +19,7 @@ import numpy as np
 
 from reobj.cameras import Poses
 from reobj.files import did_you_mean, last_name, shortened
-from reobj.formats import AUTO, Registry
+from reobj.formats import AUTO, Format
 from reobj.sources import coco
 from reobj.sources.class_names import check_length, load_class_names
 from reobj.sources.detection_formats import DETECTIONS, Reader
@@ -159,14 +159,15 @@ def _read(
         raise ReobjError(f"detect.first_frame {config.first_frame}: expected 0, 1 or order")
     names = load_class_names(config.class_names) if config.class_names else ()
     source = Source(path, video, names, config.first_frame, [poses] if poses else [])
-    return read_source(source, DETECTIONS, config.format)
+    return read_source(source, DETECTIONS.find(path, config.format))
 
 
-def read_source(source: Source, formats: Registry[Reader], name: str) -> RecordedDetections:
-    """Read a file with the reader of its format; name: of the format, or auto."""
-    reader = formats.reader(source.path, name)
+def read_source(source: Source, entry: Format[Reader]) -> RecordedDetections:
+    """Read a file in its format."""
+    if entry.read is None:
+        raise ReobjError(f"{source.path}: {entry.title}, not read; {entry.advice}")
     try:
-        return reader(source)
+        return entry.read(source)
     except ReobjError:
         raise
     except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:

@@ -225,11 +225,10 @@ NORMALISED_MAX = 1.5
 
 def npz_image_size(path: Path) -> tuple[int, int]:
     """Return the (w, h) of the images of an npz file of detections."""
-    size = np.asarray(load_npz(path)[0].get("image_size", ()))
-    if size.shape != (2,) or size.dtype.kind not in "iu" or (size < 1).any():
-        text = f"array image_size is {size.shape} of {size.dtype}"
-        raise ReobjError(f"{path}: {text}, expected (w, h) in whole pixels")
-    return int(size[0]), int(size[1])
+    data, _ = load_npz(path)
+    _check_arrays(data, path)
+    width, height = data["image_size"].tolist()
+    return width, height
 
 
 def read_npz(
@@ -288,5 +287,7 @@ def _check_arrays(data: dict[str, Any], path: Path) -> None:
     data["mask_offsets"] = data["mask_offsets"].astype(np.int64)
     ordered = (np.diff(data["mask_offsets"], prepend=0) >= 0).all()
     runs = data["mask_counts"]
+    if (data["image_size"] < 1).any():
+        raise ReobjError(f"{path}: image_size {data['image_size']}, expected (w, h) in px")
     if not ordered or data["mask_offsets"][-1] > runs.size or (runs < 0).any():
         raise ReobjError(f"{path}: mask_counts and mask_offsets are inconsistent")
