@@ -208,6 +208,7 @@ def make_parser(
     add("out", type=Path, help="output folder of an earlier `run`, or a tracks.txt")
     add("--gt", type=Path, required=True,
         help="true tracks: MOTChallenge gt.txt, KITTI, CVAT or COCO-VID")  # fmt: skip
+    add("--gt-format", default="auto", help="format of --gt (docs/input_formats.md)")
     add("--gt-objects", type=Path, help="true 3D objects, e.g. gt_objects.json")
     add("--gt-poses", type=Path, help="true cameras, TUM or 4x4 world_from_cam a line (default: "
         "poses.txt or poses_c2w.txt beside --gt-objects)")  # fmt: skip

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from reobj.files import did_you_mean, load_json
+from reobj.files import did_you_mean, load_json, shortened
 from reobj.types import ReobjError
 
 R = TypeVar("R", bound=Callable[..., Any])
@@ -24,8 +24,6 @@ HEAD_BYTES = 65536
 
 class Probe:
     """What `recognise` looks at: names, the first lines, and top-level keys of a file or folder."""
-
-    found: str = ""  # for the error of a file that fits no format
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -82,6 +80,13 @@ class Probe:
         data = self.json
         data = data[0] if isinstance(data, list) and data else data
         return frozenset(data) if isinstance(data, dict) else frozenset()
+
+    @functools.cached_property
+    def found(self) -> str:
+        """What the file holds, for the error of one that fits no format."""
+        if self.root is not None:
+            return f" (XML <{self.root.tag}>)"
+        return f" (JSON with {shortened(sorted(self.keys()))})" if self.keys() else ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -221,7 +221,7 @@ def test_corrected_mot_keeps_the_classes(room: Path, tmp_path: Path) -> None:
 
 
 BAD_TRACKS = {
-    "no xml": ("a.xml", "<annotations", "no annotations of CVAT"),
+    "no xml": ("a.xml", "<annotations", "no known format of detections"),
     "no track": ("a.xml", "<annotations><image id='0'/></annotations>", "no track with a box"),
     "no number": (
         "a.xml",

@@ -506,6 +506,29 @@ def _(lab: Lab) -> None:
     assert source.class_names == ("mouse", "stool", "chair")
 
 
+@shows("detect.format")
+def _(lab: Lab) -> None:
+    with pytest.raises(rt.ReobjError, match=r"det\.csv, line 1: 7 columns, expected 17"):
+        by_file(lab, "kitti")
+
+
+@shows("detect.image_size")
+def _(lab: Lab) -> None:
+    before, after = by_file(lab, "64x64")[0], by_file(lab, "32x128")[0]
+    assert (before.xyxy * [2, 0.5, 2, 0.5]).tolist() == after.xyxy.tolist()
+    for value in ("64", "0x64"):
+        with pytest.raises(rt.ReobjError, match=r"detect\.image_size .*expected WIDTHxHEIGHT"):
+            by_file(lab, value)
+
+
+@shows("detect.score_max")
+def _(lab: Lab) -> None:
+    assert by_file(lab, 9.0)[0].score.tolist() == [0.1]
+    for value in (0.5, 0.0):
+        with pytest.raises(rt.ReobjError, match=r"detect\.score_max"):
+            by_file(lab, value)
+
+
 @shows("detect.first_frame")
 def _(lab: Lab) -> None:
     """Frame 1 of two is the second one in CSV by default, the first with the option."""
@@ -514,7 +537,7 @@ def _(lab: Lab) -> None:
     for value, frame in (("", 1), ("0", 1), ("1", 0)):
         config = lab.config(value).detect
         assert rt.read_detections(lab.path / "det.csv", video, config).frame.tolist() == [frame]
-    with pytest.raises(rt.ReobjError, match=r"detect\.first_frame 2: expected 0 or 1"):
+    with pytest.raises(rt.ReobjError, match=r"detect\.first_frame 2: expected 0, 1 or order"):
         rt.read_detections(lab.path / "det.csv", video, lab.config("2").detect)
 
 

@@ -17,6 +17,7 @@ from scipy.optimize import linear_sum_assignment
 
 from reobj import __version__
 from reobj.files import wrapped
+from reobj.formats import AUTO
 from reobj.results.evaluation_3d import score_objects
 from reobj.results.names import OutputFile
 from reobj.results.result import Result
@@ -372,6 +373,7 @@ def evaluate(
     truth_poses: str | Path | None = None,
     classes: Sequence[str] = (),
     min_visibility: float = 0.0,
+    gt_format: str = AUTO,
 ) -> dict[str, Any]:
     """Evaluate an output folder of `run`, or a tracks.txt, against ground truth.
 
@@ -381,7 +383,8 @@ def evaluate(
 
     Args:
         out: output folder, or MOT rows; tracks.txt of an output folder means the folder.
-        gt: MOTChallenge gt.txt, KITTI tracking labels, CVAT for video, COCO-VID.
+        gt: a file with identities in one of the formats `truth.TRUTH`; gt_format: its name, or
+            auto.
         solids: gt_objects.json; truth_poses: TUM, or a 4x4 world_from_cam a line. classes: to
             evaluate, (): all. min_visibility: true boxes of lower visibility are ignored.
     Returns:
@@ -404,7 +407,7 @@ def evaluate(
         tracked = workspace.load_last()
         names = tracked.class_names
     size = (0, 0) if tracked is None else (tracked.video.width, tracked.video.height)
-    truth = read_truth(Path(gt), names, min_visibility, notes, size)
+    truth = read_truth(Path(gt), names, min_visibility, notes, size, gt_format)
     check_counts(truth, Path(gt))
     if tracked is not None:
         read = truth[_was_read(truth.frame - 1, workspace.source[1])]
@@ -479,6 +482,7 @@ def _in_true_frames(
         true, found = (f"{boxes.frame.min()}-{boxes.frame.max()}" for boxes in (truth, predicted))
         notes.append(f"no true box overlaps a box of the result (frames from 1: truth {true}, "
                      f"result {found}): truth of another video?")  # fmt: skip
+    notes += _scale_note(truth, unnamed)
     if truth.listed is not None:
         kept = predicted[np.isin(predicted.frame, truth.listed)]
         if left := len(predicted) - len(kept):
@@ -495,6 +499,23 @@ def _in_true_frames(
         notes.append(f"{len(without)} of {len(frames)} frames with boxes of the result have no "
                      f"ground truth{apart}: boxes in them count as false")  # fmt: skip
     return predicted
+
+
+def _scale_note(truth: LabelledBoxes, predicted: LabelledBoxes) -> list[str]:
+    """Note that most true boxes match only after all boxes of the result are scaled."""
+    counts: dict[float, int] = {}
+    for scale in (1, 1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 2, 3, 4):
+        scaled = dataclasses.replace(predicted, xyxy=predicted.xyxy * scale)
+        steps = _frame_steps(truth, scaled)
+        counts[scale] = sum(int((iou >= MATCH_IOU).any(1).sum()) for *_, iou in steps)
+        if counts[1] > 0.3 * len(truth):
+            return []
+    best = max(counts, key=lambda scale: counts[scale])
+    if counts[best] <= max(3 * counts[1], 0.3 * len(truth)):
+        return []
+    return [f"{counts[1]} of {len(truth)} true boxes match a box of the result, but {counts[best]} "
+            f"do if the boxes of the result are scaled by {best:.3g}: boxes of frames of another "
+            "size?"]  # fmt: skip
 
 
 def score_appearance(tracked: Result, truth: LabelledBoxes) -> dict[str, float]:

@@ -1,8 +1,8 @@
 """Readers of ground truth and results: boxes with identities and classes.
 
-Start at `read_truth` and `read_result`. Formats of ground truth: MOTChallenge rows and files of the
-same form (CVAT's MOT 1.1, DanceTrack, our rooms), KITTI tracking labels, CVAT for video 1.1,
-COCO-VID. Assumptions about a file are reported in `notes`.
+Start at `read_truth` and `read_result`. Formats of truth (TRUTH) are those of detections with
+identities; of MOTChallenge rows and files of the same form (CVAT's MOT 1.1, DanceTrack, our rooms)
+the columns of ground truth are read too. Assumptions about a file are reported in `notes`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import configparser
 import dataclasses
 import enum
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,11 +21,16 @@ import numpy as np
 import numpy.typing as npt
 
 from reobj.files import load_json, read_lines, shortened
+from reobj.formats import AUTO, Format, Registry
 from reobj.results.result import Result
-from reobj.sources.cvat import read_cvat
-from reobj.sources.tables import read_mot_rows
+from reobj.sources.detection_files import check_rows, read_source
+from reobj.sources.detection_formats import DETECTIONS, FROM_1, Reader
+from reobj.sources.recorded import Source
+from reobj.sources.tables import is_boxmot, is_mot, read_mot_rows
 from reobj.types import CLASS_MAX, Array, BoolArray, IntArray, ReobjError, counted
 from reobj.words import among, canonical
+
+TruthReader = Callable[..., "LabelledBoxes"]
 
 
 class Role(enum.IntEnum):
@@ -79,39 +84,53 @@ def read_truth(
     min_visibility: float,
     notes: list[str] | None = None,
     size: tuple[int, int] = (0, 0),
+    fmt: str = AUTO,
 ) -> LabelledBoxes:
-    """Read true boxes: MOTChallenge rows, KITTI tracking labels, CVAT for video, COCO-VID.
+    """Read true boxes in any of the formats TRUTH.
 
     Args:
         class_names: by the numbers of files that do not name their classes (from 0).
         min_visibility: rows of lower visibility are Role.IGNORED.
         notes: assumptions about the file are appended. size: (w, h) of the video, (0, 0): unknown.
+        fmt: a format of TRUTH, or auto.
     Raises:
         ReobjError: the file cannot be read, or an identity has two boxes in a frame.
     """
     notes = [] if notes is None else notes
-    if path.suffix.lower() in (".xml", ".zip"):
-        video: Any = SimpleNamespace(size=size, working_size=size, names=[], frame_count=0)
-        recorded = read_cvat(path, video)
-        if not len(recorded.identity):
-            raise ReobjError(
-                f"{path}: boxes of images, without identities; expected CVAT for video"
-            )
-        names = np.array(recorded.class_names, str)[recorded.class_id]
-        role = np.full(len(names), Role.SCORED)
-        listed = None if recorded.looked is None else recorded.looked + 1
-        truth = LabelledBoxes(
-            recorded.frame + 1, recorded.identity, recorded.xyxy, names, role, listed
-        )
-        notes += recorded.messages
-    elif path.suffix.lower() == ".json":
-        truth = _read_coco_video(path)
-    elif _is_kitti(path):
-        truth = _read_kitti(path, notes)
-    else:
-        truth = _read_mot(path, class_names, min_visibility, notes)
+    reader = TRUTH.reader(path, fmt)
+    truth = reader(path, class_names, min_visibility, notes, size)
     _check_identities(truth, path)
     return truth
+
+
+def _with_roles(entry: Format[Reader]) -> Format[TruthReader]:
+    """Return a format of detections with identities as one of ground truth."""
+
+    def read(
+        path: Path, _: Sequence[str], __: float, notes: list[str], size: tuple[int, int]
+    ) -> LabelledBoxes:
+        video = SimpleNamespace(size=size, working_size=size, names=[], files=[], frame_count=0,
+                                times_s=None, source=path.stem)  # fmt: skip
+        source = Source(path, video, messages=notes, advice="expected frame_id, or names from 0")
+        recorded = read_source(source, entry)
+        check_rows(recorded, path)
+        if not len(recorded.identity):
+            raise ReobjError(f"{path}: boxes without identities; expected tracks")
+        names = np.array([*recorded.class_names, ""], str)[recorded.class_id]
+        role = np.full(len(recorded), Role.SCORED)
+        if len(recorded.ignored):
+            role[recorded.ignored] = Role.IGNORED
+        if entry.name == "kitti":
+            names[recorded.ignored] = ""
+            notes.append("KITTI's labels: frames from 0; boxes on DontCare do not count; KITTI's "
+                         "rules of distractors, occlusion and height are not applied"
+                         )  # fmt: skip
+        listed = None if recorded.looked is None else recorded.looked + 1
+        ids = recorded.identity
+        return LabelledBoxes(recorded.frame + 1, ids, recorded.xyxy, names, role, listed)
+
+    return Format(entry.name, entry.title, entry.recognise, entry.read and read, entry.frames,
+                  entry.units, entry.unread, entry.advice)  # fmt: skip
 
 
 def read_result(out: Path, notes: list[str] | None = None) -> LabelledBoxes:
@@ -150,7 +169,11 @@ class MotClass(enum.IntEnum):
 
 
 def _read_mot(
-    path: Path, class_names: Sequence[str], min_visibility: float, notes: list[str]
+    path: Path,
+    class_names: Sequence[str],
+    min_visibility: float,
+    notes: list[str],
+    _: tuple[int, int],
 ) -> LabelledBoxes:
     """Read MOTChallenge rows.
 
@@ -172,11 +195,14 @@ def _read_mot(
         role = np.where(flagged, Role.ABSENT, hidden * Role.IGNORED)
         return labelled(rows, _by_line(number, labels, path), role)
     if stated.exists():
+        notes.append(f"classes are named by {stated.name}")
         return labelled(
             rows, _names_of(number, stated, class_names), (flagged | hidden) * Role.IGNORED
         )
-    if benchmark := _benchmark(sequence.get("name", ""), path, number, flagged):
-        notes.append(f"classes are {benchmark}'s: pedestrians count, boxes on distractors do not")
+    benchmark, why = _benchmark(sequence.get("name", ""), path, number, flagged)
+    if benchmark:
+        text = "pedestrians count, boxes on distractors do not"
+        notes.append(f"classes are {benchmark}'s, by {why}: {text}")
         pedestrian = number == MotClass.PEDESTRIAN
         role = np.where(flagged | ~pedestrian, Role.ABSENT, hidden * Role.IGNORED)
         only_mot20 = {MotClass.NON_MOTORISED_VEHICLE} if benchmark != "MOT20" else set()
@@ -184,7 +210,8 @@ def _read_mot(
         role[np.isin(number, list(distractors))] = Role.IGNORED
         return labelled(rows, "", role)
     if (number < 0).all() or (sequence and (number == MotClass.PEDESTRIAN).all()):
-        notes.append("the truth has one class without a name: classes do not count")
+        by = " (class 1, by seqinfo.ini)" if sequence else ""
+        notes.append(f"the truth has one class without a name{by}: classes do not count")
         return labelled(rows, "", np.where(flagged, Role.ABSENT, hidden * Role.IGNORED))
     notes.append("class numbers of the truth are those of the detector (COCO's), from 0")
     unnamed = number < 0
@@ -193,6 +220,16 @@ def _read_mot(
         notes.append(f"{boxes} without a class (below 0) do not count, nor do boxes on them")
     names = np.where(unnamed, "", _names_of(number, None, class_names))
     return labelled(rows, names, (flagged | hidden | unnamed) * Role.IGNORED)
+
+
+WITH_IDENTITIES = "visdrone kitti csv records coco cvat".split()
+TRUTH: Registry[TruthReader] = Registry("ground truth", "--gt-format", [
+    Format("mot", "MOTChallenge, CVAT's MOT 1.1, DanceTrack: rows of 6 to 10 numbers",
+           lambda probe: is_mot(probe) or is_boxmot(probe), _read_mot, FROM_1, "px",
+           "x, y, z in ten columns"),
+    *(_with_roles(entry) for entry in DETECTIONS.formats
+      if entry.name in WITH_IDENTITIES or entry.read is None),
+])  # fmt: skip
 
 
 def _from_one(rows: Array, path: Path, notes: list[str]) -> Array:
@@ -234,18 +271,19 @@ def _check_length(rows: Array, path: Path, sequence: dict[str, str]) -> None:
         raise ReobjError(f"{path}: frame {last:.0f}, but {known}: truth of another sequence?")
 
 
-def _benchmark(name: str, path: Path, number: IntArray, flagged: BoolArray) -> str:
-    """Return the MOTChallenge benchmark whose classes a file has, "": none.
+def _benchmark(name: str, path: Path, number: IntArray, flagged: BoolArray) -> tuple[str, str]:
+    """Return the MOTChallenge benchmark whose classes a file has, "": none, and what shows it.
 
     By the name of the sequence or of its folder; else by the rows: all have classes 1 to 13, and
     exactly those of other classes than pedestrians have flag 0.
     """
-    for text in (name, path.resolve().parent.parent.name):
+    folder = path.resolve().parent.parent.name
+    for text, why in ((name, "seqinfo.ini"), (folder, f"the folder {folder}")):
         if match := re.match(r"(MOT16|MOT17|MOT20)-\d+", text):
-            return match[1]
+            return match[1], why
     other = number != MotClass.PEDESTRIAN
     known = ((number >= 1) & (number <= 13)).all()
-    return "MOT17" if known and other.any() and (flagged == other).all() else ""
+    return ("MOT17" if known and other.any() and (flagged == other).all() else ""), "its rows"
 
 
 def _by_line(number: IntArray, labels: Path, path: Path) -> list[str]:
@@ -265,71 +303,6 @@ def _names_of(number: IntArray, stated: Path | None, class_names: Sequence[str])
         if isinstance(classes, dict):
             names = {str(k): str(v) for k, v in classes.items()}
     return [names.get(str(n), str(n)) for n in number]
-
-
-def _is_kitti(path: Path) -> bool:
-    """Test whether the first line is a KITTI tracking label: its third word is a class."""
-    words = next((line.split() for line in read_lines(path) if line.strip()), [])
-    return _has_kitti_columns(words) and not re.fullmatch(r"[-+.\deE]+", words[2])
-
-
-def _has_kitti_columns(words: Sequence[str]) -> bool:
-    """Test the number of columns: 17, with a score 18."""
-    return len(words) in (17, 18)
-
-
-def _read_kitti(path: Path, notes: list[str]) -> LabelledBoxes:
-    """Read KITTI tracking labels: frame (from 0), id, type, ..., left, top, right, bottom, ..."""
-    lines = [(at, line.split()) for at, line in enumerate(read_lines(path), 1) if line.strip()]
-    try:
-        if bad := [at for at, words in lines if not _has_kitti_columns(words)]:
-            raise ReobjError(f"{path}, line {bad[0]}: expected 17 columns as in KITTI's labels")
-        table = np.array([[*words[:2], *words[6:10]] for _, words in lines], np.float64)
-    except ReobjError:
-        raise
-    except ValueError as error:
-        raise ReobjError(f"{path}: {error}; expected KITTI's tracking labels") from error
-    names = np.array([words[2] for _, words in lines], str)
-    if not np.isfinite(table).all():
-        raise ReobjError(f"{path}: a number is not finite; expected KITTI's tracking labels")
-    dont_care = names == "DontCare"
-    role = np.where(dont_care, Role.IGNORED, Role.SCORED)
-    notes.append("KITTI's labels: frames from 0; boxes on DontCare do not count; KITTI's rules of "
-                "distractors, occlusion and height are not applied")  # fmt: skip
-    whole = table[:, :2].astype(np.int64)
-    names = np.where(dont_care, "", names)
-    return LabelledBoxes(whole[:, 0] + 1, whole[:, 1], table[:, 2:], names, role)
-
-
-def _read_coco_video(path: Path) -> LabelledBoxes:
-    """Read COCO-VID: images with frame_id (from 0), annotations with instance_id or track_id."""
-    try:
-        data = load_json(path)
-        videos = {image.get("video_id") for image in data["images"]}
-        if len(videos) > 1:
-            raise ReobjError(f"{path}: images of {len(videos)} videos; expected those of one")
-        frame_of = {image["id"]: int(image["frame_id"]) for image in data["images"]}
-        name_of = {kind["id"]: str(kind["name"]) for kind in data["categories"]}
-        rows = [
-            [frame_of[a["image_id"]] + 1, a["instance_id"] if "instance_id" in a else a["track_id"],
-             *a["bbox"]] for a in data["annotations"]
-        ]  # fmt: skip
-        table = np.array(rows, np.float64).reshape(-1, 6)
-        listed = np.array(list(frame_of.values()), np.float64) + 1  # (F,)
-        names = [name_of[a["category_id"]] for a in data["annotations"]]
-        crowd = [Role.IGNORED if a.get("iscrowd") or a.get("ignore") else Role.SCORED
-                 for a in data["annotations"]]  # fmt: skip
-    except ReobjError:
-        raise
-    except (AttributeError, LookupError, TypeError, ValueError) as error:
-        expected = "COCO-VID: images with frame_id, annotations with instance_id and bbox"
-        raise ReobjError(f"{path}: {error!r}; expected {expected}") from error
-    # Above 2^53 not every integer is a float64
-    numbers = np.append(table, listed)
-    if not np.isfinite(numbers).all() or (np.abs(numbers) > 2.0**53).any():
-        raise ReobjError(f"{path}: a number is not finite; expected COCO-VID")
-    boxes = labelled(table, np.array(names, str), np.array(crowd, np.int64))
-    return dataclasses.replace(boxes, listed=np.unique(listed.astype(np.int64)))
 
 
 def _check_identities(boxes: LabelledBoxes, path: Path) -> None:

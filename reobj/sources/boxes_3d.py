@@ -19,11 +19,19 @@ from scipy.spatial.transform import Rotation
 
 import quadrics
 from reobj.cameras import Poses, distort_boxes
-from reobj.sources.masks import NO_RUNS
-from reobj.sources.recorded import RecordedDetections
-from reobj.sources.tables import BOXES_3D, Table, read_cells, seconds, text_classes
+from reobj.formats import Probe
+from reobj.sources.recorded import RecordedDetections, Source
+from reobj.sources.tables import (
+    BOXES_3D,
+    Table,
+    head,
+    nearest_times,
+    read_cells_3d,
+    seconds,
+    text_classes,
+)
 from reobj.sources.video import Video
-from reobj.types import Array, IntArray, ReobjError, Tracks
+from reobj.types import COCO_NAMES, Array, IntArray, ReobjError, Tracks
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,10 +67,21 @@ def boxes_3d_of(recorded: RecordedDetections | None) -> Boxes3D | None:
 
 def has_boxes_3d(path: Path) -> bool:
     """Test whether a file is a table of boxes in 3D."""
-    if path.suffix.lower() not in (".csv", ".txt") or not path.is_file():
-        return False
-    with path.open(encoding="utf-8", errors="replace") as file:
-        return "tx_world_object" in file.readline(1000)
+    return path.is_file() and is_boxes_3d(Probe(path))
+
+
+def is_boxes_3d(probe: Probe) -> bool:
+    """Test for a column of positions in the world in the header."""
+    return any("tx_world_object" in cells for cells in head(probe)[:1])
+
+
+def read_source_3d(source: Source) -> RecordedDetections:
+    """Read boxes in 3D with the cameras of the source."""
+    if not source.poses:
+        fault = "these are 3D boxes in the world, which need its cameras"
+        raise ReobjError(f"{source.path}, line 1: {fault}: `run` with --detections and --poses "
+                         "FILE")  # fmt: skip
+    return read_boxes_3d(source.path, source.video, source.poses, source.names)[0]
 
 
 def read_boxes_3d(
@@ -78,7 +97,7 @@ def read_boxes_3d(
     Raises:
         ReobjError: a value is invalid, or no box is visible in its frame.
     """
-    table = read_cells(path)
+    table = read_cells_3d(path)
     box = _boxes(table)
     time_s = seconds(table)
     projected = [_projected(box, time_s, one, video) for one in poses]
@@ -93,11 +112,10 @@ def read_boxes_3d(
     if len(box) and not visible.any():
         raise ReobjError(f"{path}: no box is in the image of its frame: expected boxes in the "
                          "world of --poses, at the times of its frames")  # fmt: skip
-    class_id, known = text_classes(table, names)
-    score = table.numbers("score")
-    recorded = RecordedDetections(
-        frame, xyxy, score, class_id, [NO_RUNS] * len(frame), tuple(known), video.size,
-        video.working_size, table.line, table.unit, table.messages, boxes_3d=box,
+    source = Source(path, video, names)
+    recorded = source.recorded(
+        frame, xyxy, text_classes(table, source, COCO_NAMES), table.numbers("score"),
+        line=table.line, unit=table.unit, boxes_3d=box,
     )  # fmt: skip
     without = (frame < 0).sum()
     if without:
@@ -134,7 +152,7 @@ def _frame_times(poses: Poses, video: Video) -> tuple[IntArray, Array]:
 def _projected(box: Array, time_s: Array, poses: Poses, video: Video) -> tuple[IntArray, Array]:
     """Return the frames (N,), -1: none with a pose, and image bounds (N, 4), NaN: not visible."""
     frames, times_s = _frame_times(poses, video)
-    nearest = _nearest(times_s, time_s)
+    nearest = nearest_times(times_s, time_s, 0.5)
     frame = np.where(nearest >= 0, frames[nearest] if len(frames) else -1, -1)
     xyxy = np.full((len(box), 4), np.nan)
     img_from_world = poses.camera.K @ poses.cam_from_world[poses.known]  # (F, 3, 4)
@@ -145,15 +163,3 @@ def _projected(box: Array, time_s: Array, poses: Poses, video: Video) -> tuple[I
     size = (poses.camera.width, poses.camera.height)
     xyxy = quadrics.clip_boxes(distort_boxes(xyxy, poses.camera), size)
     return frame, xyxy * np.tile(np.divide(video.size, size), 2)
-
-
-def _nearest(times_s: Array, time_s: Array) -> IntArray:
-    """Return the rows of the nearest times (N,); -1 beyond half of the usual step."""
-    if not len(times_s):
-        return np.full(len(time_s), -1)
-    half = 0.5 * float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.5
-    after = np.searchsorted(times_s, time_s).clip(max=len(times_s) - 1)
-    pair = np.stack([(after - 1).clip(0), after], 1)  # (N, 2)
-    offset = np.abs(times_s[pair] - time_s[:, None])
-    nearest = np.take_along_axis(pair, offset.argmin(1)[:, None], 1)[:, 0]
-    return np.asarray(np.where(offset.min(1) <= half, nearest, -1), np.int64)

@@ -1,285 +1,238 @@
-"""Detections and tracks in JSON: COCO results and datasets, OA-SLAM.
+"""Detections and tracks in JSON: COCO results and datasets (COCO-VID, TAO), OA-SLAM.
 
-Start at `read_coco`. Image and category ids are resolved by the file itself, by a dataset JSON
-beside it, or as numbers and names of images.
+Image and category ids are resolved by the file itself, by a dataset JSON beside it, or as numbers
+and names of images.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import msgspec
 import numpy as np
 
 from reobj.files import load_json, shortened
 from reobj.frame_lookup import frames_by_name
 from reobj.sources.class_names import check_length
-from reobj.sources.image_frames import (
-    first_number,
-    frames_of_names,
-    frames_of_numbers,
-    last_numbers,
-)
+from reobj.sources.image_frames import frames_of_names, frames_of_numbers, original_name
 from reobj.sources.masks import NO_RUNS, Counts, coco_runs, polygon_runs
-from reobj.sources.recorded import RecordedDetections, scale_to
-from reobj.sources.video import Video
+from reobj.sources.recorded import RecordedDetections, Source
 from reobj.types import COCO_NAMES, Array, IntArray, ReobjError
 
+T = TypeVar("T")
+D = TypeVar("D", bound="Dataset")
 Id = int | str
+Box = tuple[float, float, float, float]
 
 
-@dataclass(frozen=True, slots=True)
-class Dataset:
-    """Images and categories of a valid COCO dataset.
+class Image(msgspec.Struct):
+    """An image of a dataset; `extra` holds its name before an export by Roboflow."""
 
-    Attributes:
-        path: of the file. images: by id. categories: names by id. videos: names by id.
-        entries: annotations, or None.
-    """
+    id: Id
+    file_name: str | None = None
+    width: float | None = None
+    height: float | None = None
+    frame_id: int | None = None  # COCO-VID
+    frame_index: int | None = None  # TAO
+    video_id: Id | None = None
+    extra: Any = None
 
-    path: Path
-    images: dict[Id, dict[str, Any]] = field(default_factory=dict)
-    categories: dict[Id, str] = field(default_factory=dict)
-    videos: dict[Id, str] = field(default_factory=dict)
-    entries: list[Any] | None = None
+    @property
+    def name(self) -> str | None:
+        """Name of the image before its export."""
+        extra = self.extra.get("name") if isinstance(self.extra, dict) else None
+        return extra if isinstance(extra, str) else self.file_name
 
-
-def _objects(path: Path, data: Mapping[str, Any], key: str, expected: str) -> list[dict[str, Any]]:
-    """Return the JSON objects in the list `key`, each with a valid id; an error names the entry."""
-    entries = data.get(key) or []
-    if not isinstance(entries, list):
-        raise ReobjError(f"{path}: {key} is {entries!r:.40}, expected a list of {expected}")
-    for i, entry in enumerate(entries):
-        if not isinstance(entry, dict) or not _is_id(entry.get("id")):
-            raise ReobjError(f"{path}, {key}[{i}]: {entry!r:.40}, expected {expected}")
-    return entries
+    @property
+    def number(self) -> int | None:
+        """Number of the frame."""
+        return self.frame_index if self.frame_id is None else self.frame_id
 
 
-def _is_id(value: Any) -> bool:
-    return isinstance(value, str) or (isinstance(value, int) and not isinstance(value, bool))
+class Named(msgspec.Struct):
+    """A category or a video."""
+
+    id: Id
+    name: str
 
 
-def _is_side(value: Any) -> bool:
-    return value is None or (isinstance(value, int | float) and 0 < value < 1 << 31)
+class Annotation(msgspec.Struct):
+    """A box of an image: x, y, w, h in px."""
+
+    image_id: Id
+    category_id: Id
+    bbox: Box
+    score: float = 1.0
+    file_name: str | None = None
+    track_id: float | None = None
+    instance_id: float | None = None
+    attributes: Any = None  # CVAT's hold the identity
+    segmentation: Any = None
+    iscrowd: Any = False
+    ignore: Any = False
+
+    @property
+    def identity(self) -> int:
+        """Identity, -1: none."""
+        inner = self.attributes if isinstance(self.attributes, dict) else {}
+        holders = (self.track_id, self.instance_id, inner.get("track_id"), inner.get("instance_id"))
+        value = next((value for value in holders if value is not None), -1)
+        if type(value) not in (int, float) or value % 1 or abs(value) >= 1 << 53:
+            raise ReobjError(f"track_id {value!r:.40}, expected a whole number")
+        return int(value)
 
 
-def parse_dataset(path: Path, data: Mapping[str, Any]) -> Dataset:
-    """Validate the fields of a COCO dataset that are used.
+class Dataset(msgspec.Struct):
+    """Images and classes of a COCO dataset."""
 
-    Raises:
-        ReobjError: an invalid entry, and what was expected.
-    """
-    expected = "{id, file_name, width, height}"
-    images = _objects(path, data, "images", expected)
-    for i, image in enumerate(images):
-        name = image.get("file_name")
-        sides = (image.get("width"), image.get("height"))
-        number = image.get("frame_id", image.get("frame_index", 0))
-        if not isinstance(name, str | None) or not all(map(_is_side, sides)):
-            raise ReobjError(f"{path}, images[{i}]: {image!r:.80}, expected {expected}")
-        if not isinstance(number, int) or abs(number) >= 1 << 53:
-            raise ReobjError(f"{path}, images[{i}]: frame_id {number!r:.40}, expected a number")
-    categories = _objects(path, data, "categories", "{id, name}")
-    for i, category in enumerate(categories):
-        if not isinstance(category.get("name"), str):
-            raise ReobjError(f"{path}, categories[{i}]: a category without a name, expected "
-                             "{id, name}")  # fmt: skip
-        check_length(category["name"], f"{path}, categories[{i}]")
-    videos = _objects(path, data, "videos", "{id, name}")
-    return Dataset(
-        path, {image["id"]: image for image in images}, {c["id"]: c["name"] for c in categories},
-        {v["id"]: str(v.get("name", v["id"])) for v in videos}, data.get("annotations"),
-    )  # fmt: skip
+    images: list[Image]
+    categories: list[Named] = []
+    videos: list[Named] | None = None
 
 
-def dataset_of(path: Path, data: Any) -> Dataset | None:
-    """Return the dataset in the content of a JSON file, or the matching one beside the file."""
-    if isinstance(data, dict):
-        return parse_dataset(path, data) if "images" in data else None
-    entries = [e for e in data if isinstance(e, dict)] if isinstance(data, list) else []
-    entries = [e for e in entries if _is_id(e.get("image_id"))]
-    return _beside(path, entries) if entries else None
+class Annotated(Dataset):
+    """A dataset with boxes."""
+
+    annotations: list[Annotation] | None = None
 
 
-def _beside(path: Path, entries: Sequence[Mapping[str, Any]]) -> Dataset | None:
-    """Find the dataset beside a file of results that has all ids of the results.
+class _Found(msgspec.Struct):
+    category_id: int
+    bbox: Box
+    detection_score: float = 1.0
+
+
+class _OaImage(msgspec.Struct):
+    file_name: str
+    detections: list[_Found]
+
+
+def converted(data: Any, kind: type[T], where: object) -> T:
+    """Convert the content of a JSON file to a type; an error names the entry."""
+    try:
+        return msgspec.convert(data, kind)
+    except msgspec.ValidationError as error:
+        raise ReobjError(f"{where}: {error}") from error
+
+
+def read_dataset(path: Path, data: Any, kind: type[D]) -> D:
+    """Validate a COCO dataset."""
+    dataset = converted(data, kind, path)
+    for category in dataset.categories:
+        check_length(category.name, f"{path}, categories")
+    return dataset
+
+
+def _beside(path: Path, entries: Sequence[Annotation]) -> tuple[str, Dataset | None]:
+    """Find the dataset beside a file of results that has all ids of the results, and its name.
 
     Raises:
         ReobjError: several datasets match and disagree; or none does, and the results do not name
             their images.
     """
-    datasets = list[Dataset]()
-    faults = list[ReobjError]()
+    ids = {entry.image_id for entry in entries}
+    kinds = {entry.category_id for entry in entries}
+    fault = ""
+    matches: list[tuple[str, Dataset]] = []
+    used: list[list[Any]] = []
     for other in sorted(path.parent.glob("*.json")):
         data = None
         with contextlib.suppress(ValueError, OSError):  # an invalid JSON file is no dataset
             data = load_json(other) if other != path else None
-        if isinstance(data, dict) and data.get("images"):
-            try:
-                datasets.append(parse_dataset(other, data))
-            except ReobjError as error:
-                faults.append(error)
-    ids = {entry["image_id"] for entry in entries}
-    kinds = {e["category_id"] for e in entries if _is_id(e.get("category_id"))}
-    matches = [d for d in datasets if ids <= d.images.keys()]
-    matches = [d for d in matches if not d.categories or kinds <= d.categories.keys()]
-    if len(matches) > 1:
-        names = [
-            ([d.images[i].get("file_name") for i in sorted(ids, key=str)],
-             [d.categories.get(k) for k in sorted(kinds, key=str)])
-            for d in matches
-        ]  # fmt: skip
-        if any(other_names != names[0] for other_names in names[1:]):
-            both = " and ".join(d.path.name for d in matches[:2])
-            raise ReobjError(f"{path}: {both} beside it both have the ids of its images, for other "
-                             "images or classes; keep only the dataset of this file")  # fmt: skip
-    if matches or all("file_name" in e or isinstance(e["image_id"], str) for e in entries):
-        return matches[0] if matches else None
-    if faults:
-        raise faults[0]
-    if not datasets:
-        return None
-    missing: list[Any] = sorted(ids - datasets[0].images.keys(), key=str)
-    fault = f"image_id {missing[0]}" if missing else f"category_id {min(kinds, key=str)}"
-    raise ReobjError(f"{path}: {fault} is not in the dataset JSON beside this file "
-                     f"({shortened([d.path.name for d in datasets])}); put the dataset of this "
-                     "file there, or remove them")  # fmt: skip
+        if not isinstance(data, dict) or not data.get("images"):
+            continue
+        dataset = read_dataset(other, data, Dataset)
+        images = {image.id: image.name for image in dataset.images}
+        names = {category.id: category.name for category in dataset.categories}
+        missing = [*ids.difference(images), *(kinds.difference(names) if names else ())]
+        if missing:
+            fault = f"id {missing[0]} is not in the dataset JSON {other.name} beside this file"
+            continue
+        matches.append((other.name, dataset))
+        used.append([{i: images[i] for i in ids}, {k: names.get(k) for k in kinds}])
+    if any(one != used[0] for one in used):
+        both = " and ".join(name for name, _ in matches[:2])
+        raise ReobjError(f"{path}: {both} beside it both have the ids of its images, for other "
+                         "images or classes; keep only the dataset of this file")  # fmt: skip
+    by_name = all(entry.file_name or isinstance(entry.image_id, str) for entry in entries)
+    if fault and not matches and not by_name:
+        raise ReobjError(f"{path}: {fault}; put its own dataset there, or remove the other")
+    return matches[0] if matches else ("", None)
 
 
-def read_coco(
-    path: Path, data: Any, names: Sequence[str], video: Video, first: str = ""
-) -> RecordedDetections:
-    """Read COCO results, a COCO or COCO-VID dataset, or OA-SLAM's file.
-
-    Args:
-        data: content of the file.
-        names: class names by category id from 0, (): not given.
-        first: number of the first frame, "": inferred.
-    """
-    entries = data
-    dataset = dataset_of(path, data)
-    if dataset is not None and dataset.path == path:
-        entries = dataset.entries
-    if not isinstance(entries, list):
-        raise ReobjError(f"{path}: expected COCO results: [{{image_id, category_id, bbox, score}}]")
-    if not all(isinstance(entry, dict) for entry in entries):
-        at = next(i for i, entry in enumerate(entries) if not isinstance(entry, dict))
-        raise ReobjError(f"{path}, entry {at}: {entries[at]!r:.40}, expected an object such as "
-                         "{image_id, category_id, bbox, score}")  # fmt: skip
-    keys = entries[0].keys() if entries else ()
-    if "detections" in keys:
-        return _read_oa_slam(path, entries, names, video, first)
-    return _read_coco(path, entries, dataset, names, video, first)
+def read_coco(source: Source) -> RecordedDetections:
+    """Read a COCO, COCO-VID or TAO dataset with its own annotations."""
+    dataset = read_dataset(source.path, load_json(source.path), Annotated)
+    if dataset.annotations is None:
+        raise ReobjError(f"{source.path}: a dataset without annotations; give the file of COCO "
+                         "results [{image_id, category_id, bbox, score}] beside it")  # fmt: skip
+    return _read(source, dataset.annotations, dataset)
 
 
-def _read_coco(
-    path: Path,
-    entries: Sequence[Mapping[str, Any]],
-    dataset: Dataset | None,
-    names: Sequence[str],
-    video: Video,
-    first: str,
-) -> RecordedDetections:
-    """Read COCO entries with ids of a dataset, or with names or numbers of images."""
-    for at, entry in enumerate(entries):
-        fields = {key: entry.get(key) for key in ("image_id", "category_id", "bbox")}
-        has_ids = _is_id(fields["image_id"]) and _is_id(fields["category_id"])
-        if not has_ids or not isinstance(fields["bbox"], list) or len(fields["bbox"]) != 4:
-            raise ReobjError(f"{path}, entry {at}: {fields}, expected two ids and a bbox of 4")
-    messages: list[str] = []
-    class_id, class_names = _categories(path, entries, dataset, names, messages)
-    frame, size, looked = _images(path, entries, dataset, video, first, messages)
-    box, score = _box_and_score(path, entries)
-    scale = scale_to(video.size, size, frame >= 0, str(path), messages)
-    masks = [
-        _mask(entry.get("segmentation"), video.size, ratio, f"{path}, entry {at}")
-        for at, (entry, ratio) in enumerate(zip(entries, scale[:, :2], strict=True))
-    ]
-    return RecordedDetections(
-        frame, np.hstack([box[:, :2], box[:, :2] + box[:, 2:]]) * scale,
-        score, class_id, masks,
-        class_names, video.size, video.working_size, np.arange(len(entries)), "entry", messages,
-        np.array([_identity(entry, f"{path}, entry {at}") for at, entry in enumerate(entries)],
-                 np.int64),
-        looked,
+def read_coco_results(source: Source) -> RecordedDetections:
+    """Read COCO results with ids of a dataset beside them, or with names or numbers of images."""
+    entries = converted(load_json(source.path), list[Annotation], source.path)
+    name, dataset = _beside(source.path, entries) if entries else ("", None)
+    source.say(f"images and classes of {name} beside it" * bool(name))
+    return _read(source, entries, dataset)
+
+
+def _read(source: Source, entries: list[Annotation], dataset: Dataset | None) -> RecordedDetections:
+    """Convert COCO annotations."""
+    classes = _categories(source, entries, dataset)
+    frame, size, looked = _images(source, entries, dataset)
+    scale = source.scale(size, frame >= 0)
+    box = np.array([entry.bbox for entry in entries], np.float64).reshape(-1, 4)
+    masks = []
+    identity = np.full(len(entries), -1)
+    for at, (entry, ratio) in enumerate(zip(entries, scale[:, :2], strict=True)):
+        try:
+            masks.append(_mask(entry.segmentation, source.video.size, ratio))
+            identity[at] = entry.identity
+        except ReobjError as error:
+            raise ReobjError(f"{source.path}, entry {at}: {error}") from error
+    return source.recorded(
+        frame, np.hstack([box[:, :2], box[:, :2] + box[:, 2:]]) * scale, classes,
+        np.array([entry.score for entry in entries], np.float64), masks,
+        identity=identity, looked=looked,
+        ignored=np.array([bool(entry.iscrowd or entry.ignore) for entry in entries], bool),
     )  # fmt: skip
 
 
-def _box_and_score(path: Path, entries: Sequence[Mapping[str, Any]]) -> tuple[Array, Array]:
-    """Return the boxes (N, 4) x, y, w, h and scores (N,); an error names the entry."""
-    rows = []
-    for at, entry in enumerate(entries):
-        row = [*entry["bbox"], entry.get("score", 1.0)]
-        if any(isinstance(v, bool) or not isinstance(v, int | float) for v in row):
-            fields = {key: entry.get(key) for key in ("bbox", "score")}
-            raise ReobjError(f"{path}, entry {at}: {fields!r:.80}, expected numbers")
-        rows.append(row)
-    values = np.array(rows, np.float64).reshape(-1, 5)
-    return values[:, :4], values[:, 4]
-
-
-def _identity(entry: Mapping[str, Any], where: str) -> int:
-    """Return track_id or instance_id, also from CVAT's attributes; -1: none."""
-    attributes = entry.get("attributes")
-    for holder in (entry, attributes if isinstance(attributes, dict) else {}):
-        for key in ("track_id", "instance_id"):
-            if (value := holder.get(key)) is not None:
-                if isinstance(value, bool) or not isinstance(value, int) or abs(value) >= 1 << 53:
-                    raise ReobjError(f"{where}: {key} {value!r:.40}, expected a whole number")
-                return value
-    return -1
-
-
 def _categories(
-    path: Path,
-    entries: Sequence[Mapping[str, Any]],
-    dataset: Dataset | None,
-    names: Sequence[str],
-    messages: list[str],
-) -> tuple[IntArray, tuple[str, ...]]:
+    source: Source, entries: Sequence[Annotation], dataset: Dataset | None
+) -> tuple[IntArray, Sequence[str]]:
     """Return the class (N,) of every entry and the class names.
 
-    Category ids are those of the dataset; else positions in `names` from 0, or from 1 if only that
-    is possible; else COCO's.
+    Category ids are those of the dataset; else positions in the names that the user gives, from 0,
+    or from 1 if only that is possible; else COCO's.
     """
-    used = list(dict.fromkeys(entry["category_id"] for entry in entries))
+    used = list(dict.fromkeys(entry.category_id for entry in entries))
     gaps = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)  # unused among COCO's category ids 1 to 90
-    coco_ids = (i for i in range(1, 91) if i not in gaps)
-    name_of: dict[Id, str] = dict(zip(coco_ids, COCO_NAMES, strict=True))
-    if names:
-        name_of = dict(enumerate(names))
-        text = "category ids are taken as positions in the class names, "
-        if used and not set(used) <= name_of.keys() and set(used) <= set(range(1, len(names) + 1)):
-            name_of = dict(enumerate(names, 1))
-            messages.append(text + "from 1")
-        elif used and 0 not in used:
-            messages.append(text + "from 0")
+    name_of: dict[Id, str] = dict(zip(sorted({*range(1, 91)} - {*gaps}), COCO_NAMES, strict=True))
+    if source.names:
+        from_1 = not {*used} <= {*range(len(source.names))} and 0 not in used
+        name_of = dict(enumerate(source.names, int(from_1)))
+        text = f"category ids are taken as positions in the class names, from {int(from_1)}"
+        source.say(text * bool(used and 0 not in used))
     elif dataset is not None and dataset.categories:
-        name_of = dict(dataset.categories)
+        name_of = {category.id: category.name for category in dataset.categories}
     elif used:
-        messages.append(
-            "no categories in it or beside it: category_id is taken as COCO's (1 to 90)"
-        )
+        source.say("no categories in it or beside it: category_id is taken as COCO's (1 to 90)")
     for at, entry in enumerate(entries):
-        if entry["category_id"] not in name_of:
-            raise ReobjError(f"{path}, entry {at}: category_id {entry['category_id']} is unknown: "
-                             "put the dataset JSON beside this file, or give a file of names (ids "
-                             "from 0) with --set detect.class_names=FILE")  # fmt: skip
-    classes = list(dict.fromkeys(name_of.values()))
-    index = {key: classes.index(name) for key, name in name_of.items()}
-    return np.array([index[e["category_id"]] for e in entries], np.int64), tuple(classes)
+        if entry.category_id not in name_of:
+            raise ReobjError(f"{source.path}, entry {at}: category_id {entry.category_id} is "
+                             "unknown: put the dataset JSON beside this file, or give a file of "
+                             "names (ids from 0) with --set detect.class_names=FILE")  # fmt: skip
+    names = list(dict.fromkeys(name_of.values()))
+    return np.array([names.index(name_of[e.category_id]) for e in entries], np.int64), names
 
 
 def _images(
-    path: Path,
-    entries: Sequence[Mapping[str, Any]],
-    dataset: Dataset | None,
-    video: Video,
-    first: str,
-    messages: list[str],
+    source: Source, entries: Sequence[Annotation], dataset: Dataset | None
 ) -> tuple[IntArray, Array, IntArray | None]:
     """Find the image of every entry.
 
@@ -288,100 +241,75 @@ def _images(
         listed in the dataset, ascending, None without a dataset.
     """
     size = np.zeros((len(entries), 2))
-    ids = [entry["image_id"] for entry in entries]
+    ids = [entry.image_id for entry in entries]
     if dataset is not None:
-        frame_of, text = _dataset_frames(dataset, video, first)
-        messages += [text] if text else []
+        frame_of = _dataset_frames(dataset, source)
+        image_of = {image.id: image for image in dataset.images}
         for at, i in enumerate(ids):
-            if i not in dataset.images:
-                raise ReobjError(f"{path}, entry {at}: image_id {i} is not in the dataset JSON")
-            image = dataset.images[i]
-            size[at] = image.get("width") or 0, image.get("height") or 0
+            if i not in image_of:
+                raise ReobjError(f"{source.path}, entry {at}: image_id {i} is not in the dataset")
+            size[at] = image_of[i].width or 0, image_of[i].height or 0
         listed = np.unique(np.array(list(frame_of.values()), np.int64))
         return np.array([frame_of[i] for i in ids], np.int64), size, listed[listed >= 0]
-    names = [entry.get("file_name") for entry in entries]
-    if not names or not all(isinstance(name, str) for name in names):
-        names = [str(i) for i in ids]
-    where = f"{path}, image_id"
-    if video.names or not all(isinstance(i, int) for i in ids):
-        frame, text = frames_of_names([str(n) for n in names], video, where, first, 0)
-        messages += [text] if text else []
-        return frame, size, None
-    if any(abs(i) >= 1 << 53 for i in ids):
-        raise ReobjError(f"{where}: {max(ids, key=abs)}, expected a frame number")
-    frame = np.array(ids, np.int64)
-    frame, text = frames_of_numbers(frame, video.frame_count, first, 0, False, where)
-    messages.append(text or "no dataset JSON beside it: image_id is taken as the 0-based frame")
-    return frame, size, None
+    if source.video.names or not all(isinstance(i, int) for i in ids):
+        names = [entry.file_name or str(entry.image_id) for entry in entries]
+        return frames_of_names(names, source, 0), size, None
+    numbers = np.array(ids, np.float64)
+    if (np.abs(numbers) >= 1 << 53).any():
+        raise ReobjError(f"{source.path}: image_id {numbers.max():.0f}, expected a frame number")
+    source.say("no dataset JSON beside it: image_id is taken as the frame number" * bool(ids))
+    return frames_of_numbers(numbers.astype(np.int64), source, 0), size, None
 
 
-def _dataset_frames(dataset: Dataset, video: Video, first: str) -> tuple[dict[Id, int], str]:
-    """Return the frame of every image of a dataset, -1: none, and a message about the rule.
+def _dataset_frames(dataset: Dataset, source: Source) -> dict[Id, int]:
+    """Return the frame of every image of a dataset, -1: none.
 
     By file name; else by `frame_id` (COCO-VID) or `frame_index` (TAO); else by the numbers in the
-    file names; else in order, if there is an image for every frame.
+    file names; in the order of the list only if the user says so.
     """
-    images = list(dataset.images.values())
-    where = str(dataset.path)
-    note = ""
-    ids = {image.get("video_id") for image in images} & dataset.videos.keys()
-    if len(ids) > 1:
-        stem = Path(video.source).stem
-        same_name = [
-            i for i, name in dataset.videos.items() if i in ids and Path(name).stem == stem
-        ]
-        named = video.names and any("file_name" in image for image in images)
-        if len(same_name) != 1 and not named:
-            some = shortened(sorted(dataset.videos.values()))
-            raise ReobjError(f"{where}: {len(ids)} videos ({some}), none of them called {stem}; "
-                             "keep one, or rename it")  # fmt: skip
-        if len(same_name) == 1:
-            kept = [image for image in images if image.get("video_id") == same_name[0]]
-            note = f"{len(images) - len(kept)} images of other videos left out"
-            images = kept
-    frame, text = _image_frames(images, video, first, where)
-    frame_of: dict[Id, int] = dict.fromkeys(dataset.images, -1)
-    frame_of |= dict(zip((image["id"] for image in images), frame.tolist(), strict=True))
-    return frame_of, "; ".join(filter(None, (note, text)))
+    video = source.video
+    images = _of_one_video(dataset, source)
+    names = [original_name(image.name or "") for image in images]
+    named = bool(images) and all(names)
+    numbers = [image.number for image in images]
+    rule = named and frames_by_name(list(dict.fromkeys(names)), video.files or video.names)[1]
+    if source.first == "order":
+        frame = np.arange(len(images))
+    elif not rule and all(number is not None for number in numbers):
+        frame = frames_of_numbers(np.array(numbers, np.int64), source, 0)
+    elif named or not images:
+        frame = frames_of_names(names, source)
+    else:
+        raise ReobjError(f"{source.path}: {len(images)} images without file_name or frame_id; add "
+                         "them, or say that the list has the order of the frames "
+                         "(--set detect.first_frame=order)")  # fmt: skip
+    frame_of: dict[Id, int] = dict.fromkeys((image.id for image in dataset.images), -1)
+    return frame_of | dict(zip((image.id for image in images), frame.tolist(), strict=True))
 
 
-def _image_frames(
-    images: Sequence[Mapping[str, Any]], video: Video, first: str, where: str
-) -> tuple[IntArray, str]:
-    """Find the frames of the images (N,) of a dataset that belong to one video."""
-    names = [image.get("file_name") for image in images]
-    named = bool(names) and all(isinstance(name, str) for name in names)
-    if named and video.names:
-        distinct = list(dict.fromkeys(map(str, names)))
-        frame, rule = frames_by_name(distinct, video.files or video.names, where)
-        if rule:
-            frame_of = dict(zip(distinct, frame.tolist(), strict=True))
-            return np.array([frame_of[str(name)] for name in names], np.int64), ""
-    for key in ("frame_id", "frame_index"):
-        if images and all(key in image for image in images):
-            number = np.array([image[key] for image in images], np.int64)
-            return frames_of_numbers(number, video.frame_count, first, 0, True, where)
-    every = len(images) == video.frame_count
-    number = last_numbers(list(map(str, names))) if named else np.empty(0, np.int64)
-    counted = named and number.min() >= 0 and len(np.unique(number)) == len(number)
-    if every and not first and (not counted or first_number(number, 0) is None):
-        text = (
-            "" if not counted else "as many images as frames: taken in the order of their numbers"
-        )
-        return (number.argsort().argsort() if counted else np.arange(len(images))), text
-    if counted:
-        return frames_of_names(list(map(str, names)), video, where, first, None, True)
-    if not images:
-        return np.empty(0, np.int64), ""
-    raise ReobjError(
-        f"{where}: {len(images)} images, whose names have no numbers, for {video.frame_count} "
-        "frames; expected names of the images, frame_id, or an image for every frame"
-    )
+def _of_one_video(dataset: Dataset, source: Source) -> list[Image]:
+    """Return the images of the video, of a dataset of several; all if images are found by name."""
+    images = dataset.images
+    ids = {image.video_id for image in images}
+    if len(ids) < 2:
+        return images
+    name_of = {video.id: video.name for video in dataset.videos or ()}
+    stem = Path(source.video.source).stem
+    same = [i for i in ids if i is not None and Path(name_of.get(i, str(i))).stem == stem]
+    if len(same) == 1:
+        kept = [image for image in images if image.video_id == same[0]]
+        source.say(f"{len(images) - len(kept)} images of other videos left out")
+        return kept
+    if source.video.names and any(image.file_name for image in images):
+        return images
+    some = shortened(sorted(map(str, name_of.values())))
+    raise ReobjError(f"{source.path}: images of {len(ids)} videos ({some}), none of them called "
+                     f"{stem}; keep one, or rename it")  # fmt: skip
 
 
-def _mask(mask: Any, size: tuple[int, int], scale: Array, where: str) -> Counts:
+def _mask(mask: Any, size: tuple[int, int], scale: Array) -> Counts:
     """Read a COCO segmentation as run lengths: RLE (compressed or not), polygons or none."""
-    if not mask:
+    if not mask or size == (0, 0):
         return NO_RUNS
     try:
         if not isinstance(mask, dict):
@@ -389,64 +317,45 @@ def _mask(mask: Any, size: tuple[int, int], scale: Array, where: str) -> Counts:
             return polygon_runs([ring.ravel().tolist() for ring in rings], size)
         counts = mask["counts"]
         if tuple(mask["size"]) != size[::-1]:
-            raise ReobjError(f"{where}: mask of (h, w) {mask['size']} in a video of {size[::-1]}")
+            raise ReobjError(f"mask of (h, w) {mask['size']} in a video of {size[::-1]}")
         return coco_runs(counts) if isinstance(counts, str) else np.array(counts, np.uint32).ravel()
     except ReobjError:
         raise
     except (KeyError, OverflowError, TypeError, ValueError) as error:
         text = f"segmentation cannot be read ({error!r:.80})"
-        raise ReobjError(f"{where}: {text}; expected polygons or RLE") from error
+        raise ReobjError(f"{text}; expected polygons or RLE") from error
 
 
-def _read_oa_slam(
-    path: Path, entries: Sequence[Mapping[str, Any]], names: Sequence[str], video: Video, first: str
-) -> RecordedDetections:
+def read_oa_slam(source: Source) -> RecordedDetections:
     """Read the file of OA-SLAM and VOOM: one entry per image, boxes as corners, classes from 0."""
-    rows = list[Mapping[str, Any]]()
-    images = list[str]()
-    for at, entry in enumerate(entries):
-        name = entry.get("file_name")
-        detections = entry.get("detections")
-        valid = isinstance(name, str) and isinstance(detections, list)
-        if not valid or not all(isinstance(d, dict) and _is_row(d) for d in detections or ()):
-            expected = "expected {file_name, detections: [{category_id, detection_score, bbox}]}"
-            raise ReobjError(f"{path}, entry {at}: {entry!r:.80}, {expected}")
-        rows += detections or []
-        images += [str(name)] * len(detections or ())
-    distinct = list(dict.fromkeys(str(entry["file_name"]) for entry in entries))
-    frame, text = frames_of_names(distinct, video, str(path), first, None, True)
-    frame_of = dict(zip(distinct, frame.tolist(), strict=True))
-    count = len(rows)
-    return RecordedDetections(
-        np.array([frame_of[name] for name in images], np.int64),
-        np.array([row["bbox"] for row in rows], np.float64).reshape(-1, 4),
-        np.array([row.get("detection_score", 1.0) for row in rows], np.float64),
-        np.array([row["category_id"] for row in rows], np.int64), [NO_RUNS] * count,
-        tuple(names or COCO_NAMES), video.size, video.working_size, np.arange(count), "detection",
-        [text] if text else [],
+    images = converted(load_json(source.path), list[_OaImage], source.path)
+    rows = [found for image in images for found in image.detections]
+    frames = frames_of_names([image.file_name for image in images], source)
+    return source.recorded(
+        np.repeat(frames, [len(image.detections) for image in images]),
+        np.array([row.bbox for row in rows], np.float64),
+        (np.array([row.category_id for row in rows], np.int64), source.names or COCO_NAMES),
+        np.array([row.detection_score for row in rows], np.float64), unit="detection",
     )  # fmt: skip
 
 
-def _is_row(row: Mapping[str, Any]) -> bool:
-    box = row.get("bbox")
-    kind = row.get("category_id")
-    whole = isinstance(kind, int) and 0 <= kind < 1 << 31
-    return whole and isinstance(box, list) and len(box) == 4
+def described_images(path: Path, name: str) -> tuple[tuple[int, int] | None, list[str]]:
+    """Return the common (w, h) and the names of the images of a format; as in the dataset beside.
 
-
-def image_size_of(dataset: Dataset | None) -> tuple[int, int] | None:
-    """Return the (w, h) common to all images of a dataset; None where they differ or lack it."""
-    images: Iterable[Mapping[str, Any]] = dataset.images.values() if dataset else ()
-    sizes = {(image.get("width"), image.get("height")) for image in images}
-    if len(sizes) != 1:
-        return None
-    width, height = sizes.pop()
-    return (int(width), int(height)) if width and height else None
-
-
-def image_names_of(path: Path, data: Any) -> list[str]:
-    """List the image names in a JSON file's dataset or entries; [] where there are none."""
-    dataset = dataset_of(path, data)
-    entries: Any = dataset.images.values() if dataset else data if isinstance(data, list) else ()
-    names = [e.get("file_name") for e in entries if isinstance(e, dict)]
-    return [name for name in names if isinstance(name, str)]
+    The size is None where images differ or lack it.
+    """
+    data = load_json(path)
+    if name == "oa-slam":
+        return None, [image.file_name for image in converted(data, list[_OaImage], path)]
+    if name == "coco":
+        dataset: Dataset | None = read_dataset(path, data, Dataset)
+    else:
+        entries = converted(data, list[Annotation], path)
+        dataset = _beside(path, entries)[1] if entries else None
+        if dataset is None:
+            return None, [entry.file_name for entry in entries if entry.file_name]
+    images = dataset.images if dataset else []
+    sizes = {(image.width, image.height) for image in images}
+    width, height = sizes.pop() if len(sizes) == 1 else (None, None)
+    size = (int(width), int(height)) if width and height else None
+    return size, [image.file_name for image in images if image.file_name]

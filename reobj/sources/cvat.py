@@ -16,76 +16,69 @@ from reobj.files import MEMORY_MAX, check_unpacked
 from reobj.sources.class_names import check_length
 from reobj.sources.image_frames import frames_of_names
 from reobj.sources.masks import NO_RUNS, Counts, crop_runs, polygon_runs
-from reobj.sources.recorded import RecordedDetections, scale_to
-from reobj.sources.video import Video
+from reobj.sources.recorded import RecordedDetections, Source
 from reobj.types import Array, IntArray, ReobjError
 
 
-def read_cvat(path: Path, video: Video, first: str = "") -> RecordedDetections:
-    """Read all shapes that are not "outside"; the identity is the track id + 1.
+def read_cvat(source: Source) -> RecordedDetections:
+    """Read all shapes of an XML file or CVAT's zip that are not "outside".
 
-    Polygons and masks have a mask. Other shapes than these and upright boxes become their bounding
-    boxes, and are counted in a message.
-
-    Args:
-        path: XML, or CVAT's zip. first: number of the first frame, "": 0.
-    Raises:
-        ReobjError: the file is missing, of another format, or has no shapes.
+    The identity is the track id + 1. Polygons and masks have a mask. Other shapes than these and
+    upright boxes become their bounding boxes, and are counted in a message.
     """
-    most = MEMORY_MAX // 16  # bytes, 800,000 boxes: the parser needs ten times as much memory
+    path = source.path
     try:
-        check_unpacked(path.stat().st_size, most)
-        text = path.read_bytes()
-        if zipfile.is_zipfile(path):
-            with zipfile.ZipFile(path) as packed:
-                check_unpacked(packed.getinfo("annotations.xml").file_size, most)
-                text = packed.read("annotations.xml")
-        root = ET.fromstring(text)
+        root = _root(path)
         bounded = Counter[str]()  # number of shapes of each kind that became bounding boxes
         shapes = list(_of_tracks(root)) or list(_of_images(root))
-        boxes = [_bounds(shape, bounded) for _, _, _, shape in shapes]
-        frames = [f for f, _, _, _ in shapes]
-        labels = [name for _, _, name, _ in shapes]
-        ids = np.array([identity for _, identity, _, _ in shapes], np.int64)
-        size = root.find(".//meta//original_size")
-        image_size = [0.0, 0.0]
-        if size is not None:
-            image_size = [float(size.findtext(side, "0")) for side in ("width", "height")]
+        boxes = np.array([_bounds(shape, bounded) for *_, shape in shapes], np.float64)
+        size = [float(root.findtext(f".//meta//original_size/{side}", "0"))
+                for side in ("width", "height")]  # fmt: skip
     except ReobjError as error:
         raise ReobjError(f"{path}: {error}") from error
     except Exception as error:  # zip, zlib and expat have their own exceptions for damaged files
         raise ReobjError(f"{path}: no annotations of CVAT for video 1.1 ({error!r:.200})") from None
-    looked = None
-    skeletons = sum(1 for _ in root.iter("skeleton"))
     if not shapes:
         raise ReobjError(f"{path}: no track with a box; export the task as 'CVAT for video 1.1'")
-    messages = [f"{n} {kind} taken as their bounding boxes" for kind, n in sorted(bounded.items())]
-    messages += [f"{skeletons} skeletons left out"] if skeletons else []
+    frames, identity, labels, _ = zip(*shapes, strict=True)
+    for kind, count in sorted(bounded.items()):
+        source.say(f"{count} {kind} taken as their bounding boxes")
+    skeletons = sum(1 for _ in root.iter("skeleton"))
+    source.say(f"{skeletons} skeletons left out" * bool(skeletons))
+    looked = None
     if isinstance(frames[0], str):
-        frame, note = frames_of_names([str(f) for f in frames], video, str(path), first, None, True)
-        messages += [note] if note else []
+        frame = frames_of_names(frames, source)
     else:
-        frame = np.array(frames, np.int64) - int(first or 0)
-        looked = _listed_frames(root, frames)
-        looked = None if looked is None else looked - int(first or 0)
+        begin = int(source.first == "1")
+        frame = np.array(frames, np.int64) - begin
+        looked = _listed_frames(root, frames, begin)
     names, class_id = np.unique(labels, return_inverse=True)
     for name in names.tolist():
         check_length(name, f"{path}, label")
-    n = len(shapes)
-    size_of = np.tile(image_size, (n, 1))
-    scale = scale_to(video.size, size_of, np.ones(n, bool), str(path), messages)
+    scale = source.scale(np.tile(size, (len(shapes), 1)))
     runs = [
-        _runs(shape, ratio, video.size, f"{path}, box {at}")
-        for at, ((_, _, _, shape), ratio) in enumerate(zip(shapes, scale[:, :2], strict=True))
+        _runs(shape, ratio, source.video.size, f"{path}, box {at}")
+        for at, ((*_, shape), ratio) in enumerate(zip(shapes, scale[:, :2], strict=True))
     ]
-    return RecordedDetections(
-        frame, np.array(boxes, np.float64) * scale, np.ones(n), class_id.astype(np.int64),
-        runs, tuple(names.tolist()), video.size, video.working_size, np.arange(n), "box",
-        messages, ids if (ids > 0).any() else np.empty(0, np.int64), looked=looked,
+    ids = np.array(identity, np.int64)
+    return source.recorded(
+        frame, boxes * scale, (class_id.astype(np.int64), names.tolist()), runs=runs, unit="box",
+        identity=ids if (ids > 0).any() else np.empty(0, np.int64), looked=looked,
     )  # fmt: skip
 
 
-def _listed_frames(root: ET.Element, frames: Sequence[int | str]) -> IntArray | None:
+def _root(path: Path) -> ET.Element:
+    """Parse the annotations in an XML file or a zip archive."""
+    most = MEMORY_MAX // 16  # bytes, 800,000 boxes: the parser needs ten times as much memory
+    check_unpacked(path.stat().st_size, most)
+    if not zipfile.is_zipfile(path):
+        return ET.fromstring(path.read_bytes())
+    with zipfile.ZipFile(path) as packed:
+        check_unpacked(packed.getinfo("annotations.xml").file_size, most)
+        return ET.fromstring(packed.read("annotations.xml"))
+
+
+def _listed_frames(root: ET.Element, frames: Sequence[int | str], begin: int) -> IntArray | None:
     """Return the frames (F,) of a task that skips some; None: all, or `frames` are not in them.
 
     Our exports begin at 0 and have no step, whatever frames were read.
@@ -99,7 +92,7 @@ def _listed_frames(root: ET.Element, frames: Sequence[int | str]) -> IntArray | 
     listed = range(int(start), int(stop) + 1, max(int(step or 1), 1))
     if (listed.start == 0 and listed.step == 1) or not all(f in listed for f in frames):
         return None
-    return np.array(listed, np.int64)
+    return np.array(listed, np.int64) - begin
 
 
 Shape = tuple[int | str, int, str, ET.Element]  # frame or image, identity, label, element
@@ -127,33 +120,34 @@ def _shapes(parent: ET.Element) -> list[ET.Element]:
     return [child for child in parent if child.tag in kinds]
 
 
+def _floats(shape: ET.Element, names: str) -> Array:
+    """Return attributes of a shape as numbers."""
+    return np.array([float(shape.attrib[name]) for name in names.split()])
+
+
 def _bounds(shape: ET.Element, bounded: Counter[str]) -> Array:
     """Return the bounding box (4,) of a shape; count shapes that have no mask and are no box."""
-    attributes = shape.attrib
+    angle_deg = float(shape.get("rotation") or 0)
     if shape.tag == "box":
-        sides = [float(attributes[key]) for key in ("xtl", "ytl", "xbr", "ybr")]
-        low, high = np.array(sides).reshape(2, 2)
-        angle = float(attributes.get("rotation", "0") or 0)
-        if not angle % 180:
-            return np.hstack([low, high])
+        box = _floats(shape, "xtl ytl xbr ybr")
+        if not angle_deg % 180:
+            return box
         bounded["turned boxes"] += 1
-        return _rotated_bounds((low + high) / 2, (high - low) / 2, angle, box=True)
+        return _rotated_bounds((box[:2] + box[2:]) / 2, (box[2:] - box[:2]) / 2, angle_deg, True)
     if shape.tag not in ("polygon", "mask"):
         bounded[shape.tag + "s" * (shape.tag != "points")] += 1
     if shape.tag == "ellipse":
-        centre = np.array([float(attributes["cx"]), float(attributes["cy"])])
-        radii = np.array([float(attributes["rx"]), float(attributes["ry"])])
-        angle = float(attributes.get("rotation", "0") or 0)
-        return _rotated_bounds(centre, radii, angle, box=False)
+        radii = _floats(shape, "rx ry")
+        return _rotated_bounds(_floats(shape, "cx cy"), radii, angle_deg, False)
     if shape.tag == "mask":
-        low = np.array([float(attributes["left"]), float(attributes["top"])])
-        size = np.array([float(attributes["width"]), float(attributes["height"])])
-        return np.hstack([low, low + size])
+        low = _floats(shape, "left top")
+        return np.hstack([low, low + _floats(shape, "width height")])
     if shape.tag == "cuboid":
-        x, y = ([float(v) for k, v in attributes.items() if re.fullmatch(axis + "[tb][lr][12]", k)]
-                for axis in "xy")  # fmt: skip
-        return np.array([min(x), min(y), max(x), max(y)])
-    corners = _corners(shape)
+        names = [" ".join(k for k in shape.attrib if re.fullmatch(axis + "[tb][lr][12]", k))
+                 for axis in "xy"]  # fmt: skip
+        corners = np.stack([_floats(shape, of_axis) for of_axis in names], 1)
+    else:
+        corners = _corners(shape)
     return np.hstack([corners.min(0), corners.max(0)])
 
 
@@ -182,9 +176,7 @@ def _runs(shape: ET.Element, scale: Array, size: tuple[int, int], where: str) ->
 
 def _mask_runs(shape: ET.Element, scale: Array, size: tuple[int, int]) -> Counts:
     """Return a mask as run lengths down the columns of the image; the file's follow its rows."""
-    left, top, width, height = (
-        int(float(shape.attrib[key])) for key in ("left", "top", "width", "height")
-    )
+    left, top, width, height = _floats(shape, "left top width height").astype(int).tolist()
     low = np.array([left, top], np.float64) * scale
     high = np.array([left + width, top + height], np.float64) * scale
     if width < 1 or height < 1 or (low < -scale).any() or (high > size + scale).any():

@@ -1,14 +1,15 @@
-"""Recorded detections and tracks of other tools: one table of readers, one validation.
+"""Recorded detections and tracks of other tools: one registry of readers, one validation.
 
-Start at `read_detections` and `read_tracks`. Every reader returns a `RecordedDetections`, which is
-then validated: invalid content raises an error with the line number; unusable rows are dropped and
-counted in a message.
+Start at `read_detections` and `read_tracks`. Every reader (`detection_formats`) returns a
+`RecordedDetections`, which is then validated: invalid content raises an error with the line number;
+unusable rows are dropped and counted in a message.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
+import re
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,20 +18,15 @@ from pathlib import Path
 import numpy as np
 
 from reobj.cameras import Poses
-from reobj.files import did_you_mean, last_name, load_json, shortened
-from reobj.sources import coco, tables
-from reobj.sources.boxes_3d import has_boxes_3d, read_boxes_3d
+from reobj.files import did_you_mean, last_name, shortened
+from reobj.formats import AUTO, Format
+from reobj.sources import coco
 from reobj.sources.class_names import check_length, load_class_names
-from reobj.sources.cvat import read_cvat
-from reobj.sources.label_folders import label_files, read_label_folder
+from reobj.sources.detection_formats import DETECTIONS, Reader
+from reobj.sources.label_folders import label_files
 from reobj.sources.looked import frames_looked_at, looked_message
-from reobj.sources.recorded import (
-    NORMALISED_MAX,
-    RecordedDetections,
-    npz_image_size,
-    read_npz,
-)
-from reobj.sources.tables import read_cells, read_table, recorded_table, seconds, table_of_records
+from reobj.sources.recorded import NORMALISED_MAX, RecordedDetections, Source, npz_image_size
+from reobj.sources.tables import are_numbers, read_cells, read_cells_3d, seconds
 from reobj.sources.video import Video
 from reobj.types import (
     CLASS_NAME_MAX,
@@ -76,9 +72,19 @@ class DetectConfig:
     class_names: str = option(
         "", "file of class names that are not COCO's: text, one a line, or a data.yaml"
     )
+    format: str = option(
+        AUTO, "format of the file of detections or identities: auto, or a name of the table in "
+        "docs/input_formats.md", "--detections-format",
+    )  # fmt: skip
     first_frame: str = option(
-        "", "number of the first frame in a file of detections, 0 or 1 (default: inferred)"
-    )
+        "", "number of the first frame in a file of detections, 0 or 1 (default: as the format "
+        "says); order: the images that a COCO dataset lists are the frames, in this order",
+    )  # fmt: skip
+    image_size: str = option(
+        "", "WIDTHxHEIGHT of the frames that a file of detections was made for, if it does not "
+        "say so; boxes are scaled",
+    )  # fmt: skip
+    score_max: float = option(1.0, "largest possible score in a file of detections")
     max_detections: int = option(
         0, "most detections per frame, by score (0: 100 of a model, all of a file)"
     )
@@ -131,107 +137,73 @@ def read_detections(
 
     Args:
         path: the file, or a folder of YOLO labels; boxes in px and frame numbers of the source.
-        config: min_score, classes, class_names, first_frame and max_detections apply.
+        config: all options but the detector's apply.
         poses: cameras that project boxes in 3D (Boxer's CSV).
     Raises:
         ReobjError: the file, the line and what was expected.
     """
     path = Path(path)
     config = config or DetectConfig()
-    if poses is not None and has_boxes_3d(path):
-        recorded = read_boxes_3d(path, video, [poses], _names(config))[0]
-    else:
-        recorded = _read(path, video, config)
-    _note_looked(recorded, video.frame_count)
+    recorded = _read(path, video, config, poses)
+    listed = recorded.looked is not None
+    if recorded.looked is None:
+        recorded.looked = frames_looked_at(recorded.frame, video.frame_count)
+    elif not 0 < len(recorded.looked) < (video.frame_count or sys.maxsize):
+        recorded.looked = None
+    if recorded.looked is not None:
+        recorded.messages.append(looked_message(recorded.looked, listed))
+    _check_scores(recorded, config.score_max, path)
     _check(recorded, path, config, video.frame_count)
     return recorded
 
 
-def _read(path: Path, video: Video, config: DetectConfig) -> RecordedDetections:
+def _read(
+    path: Path, video: Video, config: DetectConfig, poses: Poses | None = None
+) -> RecordedDetections:
     """Read a file of any format without validation."""
-    if not path.exists():
-        raise ReobjError(f"{path}: no such file of detections")
-    if config.first_frame not in ("", "0", "1"):
-        raise ReobjError(f"detect.first_frame {config.first_frame}: expected 0 or 1")
+    if config.first_frame not in ("", "0", "1", "order"):
+        raise ReobjError(f"detect.first_frame {config.first_frame}: expected 0, 1 or order")
+    names = load_class_names(config.class_names) if config.class_names else ()
+    source = Source(path, video, names, config.first_frame, [poses] if poses else [])
+    return read_source(source, DETECTIONS.find(path, config.format))
+
+
+def read_source(source: Source, entry: Format[Reader]) -> RecordedDetections:
+    """Read a file in its format."""
+    if entry.read is None:
+        raise ReobjError(f"{source.path}: {entry.title}, not read; {entry.advice}")
     try:
-        return _read_kind(path, _names(config), video, config.first_frame)
+        return entry.read(source)
     except ReobjError:
         raise
     except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
-        raise ReobjError(f"{path}: an entry cannot be read: {error!r}") from error
+        raise ReobjError(f"{source.path}: an entry cannot be read: {error!r}") from error
 
 
-def _names(config: DetectConfig) -> tuple[str, ...]:
-    return load_class_names(config.class_names) if config.class_names else ()
+def described_images(
+    path: Path, config: DetectConfig
+) -> tuple[tuple[int, int] | None, list[str], Array | None]:
+    """Return what a file of detections, or a dataset beside it, says about its images.
 
-
-def _note_looked(recorded: RecordedDetections, frame_count: int) -> None:
-    """Set the frames on which the detector was run: as the file lists them, else inferred."""
-    listed = recorded.looked is not None
-    if recorded.looked is None:
-        recorded.looked = frames_looked_at(recorded.frame, frame_count)
-    elif not 0 < len(recorded.looked) < (frame_count or sys.maxsize):
-        recorded.looked = None
-    if recorded.looked is not None:
-        recorded.messages.append(looked_message(recorded.looked, listed))
-
-
-def _read_kind(path: Path, names: Sequence[str], video: Video, first: str) -> RecordedDetections:
-    """Read a file with the reader of its format."""
-    match _kind(path):
+    Returns:
+        their common (w, h), None: not stated or they differ; their names; their times in s,
+        ascending, None: frames are not found by times.
+    """
+    match DETECTIONS.find(path, config.format).name:
         case "npz":
-            return read_npz(path, video.size, video.working_size)[0]
-        case "json":
-            return _read_json(path, names, video, first)
-        case "cvat":
-            return read_cvat(path, video, first)
-        case "folder":
-            return read_label_folder(path, names, video, first)
-        case _:
-            return read_table(path, names, video, first)
-
-
-def _read_json(path: Path, names: Sequence[str], video: Video, first: str) -> RecordedDetections:
-    """Read a table of records, or a COCO or OA-SLAM file."""
-    data = load_json(path)
-    table = table_of_records(path, data)
-    if table is not None:
-        return recorded_table(table, names, video, first)
-    return coco.read_coco(path, data, names, video, first)
-
-
-def _kind(path: Path) -> str:
-    """Return the format of a file: npz, json, cvat, folder (of YOLO labels) or table."""
-    kinds = {".npz": "npz", ".json": "json", ".xml": "cvat", ".zip": "cvat"}
-    return "folder" if path.is_dir() else kinds.get(path.suffix.lower(), "table")
-
-
-def recorded_times(path: Path) -> Array | None:
-    """Return the distinct times in s, ascending, of a table with times and without frames."""
-    if _kind(path) != "table":
-        return None
-    table = read_cells(path)
-    if "time" not in table.cells or "frame" in table.cells or "image" in table.cells:
-        return None
-    return np.unique(seconds(table))
-
-
-def image_size(path: Path) -> tuple[int, int] | None:
-    """Return the (w, h) of the images of a file of detections; None if the file lacks it."""
-    kind = _kind(path)
-    if kind == "npz":
-        return npz_image_size(path)
-    return coco.image_size_of(coco.dataset_of(path, load_json(path))) if kind == "json" else None
-
-
-def image_names(path: Path) -> list[str]:
-    """List the image names in a file of detections or a dataset beside it; [] if there are none."""
-    kind = _kind(path)
-    if kind == "json":
-        return coco.image_names_of(path, load_json(path))
-    if kind == "folder":
-        return [str(file.relative_to(path)) for file in label_files(path)]
-    return tables.image_names_of(read_cells(path)) if kind == "table" else []
+            return npz_image_size(path), [], None
+        case "coco" | "coco-results" | "oa-slam" as name:
+            return *coco.described_images(path, name), None
+        case "yolo":
+            return None, [str(file.relative_to(path)) for file in label_files(path)], None
+        case "boxer-3d":
+            return None, [], np.unique(seconds(read_cells_3d(path)))
+        case "csv" if "frame" not in (table := read_cells(path)).cells:
+            if "image" not in table.cells:
+                return None, [], np.unique(seconds(table))
+            names = list(dict.fromkeys(table.cells["image"]))
+            return None, [] if are_numbers(names) else names, None
+    return None, [], None
 
 
 def _check(
@@ -241,9 +213,13 @@ def _check(
 
     Invalid content is an error; dropped rows are counted in a message.
     """
-    _check_rows(recorded, path)
-    keep = _usable(recorded, path, frame_count)
-    _check_scores(recorded)
+    check_rows(recorded, path)
+    if ignored := int(recorded.ignored.sum()):
+        recorded.messages.append(f"{ignored} ignored regions of the file left out")
+        recorded.select(np.flatnonzero(~recorded.ignored))
+    if config.image_size:
+        recorded.xyxy = recorded.xyxy * _stated_scale(config.image_size, recorded.size)
+    keep = _usable(recorded, path, frame_count, not config.image_size)
     if (low := keep & (recorded.score < config.min_score)).any():
         text = f"{low.sum()} of {len(recorded)} boxes have a score below {config.min_score:g}"
         recorded.messages.append(f"{text} (detect.min_score): left out")
@@ -265,50 +241,51 @@ def _check(
     recorded.messages[:] = [f"{last_name(path)}: {text}" for text in recorded.messages]
 
 
-def _check_rows(recorded: RecordedDetections, path: Path) -> None:
+def _stated_scale(text: str, size: tuple[int, int]) -> Array:
+    """Return the factors (4,) from frames of WIDTHxHEIGHT to those of the video."""
+    if not (match := re.fullmatch(r"([1-9]\d{0,5})x([1-9]\d{0,5})", text)):
+        raise ReobjError(f"detect.image_size {text}: expected WIDTHxHEIGHT, such as 640x480")
+    return np.tile(np.divide(size, [int(match[1]), int(match[2])]), 2)
+
+
+def check_rows(recorded: RecordedDetections, path: Path) -> None:
     """Refuse invalid values and masks; the error names the first such row."""
+    names = recorded.class_names
     with np.errstate(invalid="ignore", over="ignore"):  # inf - inf
         finite = np.isfinite(recorded.xyxy.sum(1) + recorded.score)  # (N,)
     finite &= (np.abs(recorded.xyxy) <= COORDINATE_MAX).all(1)
-    named = np.isin(recorded.class_id, np.arange(len(recorded.class_names)))
-    lengths = np.array([*map(len, recorded.class_names), 0])
-    short = lengths[np.where(named, recorded.class_id, -1)] <= CLASS_NAME_MAX
+    named = (recorded.class_id >= 0) & (recorded.class_id < len(names))
     pixels = np.array([runs.sum() for runs in recorded.runs], np.int64)  # (N,)
     masked = np.array([len(runs) > 0 for runs in recorded.runs], bool)
-    fits = ~masked | (pixels == math.prod(recorded.size))
-    for row in np.flatnonzero(~(finite & named & short & fits))[:1]:
-        where = f"{path}, {recorded.unit} {recorded.line[row]}"
+    unfit = masked & (pixels != math.prod(recorded.size))
+    for row in np.flatnonzero(~finite | ~named | unfit)[:1]:
         text = f"mask of {pixels[row]} pixels in a video of {recorded.size}"
         if not finite[row]:
-            text = (
-                f"{recorded.xyxy[row]}, {recorded.score[row]}: NaN, infinite or beyond 1e7 pixels"
-            )
+            values = f"{recorded.xyxy[row]}, {recorded.score[row]}"
+            text = f"{values}: NaN, infinite or beyond 1e7 pixels"
         elif not named[row]:
-            text = unnamed_class(int(recorded.class_id[row]), len(recorded.class_names))
-        elif not short[row]:
-            check_length(recorded.class_names[recorded.class_id[row]], where)
-        raise ReobjError(f"{where}: {text}")
-    for name in recorded.class_names:
-        check_length(name, f"{path}, class names")
+            text = unnamed_class(int(recorded.class_id[row]), len(names))
+        raise ReobjError(f"{path}, {recorded.unit} {recorded.line[row]}: {text}")
+    long = [number for number, name in enumerate(names) if len(name) > CLASS_NAME_MAX]
+    for number in long:
+        rows = np.flatnonzero(recorded.class_id == number)[:1]
+        where = f"{recorded.unit} {recorded.line[rows[0]]}" if len(rows) else "class names"
+        check_length(names[number], f"{path}, {where}")
 
 
-def _check_scores(recorded: RecordedDetections) -> None:
-    """Convert scores to [0, 1]: -1 for all, percentages, or clipped; with a message."""
-    low = recorded.score.min(initial=0)
-    high = recorded.score.max(initial=0)
-    if len(recorded) and (recorded.score == -1).all():
+def _check_scores(recorded: RecordedDetections, most: float, path: Path) -> None:
+    """Convert scores of up to `most` to [0, 1]: -1 for all is no score; below 0 is 0."""
+    score = recorded.score
+    if len(score) and (score == -1).all():
         recorded.messages.append("scores are all -1: taken as 1")
-        recorded.score = -recorded.score
-    elif 2 < high <= 100 and low >= 0:  # a best score of 2 % is implausible
-        recorded.messages.append(
-            f"scores from {recorded.score.min():g} to {high:g} are taken as percent"
-        )
-        recorded.score = recorded.score / 100.0
-    elif low < 0 or high > 1:
-        outside = (recorded.score < 0) | (recorded.score > 1)
-        text = f"scores from {recorded.score.min():g} to {high:g} clipped to [0, 1]"
-        recorded.messages.append(f"{text}: {outside.sum()} of {len(recorded)} boxes")
-        recorded.score = np.clip(recorded.score, 0, 1)
+        recorded.score = -score
+        return
+    if (high := score.max(initial=0)) > most * 1.01 or not most:  # rounded
+        raise ReobjError(f"{path}: scores up to {high:g}, expected 0 to {most:g}; name the largest "
+                         "with --set detect.score_max=N, e.g. 100 for percent")  # fmt: skip
+    if (low := score < 0).any():
+        recorded.messages.append(f"{low.sum()} scores below 0, from {score.min():g}, count as 0")
+    recorded.score = np.clip(score / most, 0, 1)
 
 
 def _best_per_frame(
@@ -328,7 +305,9 @@ def _best_per_frame(
     return rows
 
 
-def _usable(recorded: RecordedDetections, path: Path, frame_count: int) -> BoolArray:
+def _usable(
+    recorded: RecordedDetections, path: Path, frame_count: int, checks_size: bool
+) -> BoolArray:
     """Test which boxes (N,) have an area, overlap the image and belong to a frame of the video."""
     count = len(recorded)
     low = recorded.xyxy[:, :2]
@@ -339,18 +318,27 @@ def _usable(recorded: RecordedDetections, path: Path, frame_count: int) -> BoolA
     if count and recorded.xyxy.max() <= NORMALISED_MAX:
         raise ReobjError(f"{path}: no coordinate above {NORMALISED_MAX}: normalised to 0..1? "
                          "Multiply them by the image size")  # fmt: skip
+    if checks_size and (made_for := _other_size(recorded.xyxy[~empty], recorded.size)):
+        raise ReobjError(f"{path}: {made_for}")
     if reading := _other_reading(recorded.xyxy, recorded.size):
         raise ReobjError(f"{path}: {reading}")
-    if 2 * (empty | outside).sum() > count:  # the format is wrong, not a few boxes
+    if 2 * (empty | outside).sum() > count or outside.sum() > max(10, 0.05 * count):
         raise ReobjError(
             f"{path}: {empty.sum()} of {count} boxes have no area and {outside.sum()} lie outside "
-            f"the image of {recorded.size}: x, y, w, h where x1, y1, x2, y2 is expected, or "
-            "another video?"
+            f"the image of {recorded.size}: x, y, w, h where x1, y1, x2, y2 is expected, "
+            "frames of another size (--set detect.image_size=WIDTHxHEIGHT), or another video?"
         )
     numbers = shortened(np.unique(recorded.frame[missing]).tolist())
     text = f"of frames that the video lacks (0-based: {numbers}; it has {frame_count or 'some'})"
     if count and missing.all():
         raise ReobjError(f"{path}: all detections are {text}: detections of another video?")
+    reach = recorded.xyxy[:, 2:].max(0, initial=0)
+    begins = bool(count) and (low.min(0) <= 0.02 * reach).any()
+    if checks_size and count >= 50 and begins and (reach < np.multiply(0.9, recorded.size)).all():
+        recorded.messages.append(
+            f"no box of {count} ends beyond x = {reach[0]:.0f} or y = {reach[1]:.0f} in images of "
+            f"{recorded.size}: boxes of frames of another size (detect.image_size)?"
+        )
     for bad, fault in ((empty, "without area"), (outside, "wholly outside the image"),
                        (missing, text)):  # fmt: skip
         if bad.any():
@@ -359,32 +347,50 @@ def _usable(recorded: RecordedDetections, path: Path, frame_count: int) -> BoolA
     return np.logical_not(empty | outside | missing)
 
 
+def _other_size(xyxy: Array, size: tuple[int, int]) -> str:
+    """Describe the frames of another size that boxes (N, 4) were made for; "" if there are none.
+
+    Boxes of a detector begin at 0 and end at the borders of its frame: several have the largest x2
+    (y2), and differ in x1 (y1). If these borders are not those of the image, the frames had another
+    size. One border is enough if boxes reach the same share of the image in the other direction.
+    """
+    most = xyxy[:, 2:].max(0, initial=1)  # (2,)
+    share = most / size
+    begins = xyxy[:, :2].min(0, initial=np.inf) <= 0.02 * most  # of the largest corner
+    cut = [xyxy[xyxy[:, k + 2] >= most[k] - 1, k] // (0.02 * most[k]) for k in (0, 1)]
+    ends = np.array([len(np.unique(starts)) >= 4 for starts in cut])  # chosen: not one object
+    moved = np.abs(share - 1) > 0.02
+    similar = abs(share[0] - share[1]) <= 0.02
+    if not ((moved & begins).any() and (ends.all() or (ends.any() and similar))):
+        return ""
+    where = f"x = {most[0]:.0f}, y = {most[1]:.0f}, and the image is {size[0]}x{size[1]}"
+    return (f"boxes are cut off at {where}: boxes of frames of another size? Name it with --set "
+            "detect.image_size=WIDTHxHEIGHT")  # fmt: skip
+
+
 def _other_reading(xyxy: Array, size: tuple[int, int]) -> str:
     """Describe the box format that boxes (N, 4) probably have; "" if corners are valid.
 
     Corners are invalid if the second is before the first or the centre lies outside the image.
     Then common mistakes are tried; one is the cause if all boxes fit the image with it.
     """
-    image = np.array(size, np.float64)
-    centre = (xyxy[:, :2] + xyxy[:, 2:]) / 2
-    inverted = (xyxy[:, 2:] < xyxy[:, :2]).any(1)
-    beyond = ((centre < 0) | (centre > image)).any(1)
+    low, high = xyxy[:, :2], xyxy[:, 2:]
+    centre = (low + high) / 2
+    inverted = (high < low).any(1)
+    beyond = ((centre < 0) | (centre > size)).any(1)
     if not (inverted | beyond).any():
         return ""
     why = f"{inverted.sum()} of {len(xyxy)} boxes have x2 < x1 or y2 < y1 and {beyond.sum()} have "
     why += f"their centre outside the image of {size}"
-    from_sizes = np.hstack([xyxy[:, :2], xyxy[:, :2] + xyxy[:, 2:]])
-    from_corners = np.hstack([xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]])
-    for box, limit, cause in (
-        (xyxy, image[::-1], f"all fit the frame turned by 90 deg, {size[::-1]}: made on frames "
-                            "that were not turned upright? Detect on upright frames"),
-        (from_sizes, image, "all fit it as x, y, w, h: name the columns so, or give corners"),
-        (from_corners, image,
-         "all fit it if w and h are the corner x2, y2: name them so, or give sizes"),
+    for end, limit, cause in (
+        (high, size[::-1], f"all fit the frame turned by 90 deg, {size[::-1]}: made on frames that "
+                           "were not turned upright? Detect on upright frames"),
+        (low + high, size, "all fit it as x, y, w, h: name the columns so, or give corners"),
+        (high - low, size, "all fit it if w and h are the corner x2, y2: name them so, or give "
+                           "sizes"),
     ):  # fmt: skip
         # Tolerance of 1 px: detectors round boxes to whole pixels
-        inside = (box >= -1).all(1) & (box[:, :2] <= box[:, 2:]).all(1)
-        if (inside & (box[:, 2:] <= limit + 1).all(1)).all():
+        if (low >= -1).all() and (low <= end).all() and (end <= np.add(limit, 1)).all():
             return f"{why}; {cause}"
     return ""
 
@@ -411,6 +417,7 @@ def read_tracks(
     config = config or DetectConfig()
     limit = dataclasses.replace(config, min_score=0.0, max_detections=0)
     recorded = _read(path, video, limit)
+    recorded.score = np.clip(np.where(recorded.score == -1, 1, recorded.score), 0, 1)
     _check(recorded, path, limit, video.frame_count)
     if len(recorded):
         _check_identities(recorded, path)

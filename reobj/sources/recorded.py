@@ -1,6 +1,6 @@
 """Detections of a video as arrays, and the npz format for them and their masks.
 
-`detection_files` reads the other formats and validates the content of all.
+A reader (`detection_formats`) makes them from a `Source`; `detection_files` validates the content.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from reobj.cameras import Poses
 from reobj.files import LINES_MAX, MEMORY_MAX, load_npz, save_npz
 from reobj.sources.masks import NO_RUNS, Counts, rle_decode, rle_encode
 from reobj.types import CLASS_MAX, Array, BoolArray, Detections, IntArray, ReobjError, visible_name
@@ -34,6 +35,7 @@ class RecordedDetections:
         identity: (N,) as in the file, or empty.
         looked: frames on which the detector was run, ascending; None: all.
         boxes_3d: (N, 15) of `boxes_3d.Boxes3D`, or empty.
+        ignored: (N,) regions that do not count, as the file marks them, or empty.
     """
 
     frame: IntArray
@@ -50,6 +52,7 @@ class RecordedDetections:
     identity: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
     looked: IntArray | None = None
     boxes_3d: Array = field(default_factory=lambda: np.empty((0, 15)))
+    ignored: BoolArray = field(default_factory=lambda: np.empty(0, bool))
 
     def __post_init__(self) -> None:
         self.class_names = tuple(map(visible_name, self.class_names))
@@ -59,10 +62,11 @@ class RecordedDetections:
 
     def select(self, rows: IntArray) -> None:
         """Select rows (n,), in this order."""
-        self.identity = self.identity[rows] if len(self.identity) else self.identity
-        self.boxes_3d = self.boxes_3d[rows] if len(self.boxes_3d) else self.boxes_3d
-        for name in ("frame", "xyxy", "score", "class_id", "line"):
-            setattr(self, name, getattr(self, name)[rows])
+        count = len(self)
+        columns = ("frame", "xyxy", "score", "class_id", "line", "identity", "boxes_3d", "ignored")
+        for name in columns:
+            values = getattr(self, name)
+            setattr(self, name, values[rows] if len(values) == count else values)
         self.runs = [self.runs[row] for row in rows]
 
     def fingerprint(self) -> str:
@@ -85,6 +89,76 @@ class RecordedDetections:
             decoded = (rle_decode(counts, self.size) for counts in runs)
             masks = np.stack([_resized_mask(mask, self.working_size) for mask in decoded])
         return Detections(self.xyxy[rows] * ratio, self.score[rows], self.class_id[rows], masks)
+
+
+@dataclass(slots=True)
+class Source:
+    """A file or folder of detections, and what its reader needs besides.
+
+    Attributes:
+        path: of the file. video: whose frames the boxes belong to (attributes of `Video`).
+        names: class names by number, (): not given. first: number of the first frame, "": as the
+            format says, or "order": listed images are the frames in this order.
+        poses: cameras that project boxes in 3D. messages: about assumptions, for the user.
+        advice: in the error about frame numbers that may count from 0 or from 1.
+    """
+
+    path: Path
+    video: Any
+    names: Sequence[str] = ()
+    first: str = ""
+    poses: Sequence[Poses] = ()
+    messages: list[str] = field(default_factory=list)
+    advice: str = "say which with --set detect.first_frame=0 or detect.first_frame=1"
+
+    def say(self, *texts: str) -> None:
+        """Add messages, without empty ones."""
+        self.messages += filter(None, texts)
+
+    def recorded(
+        self,
+        frame: IntArray,
+        xyxy: Array,
+        classes: tuple[IntArray, Sequence[str]],
+        score: Array | None = None,
+        runs: list[Counts] | None = None,
+        line: npt.NDArray[Any] | None = None,
+        unit: str = "entry",
+        **columns: Any,
+    ) -> RecordedDetections:
+        """Return the detections of N rows; columns: further attributes of RecordedDetections."""
+        count = len(frame)
+        return RecordedDetections(
+            frame, xyxy.reshape(-1, 4), np.ones(count) if score is None else score, classes[0],
+            [NO_RUNS] * count if runs is None else runs, tuple(classes[1]), self.video.size,
+            self.video.working_size, np.arange(count) if line is None else line, unit,
+            self.messages, **columns,
+        )  # fmt: skip
+
+    def scale(self, made_for: Array, used: BoolArray | None = None) -> Array:
+        """Return the factors (N, 4) from the images of the boxes to those of the video.
+
+        Args:
+            made_for: (N, 2) size of each box's image, 0: unknown. used: (N,) the box belongs to a
+                frame; None: all do.
+        Raises:
+            ReobjError: images of another aspect ratio.
+        """
+        size = self.video.size
+        scale = np.ones((len(made_for), 4))
+        known = (made_for > 0).all(1) & (True if used is None else used)
+        for w, h in np.unique(made_for[known], axis=0).tolist() if size != (0, 0) else ():
+            text = f"made for images of {w:g}x{h:g}, but the video is {size[0]}x{size[1]}"
+            if (w, h) == size:
+                continue
+            if abs(w * size[1] / size[0] - h) > 1:  # px: sides of resized images are rounded
+                turned = (h, w) == size
+                why = ": made on frames that were not turned upright?" if turned else ""
+                raise ReobjError(f"{self.path}: {text}, of another shape{why or ': other images?'} "
+                                 "Run the detector on the frames of this video")  # fmt: skip
+            scale[(made_for == (w, h)).all(1)] = np.tile([size[0] / w, size[1] / h], 2)
+            self.say(f"{text}: boxes are scaled")
+        return scale
 
 
 def _resized_mask(mask: BoolArray, size: tuple[int, int]) -> BoolArray:
@@ -151,11 +225,10 @@ NORMALISED_MAX = 1.5
 
 def npz_image_size(path: Path) -> tuple[int, int]:
     """Return the (w, h) of the images of an npz file of detections."""
-    size = np.asarray(load_npz(path)[0].get("image_size", ()))
-    if size.shape != (2,) or size.dtype.kind not in "iu" or (size < 1).any():
-        text = f"array image_size is {size.shape} of {size.dtype}"
-        raise ReobjError(f"{path}: {text}, expected (w, h) in whole pixels")
-    return int(size[0]), int(size[1])
+    data, _ = load_npz(path)
+    _check_arrays(data, path)
+    width, height = data["image_size"].tolist()
+    return width, height
 
 
 def read_npz(
@@ -170,79 +243,51 @@ def read_npz(
         those without detections (default: the frame of every detection).
     """
     data, _ = load_npz(path, sealed)
-    sizes = {"frame": LINES_MAX, "done": LINES_MAX, "class_names": CLASS_MAX,
-             "mask_counts": MEMORY_MAX // 8}  # fmt: skip  # uint32, held twice
-    for key, most in sizes.items():
+    _check_arrays(data, path)
+    if (made_for := tuple(data["image_size"].tolist())) != size:
+        turned = ": made on frames that were not turned upright?" if made_for == size[::-1] else ""
+        text = f"made for images of {made_for} px, but the video is {size} px"
+        raise ReobjError(f"{path}: {text}{turned}")
+    count = len(data["frame"])
+    recorded = RecordedDetections(
+        data["frame"].astype(np.int64), data["xyxy"].astype(np.float64),
+        data["score"].astype(np.float64), data["class_id"].astype(np.int64),
+        np.split(data["mask_counts"].astype(np.uint32), data["mask_offsets"][1:])[:count],
+        tuple(data["class_names"].tolist()), size, working_size, np.arange(count), "row",
+    )  # fmt: skip
+    if "done" not in data:
+        return recorded, recorded.frame
+    recorded.looked = np.unique(data["done"]).astype(np.int64)
+    return recorded, recorded.looked
+
+
+def _check_arrays(data: dict[str, Any], path: Path) -> None:
+    """Validate number, shape and kind of the arrays; add empty masks where there are none."""
+    limits = {"frame": LINES_MAX, "done": LINES_MAX, "class_names": CLASS_MAX,
+              "mask_counts": MEMORY_MAX // 8}  # fmt: skip  # uint32, held twice
+    for key, most in limits.items():
         if key in data and data[key].size > most:
             raise ReobjError(f"{path}: {data[key].size} {key}, at most {most} are allowed")
     count = len(np.atleast_1d(data.get("frame", ())))
     data.setdefault("mask_counts", NO_RUNS)
     data.setdefault("mask_offsets", np.zeros(count + 1, np.int64))
-    shapes = {"frame": (count,), "xyxy": (count, 4), "score": (count,), "class_id": (count,),
-              "class_names": (-1,), "image_size": (2,), "mask_offsets": (count + 1,)}  # fmt: skip
-    for key, expected in shapes.items():
-        shape = data[key].shape if key in data else "missing"
-        if shape != expected and (key != "class_names" or shape == "missing"):
-            raise ReobjError(f"{path}: array {key} is {shape}, expected shape {expected}")
-    dtypes = {"frame": "iu", "xyxy": "fiu", "score": "fiu", "class_id": "iu", "class_names": "U",
-              "image_size": "iu", "mask_counts": "iu", "mask_offsets": "iu"}  # fmt: skip
-    for key, kinds in dtypes.items():
+    expected: dict[str, tuple[tuple[int, ...], str]] = {
+        "frame": ((count,), "iu"), "xyxy": ((count, 4), "fiu"), "score": ((count,), "fiu"),
+        "class_id": ((count,), "iu"), "class_names": ((-1,), "U"), "image_size": ((2,), "iu"),
+        "mask_counts": ((-1,), "iu"), "mask_offsets": ((count + 1,), "iu"), "done": ((-1,), "iu"),
+    }  # fmt: skip
+    for key, (shape, kinds) in expected.items():
+        if key not in data and key == "done":
+            continue
+        found = data[key].shape if key in data else "missing"
+        if found != shape and (shape != (-1,) or len(found) != 1):
+            raise ReobjError(f"{path}: array {key} is {found}, expected shape {shape}")
         if data[key].dtype.kind not in kinds and data[key].size:
             raise ReobjError(f"{path}: array {key} is of {data[key].dtype}, expected {kinds}")
-    if data["class_names"].ndim != 1:
-        raise ReobjError(f"{path}: array class_names is {data['class_names'].shape}, expected (C,)")
-    offsets = data["mask_offsets"].astype(np.int64)
+    data["mask_offsets"] = data["mask_offsets"].astype(np.int64)
+    ordered = (np.diff(data["mask_offsets"], prepend=0) >= 0).all()
     runs = data["mask_counts"]
-    ordered = (np.diff(offsets, prepend=0) >= 0).all() and offsets[-1:].max(initial=0) <= runs.size
-    if runs.ndim != 1 or not ordered or (runs < 0).any():
+    if (data["image_size"] < 1).any():
+        raise ReobjError(f"{path}: image_size {data['image_size']}, expected (w, h) in px")
+    if not ordered or data["mask_offsets"][-1] > runs.size or (runs < 0).any():
         raise ReobjError(f"{path}: mask_counts and mask_offsets are inconsistent")
-    if (made_for := tuple(data["image_size"].tolist())) != size:
-        turned = ": made on frames that were not turned upright?" if made_for == size[::-1] else ""
-        text = f"made for images of {made_for} px, but the video is {size} px"
-        raise ReobjError(f"{path}: {text}{turned}")
-    recorded = RecordedDetections(
-        data["frame"].astype(np.int64), data["xyxy"].astype(np.float64),
-        data["score"].astype(np.float64), data["class_id"].astype(np.int64),
-        np.split(runs.astype(np.uint32), offsets[1:])[:count],
-        tuple(data["class_names"].tolist()), size, working_size, np.arange(count), "row",
-    )  # fmt: skip
-    recorded.looked = _frames_done(data, path)
-    return recorded, recorded.frame if recorded.looked is None else recorded.looked
-
-
-def _frames_done(data: dict[str, Any], path: Path) -> IntArray | None:
-    """Return the frames, ascending, on which the detector was run; None: not in the file."""
-    if "done" not in data:
-        return None
-    done = np.asarray(data["done"])
-    if done.ndim != 1 or (done.size and done.dtype.kind not in "iu"):
-        raise ReobjError(f"{path}: array done is {done.dtype} {done.shape}, expected frames (F,)")
-    return np.unique(done).astype(np.int64)
-
-
-def scale_to(
-    size: tuple[int, int], made_for: Array, used: Any, where: str, messages: list[str]
-) -> Array:
-    """Return the factors (N, 4) from the images of the boxes to those of the video.
-
-    Args:
-        size: (w, h) of the video, (0, 0): unknown, no scaling.
-        made_for: (N, 2) size of each box's image, 0: unknown. used: (N,) the box belongs to a
-            frame.
-    Raises:
-        ReobjError: images of another aspect ratio.
-    """
-    scale = np.ones((len(made_for), 4))
-    sizes = np.unique(made_for[used & (made_for > 0).all(1)], axis=0)
-    if size == (0, 0):
-        return scale
-    for w, h in sizes[(sizes != size).any(1)].tolist():
-        text = f"made for images of {w:g}x{h:g}, but the video is {size[0]}x{size[1]}"
-        if abs(w * size[1] / size[0] - h) > 1:  # px: sides of resized images are rounded
-            turned = (h, w) == size
-            why = ": made on frames that were not turned upright?" if turned else ": other images?"
-            raise ReobjError(f"{where}: {text}{why} Run the detector on the frames of this video")
-        rows = (made_for == (w, h)).all(1)
-        scale[rows] = np.tile([size[0] / w, size[1] / h], 2)
-        messages.append(f"{text}: boxes are scaled")
-    return scale

@@ -158,7 +158,7 @@ TABLES = {
                                 "{f};{x1},0;{y1},0;{x2},0;{y2},0;0,9;chair"),
     "Boxer's 2D boxes": csv(
         "time_ns,frame_id,sensor,device,img_width,img_height,x1,y1,x2,y2,name,instance,sem_id,prob",
-        "-1,{f},rgb,iPad,640,480,{x1},{y1},{x2},{y2},chair,-1,56,0.9"),
+        "-1,{f},rgb,iPad,320,240,{x1},{y1},{x2},{y2},chair,-1,56,0.9"),
     "pandas' index": csv(",frame,x1,y1,x2,y2,score,class", "{n}," + CSV_ROW),
     "pandas' floats": csv("frame,x1,y1,x2,y2,score,class", "{f}.0,{x1}.0,{y1},{x2},{y2},.9,56.0"),
     "supervision's sink": csv(
@@ -188,7 +188,9 @@ def test_tables(tmp_path: Path, tracked: Callable[..., Tracked], what: str) -> N
     named = (
         what[:3] in ("mot", "box") and "commas" not in what and "own" not in what
     ) or "floats" in what
-    made = tracked(write_clip(tmp_path / "v.avi"), "--detections", path, *(names if named else ()))
+    more = ("--detections-format", "boxmot") if what.startswith("boxmot: 1") else ()
+    more += names if named else ()
+    made = tracked(write_clip(tmp_path / "v.avi"), "--detections", path, *more)
     assert is_truth(made, "object" if "commas" in what else "chair"), made
 
 
@@ -265,7 +267,12 @@ def test_frame_numbers_in_the_image_names_of_cvat(
         }  # fmt: skip
         (tmp_path / "instances.json").write_text(json.dumps(data))
         for option in ("--detections", "--tracks"):
-            made = tracked(source, option, tmp_path / "instances.json", "--overwrite")
+            command = (source, option, tmp_path / "instances.json", "--overwrite")
+            if begin:  # without a 0 the names leave it open
+                with pytest.raises(rt.ReobjError, match=r"detect\.first_frame"):
+                    rt.read_detections(tmp_path / "instances.json", rt.Video(source))
+                command += ("--set", "detect.first_frame=1")
+            made = tracked(*command)
             assert is_truth(made, frames=range(0, 15, 3)), (option, begin, made)
 
 
@@ -416,15 +423,14 @@ def test_boxes_of_a_file_are_limited_only_by_the_users_option(
     ("text", "said"),
     [
         (mot(tail=".9,57") + "2,-1,9,9,9,9,.05,57\n", "1 of 9 boxes have a score below 0.1"),
-        (mot(tail="87.5,57"), "are taken as percent"),
         (mot(tail=".9,57") + "2,1,200,100,40,40,.9,-1\n", "1 boxes without a class are called"),
-        (mot(tail=".9,57") + "2,1,200,100,40,40,0,0\n", "ignored regions"),
-        (mot(tail=".9,1.25"), "column 8 holds no class numbers"),
+        (mot(tail="1,4,0,1") + "2,0,200,100,40,40,0,0,0,0\n", "1 ignored regions"),
+        (mot(tail=".9,1.25,-7,0"), "x, y, z in the world"),
         (
             mot(tail=".9,57") + "99,1,200,100,40,40,.9,57\n",
             "1 boxes of frames that the video lacks",
         ),
-        (kitti(), "1 rows DontCare left out"),
+        (kitti(), "1 ignored regions"),
         (TABLES["frames without boxes"], "1 rows without a box left out"),
         (TABLES["numbers from 1"], "are taken as counted from 1"),
     ],
@@ -542,17 +548,18 @@ def dataset(**changes: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({"images": 5}, "images is 5"),
-        ({"images": {"a": 1}}, "images is {'a': 1}"),
-        ({"images": [{"id": 0, "file_name": "0.png"}, 7]}, "images[1]: 7"),
-        ({"images": [{"id": 0, "file_name": 7}]}, "images[0]: {'id': 0, 'file_name': 7}"),
-        ({"images": [{"id": [0], "file_name": "0.png"}]}, "images[0]: "),
-        ({"images": [{"id": 0, "width": "wide"}]}, "images[0]: "),
-        ({"categories": ["chair"]}, "categories[0]: 'chair'"),
+        ({"images": 5}, "`$.images`"),
+        ({"images": {"a": 1}}, "`$.images`"),
+        ({"images": [{"id": 0, "file_name": "0.png"}, 7]}, "`$.images[1]`"),
+        ({"images": [{"id": 0, "file_name": 7}]}, "`$.images[0].file_name`"),
+        ({"images": [{"id": [0], "file_name": "0.png"}]}, "`$.images[0].id`"),
+        ({"images": [{"id": 0, "width": "wide"}]}, "`$.images[0].width`"),
+        ({"categories": ["chair"]}, "`$.categories[0]`"),
         ({"categories": [{"id": 1, "name": "c" * 300}]}, "a class name of 300 characters"),
-        ({"annotations": [7]}, "entry 0: 7, expected an object"),
-        ({"annotations": [{"image_id": 0, "category_id": 1, "bbox": "1234"}]}, "a bbox of 4"),
-        ({"annotations": [{"image_id": [0], "category_id": 1, "bbox": [1, 2, 3, 4]}]}, "two ids"),
+        ({"annotations": [7]}, "`$.annotations[0]`"),
+        ({"annotations": [{"image_id": 0, "category_id": 1, "bbox": "1234"}]}, "[0].bbox`"),
+        ({"annotations": [{"image_id": [0], "category_id": 1, "bbox": [1, 2, 3, 4]}]},
+         "`$.annotations[0].image_id`"),
         ({"annotations": [{"image_id": 0, "category_id": 1, "bbox": [1, 2, 30, 40],
                            "segmentation": "x"}]}, "segmentation cannot be read"),
     ],
@@ -802,3 +809,284 @@ def test_labels_that_are_text(tmp_path: Path, made: Callable[[Any], Any]) -> Non
                     detections=lambda image: made(box(next(frames))), in_3d=False)  # fmt: skip
     assert [o.class_name for o in result.objects] == ["red mug"]
     assert result.tracks.frame.tolist() == list(range(FRAMES))
+
+
+# ---- Formats that are declared -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "classes", "score"), [("mot", {"cake"}, 1.0), ("boxmot", {"chair"}, 0.87)]
+)
+def test_nine_columns_of_which_the_seventh_is_1(
+    tmp_path: Path, tracked: Callable[..., Tracked], name: str, classes: set[str], score: float
+) -> None:
+    """Truth with visibilities or results of boxmot: the user says which."""
+    (tmp_path / "det.txt").write_text(mot(tail=f"1,{CHAIR},.87"))
+    (tmp_path / "names.txt").write_text("\n".join(rt.COCO_NAMES))
+    source = write_clip(tmp_path / "v.avi")
+    made = tracked(source, "--detections", tmp_path / "det.txt")
+    assert made.code == 2 and "mot, boxmot; name one with --detections-format" in made.said
+    config = rt.DetectConfig(format=name, class_names=str(tmp_path / "names.txt"))
+    found = rt.read_detections(tmp_path / "det.txt", rt.Video(source), config)
+    assert {found.class_names[k] for k in found.class_id} == classes
+    assert set(found.score.tolist()) == {score}
+    wrong = rt.DetectConfig(format="botmox")
+    with pytest.raises(rt.ReobjError, match=r"--detections-format botmox: .*did you mean boxmot"):
+        rt.read_detections(tmp_path / "det.txt", rt.Video(source), wrong)
+
+
+def test_labels_beside_a_mot_file_name_its_classes(
+    tmp_path: Path, tracked: Callable[..., Tracked]
+) -> None:
+    """As CVAT writes it; the file that decides is named."""
+    (tmp_path / "gt").mkdir()
+    (tmp_path / "gt/gt.txt").write_text(mot(tail="1,2,.87"))
+    (tmp_path / "gt/labels.txt").write_text("lamp\nchair\n")
+    source = write_clip(tmp_path / "v.avi")
+    made = tracked(source, "--tracks", tmp_path / "gt/gt.txt")
+    assert is_truth(made) and "labels.txt" in made.said
+
+
+def test_the_classes_of_visdrone(tmp_path: Path, tracked: Callable[..., Tracked]) -> None:
+    rows = mot(tail="1,4,0,1") + "2,0,200,100,40,40,0,0,0,0\n"
+    (tmp_path / "det.txt").write_text(rows)
+    made = tracked(write_clip(tmp_path / "v.avi"), "--detections", tmp_path / "det.txt")
+    assert is_truth(made, "car") and "1 ignored regions" in made.said
+
+
+def test_scores_that_are_percent(tmp_path: Path, tracked: Callable[..., Tracked]) -> None:
+    (tmp_path / "det.txt").write_text(mot(tail="87.5,57"))
+    source = write_clip(tmp_path / "v.avi")
+    made = tracked(source, "--detections", tmp_path / "det.txt")
+    assert made.code == 2 and "detect.score_max" in made.said
+    config = rt.DetectConfig(score_max=100.0)
+    found = rt.read_detections(tmp_path / "det.txt", rt.Video(source), config)
+    assert set(found.score.tolist()) == {0.875}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        csv("frame,x1,y1,x2,y2", "{f},{x1},5,{y1},0,{x2},5,{y2},0"),
+        mot().replace(",20,40,40,", ",20,5,40,0,40,0,"),
+        csv("frame,x1,y1,x2,y2", '{f},"{x1},5",{y1},{x2},{y2}'),
+    ],
+)
+def test_decimal_commas_between_commas(
+    tmp_path: Path, tracked: Callable[..., Tracked], text: str
+) -> None:
+    (tmp_path / "det.csv").write_text(text)
+    made = tracked(write_clip(tmp_path / "v.avi"), "--detections", tmp_path / "det.csv")
+    assert made.code == 2 and "decimal commas? Separate the columns with semicolons" in made.said
+
+
+OTHER_TOOLS = {
+    "Label Studio": [{"id": 1, "annotations": [{"result": []}], "data": {"image": "/0.jpg"}}],
+    "Scalabel": [{"name": "0.jpg", "frameIndex": 0, "labels": [{"id": "1", "box2d": {}}]}],
+    "Datumaro": {"info": {}, "categories": {"label": {}}, "items": []},
+    "labelme": {"version": "5.0", "flags": {}, "shapes": [], "imagePath": "0.jpg"},
+    "VGG Image Annotator": {"0.jpg12": {"filename": "0.jpg", "size": 12, "regions": []}},
+    "no image_id": [{"frame": 0, "track_id": 1, "bbox": [64, 96, 256, 288], "confidence": 0.9}],
+    "Pascal VOC": "<annotation><object><bndbox/></object></annotation>",
+    "UA-DETRAC": '<?xml version="1.0"?>\n<sequence name="MVI_1"><frame/></sequence>',
+}
+
+
+@pytest.mark.parametrize("tool", OTHER_TOOLS)
+def test_files_of_other_tools_are_named(
+    tmp_path: Path, tracked: Callable[..., Tracked], tool: str
+) -> None:
+    """With the export to use."""
+    content: Any = OTHER_TOOLS[tool]
+    path = tmp_path / ("a.xml" if isinstance(content, str) else "a.json")
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    made = tracked(write_clip(tmp_path / "v.avi"), "--detections", path)
+    assert made.code == 2 and tool in made.said and "export it" in made.said
+    assert made.said.count("\n") == 1
+
+
+# ---- Names of images decide, never the order of a list -------------------------------------------
+
+
+def in_list_order(name: str, extra: bool, frames: Sequence[int]) -> dict[str, Any]:
+    """A dataset whose list has another order than the names; images without boxes too."""
+    images = [
+        {"id": i, "file_name": name.format(f)}
+        | ({"extra": {"name": f"desk_{f:04d}.png"}} if extra else {})
+        for i, f in enumerate(frames)
+    ]
+    boxes = [{"image_id": i, "category_id": 1, "bbox": coco_box(f)} for i, f in enumerate(frames)]
+    return {"images": images, "categories": [{"id": 1, "name": "chair"}], "annotations": boxes}
+
+
+@pytest.mark.parametrize("frames", [[3, 0, 5, 1, 7, 2, 6, 4], [3, 1, 0, 5]])
+@pytest.mark.parametrize(
+    ("name", "extra"),
+    [
+        ("desk_{:04d}_png.rf.5b3c8f01d97e42a6f8c5b09e1d74a3f6.jpg", False),
+        ("upload.rf.5b3c8f01d97e42a6{:04d}f8c5b09e1d74a3f6.jpg", True),
+        ("desk_{:04d}.png", False),
+    ],
+)
+def test_datasets_in_another_order_than_the_frames(
+    tmp_path: Path, tracked: Callable[..., Tracked], frames: list[int], name: str, extra: bool
+) -> None:
+    source = images(tmp_path / "im", [f"desk_{f:04d}.png" for f in range(FRAMES)])
+    (tmp_path / "d.json").write_text(json.dumps(in_list_order(name, extra, frames)))
+    made = tracked(source, "--detections", tmp_path / "d.json")
+    assert is_truth(made, frames=sorted(frames)), made
+
+
+def test_names_that_fit_no_image(tmp_path: Path, tracked: Callable[..., Tracked]) -> None:
+    """As many images as frames: still refused, unless the user says that the order counts."""
+    data = in_list_order("desk_{:04d}.png", False, range(4))
+    for image, name in zip(data["images"], ("hall", "door", "sofa", "left"), strict=True):
+        image["file_name"] = f"{name}.jpg"
+    (tmp_path / "d.json").write_text(json.dumps(data))
+    source = images(tmp_path / "im", [f"{f:06d}.png" for f in range(4)])
+    made = tracked(source, "--detections", tmp_path / "d.json")
+    assert made.code == 2 and "door.jpg" in made.said and "000000.png" in made.said
+    made = tracked(source, "--detections", tmp_path / "d.json", "--set", "detect.first_frame=order")
+    assert is_truth(made, frames=range(4)), made
+
+
+def test_the_dataset_beside_results_is_named(
+    tmp_path: Path, tracked: Callable[..., Tracked]
+) -> None:
+    data = in_list_order("desk_{:04d}.png", False, [2, 0, 1, 3])
+    (tmp_path / "results.json").write_text(json.dumps(data.pop("annotations")))
+    (tmp_path / "instances.json").write_text(json.dumps(data))
+    source = images(tmp_path / "im", [f"desk_{f:04d}.png" for f in range(FRAMES)])
+    made = tracked(source, "--detections", tmp_path / "results.json")
+    assert is_truth(made, frames=range(4)) and "instances.json" in made.said
+
+
+# ---- Sizes, classes and identities that a file states --------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("header", "cells"),
+    [
+        ("filename,width,height,class,xmin,ymin,xmax,ymax",
+         "f_{f}.jpg,640,480,chair,{x1},{y1},{x2},{y2}"),
+        ("frame,x1,y1,x2,y2,class,image_width,image_height",
+         "{f},{x1},{y1},{x2},{y2},chair,640,480"),
+        ("frame,x,y,w,h,width,height,class", "{f},{x1},{y1},{w},{h},640,480,chair"),
+    ],
+)  # fmt: skip
+def test_image_sizes_in_a_csv(
+    tmp_path: Path, tracked: Callable[..., Tracked], header: str, cells: str
+) -> None:
+    """Boxes for images of twice the size are scaled; another shape is refused."""
+    (tmp_path / "det.csv").write_text(csv(header, cells))
+    source = write_clip(tmp_path / "v.avi")
+    made = tracked(source, "--detections", tmp_path / "det.csv")
+    assert made.boxes[0] == (5, 10, 25, 30) and "640x480" in made.said
+    (tmp_path / "det.csv").write_text(csv(header, cells.replace("480", "640")))
+    with pytest.raises(rt.ReobjError, match="made for images of 640x640"):
+        rt.read_detections(tmp_path / "det.csv", rt.Video(source))
+
+
+def test_sizes_of_boxes_beside_their_corners(
+    tmp_path: Path, tracked: Callable[..., Tracked]
+) -> None:
+    text = csv("frame,xmin,ymin,xmax,ymax,width,height", "{f},{x1},{y1},{x2},{y2},{w},{h}")
+    (tmp_path / "det.csv").write_text(text)
+    made = tracked(write_clip(tmp_path / "v.avi"), "--detections", tmp_path / "det.csv")
+    assert is_truth(made, "object"), made
+
+
+def test_columns_of_classes_and_identities_are_read_or_named(
+    tmp_path: Path, tracked: Callable[..., Tracked]
+) -> None:
+    """Other names of the same classes are not; numbers of rows are neither."""
+    text = csv("frame,x1,y1,x2,y2,label,class_id,room_class,person_id",
+               "{f},{x1},{y1},{x2},{y2},chair,56,{f},{f}")  # fmt: skip
+    (tmp_path / "det.csv").write_text(text)
+    made = tracked(write_clip(tmp_path / "v.avi"), "--detections", tmp_path / "det.csv")
+    assert is_truth(made) and "not read: room_class, person_id" in made.said
+
+
+def test_labels_with_keypoints(tmp_path: Path, tracked: Callable[..., Tracked]) -> None:
+    """Boxes with three columns a keypoint are no polygons."""
+    labels = yolo_folder(
+        tmp_path / "labels", lambda f: yolo(f, 0, " 0.1 0.2 2 0.3 0.4 1"), "v_{}.txt", 1
+    )
+    (labels / "classes.txt").write_text("chair\n")
+    made = tracked(write_clip(tmp_path / "v.avi"), "--detections", labels)
+    assert is_truth(made) and "keypoints after class cx cy w h are not read" in made.said
+
+
+def test_labels_with_keypoints_and_confidences(
+    tmp_path: Path, tracked: Callable[..., Tracked]
+) -> None:
+    """Polygons have the same form: the user says which."""
+    points = " .1 .2 .9 .3 .4 .8 .5 .6 .7 .95"
+    labels = yolo_folder(tmp_path / "labels", lambda f: yolo(f, 0, points), "v_{}.txt", 1)
+    (labels / "classes.txt").write_text("chair\n")
+    source = write_clip(tmp_path / "v.avi")
+    made = tracked(source, "--detections", labels)
+    assert made.code == 2 and "yolo, yolo-pose; name one with" in made.said
+    made = tracked(source, "--detections", labels, "--detections-format", "yolo-pose")
+    assert is_truth(made) and "keypoints" in made.said
+    found = rt.read_detections(labels, rt.Video(source), rt.DetectConfig(format="yolo-pose"))
+    assert set(found.score.tolist()) == {0.95}
+
+
+def test_identities_at_the_end_of_label_rows(
+    tmp_path: Path, tracked: Callable[..., Tracked]
+) -> None:
+    """The identity 1 is one if others are above 1; it was taken for a confidence."""
+    labels = yolo_folder(
+        tmp_path / "labels", lambda f: yolo(f, 0, " 1") + "0 .8 .8 .1 .1 2\n", "v_{}.txt", 1
+    )
+    (labels / "classes.txt").write_text("chair\n")
+    found = rt.read_tracks(labels, rt.Video(write_clip(tmp_path / "v.avi")))[0]
+    assert sorted(set(found.track_id.tolist())) == [1, 2] and len(found) == 2 * FRAMES
+
+
+# ---- Frames of another size ----------------------------------------------------------------------
+
+
+def crowd(scale: float, frames: int = FRAMES, clipped: bool = True) -> str:
+    """Boxes that move through the borders of 320 x 240, times a factor."""
+    rng = np.random.default_rng(0)
+    centre = rng.uniform(0, SIZE, (frames, 12, 2))
+    half = rng.uniform(15, 40, (frames, 12, 2))
+    xyxy = np.concatenate([centre - half, centre + half], 2)
+    if clipped:
+        xyxy = xyxy.clip(0, np.tile(SIZE, 2))
+    rows = [
+        f"{f}," + ",".join(f"{v:.2f}" for v in b) + ",.9,chair\n"
+        for f in range(frames)
+        for b in (xyxy[f] * scale).tolist()
+    ]
+    return "frame,x1,y1,x2,y2,score,class\n" + "".join(rows)
+
+
+@pytest.mark.parametrize("scale", [0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0])
+def test_boxes_of_resized_frames(
+    tmp_path: Path, tracked: Callable[..., Tracked], scale: float
+) -> None:
+    """They are refused, and scaled if the user says for which size they were made."""
+    (tmp_path / "det.csv").write_text(crowd(scale))
+    source = write_clip(tmp_path / "v.avi")
+    made = tracked(source, "--detections", tmp_path / "det.csv")
+    assert made.code == (2 if scale != 1 else 0), made.said
+    assert ("detect.image_size" in made.said) == (scale != 1)
+    (tmp_path / "true.csv").write_text(crowd(1))
+    stated = rt.DetectConfig(image_size=f"{320 * scale:.0f}x{240 * scale:.0f}")
+    found = rt.read_detections(tmp_path / "det.csv", rt.Video(source), stated)
+    true = rt.read_detections(tmp_path / "true.csv", rt.Video(source))
+    assert np.abs(found.xyxy - true.xyxy).max() < 0.05
+
+
+def test_boxes_of_resized_frames_that_are_not_cut_off(tmp_path: Path) -> None:
+    """Of smaller frames: a question; of larger ones: refused."""
+    video = rt.Video(write_clip(tmp_path / "v.avi"))
+    (tmp_path / "det.csv").write_text(crowd(0.5, clipped=False))
+    found = rt.read_detections(tmp_path / "det.csv", video)
+    assert any("frames of another size" in text for text in found.messages)
+    (tmp_path / "det.csv").write_text(crowd(1.5, clipped=False))
+    with pytest.raises(rt.ReobjError, match="frames of another size"):
+        rt.read_detections(tmp_path / "det.csv", video)

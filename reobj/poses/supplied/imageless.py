@@ -25,10 +25,8 @@ from reobj.poses.supplied.pose_formats import PoseFile
 from reobj.poses.supplied.readers import read_pose_file
 from reobj.sources.detection_files import (
     DetectConfig,
-    image_names,
-    image_size,
+    described_images,
     read_detections,
-    recorded_times,
 )
 from reobj.sources.image_files import TimeUnit, sorted_names
 from reobj.sources.imageless import ImagelessVideo
@@ -70,7 +68,8 @@ def open_video(
     unknown = (1, 1)
     if not path.exists():
         raise ReobjError(f"{path}: no such file of detections")
-    size = image_size(path)
+    detect = detect or DetectConfig()
+    size = described_images(path, detect)[0]
     stated = stated_camera(poses.camera, size)
     size = size or (unknown if stated is None else (stated.width, stated.height))
     pose_file = read_pose_file(Path(poses.mode), poses.fmt, size)
@@ -80,7 +79,7 @@ def open_video(
         raise ReobjError(
             f"{poses.mode}: no image size in it; give --camera MODEL WIDTH HEIGHT PARAMS"
         )
-    video = _frames_of(pose_file, path, size, poses.mode, config, detect or DetectConfig())
+    video = _frames_of(pose_file, path, size, poses.mode, config, detect)
     video.messages.append(
         f"{NOTE_START}no images: {video.frame_count} frames of {size[0]}x{size[1]} from "
         f"{poses.mode} and {path}; tracked by motion and cameras alone, without appearance and "
@@ -104,9 +103,10 @@ def _frames_of(
     frames, by these numbers. Poses without names: evenly spaced times from 0 on are numbers;
     otherwise each row is one frame.
     """
-    if (times_s := recorded_times(boxes)) is not None:
+    _, given, times_s = described_images(boxes, detect)
+    if times_s is not None:
         return ImagelessVideo(source, size, config, times_s=times_s)
-    named = {Path(name.replace("\\", "/")).name for name in image_names(boxes)}
+    named = {Path(name.replace("\\", "/")).name for name in given}
     posed = {Path(name).name for name in pose_file.names}
     if named and posed and (frames_by_name(sorted(named), sorted(posed))[0] >= 0).all():
         named = posed  # all of the detections' images and more, with suffixes

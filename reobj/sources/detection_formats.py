@@ -1,0 +1,124 @@
+"""The formats of detections and tracks: how each is recognised, and its reader."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+
+from reobj.formats import Format, Probe, Registry
+from reobj.sources import boxes_3d, coco, cvat, label_folders, tables
+from reobj.sources.recorded import RecordedDetections, Source, read_npz
+from reobj.types import ReobjError
+
+Reader = Callable[[Source], RecordedDetections]
+
+
+def _read_npz(source: Source) -> RecordedDetections:
+    return read_npz(source.path, source.video.size, source.video.working_size)[0]
+
+
+def _has(*keys: str, listed: bool | None = None) -> Callable[[Probe], bool]:
+    """Test for keys of a JSON object, or of the first object of a list; listed: which of both."""
+    return lambda probe: probe.keys() >= {*keys} and listed in (None, isinstance(probe.json, list))
+
+
+def _is_records(probe: Probe) -> bool:
+    return _has(listed=True)(probe) and bool(probe.keys() & {*tables.ALIASES["x1"].split()})
+
+
+def _is_results(probe: Probe) -> bool:
+    return probe.json == [] or _has("image_id", "bbox", listed=True)(probe)
+
+
+def _root(tag: str) -> Callable[[Probe], bool]:
+    return lambda probe: probe.root is not None and probe.root.tag == tag
+
+
+def _is_voc(probe: Probe) -> bool:
+    """Test for a file, or a folder of nothing else."""
+    folder = probe.is_dir and bool(probe.names)
+    return _root("annotation")(probe) or (folder and all(n.endswith(".xml") for n in probe.names))
+
+
+def _is_via(probe: Probe) -> bool:
+    """Test for a JSON object whose values have regions."""
+    data = probe.json
+    values = list(data.values())[:1] if isinstance(data, dict) else []
+    regions = any(isinstance(value, dict) and "regions" in value for value in values)
+    return regions or _has("_via_img_metadata")(probe)
+
+
+def _is_cvat(probe: Probe) -> bool:
+    return _root("annotations")(probe) or "annotations.xml" in probe.names
+
+
+def _keypoints(probe: Probe) -> bool | None:
+    with contextlib.suppress(ReobjError):
+        return label_folders.keypoints(probe.path)
+    return False
+
+
+def _is_labels(probe: Probe) -> bool:
+    return probe.is_dir and not _is_voc(probe)
+
+
+FROM_1 = "from 1; from 0 if there is a 0"
+NAMED = "by image name, else by the number in it"
+COCO, YOLO = "as COCO JSON", "as a folder of YOLO labels"
+
+DETECTIONS: Registry[Reader] = Registry("detections", "--detections-format", [
+    Format("mot", "MOTChallenge, CVAT's MOT 1.1, trackers: rows of 6 to 10 numbers",
+           tables.is_mot, tables.read_mot, FROM_1, "px", "column 9; x, y, z in ten columns"),
+    Format("boxmot", "boxmot: nine columns that end in 1, class from 0, score", tables.is_boxmot,
+           tables.read_boxmot, FROM_1, "px"),
+    Format("visdrone", "VisDrone: ten columns that end in class, truncation, occlusion",
+           tables.is_visdrone, tables.read_visdrone, FROM_1, "px", "truncation, occlusion"),
+    Format("kitti", "KITTI tracking: 17 or 18 columns", tables.is_kitti, tables.read_kitti,
+           "from 0", "px", "everything in 3D"),
+    Format("csv", "tables with a header: supervision's CSVSink, pandas, Boxer's 2D boxes, "
+           "Roboflow's CSV", lambda probe: tables.has_header(probe)
+           and not boxes_3d.is_boxes_3d(probe), tables.read_csv,
+           "from 0 (bb_left: from 1), image names, or times", "px", "other columns"),
+    Format("boxer-3d", "Boxer, WildDet3D: boxes in the world of --poses", boxes_3d.is_boxes_3d,
+           boxes_3d.read_source_3d, "by time", "world", "instance, sem_id"),
+    Format("records", "supervision's JSONSink: a JSON list of flat objects", _is_records,
+           tables.read_records, "from 0", "px", "other keys"),
+    Format("coco-results", "COCO results, ultralytics' predictions.json", _is_results,
+           coco.read_coco_results, f"{NAMED}, else image_id from 0", "px"),
+    Format("coco", "COCO, COCO-VID and TAO datasets, CVAT's and Roboflow's COCO",
+           _has("images", listed=False), coco.read_coco, f"frame_id from 0; else {NAMED}", "px",
+           "keypoints"),
+    Format("oa-slam", "OA-SLAM, VOOM", _has("file_name", "detections", listed=True),
+           coco.read_oa_slam, NAMED, "px"),
+    Format("yolo", "a folder of YOLO labels, boxes or polygons",
+           lambda probe: _is_labels(probe) and not _keypoints(probe),
+           label_folders.read_label_folder, f"{NAMED}; VIDEO_N.txt from 1", "fractions"),
+    Format("yolo-pose", "a folder of YOLO labels, boxes with keypoints",
+           lambda probe: _is_labels(probe) and _keypoints(probe) is not False,
+           label_folders.read_pose_folder, f"{NAMED}; VIDEO_N.txt from 1", "fractions",
+           "keypoints"),
+    Format("cvat", "CVAT for video 1.1 and for images 1.1, XML or zip", _is_cvat, cvat.read_cvat,
+           f"from 0; images {NAMED}", "px", "skeletons"),
+    Format("npz", "`rt.write_detections_npz`", lambda probe: probe.suffix == ".npz", _read_npz,
+           "from 0", "px"),
+    *(Format(name, title, recognise, None, advice=f"export it {advice}")
+      for name, title, recognise, advice in (
+        ("label-studio", "Label Studio's JSON", lambda probe: _has("data", listed=True)(probe)
+         and bool(probe.keys() & {"annotations", "predictions", "completions"}), COCO),
+        ("scalabel", "Scalabel's or BDD100K's JSON", lambda probe: _has("labels", "name")(probe)
+         or _has("frames", "config")(probe), COCO),
+        ("voc", "Pascal VOC's XML", _is_voc, YOLO),
+        ("detrac", "UA-DETRAC's XML", _root("sequence"), "as MOTChallenge rows"),
+        ("datumaro", "Datumaro's JSON", _has("items", "categories"), COCO),
+        ("labelme", "labelme's JSON", _has("shapes", "imagePath"), COCO),
+        ("via", "VGG Image Annotator's JSON", _is_via, COCO),
+        ("createml", "Create ML's JSON", _has("image", "annotations", listed=True), COCO),
+        ("supervisely", "Supervisely's JSON", _has("objects", "size"), COCO),
+        ("darwin", "V7's Darwin JSON", _has("item", "annotations"), COCO),
+        ("ultralytics", "ultralytics' `to_json`", _has("box", "confidence", listed=True),
+         "with save_txt=True"),
+        ("boxes-json", "a JSON list whose objects have a list bbox and no image_id",
+         lambda probe: _has("bbox", listed=True)(probe) and "image_id" not in probe.keys(),
+         "as CSV with the columns frame,x1,y1,x2,y2,score,class"),
+      )),
+])  # fmt: skip
