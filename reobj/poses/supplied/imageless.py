@@ -71,7 +71,7 @@ def open_video(
     if not path.exists():
         raise ReobjError(f"{path}: no such file of detections")
     size = image_size(path)
-    stated = stated_camera(poses.camera, size)
+    stated = stated_camera(poses.camera, size, poses.camera_format)
     size = size or (unknown if stated is None else (stated.width, stated.height))
     pose_file = read_pose_file(Path(poses.mode), poses.fmt, size)
     if size == unknown and (camera := next(filter(None, pose_file.cameras), None)) is not None:
