@@ -544,7 +544,12 @@ DAMAGED = [
         lambda p: edit(p, 1, drop_last),
         "2.txt, line 2: 3 words .*; expected 4 numbers",
     ),
-    (as_scannet, "pose/2.txt", lambda p: edit(p, 1, word(0, "x")), "2.txt, line 2: .*expected 4 numbers"),
+    (
+        as_scannet,
+        "pose/2.txt",
+        lambda p: edit(p, 1, word(0, "x")),
+        "2.txt, line 2: .*expected 4 numbers",
+    ),
     (as_scannet, "pose/2.txt", lambda p: text(p, mirror(np.loadtxt(p))), "2.txt: .*mirrored"),
     (as_scannet, COLOR, lambda p: p.unlink(), "--camera"),
     (as_scannet, COLOR, lambda p: edit(p, 0, word(2, "648")), "do not fit"),
@@ -604,7 +609,9 @@ def test_damaged_files_are_refused_in_one_clear_line(tmp_path, write, file, dama
 
 
 def test_a_folder_in_no_known_format_is_refused_with_the_formats(tmp_path):
-    with pytest.raises(rt.ReobjError, match="no known format of poses; expected one of colmap, tum"):
+    with pytest.raises(
+        rt.ReobjError, match="no known format of poses; expected one of colmap, tum"
+    ):
         read(tmp_path)
 
 

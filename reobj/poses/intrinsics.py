@@ -346,10 +346,9 @@ def camera_of_keys(data: dict[str, Any], size: Size) -> Camera | None:
             raise ReobjError(f"no {missing} of a {model} camera")
         camera = Camera(model, *_sized(size), tuple(map(float, values)))
     for plain, (key, value) in keys.items():
-        repeated = {0.0, *camera.params}
-        if re.fullmatch(CAMERA_LIKE, plain, re.IGNORECASE) and not repeated.issuperset(
-            _numbers(value)
-        ):
+        repeated = () if key[1:].isdecimal() else camera.params  # not those of k1, p1
+        lost = {*_numbers(value)} - {0.0, *repeated}
+        if lost and re.fullmatch(CAMERA_LIKE, plain, re.IGNORECASE):
             raise ReobjError(
                 f"{key!r} is not read; expected fx, fy, cx, cy or a matrix K, k1, k2, p1, p2, k3 "
                 "or a list dist_coeffs in OpenCV's order, width, height"
