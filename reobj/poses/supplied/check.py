@@ -52,7 +52,7 @@ def _axes_text(cv_from_file: Array) -> str:
     words = [WORDS[a][int(cv_from_file[a, k] < 0)] for k, a in enumerate(axis.tolist())]
     text = ", ".join(f"{name} {word}" for name, word in zip("xyz", words, strict=True))
     hand = "" if np.linalg.det(cv_from_file) > 0 else "left-handed "
-    return f"{hand}camera axes {text}" + f" ({KNOWN[text]})" * (text in KNOWN)
+    return f"{hand}camera axes {text}" + (f" ({KNOWN[text]})" if text in KNOWN else "")
 
 
 def conventions(given: Supplied) -> Iterator[tuple[str, Array]]:

@@ -40,6 +40,7 @@ class PoseFile:
         axes: (3, 3) OpenCV's camera axes from those of the file, as it was read.
         by_text: without names, poses are in the order of the images' names as text: 1, 10, 2.
         stored_pixels: cameras are those of images as they are stored, without their EXIF turn.
+        lost: number of poses that are missing.
         kind: name of the format. messages: what was assumed or left out.
     """
 
@@ -57,6 +58,7 @@ class PoseFile:
     axes: Array = field(default_factory=lambda: np.eye(3))
     by_text: bool = False
     stored_pixels: bool = False
+    lost: int = 0
     kind: str = ""
     messages: tuple[str, ...] = ()
 

@@ -103,6 +103,9 @@ def read_supplied(
     if not usable(intrinsics):
         raise ReobjError(f"{path}: {intrinsics}: expected finite numbers, focal lengths above 0")
     cam_from_world, lost = _of_frames(pose_file.cam_from_world, stamps_s, assignment, source, path)
+    if pose_file.lost:
+        lost = lost or f"{path}: a pose for each frame"
+        lost += f"; {pose_file.lost} poses of lost frames (the identity, zeros, not finite)"
     for f, turn in turns.items():
         cam_from_world[f, :2] = turn @ cam_from_world[f, :2]
     poses = Poses(
@@ -111,15 +114,17 @@ def read_supplied(
         metric=pose_file.metric or metric, up_in_world=pose_file.up_in_world,
         points=pose_file.points, colors=pose_file.colors,
         visibility=_in_frames(pose_file.visibility, row),
-        messages=(*pose_file.messages, *messages, *turn_messages, *lost),
+        messages=(*pose_file.messages, *messages, *turn_messages, *[lost] * bool(lost)),
         reading=f"{pose_file.kind}, frames by {assignment.rule}",
     )  # fmt: skip
-    orders = {}
-    if assignment.key in ("order", "text") and source.images:
-        for other in by_order(len(pose_file.cam_from_world), source, assignment.key == "order"):
-            orders[other.rule] = _of_frames(
-                pose_file.cam_from_world, None, other, source, path
-            )[0]  # fmt: skip
+    others = by_order(len(pose_file.cam_from_world), source, assignment.key == "order")
+    orders = {
+        f"the {one.rule} (--set poses.frames_by={one.key})": _of_frames(
+            pose_file.cam_from_world, None, one, source, path
+        )[0]
+        for one in others
+        if assignment.key in ("order", "text") and one.key != assignment.key
+    }
     return Supplied(poses, pose_file.axes, orders)
 
 
@@ -135,6 +140,8 @@ def _assignment(
         compared = _compared(pose_file, stamps_s, source)
         raise ReobjError(f"{path}: none of its {count} poses belongs to a frame ({compared})")
     if frames_by:
+        if not pose_file.names and stamps_s is None:
+            found += by_order(count, source, not pose_file.by_text)
         chosen = [one for one in found if one.key == frames_by]
         if not chosen:
             keys = ", ".join(one.key for one in found)
@@ -197,8 +204,12 @@ def _of_frames(
     assignment: FrameAssignment,
     source: SourceFrames,
     path: Path,
-) -> tuple[Array, list[str]]:
-    """Return the poses (F, 3, 4) of the frames by one assignment, and report frames without one."""
+) -> tuple[Array, str]:
+    """Return the poses (F, 3, 4) of the frames by one assignment; report frames without, if any.
+
+    Returns:
+        the poses, and which frames have none: "" or a text.
+    """
     row = assignment.row
     known = row >= 0
     poses = np.full((len(row), 3, 4), np.nan)
@@ -210,10 +221,10 @@ def _of_frames(
     if (np.abs(poses[known]) >= WORLD_MAX).any():
         raise ReobjError(f"{path}: a camera is more than {WORLD_MAX:g} units away from the origin")
     if known.all():
-        return poses, []
+        return poses, ""
     step = int(np.median(np.diff(source.frame))) if len(row) > 1 else 1
     lost = spans(source.frame[~known].tolist(), step)
-    return poses, [f"{path}: poses for {known.sum()} of {len(row)} frames, none for {lost}"]
+    return poses, f"{path}: poses for {known.sum()} of {len(row)} frames, none for {lost}"
 
 
 def _compared(pose_file: PoseFile, stamps_s: Array | None, source: SourceFrames) -> str:
@@ -271,14 +282,9 @@ def _without_lost(pose_file: PoseFile, path: Path) -> PoseFile:
         same[same.argmax()] = False
     cam_from_world = np.where(same[:, None, None], np.nan, cam_from_world)
     lost: BoolArray = ~np.all(np.isfinite(cam_from_world), axis=(1, 2))
-    text = (
-        f"{path}: {lost.sum()} of {len(lost)} poses are lost frames (the identity, zeros or not "
-        "finite) and left out"
-    )
     if lost.all():
-        raise ReobjError(f"{path}: no poses in it; all rows are lost frames")
-    messages = (*pose_file.messages, *[text] * bool(lost.any()))
-    return dataclasses.replace(pose_file, cam_from_world=cam_from_world, messages=messages)
+        raise ReobjError(f"{path}: no poses in it, or only those of lost frames")
+    return dataclasses.replace(pose_file, cam_from_world=cam_from_world, lost=int(lost.sum()))
 
 
 def _head(probe: Probe) -> tuple[str, list[str], str]:
