@@ -135,14 +135,13 @@ from reobj.options import (
 from reobj.poses.estimate import PosesConfig, estimate_poses
 from reobj.poses.intrinsics import parse_camera
 from reobj.poses.stage import (
+    checked_poses,
     poses_key,
     reconstruct_cached,
-    settled_poses,
     supplied_poses,
     write_supplied_model,
 )
 from reobj.poses.supplied.imageless import open_video
-from reobj.poses.supplied.interpretation import PoseReading
 from reobj.poses.supplied.readers import read_poses
 from reobj.results.changes import Change, Changes, read_changes
 from reobj.results.checkpoint import Checkpoint
@@ -165,7 +164,7 @@ from reobj.results.scene import write_pictures
 from reobj.results.serve import Server
 from reobj.results.stages import collect_tracks, detect_all, detections_key, keep_detections
 from reobj.results.workspace import Workspace
-from reobj.sources.boxes_3d import boxes_3d_of, has_boxes_3d, read_boxes_3d
+from reobj.sources.boxes_3d import boxes_3d_of
 from reobj.sources.detection_files import DetectConfig, read_detections, read_tracks
 from reobj.sources.detectors import (
     DetectionSource,
@@ -1405,13 +1404,13 @@ def run(
         log.debug("options that differ from the defaults: %s", changed_options(config))
         viewer = open_viewer(VideoInfo.of(video), opened) if show else None
         in_3d = in_3d and config.poses.mode != "none"
-        readings = _pose_readings(video, config.poses, detections) if in_3d else []
+        supplied = supplied_poses(video, config.poses) if in_3d else None
         if tracks:
             result = _given_tracks(tracks, video, config.detect, workspace.last_tracks)
             boxes = result.tracks
             class_names = result.class_names
         else:
-            cameras = readings[0].poses if readings else None
+            cameras = supplied.poses if supplied else None
             detected, boxes = _detect(job, detections, in_3d, cameras)
             class_names = tuple(detected.class_names)
             log.info("detections: %d, of %d classes", len(boxes), len(np.unique(boxes.class_id)))
@@ -1419,8 +1418,10 @@ def run(
         check_known_size(sizes.known_size, sizes.size_priors(), class_names)
         poses: Poses | None = None
         models: list[Path] = []
-        if readings:
-            poses = _supplied_cameras(job, readings, boxes if tracks else _tracklets(boxes))
+        if supplied:
+            with job.timed("poses"):
+                seen = boxes if tracks else _tracklets(boxes)
+                poses = checked_poses(supplied, seen, video, config.poses, workspace, job.progress)
         elif in_3d and not video.is_live:
             poses, models = _reconstructed_cameras(job, boxes, class_names)
         if poses is not None:
@@ -1629,27 +1630,6 @@ def _detect(
         return detect_all(source, job.video, job.workspace, job.progress)
 
 
-def _pose_readings(video: Video, config: PosesConfig, detections: Any) -> list[PoseReading]:
-    """List the interpretations of the user's poses.
-
-    With boxes in 3D: only the one in which most of them are visible.
-    """
-    readings = supplied_poses(video, config)
-    if not readings or not isinstance(detections, str | Path):
-        return readings
-    if not has_boxes_3d(path := Path(detections)):
-        return readings
-    return [readings[read_boxes_3d(path, video, [one.poses for one in readings])[1]]]
-
-
-def _supplied_cameras(job: _Job, readings: list[PoseReading], boxes: Tracks) -> Poses:
-    """Choose the interpretation of the user's poses that agrees with images and boxes."""
-    with job.timed("poses"):
-        return settled_poses(
-            readings, boxes, job.video, job.config.poses, job.workspace, job.progress
-        )
-
-
 def _reconstructed_cameras(
     job: _Job, boxes: Tracks, class_names: Sequence[str]
 ) -> tuple[Poses, list[Path]]:
@@ -1722,7 +1702,9 @@ def _given_tracks(
 def _place(job: _Job, room: OpenMap, poses: Poses, models: list[Path]) -> tuple[Placed, list[Path]]:
     """Place the cameras, and their COLMAP models, in the world of the map."""
     with job.timed("map"):
-        camera = parse_camera(job.config.poses.camera, job.video.size)
+        camera = parse_camera(
+            job.config.poses.camera, job.video.size, job.config.poses.camera_format
+        )
         options = PlacementOptions(size_px=job.config.poses.size_px)
         placed = place_recording(room, poses, job.video, options, job.progress, camera)
         return placed, _moved_models(job, models, poses, placed)
@@ -1913,8 +1895,8 @@ def _cmd_poses(args: argparse.Namespace) -> int:
     with Workspace(args.out, args.overwrite) as workspace:
         workspace.bind(video, args.overwrite)
         model = None
-        if readings := supplied_poses(video, config.poses):
-            poses = settled_poses(readings, Tracks.empty(), video, config.poses, workspace)
+        if supplied := supplied_poses(video, config.poses):
+            poses = checked_poses(supplied, Tracks.empty(), video, config.poses, workspace)
         else:
             poses, model = reconstruct_cached(video, config.poses, workspace)
         with replaced(workspace.out, (OutputFile.POSES, OutputFile.MODEL)) as new:

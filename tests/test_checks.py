@@ -7,12 +7,12 @@ import statistics
 import numpy as np
 import pytest
 from pose_worlds import FOCAL, PINHOLE, SIZE, FakeVideo, motion, supplied
+from reobj.poses.supplied.interpretation import PoseReading, by_images, by_tracks, check_poses
 from scipy.spatial.transform import Rotation
 
 import quadrics
 import reobj_track as rt
 from reobj.cameras import invert_rigid
-from reobj.poses.supplied.interpretation import PoseReading, by_images, by_tracks, check_poses
 
 
 def box_tracks(cams, noise_px, seed, objects=12):

@@ -157,7 +157,7 @@ def test_all_spellings_of_distortion_are_read(tmp_path, key, yaml):
 def test_distortion_that_is_not_read_is_refused(tmp_path, more, key):
     path = tmp_path / "camera.json"
     path.write_text(json.dumps(FX | more))
-    with pytest.raises(rt.ReobjError, match=f"the distortion '{key}' is not read"):
+    with pytest.raises(rt.ReobjError, match=f"'{key}' is not read"):
         parse_camera(str(path), SIZE)
     zeros = {k: np.zeros_like(v).tolist() if k == key else v for k, v in more.items()}
     path.write_text(json.dumps({**FX, **zeros, "distortion_model": "", "is_undistorted": 1}))
@@ -205,7 +205,7 @@ def test_a_camera_of_another_size_is_resized_and_of_another_shape_refused(tmp_pa
     "name, content, message",
     [
         ("a.json", "{", "line 1: not valid JSON"),
-        ("a.json", "[1, 2]", "not a camera file"),
+        ("a.json", "[1, 2]", "no known format of cameras"),
         ("a.json", "{}", "no focal length"),
         ("a.json", '{"w": 640, "h": 480}', "no focal length"),
         ("a.json", '{"fx": 500, "cx": 320}', "not a camera file"),
@@ -216,10 +216,10 @@ def test_a_camera_of_another_size_is_resized_and_of_another_shape_refused(tmp_pa
         ("a.json", '{"fx": 500, "model": "FOV"}', "no omega of a FOV camera"),
         ("a.json", '{"fx": 500, "model": "MAGIC"}', "no camera model MAGIC"),
         ("cameras.txt", "1 PINHOLE 640 480 500 510 320 240\n" * 2, "2 cameras; expected one"),
-        ("K.txt", "1 2\n3 4\n", "expected fx,fy"),
-        ("K.txt", "1 2 3\n3 4\n", "not a camera file"),
-        ("empty.txt", "", "0 numbers"),
-        ("picture.txt", bytes(range(256)), "cannot be read as text"),
+        ("K.txt", "1 2\n3 4\n", "no known format"),
+        ("K.txt", "1 2 3\n3 4\n5 6 7", "not a camera file"),
+        ("empty.txt", "", "no known format"),
+        ("picture.txt", bytes(range(256)), "no known format"),
     ],
 )
 def test_a_wrong_file_is_refused_in_one_line(tmp_path, name, content, message):

@@ -76,7 +76,8 @@ TRANSFORMS = json.dumps({
     "w": 640, "h": 480, "fl_x": 500, "fl_y": 500, "cx": 320, "cy": 240,
     "applied_transform": np.eye(4)[:3].tolist(),
     "frames": [
-        {"file_path": f"{f}.png", "transform_matrix": np.eye(4).tolist()} for f in range(20)
+        {"file_path": f"{f}.png", "transform_matrix": np.diag([1.0, -1, -1, 1]).tolist()}
+        for f in range(20)
     ],
 })  # fmt: skip
 PRIORS = json.dumps({

@@ -52,7 +52,7 @@ class PosesConfig:
     fmt: str = option(
         "auto",
         "format of supplied poses: auto, colmap, tum, transforms, scannet, record3d, arkit, "
-        "matrices, euroc, stray, arkitscenes, scannetpp, llff, splatting, rows",
+        "matrices, euroc, stray, arkitscenes, scannetpp, llff, splatting",
         "--pose-format",
     )
     frames_by: str = option(
@@ -65,6 +65,12 @@ class PosesConfig:
         "intrinsics, native pixels (COLMAP: centre + .5): fx,fy,cx,cy[,k1,k2,p1,p2[,k3]], "
         "MODEL WIDTH HEIGHT PARAMS, or a file (cameras.txt, K.txt, intrinsics.json, camera.yaml)",
         "--camera",
+    )
+    camera_format: str = option(
+        "auto",
+        "format of the file of --camera: auto, colmap, numbers, matrix, pincam, json, yaml, xml, "
+        "npz",
+        "--camera-format",
     )
     metric: bool = option(False, "supplied poses are in metres, whatever their format", "--metric")
     depth: str = option(
@@ -104,7 +110,7 @@ def estimate_poses(
     if getattr(video, "is_live", False):
         raise ReobjError("a live camera has no poses: record a video first, or use --poses none")
     size = (int(video.size[0]), int(video.size[1]))
-    camera = parse_camera(config.camera, size)
+    camera = parse_camera(config.camera, size, config.camera_format)
     resized = ResizedVideo(video, config.size_px)
     first_models = work_dir / "first"
     with mapping_child(work_dir) as child:
@@ -242,7 +248,9 @@ def _locate_all(
         line.close()
         size = (int(video.video.size[0]), int(video.video.size[1]))
         guess = (FOCAL_GUESS * max(size), size[0] / 2, size[1] / 2)
-        camera = parse_camera(config.camera, size) or Camera("SIMPLE_PINHOLE", *size, guess)
+        camera = parse_camera(config.camera, size, config.camera_format) or Camera(
+            "SIMPLE_PINHOLE", *size, guess
+        )
         return Poses(camera, frame, time_s, cam_from_world, status, "none"), []
     visibility = []
     by_model = list[Located]()

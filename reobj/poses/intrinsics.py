@@ -1,6 +1,6 @@
-"""Read intrinsics: the value of --camera, COLMAP's camera lines, JSON and YAML of many tools.
+"""Read intrinsics: the value of --camera, COLMAP's camera lines, JSON, YAML and XML of many tools.
 
-Start at `parse_camera`.
+Start at `parse_camera`; the formats of files are the registry CAMERAS.
 """
 
 from __future__ import annotations
@@ -8,28 +8,31 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Sequence
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from reobj.cameras import Camera, camera_parameters, checked_camera
-from reobj.files import load_json, read_text
+from reobj.files import load_json, load_npz, read_text
+from reobj.formats import AUTO, Format, Probe, Registry
 from reobj.types import COORDINATE_MAX, ReobjError
 
+Size = tuple[int, int] | None
 CAMERA_FORMS = (  # the numbers in OpenCV's order
     "fx,fy,cx,cy[,k1,k2,p1,p2[,k3[,k4,k5,k6]]]; MODEL WIDTH HEIGHT PARAMS of COLMAP; or a file"
 )
 
 
-def parse_camera(text: str, size: tuple[int, int]) -> Camera | None:
+def parse_camera(text: str, size: tuple[int, int], fmt: str = AUTO) -> Camera | None:
     """Parse the value of --camera: numbers, a camera line of COLMAP, or a file.
 
     Args:
         text: `fx,fy,cx,cy[,k1,k2,p1,p2[,k3[,k4,k5,k6]]]`, pixels; `[ID] MODEL WIDTH HEIGHT PARAMS`;
-            or a file with one of these (a cameras.txt of one camera), a 3x3 or 4x4 matrix K, JSON
-            (`camera_from_json`), YAML (`camera_from_yaml`), or ARKitScenes' .pincam.
+            or a file in a format of CAMERAS. fmt: the format, of a file.
         size: (w, h) of the frames, and of a camera without a size.
     Returns:
         the camera, resized to the frames if the aspect ratio is the same; None of an empty text.
@@ -39,14 +42,14 @@ def parse_camera(text: str, size: tuple[int, int]) -> Camera | None:
     >>> parse_camera("500,500,320,240", (640, 480)).model
     'PINHOLE'
     """
-    camera = stated_camera(text, size)
+    camera = stated_camera(text, size, fmt)
     return None if camera is None else fitted_camera(camera, size, f"--camera {text:.200}")
 
 
 CAMERA_MAX = 1 << 20  # characters of a file; chosen: a thousand times what a camera takes
 
 
-def stated_camera(text: str, size: tuple[int, int] | None) -> Camera | None:
+def stated_camera(text: str, size: Size, fmt: str = AUTO) -> Camera | None:
     """Parse as `parse_camera` does, but return the camera at its own size, unchecked.
 
     Args:
@@ -54,25 +57,22 @@ def stated_camera(text: str, size: tuple[int, int] | None) -> Camera | None:
     """
     if not text.strip():
         return None
+    where = f"--camera {text:.200}"
     is_file = os.path.isfile(text)  # does not raise for long texts
+    if is_file and os.path.getsize(text) > CAMERA_MAX:
+        raise ReobjError(f"{where}: more than {CAMERA_MAX} bytes, not a camera file")
     try:
-        content = read_text(Path(text), CAMERA_MAX) if is_file else text
-        if is_file and content.lstrip()[:1] in ("{", "["):
-            camera = camera_from_json(load_json(Path(text)), size)
-        elif is_file and (content.startswith("%YAML") or text.endswith((".yaml", ".yml"))):
-            camera = camera_from_yaml(read_yaml(Path(text)), size)
-        elif is_file and text.endswith(".pincam"):  # w h fx fy cx cy
-            width, height, *params = map(float, content.split())
-            camera = brown_camera((image_side(width), image_side(height)), *params)
+        if is_file:
+            camera = CAMERAS.reader(Path(text), fmt)(Path(text), size)
         else:
-            camera = _camera_from_text(content, size)
+            camera = _camera_of_rows(_rows(text), size)
         if camera is None:
             raise ReobjError(f"no focal length; expected {CAMERA_FORMS}")
     except ReobjError as error:
-        raise ReobjError(f"--camera {text:.200}: {error}") from None
-    except (ValueError, TypeError, KeyError, IndexError, AttributeError):
+        raise ReobjError(f"{where}: {str(error).removeprefix(f'{text}: ')}") from None
+    except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError):
         fault = "not a camera file" if is_file else "neither a file nor a camera"
-        raise ReobjError(f"--camera {text:.200}: {fault}; expected {CAMERA_FORMS}") from None
+        raise ReobjError(f"{where}: {fault}; expected {CAMERA_FORMS}") from None
     return camera
 
 
@@ -125,11 +125,20 @@ def camera_line(camera: Camera) -> str:
     return " ".join(map(str, (camera.model, camera.width, camera.height, *camera.params)))
 
 
-def _camera_from_text(text: str, size: tuple[int, int] | None) -> Camera:
-    """Read numbers, a matrix K, or a line of COLMAP's cameras.txt; `#` begins a comment."""
+def _rows(text: str) -> list[list[str]]:
+    """Split a text into lines of words; `#` begins a comment."""
     lines = [line.partition("#")[0].replace(",", " ").split() for line in text.splitlines()]
-    rows = [words for words in lines if words]
-    if any(word.isupper() and not _is_number(word) for words in rows for word in words[:2]):
+    return [words for words in lines if words]
+
+
+def _is_model_line(rows: list[list[str]]) -> bool:
+    """Test for a line of COLMAP's cameras.txt: [ID] MODEL WIDTH ..."""
+    return any(re.fullmatch("[A-Z][A-Z0-9_]{3,}", word) for row in rows[:1] for word in row[:2])
+
+
+def _camera_of_rows(rows: list[list[str]], size: Size) -> Camera:
+    """Read numbers, a matrix K, or a line of COLMAP's cameras.txt."""
+    if _is_model_line(rows):
         if len(rows) > 1:
             raise ReobjError(f"{len(rows)} cameras; expected one")
         return colmap_camera(rows[0][rows[0][0].isdigit() :])
@@ -140,14 +149,6 @@ def _camera_from_text(text: str, size: tuple[int, int] | None) -> Camera:
     if len(rows) != 1 or len(numbers) not in (*range(4, 10), 12):
         raise ReobjError(f"{len(numbers)} numbers; expected {CAMERA_FORMS}")
     return brown_camera(size, *numbers)
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def colmap_camera(words: Sequence[str]) -> Camera:
@@ -190,85 +191,14 @@ def brown_camera(
     return Camera(model, width, height, params)
 
 
-def _focal_and_centre(matrix: Any) -> tuple[float, float, float, float]:
-    """Return fx, fy, cx, cy of K: 3x3 or 4x4, nested or flat, row by row or column by column."""
+def _focal_and_centre(matrix: Any) -> tuple[float, ...]:
+    """Return fx, fy, cx, cy of these, or of K: 3x3 or 4x4, row by row or column by column."""
     flat = np.array(matrix, np.float64).ravel()
+    if flat.size == 4:  # Kalibr, EuRoC
+        return tuple(flat.tolist())
     K = flat.reshape(4, 4)[:3, :3] if flat.size == 16 else flat.reshape(3, 3)
     K = K.T if K[2, :2].any() else K  # Open3D, Record3D
     return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
-
-
-def camera_from_json(data: Any, size: tuple[int, int] | None) -> Camera | None:
-    """Make a camera from the keys of JSON files of various tools.
-
-    Args:
-        data: focal length `fx`, `fy` (`fl_x`, or `camera_angle_x` in radians) and centre `cx`,
-            `cy`, or a matrix `K`, `camera_matrix`, `intrinsic_matrix`; distortion by name (`k1`,
-            ...) or as a list in OpenCV's order (`_is_list`); `w`, `h` or `width`, `height`; `model`
-            or `camera_model`, with COLMAP's `params` or the names of its parameters. All of these
-            may be in an object `camera` or `intrinsics`.
-        size: (w, h) where the data have none.
-    Returns:
-        the camera at the size of the data; None without a focal length.
-    Raises:
-        ReobjError: distortion that is not read, an unknown lens model.
-    """
-    # names and keys, also below, of COLMAP, nerfstudio and instant-ngp, OpenCV and ROS, Open3D,
-    # Record3D, RealSense
-    fisheye = ("OPENCV_FISHEYE", "FISHEYE", "EQUIDISTANT", "KANNALA_BRANDT4")
-    brown = (
-        "", "NONE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV",
-        "PERSPECTIVE", "PLUMB_BOB", "RATIONAL_POLYNOMIAL", "RADTAN", "RADIAL-TANGENTIAL",
-        "RADIAL_TANGENTIAL",
-    )  # fmt: skip
-    data = data | next((data[k] for k in ("camera", "intrinsics") if _is_object(data.get(k))), {})
-    for key, value in tuple(data.items()):
-        if key.replace("_", "").lower() == "cameramatrix":  # Camera_Matrix, cameraMatrix
-            data["camera_matrix"] = value
-        elif _is_distortion(key) and _is_object(value) and "data" not in value:
-            data |= value  # {"k1": ...}
-    sides = (("w", "h"), ("width", "height"), ("image_width", "image_height"))
-    size = next(
-        ((image_side(data[w]), image_side(data[h])) for w, h in sides if w in data and h in data),
-        size,
-    )
-    model = str(data.get("model", data.get("camera_model", ""))).upper()
-    lens = str(data.get("distortion_model", "")).upper()  # of ROS and Kalibr
-    model = lens if model in ("", "PINHOLE") and lens else model
-    if size and model and "params" in data:
-        _check_read(data, camera_parameters(model))
-        return colmap_camera([model, *map(str, (*size, *data["params"]))])
-    pinhole = _pinhole_of_json(data, size)
-    if pinhole is None:
-        return None
-    if data.get("is_fisheye") or model in fisheye:
-        width, height = _sized(size)
-        return Camera("OPENCV_FISHEYE", width, height, (*pinhole, *_terms(data, "k1 k2 k3 k4")))
-    if model in brown:
-        return brown_camera(size, *pinhole, *_terms(data, "k1 k2 p1 p2 k3 k4 k5 k6"))
-    return _camera_of_names(model, data, pinhole, _sized(size))
-
-
-def camera_from_yaml(data: dict[str, Any], size: tuple[int, int] | None) -> Camera | None:
-    """Make a camera from YAML of OpenCV, ROS, Kalibr (`cam0`), EuRoC or ORB-SLAM (`Camera.fx`).
-
-    Args:
-        data: as `read_yaml` returns it. size: (w, h) where the data have none.
-    Returns:
-        the camera at the size of the data; None without a focal length.
-    Raises:
-        ReobjError: several cameras, or an unknown lens model.
-    """
-    kalibr = [name for name, entry in data.items() if _is_object(entry) and "intrinsics" in entry]
-    if len(kalibr) > 1:
-        raise ReobjError(f"cameras {', '.join(kalibr)}; expected one: leave the others out")
-    data = data[kalibr[0]] if kalibr else data
-    keys = {re.sub(r"^Camera1?\.", "", key): data[key] for key in data}
-    if len(keys.get("resolution", ())) == 2:
-        keys["width"], keys["height"] = keys.pop("resolution")
-    if isinstance(keys.get("intrinsics"), list):
-        keys |= dict(zip(("fx", "fy", "cx", "cy"), keys.pop("intrinsics"), strict=True))
-    return camera_from_json(keys, size)
 
 
 def image_side(value: Any) -> int:
@@ -279,146 +209,225 @@ def image_side(value: Any) -> int:
     return int(side)
 
 
-def _is_object(value: Any) -> bool:
-    return isinstance(value, dict)
-
-
-def _pinhole_of_json(
-    data: dict[str, Any], size: tuple[int, int] | None
-) -> tuple[float, float, float, float] | None:
-    """Return fx, fy, cx, cy from the keys or the matrix of an object; None without focal length."""
-    for key in ("camera_matrix", "K", "intrinsic_matrix", "intrinsics", "intrinsic"):
-        matrix = data[key].get("data") if _is_object(data.get(key)) else data.get(key)
-        if matrix is not None:
-            return _focal_and_centre(matrix)
-    middle = (0.5 * size[0], 0.5 * size[1]) if size else (math.nan, math.nan)
-    centres = (("cx", "cy"), ("ppx", "ppy"))
-    cx, cy = next(((data[x], data[y]) for x, y in centres if x in data), middle)
-    focals = (("fx", "fy"), ("fl_x", "fl_y"), ("f", "f"), ("focal", "focal"))
-    fx, fy = next(((data[x], data.get(y, data[x])) for x, y in focals if x in data), (None, None))
-    if fx is None and size and "camera_angle_x" in data:
-        angle = float(data["camera_angle_x"])
-        if not 0 < angle < math.pi:
-            raise ReobjError(f"camera_angle_x {angle:g}, expected radians between 0 and pi")
-        fx = fy = 0.5 * size[0] / math.tan(0.5 * angle)
-    return None if fx is None or fy is None else (float(fx), float(fy), float(cx), float(cy))
-
-
-def _terms(data: dict[str, Any], order: str) -> list[float]:
-    """Return the distortion in the order of its names, words; 0 where it is not given."""
-    names = order.split()
-    key = next((key for key, value in data.items() if _is_list(key) and _numbers(value)), "")
-    _check_read(data, (*names, key))
-    values = _numbers(data.get(key))
-    if len(values) > len(names) and any(values[len(names) :]):
-        raise ReobjError(f"{len(values)} distortion coefficients; expected {','.join(names)}")
-    listed = dict(zip(names, values, strict=False)) or {"k1": data.get("k", 0.0)}
-    return [float(data.get(name, listed.get(name, 0.0))) for name in names]
-
-
-def _is_list(key: str) -> bool:
-    """Test for a list of distortion coefficients: dist_coeffs, distCoeff, distortion, D, ..."""
-    form = r"dist(ortion)?(coef|coeffs?|coefs|coefficients?)?|coeffs?|kc"  # kc: Bouguet's toolbox
-    word = re.sub(r"[_\W]", "", key).lower()
-    return key == "D" or re.fullmatch(form, word) is not None
-
-
-def _is_distortion(key: str) -> bool:
-    """Test whether a key looks like distortion; `undistorted` does not."""
-    named = re.search(r"(?<!un)distort", key, re.IGNORECASE) is not None
-    return named or _is_list(key) or re.fullmatch(r"[kps]\d", key, re.IGNORECASE) is not None
-
-
-def _numbers(value: Any) -> list[float]:
-    """Return the numbers in a value, nested or under `data`; [] of anything else."""
-    values = np.ravel(value.get("data", []) if _is_object(value) else value)
-    return values.astype(np.float64).tolist() if values.dtype.kind in "iuf" else []
-
-
-def _check_read(data: dict[str, Any], read: Sequence[str]) -> None:
-    """Refuse distortion under keys other than those that are read, unless it is 0 or repeated."""
-    known = [_numbers(data.get(key)) for key in read if _is_list(key)]
-    for key, value in data.items():
-        if key in read or not _is_distortion(key):
-            continue
-        found = _numbers(value)
-        if any(found) and found not in known:
-            expected = ", ".join(filter(None, read))
-            raise ReobjError(f"the distortion {key!r} is not read; expected {expected}, or a list "
-                             "distortion_coefficients in OpenCV's order")  # fmt: skip
-
-
-def _camera_of_names(
-    model: str, data: dict[str, Any], pinhole: Sequence[float], size: tuple[int, int]
-) -> Camera:
-    """Make a camera of another of COLMAP's models from parameters with its names."""
-    values = data | dict(zip(("fx", "fy", "cx", "cy"), pinhole, strict=True)) | {"f": pinhole[0]}
-    names = camera_parameters(model)
-    _check_read(data, names)
-    missing = [name for name in names if name not in values]
-    if missing:
-        raise ReobjError(f"no {', '.join(missing)} of a {model} camera")
-    return Camera(model, *size, tuple(float(values[name]) for name in names))
-
-
-def _sized(size: tuple[int, int] | None) -> tuple[int, int]:
+def _sized(size: Size) -> tuple[int, int]:
     if size is None:
         raise ReobjError("no image size; expected MODEL WIDTH HEIGHT PARAMS, or JSON with w and h")
     return size
 
 
-# ---- YAML ----------------------------------------------------------------------------------------
+# ---- Keys of JSON, YAML, XML and npz -------------------------------------------------------------
+
+FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "EQUIDISTANT", "KANNALA_BRANDT4", "KANNALABRANDT8")
+BROWN = (
+    "", "NONE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV",
+    "PERSPECTIVE", "PLUMB_BOB", "RATIONAL_POLYNOMIAL", "RADTAN", "RADIAL-TANGENTIAL",
+    "RADIAL_TANGENTIAL",
+)  # fmt: skip
+DISTORTION = r"dist(ortion)?(coef|coeffs?|coefs|coefficients?)?|coeffs?|kc"  # kc: Bouguet's toolbox
+SIDES = ("resolution", "camerares", "imagesize", "imgsize", "imageresolution")
+# Keys that change the camera; not the matrices of rectified images in ROS's files
+CAMERA_LIKE = (
+    r".*((?<!un)distort|focal|intrinsic|cam(era)?ma?t(ri)?x|principal|mirrorparam).*|[kps]\d|"
+    rf"[fc][xyuv]|[muv][0uv]|xi|skew|fov[xy]?|mtx|k|f|d|{DISTORTION}|{'|'.join(SIDES)}"
+)
+
+
+def _plain(key: str) -> str:
+    """Return a key without a prefix of ORB-SLAM; if long, in small letters and digits alone."""
+    key = re.sub(r"^Camera1?\.", "", str(key).replace("Camera.type", "model"))
+    plain = re.sub(r"[^a-z0-9]", "", key.lower())
+    return plain if len(plain) > 2 else key
+
+
+def _flat(data: dict[str, Any]) -> dict[str, tuple[str, Any]]:
+    """Return keys as they are written, and values, by `_plain`; also those of nested cameras."""
+    keys: dict[str, tuple[str, Any]] = {}
+    for key, value in data.items():
+        is_group = isinstance(value, dict) and "data" not in value
+        if is_group and re.fullmatch(f"camera|.*parameters|{CAMERA_LIKE}", _plain(key)):
+            keys |= _flat(value)
+        else:
+            keys[_plain(key)] = str(key), value
+    return keys
+
+
+def _take(keys: dict[str, tuple[str, Any]], *names: str) -> Any:
+    """Remove the first of the names that is a key; return its value, or None."""
+    return next((keys.pop(name)[1] for name in names if name in keys), None)
+
+
+def _numbers(value: Any) -> list[float]:
+    """Return the numbers in a value, nested or under `data`; [] of anything else."""
+    value = value.get("data") if isinstance(value, dict) else value
+    try:
+        return [] if value is None else np.array(value, np.float64).ravel().tolist()
+    except (TypeError, ValueError):
+        return []
+
+
+def _terms(keys: dict[str, tuple[str, Any]], *names: str) -> list[float]:
+    """Take the distortion in the order of its names: by name, or from a list; else 0."""
+    found = [key for key in keys if key == "D" or re.fullmatch(DISTORTION, key)]
+    values = _numbers(_take(keys, *found))
+    if any(values[len(names) :]):
+        raise ReobjError(f"{len(values)} distortion coefficients; expected {','.join(names)}")
+    listed = [*values, *[0.0] * len(names)]
+    pairs = zip(names, listed, strict=False)
+    return [float(keys.pop(name)[1]) if name in keys else value for name, value in pairs]
+
+
+def _pinhole(keys: dict[str, tuple[str, Any]], size: Size) -> tuple[float, ...] | None:
+    """Take fx, fy, cx, cy, or a matrix; None without a focal length."""
+    matrix = _take(keys, "cameramatrix", "K", "intrinsicmatrix", "mtx", "intrinsics", "intrinsic")
+    if matrix is not None:
+        return _focal_and_centre(_numbers(matrix))
+    fx = _take(keys, "fx", "flx", "f", "focal")
+    fy = _take(keys, "fy", "fly")
+    centre = [_take(keys, "cx", "ppx"), _take(keys, "cy", "ppy")]
+    angle = _take(keys, "cameraanglex")
+    if fx is None and angle is not None and size:
+        if not 0 < float(angle) < math.pi:
+            raise ReobjError(f"camera_angle_x {angle}, expected radians between 0 and pi")
+        fx = 0.5 * size[0] / math.tan(0.5 * float(angle))
+    if fx is None:
+        return None
+    if centre == [None, None]:
+        centre = [0.5 * side for side in _sized(size)]
+    return tuple(map(float, (fx, fx if fy is None else fy, *centre)))
+
+
+def camera_of_keys(data: dict[str, Any], size: Size) -> Camera | None:
+    """Make a camera from the keys of JSON, YAML, XML or npz of various tools.
+
+    Args:
+        data: focal length `fx`, `fy` (`fl_x`, or `camera_angle_x` in radians) and centre `cx`,
+            `cy`, or a matrix (`K`, `camera_matrix`, `mtx`, ...); distortion by name (`k1`, ...) or
+            as a list in OpenCV's order (DISTORTION); `w`, `h` or `width`, `height`; `model`
+            or `camera_model`, with COLMAP's `params` or the names of its parameters. All of these
+            may be in an object `camera`, `intrinsics`, ...
+        size: (w, h) where the data have none.
+    Returns:
+        the camera at the size of the data; None without a focal length.
+    Raises:
+        ReobjError: several cameras, an unknown lens model, or a key that looks like a camera's and
+            is not read.
+    """
+    rigs = [name for name, v in data.items() if isinstance(v, dict) and "intrinsics" in v]
+    if len(rigs) > 1:  # Kalibr
+        raise ReobjError(f"cameras {', '.join(rigs)}; expected one: leave the others out")
+    keys = _flat(data[rigs[0]] if rigs else data)
+    sides = _take(keys, *SIDES) or [
+        _take(keys, letter, word, f"image{word}", f"img{word}")
+        for letter, word in (("w", "width"), ("h", "height"))
+    ]
+    size = size if None in sides else (image_side(sides[0]), image_side(sides[1]))
+    model = str(_take(keys, "cameramodel", "model", "modeltype") or "").upper()
+    lens = str(_take(keys, "distortionmodel") or "").upper()  # of ROS and Kalibr
+    model = lens if model in ("", "PINHOLE") and lens else model
+    params = _take(keys, "params")
+    if model and params is not None:
+        camera = colmap_camera([model, *map(str, (*_sized(size), *params))])
+    elif (pinhole := _pinhole(keys, size)) is None:
+        return None
+    elif str(_take(keys, "isfisheye")).lower() in ("true", "1") or model in FISHEYE:
+        terms = _terms(keys, "k1", "k2", "k3", "k4")
+        camera = Camera("OPENCV_FISHEYE", *_sized(size), (*pinhole, *terms))
+    elif model in BROWN:
+        first = _take(keys, "k")  # of SIMPLE_RADIAL
+        keys |= {} if first is None else {"k1": ("k", first)}
+        terms = _terms(keys, "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+        camera = brown_camera(size, *pinhole, *terms)
+    else:
+        known = dict(zip(("fx", "fy", "cx", "cy", "f"), (*pinhole, pinhole[0]), strict=True))
+        names = camera_parameters(model)
+        values = [known[name] if name in known else _take(keys, name) for name in names]
+        if None in values:
+            missing = names[values.index(None)]
+            raise ReobjError(f"no {missing} of a {model} camera")
+        camera = Camera(model, *_sized(size), tuple(map(float, values)))
+    for plain, (key, value) in keys.items():
+        repeated = () if key[1:].isdecimal() else camera.params  # not those of k1, p1
+        lost = {*_numbers(value)} - {0.0, *repeated}
+        if lost and re.fullmatch(CAMERA_LIKE, plain, re.IGNORECASE):
+            raise ReobjError(
+                f"{key!r} is not read; expected fx, fy, cx, cy or a matrix K, k1, k2, p1, p2, k3 "
+                "or a list dist_coeffs in OpenCV's order, width, height"
+            )
+    return camera
+
+
+class _Loader(yaml.BaseLoader):  # type: ignore[misc]
+    """All scalars are text (1e-3 is none of YAML 1.1's numbers); tags are ignored; no aliases."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            raise ReobjError("a YAML alias; expected plain keys and numbers")  # may repeat forever
+        return super().compose_node(parent, index)
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Read the subset of YAML in camera files: nested mappings of words, numbers and lists.
-
-    Enough for OpenCV's FileStorage, ROS's camera_info, Kalibr's camchain, EuRoC's sensor.yaml.
-    Indentation nests; `[1, 2]` may span lines; lines `- 1` and `- [1, 2]` are lists. Tags, comments
-    and document marks are skipped.
-
-    Raises:
-        ReobjError: no form matches a line.
-    """
-    text = re.sub(r"(^|\s)#.*", r"\1", read_text(path, CAMERA_MAX), flags=re.MULTILINE)
-    text = re.sub(r"\[[^\[\]]*\]", lambda m: " ".join(m[0].split()), text)  # lists to one line
-    root: dict[str, Any] = {}
-    stack: list[tuple[int, Any]] = [(-1, root)]  # indentation and content of open mappings
-    key = ""
-    key_indent = -1
-    for line in text.splitlines():
-        if not line.strip() or line.startswith(("%", "---", "...")):
-            continue
-        indent = len(line) - len(line.lstrip())
-        word = line.strip()
-        is_item = word.startswith("- ")
-        while not is_item and stack[-1][0] >= indent and len(stack) > 1:
-            stack.pop()
-        parent = stack[-1][1]
-        if is_item:
-            rows = parent.get(key) if isinstance(parent.get(key), list) else []
-            parent[key] = [*rows, _value(word[2:])]
-            continue
-        if key and indent > key_indent and parent.get(key, "") is None:
-            parent[key] = {}
-            stack.append((key_indent, parent[key]))
-            parent = parent[key]
-        name, colon, value = word.partition(":")
-        if not colon:
-            raise ReobjError(f"{path}: cannot parse {word[:60]!r}; expected `key: value`")
-        key = name.strip(" \"'")
-        key_indent = indent
-        value = re.sub(r"^!\S+", "", value.strip()).strip()
-        parent[key] = _value(value) if value else None
-    return root
-
-
-def _value(text: str) -> Any:
-    """Convert a word, a number or a list of them."""
-    text = text.strip()
-    if text.startswith("["):
-        return [_value(part) for part in text.strip("[]").split(",") if part.strip()]
+    """Read YAML, also OpenCV's with `%YAML:1.0` and `!!opencv-matrix`; all scalars are text."""
+    text = re.sub(r"\A\s*%YAML.*", "", read_text(path, CAMERA_MAX))
     try:
-        return float(text)
-    except ValueError:
-        return text.strip("\"'")
+        data = yaml.load(text, _Loader)
+    except yaml.YAMLError as error:
+        raise ReobjError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from None
+    if not isinstance(data, dict):
+        raise ReobjError(f"{path}: expected `key: value`")
+    return data
+
+
+def _of_xml(element: ElementTree.Element) -> Any:
+    """Return a dict of the children of an element of OpenCV's FileStorage, or its words."""
+    words = (element.text or "").split()
+    return {e.tag: _of_xml(e) for e in element} or (words if len(words) != 1 else words[0])
+
+
+# ---- Formats of files ----------------------------------------------------------------------------
+
+ReadCamera = Callable[[Path, Size], Camera | None]
+
+
+def _text_rows(probe: Probe) -> list[list[str]]:
+    """Return the words of the lines of a text file that is no YAML, JSON or XML."""
+    marked = probe.suffix in (".pincam", ".yaml", ".yml") or not probe.lines
+    return [] if marked or probe.lines[0][0] in "[{<%" else _rows("\n".join(probe.lines))
+
+
+def _read_rows(path: Path, size: Size) -> Camera:
+    return _camera_of_rows(_rows(read_text(path, CAMERA_MAX)), size)
+
+
+def _read_pincam(path: Path, size: Size) -> Camera:
+    width, height, *params = map(float, read_text(path, CAMERA_MAX).split())
+    return brown_camera((image_side(width), image_side(height)), *params)
+
+
+def _keys_of(read: Callable[[Path], dict[str, Any]]) -> ReadCamera:
+    return lambda path, size: camera_of_keys(read(path), size)
+
+
+FRAME_PX, OWN_PX, UNREAD = "px of the frames", "px of the size in it", "rectified images"
+CAMERAS: Registry[ReadCamera] = Registry("cameras", "--camera-format", [
+    Format("colmap", "COLMAP: `cameras.txt` with one camera, `[ID] MODEL WIDTH HEIGHT PARAMS`, of "
+           "any model with a focal length", lambda p: _is_model_line(_text_rows(p)), _read_rows,
+           units=OWN_PX),
+    Format("numbers", "one line `fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]]`, OpenCV's order",
+           lambda p: len(rows := _text_rows(p)) == 1 and not _is_model_line(rows), _read_rows,
+           units=FRAME_PX),
+    Format("matrix", "K.txt, ScanNet: matrix K, 3x3 or 4x4",
+           lambda p: len(rows := _text_rows(p)) in (3, 4) and len(rows[0]) == len(rows), _read_rows,
+           units=FRAME_PX),
+    Format("pincam", "ARKitScenes: `w h fx fy cx cy`", lambda p: p.suffix == ".pincam",
+           _read_pincam, units=OWN_PX),
+    Format("json", "COLMAP, nerfstudio, instant-ngp, OpenCV, Open3D, Record3D, RealSense",
+           lambda p: p.suffix not in (".yaml", ".yml") and isinstance(p.json, dict),
+           _keys_of(load_json), units=OWN_PX),
+    Format("yaml", "OpenCV, ROS, Kalibr (one camera), EuRoC, ORB-SLAM, VINS, PyYAML",
+           lambda p: p.suffix in (".yaml", ".yml") or "".join(p.lines[:1]).startswith("%YAML"),
+           _keys_of(read_yaml), units=OWN_PX, unread=UNREAD),
+    Format("xml", "OpenCV: FileStorage", lambda p: getattr(p.root, "tag", "") == "opencv_storage",
+           _keys_of(lambda path: _of_xml(ElementTree.fromstring(read_text(path)))), units=OWN_PX),
+    Format("npz", "OpenCV: arrays `mtx`, `dist`, or as in JSON", lambda p: p.suffix == ".npz",
+           _keys_of(lambda path: load_npz(path)[0]), units=OWN_PX),
+])  # fmt: skip

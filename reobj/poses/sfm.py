@@ -34,6 +34,7 @@ from reobj.poses.child_job import (
 from reobj.poses.features import (
     MIN_MATCHES,
     UNORDERED,
+    MatchedPairs,
     choose_pairs,
     choose_posed_pairs,
     extract_features,
@@ -45,6 +46,7 @@ from reobj.poses.features import (
 from reobj.poses.keyframes import choose_posed_keyframes, path_steps, sharpest_images
 from reobj.poses.mapping import Focal, MapperSearch, estimate_focal, without_poses
 from reobj.poses.redundancy import find_repeated, register
+from reobj.poses.supplied.check import EXPLAINED
 from reobj.poses.verification import FocalSource
 from reobj.poses.windows import map_keyframes
 from reobj.types import Array, IntArray
@@ -194,6 +196,7 @@ def triangulate(
     seed: int,
     work_dir: Path,
     progress: Callable[[str, int], Progress] = Progress,
+    check: Callable[[IntArray, IntArray, Array], float] = lambda *_: np.nan,
 ) -> Poses:
     """Triangulate sparse points of the images from known poses.
 
@@ -203,6 +206,7 @@ def triangulate(
     Args:
         video: a `Video`, iterated once. size_px: longer side to which its images are shrunk.
         work_dir: receives `points.log`, and scratch files while it works.
+        check: refuses poses that contradict the matches, as `check_matches` does.
     Returns:
         the poses with points, colours and visibility (of keyframes). Where there is nothing to
         triangulate, or the poses do not explain the images, the unchanged poses with a message.
@@ -233,6 +237,7 @@ def triangulate(
         return _without_points(poses, f"the triangulation {problem}")
     arrays, facts = load_npz(folder / "points.npz")
     shutil.rmtree(folder)
+    explained = check(np.array(rows), arrays.pop("match_rows"), arrays.pop("match_rays"))
     image, point = arrays["visibility"].T
     views = np.bincount(point)[point]  # (M,) of the observed point
     # rays of two views often intersect by chance, as with sideways motion in another order
@@ -241,11 +246,13 @@ def triangulate(
     if not matched:
         return _without_points(poses, f"no features of {len(rows)} images could be matched")
     if not triangulated or triangulated < MIN_TRIANGULATED * matched:
+        cause = "are the poses of this video, in this order, with this camera?"
+        if explained > EXPLAINED:
+            cause = "the poses agree with the matches: too few views, or too little parallax"
         return _without_points(
             poses,
             f"with the supplied poses only {triangulated} of {matched} matched features of "
-            f"{len(rows)} images triangulate (correct poses: half of them); are the poses of this "
-            "video, in this order, with this camera?",
+            f"{len(rows)} images triangulate (usual: half of them); {cause}",
         )
     arrays["visibility"] = np.column_stack([np.array(rows)[image], point])
     messages = (*poses.messages, *_inconsistent(arrays.pop("ties"), poses.frame[rows]))
@@ -397,8 +404,21 @@ def _triangulate_job(folder: Path, job: dict[str, Any], images: ImageFile) -> No
         "colors": np.array(colors, np.uint8).reshape(-1, 3),
         "visibility": np.array(visibility, np.int64).reshape(-1, 2),
         "ties": _count_ties(database, model, len(images)),
+        **_matched_rays(read_pairs(database), camera),
     }
     save_npz(folder / "points.npz", arrays, matched=_count_matched(database))
+
+
+def _matched_rays(pairs: MatchedPairs, camera: Any) -> dict[str, Any]:
+    """Return the keyframes (M, 2) of all verified matches, and their rays (M, 2, 2), z = 1."""
+    rays = {i: np.asarray(camera.cam_ray_from_img(xy)) for i, xy in pairs.keypoints.items()}
+    both = zip(pairs.image_ids.tolist(), pairs.inliers, strict=True)
+    found = [np.stack([rays[i][rows[:, 0]], rays[j][rows[:, 1]]], 1) for (i, j), rows in both]
+    matched = np.concatenate([np.empty((0, 2, 3)), *found])  # (M, 2, 3)
+    return {
+        "match_rows": np.repeat(pairs.image_ids - 1, pairs.matches, 0),
+        "match_rays": matched[..., :2] / matched[..., 2:],
+    }
 
 
 def _posed_model(camera: Any, job: dict[str, Any], folder: Path) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import shutil
 from collections.abc import Callable
@@ -16,11 +17,11 @@ from reobj.files import Progress, load_cached, load_npz, part_path
 from reobj.poses.estimate import PosesConfig, estimate_poses
 from reobj.poses.intrinsics import camera_line, parse_camera
 from reobj.poses.sfm import triangulate
+from reobj.poses.supplied.check import Supplied, check_boxes, check_matches, without_frozen
 from reobj.poses.supplied.depth import add_depth
-from reobj.poses.supplied.interpretation import PoseReading, by_images, by_tracks, check_poses
-from reobj.poses.supplied.readers import pose_readings, the_reading
+from reobj.poses.supplied.readers import read_supplied
 from reobj.sources.video import Video, source_fingerprint
-from reobj.types import ReobjError, Tracks, rows_by
+from reobj.types import ReobjError, Tracks
 
 MakeProgress = Callable[[str, int], Progress]  # name and total of a step -> its progress line
 
@@ -34,42 +35,41 @@ class StageCache(Protocol):
         """Return the file for a stage's result under a key: its inputs and options."""
 
 
-def supplied_poses(video: Video, config: PosesConfig) -> list[PoseReading]:
-    """Read poses supplied by the user; all readings that file and images leave open.
-
-    Returns:
-        [] if there are none: poses are reconstructed, or not wanted.
-    """
+def supplied_poses(video: Video, config: PosesConfig) -> Supplied | None:
+    """Read poses supplied by the user; None: poses are reconstructed, or not wanted."""
     if config.mode in ("auto", "none"):
         if config.metric:
             raise ReobjError(
                 "--metric applies to supplied poses only; a reconstruction has unknown scale"
             )
-        return []
-    readings = pose_readings(
-        config.mode, video, config.fmt, config.camera, config.metric, config.frames_by
-    )
-    return by_images(readings, video)
+        return None
+    return read_supplied(
+        config.mode, video, config.fmt, config.camera, config.metric, config.frames_by,
+        config.camera_format,
+    )  # fmt: skip
 
 
-def settled_poses(
-    readings: list[PoseReading],
+def checked_poses(
+    supplied: Supplied,
     tracks: Tracks,
     video: Video,
     config: PosesConfig,
     workspace: StageCache,
     progress: MakeProgress = Progress,
 ) -> Poses:
-    """Choose between readings of supplied poses by tracks, check them, and add points.
+    """Check supplied poses against images or, without matches in them, tracks; add points.
 
     Args:
         tracks: of the video's detections; may be empty.
     Raises:
-        ReobjError: the tracks do not decide, or contradict the poses' direction or axes.
+        ReobjError: images or tracks contradict the poses.
     """
-    poses = the_reading(by_tracks(readings, tracks), Path(config.mode))
-    check_directions(poses, tracks)
-    return with_points(poses, video, config, workspace, progress)
+    poses = without_frozen(supplied.poses, tracks)
+    supplied = dataclasses.replace(supplied, poses=poses)
+    found = with_points(poses, video, config, workspace, progress, supplied)
+    if len(poses.visibility) or config.depth or not len(found.visibility):  # not by images
+        check_boxes(supplied, tracks)
+    return found
 
 
 def with_points(
@@ -78,8 +78,13 @@ def with_points(
     config: PosesConfig,
     workspace: StageCache,
     progress: MakeProgress = Progress,
+    supplied: Supplied | None = None,
 ) -> Poses:
-    """Add points to poses: triangulated where they have none, from depth maps, or cached."""
+    """Add points to poses: triangulated where they have none, from depth maps, or cached.
+
+    Args:
+        supplied: the poses are from a file, and checked against the images.
+    """
     if (
         not video.has_images
         or not poses.known.any()
@@ -89,6 +94,7 @@ def with_points(
     path = _points_path(poses, video, config, workspace)
     if (cached := load_cached(path, load_poses)) is not None:
         return cached
+    check = {"check": functools.partial(check_matches, supplied)} if supplied else {}
     depth_first = bool(config.depth) and poses.metric  # else the scale is estimated from points
     if depth_first:
         poses = add_depth(poses, config.depth, video)
@@ -100,6 +106,7 @@ def with_points(
             seed=config.seed,
             work_dir=workspace.cache / "sfm",
             progress=progress,
+            **check,
         )
     if config.depth and not depth_first:
         poses = add_depth(poses, config.depth, video)
@@ -115,18 +122,6 @@ def _points_path(poses: Poses, video: Video, config: PosesConfig, workspace: Sta
     digest = hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()
     key = (poses.camera, poses.metric, poses.messages, config, maps, digest)
     return workspace.path("points", video.fingerprint, video.config, *key)
-
-
-def check_directions(poses: Poses, tracks: Tracks) -> None:
-    """Refuse supplied poses whose direction or axes contradict the tracks.
-
-    Raises:
-        ReobjError: names the likely mistake.
-    """
-    centers = (tracks.xyxy[:, :2] + tracks.xyxy[:, 2:]) / 2
-    views = [(tracks.frame[rows], centers[rows]) for rows in rows_by(tracks.tracklet_id)]
-    if fault := check_poses(poses, views):
-        raise ReobjError(fault)
 
 
 def reconstruct_cached(
@@ -153,7 +148,9 @@ def reconstruct_cached(
     if moving is not None and len(moving):
         boxes = np.column_stack([moving.frame, moving.xyxy])
     digest = hashlib.sha256(boxes.round(1).tobytes()).hexdigest()
-    if camera := parse_camera(config.camera, video.size):  # a file's content, not its name
+    if camera := parse_camera(
+        config.camera, video.size, config.camera_format
+    ):  # a file's content, not its name
         config = dataclasses.replace(config, camera=camera_line(camera))
     without_depth = dataclasses.replace(config, depth="")
     path = workspace.path("poses", video.fingerprint, video.config, without_depth, digest)

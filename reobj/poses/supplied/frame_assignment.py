@@ -1,7 +1,6 @@
 """Assign the poses of a file to the frames of a video: by name, number, time stamp or order.
 
-Where a file is ambiguous, all assignments that it allows are returned; images or tracks decide
-between them (`interpretation`), or the user.
+Where a file is ambiguous, all assignments that it allows are returned; the user chooses.
 """
 
 from __future__ import annotations
@@ -70,6 +69,7 @@ def assignments(
     source: SourceFrames,
     where: str,
     is_ours: bool = False,
+    by_text: bool = False,
 ) -> list[FrameAssignment]:
     """List the assignments of `count` poses that the file and the source allow.
 
@@ -78,9 +78,9 @@ def assignments(
     Args:
         names, stamps_s: of the poses, or () and None. where: the file, for errors.
         is_ours: this tool wrote the stamps, for the same source.
+        by_text: the order of rows is that of the images' names as text.
     Returns:
-        assignments that differ for the frames that are read, the likeliest first; [] if no pose
-        belongs to a frame.
+        assignments that differ for the frames that are read; [] if no pose belongs to a frame.
     Raises:
         ReobjError: a key is not unique, or the number of rows is not that of the frames.
     """
@@ -89,7 +89,7 @@ def assignments(
     elif stamps_s is not None:
         found = _by_stamps(stamps_s, source, is_ours)
     else:
-        found = _by_order(count, source, where)
+        found = by_order(count, source, by_text) or _by_counts(count, source, where)
     some_fit = any(a.key != "time" and not a.outside for a in found)
     kept: list[FrameAssignment] = []
     for candidate in found:
@@ -155,12 +155,6 @@ def _by_image_numbers(
     for key, rule, offset in rules:
         frame = np.array([frame_of.get(n + offset, -1) for n in number.tolist()], np.int64)
         found.append(_assignment(key, rule, np.where(known, frame, -1), source))
-    if found[0].outside and not np.isin(images, number[known]).all():  # both have unmatched numbers
-        for first in (0, 1):
-            rule = f"{noun} as positions in the order of the images, counted from {first}"
-            found.append(
-                _assignment(f"place{first}", rule, np.where(known, number - first, -1), source)
-            )
     if known.all() and len(number) == len(images):
         order = np.argsort(np.argsort(number))
         found.append(_assignment("order", f"order of the {noun}", order, source))
@@ -364,23 +358,36 @@ def interpolated(
 # ---- Order ---------------------------------------------------------------------------------------
 
 
-def _by_order(count: int, source: SourceFrames, where: str) -> list[FrameAssignment]:
-    """Assign `count` rows without names or times: one a frame, or by the numbers of the images."""
+def by_order(count: int, source: SourceFrames, by_text: bool = False) -> list[FrameAssignment]:
+    """Assign rows without names or times, one for each frame of the source; [] for other counts.
+
+    Args:
+        by_text: in the order of the images' names as text (1, 10, 2), not of their numbers.
+    """
+    if count != source.count or _by_picked_images(count, source):
+        return []
+    if not by_text or not source.images:
+        rule = "order, one row for each frame of the source"
+        return [_assignment("order", rule, np.arange(count), source)]
+    frame = sorted(range(count), key=lambda n: PurePosixPath(source.images[n]).name)
+    rule = "order of the image names as text (1, 10, 2)"
+    return [_assignment("text", rule, np.array(frame, np.int64), source)]
+
+
+def _by_counts(count: int, source: SourceFrames, where: str) -> list[FrameAssignment]:
+    """Assign `count` rows by the numbers of selected images, or one for each frame in k."""
     if picked := _by_picked_images(count, source):
         return picked
     rows = np.arange(count)
     last = int(source.frame[-1])
-    if count == source.count:
-        return [_assignment("order", "order, one row for each frame of the source", rows, source)]
     if count == len(source.frame):
         return [FrameAssignment("order", "order, one row for each frame that is read", rows, 0)]
     if last < count:
         rule = f"order, row n for frame n of {source.count or 'an unknown number of'}"
         return [FrameAssignment("order", rule, source.frame.copy(), 0)]
-    steps = range(2, source.count // max(count - 1, 1) + 1)
     found = [
         _assignment(f"every{k}", f"order, a row for one frame in {k}", k * rows, source)
-        for k in steps
+        for k in range(2, source.count // max(count - 1, 1) + 1)
         if -(-source.count // k) == count
     ]
     if not found:

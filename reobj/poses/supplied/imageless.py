@@ -70,7 +70,7 @@ def open_video(
         raise ReobjError(f"{path}: no such file of detections")
     detect = detect or DetectConfig()
     size = described_images(path, detect)[0]
-    stated = stated_camera(poses.camera, size)
+    stated = stated_camera(poses.camera, size, poses.camera_format)
     size = size or (unknown if stated is None else (stated.width, stated.height))
     pose_file = read_pose_file(Path(poses.mode), poses.fmt, size)
     if size == unknown and (camera := next(filter(None, pose_file.cameras), None)) is not None:

@@ -1,4 +1,4 @@
-"""Pose files of other tools and datasets: one small reader per format, listed in `readers.READERS`.
+"""Pose files of other tools and datasets: one small reader per format, listed in `readers.POSES`.
 
 All convert their conventions to cam_from_world, OpenCV axes, COLMAP pixels.
 """
@@ -9,7 +9,7 @@ import dataclasses
 import json
 import re
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,13 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from reobj.cameras import CV_FROM_GL, WORLD_MAX, Camera, invert_rigid
 from reobj.files import MEMORY_MAX, check_unpacked, load_json, read_lines
-from reobj.poses.intrinsics import (
-    brown_camera,
-    camera_from_json,
-    camera_from_yaml,
-    image_side,
-    read_yaml,
-)
+from reobj.poses.intrinsics import brown_camera, camera_of_keys, image_side, read_yaml
 from reobj.types import Array, IntArray, ReobjError
 
 # ---- Result of a reader, and checks of all readers -----------------------------------------------
@@ -43,8 +37,10 @@ class PoseFile:
         unit: of the stamps: s, ms, us, ns, or "" if the format does not specify it.
         is_ours: this tool wrote the stamps, for the same video.
         visibility: (M, 2) row of the pose that observed a point, and row of the point.
-        w_first: (N, 3, 4), or None: the poses if the quaternions have w first, where the file does
-            not specify the order; `cam_from_world` assumes w last.
+        axes: (3, 3) OpenCV's camera axes from those of the file, as it was read.
+        by_text: without names, poses are in the order of the images' names as text: 1, 10, 2.
+        stored_pixels: cameras are those of images as they are stored, without their EXIF turn.
+        lost: number of poses that are missing.
         kind: name of the format. messages: what was assumed or left out.
     """
 
@@ -59,68 +55,45 @@ class PoseFile:
     points: Array = field(default_factory=lambda: np.empty((0, 3)))
     colors: npt.NDArray[np.uint8] = field(default_factory=lambda: np.empty((0, 3), np.uint8))
     visibility: IntArray = field(default_factory=lambda: np.empty((0, 2), np.int64))
-    w_first: Array | None = None
+    axes: Array = field(default_factory=lambda: np.eye(3))
+    by_text: bool = False
+    stored_pixels: bool = False
+    lost: int = 0
     kind: str = ""
     messages: tuple[str, ...] = ()
 
-    def with_messages(self, *messages: str) -> PoseFile:
-        """Return a copy with more messages."""
-        return dataclasses.replace(self, messages=(*self.messages, *messages))
-
-
-def lines(path: Path) -> Iterator[tuple[str, list[str]]]:
-    """Yield location (for messages) and words of each line of a text file, without comments."""
-    for number, text in enumerate(read_lines(path), 1):
-        if not text.lstrip().startswith("#"):
-            yield f"{path}, line {number}", text.split()
-
-
-def numbers(words: Sequence[str], where: str, expected: str, finite: bool = True) -> list[float]:
-    """Convert the words of a line; `where` and `expected` are for messages."""
-    try:
-        row = [float(word) for word in words]
-    except ValueError:
-        text = " ".join(words)[:60]
-        raise ReobjError(
-            f"{where}: {text!r} is not a row of numbers; expected {expected}"
-        ) from None
-    if finite and not np.isfinite(row).all():
-        raise ReobjError(f"{where}: a number is not finite; leave out rows of frames without pose")
-    return row
-
 
 def read_table(
-    path: Path,
-    columns: tuple[int, ...],
-    expected: str,
-    finite: bool = True,
-    header: bool = False,
-) -> tuple[Array, list[str]]:
-    """Read a table of numbers.
+    path: Path, columns: Sequence[int], finite: bool = True
+) -> tuple[Array, list[str], str]:
+    """Read a table of numbers with spaces or commas, after a header.
 
     Args:
-        columns: numbers of columns that are allowed. expected: for messages. finite: refuse inf and
-            nan. header: the first line may name the columns.
+        columns: numbers of columns that are allowed. finite: refuse inf and nan.
     Returns:
-        rows: (N, C), C in `columns`. where: file and line of each.
+        rows (N, C), C in `columns`; file and line of each; the header: comments, column names.
     """
+    expected = " or ".join(map(str, columns))
     rows: list[list[float]] = []
     where = []
-    for at, words in lines(path):
-        if not words:
+    header = ""
+    for number, text in enumerate(read_lines(path), 1):
+        words = text.replace(",", " ").split()
+        if not words or words[0].startswith("#") or (not rows and not is_number(words[0])):
+            header += text if not rows else ""
             continue
-        words = " ".join(words).replace(",", " ").split()
-        if header and not rows and not is_number(words[0]):
-            header = False
-            continue
-        row = numbers(words, at, expected, finite)
-        if len(row) not in columns or (rows and len(row) != len(rows[0])):
-            raise ReobjError(f"{at}: {len(row)} numbers; expected {expected}")
-        rows.append(row)
+        at = f"{path}, line {number}"
+        if not all(map(is_number, words)) or len(words) not in columns:
+            raise ReobjError(f"{at}: {len(words)} words {text.strip()[:60]!r}; expected "
+                             f"{expected} numbers")  # fmt: skip
+        rows.append([float(word) for word in words])
         where.append(at)
+        raise_where([len(row) != len(rows[0]) for row in rows[-1:]], [at], "another row length")
     if not rows:
-        raise ReobjError(f"{path}: no poses in it; expected {expected}")
-    return np.array(rows), where
+        raise ReobjError(f"{path}: no poses in it; expected rows of {expected} numbers")
+    table = np.array(rows)  # (N, C)
+    raise_where(finite & ~np.isfinite(table).all(1), where, "a number is not finite")
+    return table, where, header
 
 
 def is_number(word: str) -> bool:
@@ -132,14 +105,6 @@ def is_number(word: str) -> bool:
     return True
 
 
-def json_object(path: Path) -> dict[str, Any]:
-    """Read a JSON file that holds an object."""
-    content = load_json(path)
-    if not isinstance(content, dict):
-        raise ReobjError(f"{path}: expected an object with `frames` (nerfstudio) or `poses`")
-    return content
-
-
 POSE_TOLERANCE = 0.005  # of entries of rotations and quaternions (7-Scenes: off by 1e-3)
 
 
@@ -147,11 +112,12 @@ def checked_rigid(matrix: Array, where: Sequence[str]) -> Array:
     """Check rigid transforms and orthonormalise their rotations.
 
     Args:
-        matrix: (N, 4, 4), not finite where there is no pose. where: of each, for messages.
+        matrix: (N, 4, 4); no pose: not finite, or a rotation of zeros. where: of each, for
+            messages.
     Returns:
         (N, 3, 4), NaN where there is no pose.
     """
-    lost = ~np.asarray(np.isfinite(matrix).all((1, 2)), bool)
+    lost = ~np.isfinite(matrix).all((1, 2)) | (matrix[:, :3, :3] == 0).all((1, 2))
     matrix = np.where(lost[:, None, None], np.eye(4), matrix)
     last_row = np.abs(matrix[:, 3] - [0, 0, 0, 1])  # (N, 4)
     raise_where(
@@ -159,7 +125,8 @@ def checked_rigid(matrix: Array, where: Sequence[str]) -> Array:
         where,
         "the last row is not 0 0 0 1; expected row-major 4x4 (transpose column-major ones)",
     )
-    check_positions(matrix[:, :3, 3], where)
+    far = (np.abs(matrix[:, :3, 3]) >= WORLD_MAX).any(1)
+    raise_where(far, where, f"more than {WORLD_MAX:g} units away from the origin")
     rotation = matrix[:, :3, :3].clip(-2, 2)  # the squares of 1e300 are too large
     error = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3))  # (N, 3, 3)
     raise_where(
@@ -178,93 +145,53 @@ def checked_rigid(matrix: Array, where: Sequence[str]) -> Array:
     return np.where(lost[:, None, None], np.nan, exact)
 
 
-def check_positions(translation: Array, where: Sequence[str]) -> None:
-    """Refuse translations (N, 3) beyond WORLD_MAX."""
-    far = (np.abs(translation) >= WORLD_MAX).any(1)
-    raise_where(far, where, f"more than {WORLD_MAX:g} units away from the origin")
-
-
 def raise_where(bad: Any, where: Sequence[str], problem: str) -> None:
     """Raise the problem with the location of the first bad (N,) input, if any."""
     if np.any(bad):
         raise ReobjError(f"{where[int(np.argmax(bad))]}: {problem}")
 
 
+def homogeneous(matrix: Array) -> Array:
+    """Append the row 0 0 0 1 to transforms (N, 3, 4)."""
+    return np.concatenate([matrix, np.tile([[[0, 0, 0, 1.0]]], (len(matrix), 1, 1))], 1)
+
+
+def from_rotations(rotation: Rotation, translation: Array) -> Array:
+    """Make transforms (N, 4, 4) of rotations and translations (N, 3)."""
+    return homogeneous(np.concatenate([rotation.as_matrix(), translation[:, :, None]], 2))
+
+
 def from_quaternions(xyzw: Array, translation: Array, where: Sequence[str]) -> Array:
-    """Make rigid transforms (N, 3, 4) of unit quaternions (N, 4) and translations (N, 3)."""
-    finite = np.isfinite(np.column_stack([xyzw, translation])).all(1)
-    raise_where(~finite, where, "a number is not finite")
-    check_positions(translation, where)
-    norm = np.linalg.norm(xyzw.clip(-2, 2), axis=1)
+    """Make rigid transforms (N, 3, 4) of unit quaternions (N, 4) and translations (N, 3).
+
+    NaN where a number is not finite or the quaternion is 0: there is no pose.
+    """
+    lost = ~np.isfinite(np.column_stack([xyzw, translation])).all(1) | (xyzw == 0).all(1)
+    xyzw = np.where(lost[:, None], [0, 0, 0, 1], xyzw).clip(-2, 2)
     raise_where(
-        np.abs(norm - 1) > POSE_TOLERANCE,
+        np.abs(np.linalg.norm(xyzw, axis=1) - 1) > POSE_TOLERANCE,
         where,
         "the quaternion is not of length 1; expected the columns of the format in its order",
     )
-    return np.concatenate([Rotation.from_quat(xyzw).as_matrix(), translation[:, :, None]], 2)
-
-
-MAX_FOCAL_SPREAD = 0.02  # relative, over the images of one camera: autofocus (chosen)
-
-
-def one_camera(cameras: Sequence[Camera | None], path: Path) -> Camera | None:
-    """Return the single camera of images: the median of slightly different focal lengths.
-
-    Raises:
-        ReobjError: they differ by more than MAX_FOCAL_SPREAD, or in model or size.
-    """
-    found = sorted((c for c in cameras if c is not None), key=lambda c: c.params[0])
-    if not found:
-        return None
-    kinds = sorted({f"{c.model} {c.width}x{c.height}" for c in found})
-    least = found[0].params[0]
-    most = found[-1].params[0]
-    spread = (most - least) / max(abs(least), 1e-9)
-    if len(kinds) > 1 or spread > MAX_FOCAL_SPREAD:
-        cameras_text = f"focal lengths {least:.4g}-{most:.4g}"
-        if len(kinds) > 1:
-            cameras_text = ", ".join(kinds[:3])
-        raise ReobjError(
-            f"{path}: several different cameras took the frames ({cameras_text}); expected one: "
-            "give its intrinsics with --camera, or reconstruct with a single camera"
-        )
-    return found[len(found) // 2]
+    translation = np.where(lost[:, None], np.nan, translation)
+    return checked_rigid(from_rotations(Rotation.from_quat(xyzw), translation), where)
 
 
 Y_UP = np.array([0, 1.0, 0])
 Z_UP = np.array([0, 0, 1.0])
+CV_FROM_LLFF = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]])  # LLFF: x down, y right, z backward
 
 
 # ---- Tables: TUM, ORB-SLAM3, EuRoC, rows of matrices ---------------------------------------------
 
 
-def read_rows(path: Path, size: tuple[int, int]) -> PoseFile:
-    """Read a table by its columns: 8 (TUM, ORB-SLAM3, EuRoC), 12 or 16 (matrices), 17 (EuRoC)."""
-    expected = "TUM rows t tx ty tz qx qy qz qw, or 12 or 16 numbers (world_from_cam, row by row)"
-    rows, where, header = _table(path, (8, 12, 16, 17), expected)
-    if rows.shape[1] in (12, 16):
-        return read_matrices(path, size)
-    named = _named_columns(header, rows.shape[1])
-    text = next(line for line in read_lines(path)[::-1] if line.strip())
-    in_ns = abs(rows[0, 0]) >= 1e15  # in us this is the year 2001, in ms 33,658
-    if rows.shape[1] == 17 or "_RS_" in header or ("," in text and in_ns and named is None):
-        return read_euroc(path, size)
-    found = read_tum(path, size)
-    if "," in text and named is None:  # TUM and ORB-SLAM3 write spaces, EuRoC commas
-        kept = _by_time(rows[:, 0], path)[0]
-        other = from_quaternions(np.roll(rows[:, 4:], -1, 1), rows[:, 1:4], where)
-        return dataclasses.replace(found, w_first=invert_rigid(other)[kept])
-    return found
+def table_file(path: Path) -> Path:
+    """Return a table, or that in a folder: of TUM, Replica, or ours."""
+    names = ("poses.txt", "groundtruth.txt", "traj.txt", "poses_c2w.txt")
+    return next(filter(Path.is_file, (path / name for name in names)), path)
 
 
-def _table(path: Path, columns: tuple[int, ...], expected: str) -> tuple[Array, list[str], str]:
-    """Read a table of numbers with commas or spaces, and its header: comments, column names."""
-    rows, where = read_table(path, columns, expected, header=True)
-    first = int(where[0].rpartition(" ")[2])  # line of the first row
-    return rows, where, "".join(read_lines(path)[: first - 1])
-
-
-def _named_columns(header: str, count: int) -> list[int] | None:
+def named_columns(header: str, count: int) -> list[int] | None:
     """Find x, y, z and the quaternion x, y, z, w among `count` columns by their names.
 
     Returns:
@@ -291,10 +218,14 @@ def read_tum(path: Path, size: tuple[int, int]) -> PoseFile:
 
     Column names in the header override this order.
     """
-    rows, where, header = _table(path, (8,), "TUM rows: t tx ty tz qx qy qz qw")
-    columns = _named_columns(header, 8) or list(range(1, 8))
-    world_from_cam = from_quaternions(rows[:, columns[3:]], rows[:, columns[:3]], where)
+    path = table_file(path)
+    rows, where, header = read_table(path, (8,), finite=False)
+    columns = named_columns(header, 8)
+    order = columns or list(range(1, 8))
+    world_from_cam = from_quaternions(rows[:, order[3:]], rows[:, order[:3]], where)
     kept, messages = _by_time(rows[:, 0], path)
+    if columns is None and "," in read_lines(path)[-1]:  # TUM has spaces
+        messages += (f"{path}: no header names its columns: read as TUM's, quaternion w last",)
     is_ours = "(world_from_cam, seconds, units: " in header  # of `cameras.write_tum`
     return PoseFile(
         invert_rigid(world_from_cam)[kept], stamps=rows[kept, 0], is_ours=is_ours,
@@ -304,6 +235,7 @@ def read_tum(path: Path, size: tuple[int, int]) -> PoseFile:
 
 def _by_time(stamps: Array, path: Path) -> tuple[IntArray, tuple[str, ...]]:
     """Return the rows (n,) by ascending stamp, without repeated ones, and a message about these."""
+    raise_where(~np.isfinite(stamps), [str(path)] * len(stamps), "a time stamp is not finite")
     kept = np.unique(stamps, return_index=True)[1]
     repeated = len(stamps) - len(kept)
     if not repeated:
@@ -318,52 +250,42 @@ def read_euroc(path: Path, size: tuple[int, int]) -> PoseFile:
     without one the body is taken for the camera, with a message.
     """
     path = path / "data.csv" if path.is_dir() else path
-    rows, where, header = _table(path, (8, 17), "EuRoC rows: ns, x, y, z, qw, qx, qy, qz[, 9 more]")
-    columns = _named_columns(header, rows.shape[1]) or [1, 2, 3, 5, 6, 7, 4]
+    rows, where, header = read_table(path, (8, 17), finite=False)
+    columns = named_columns(header, rows.shape[1]) or [1, 2, 3, 5, 6, 7, 4]
     world_from_cam = from_quaternions(rows[:, columns[3:]], rows[:, columns[:3]], where)
     kept, messages = _by_time(rows[:, 0], path)
-    camera = None
-    sensor = _sensor_of(path)
-    if sensor is None:
+    cameras: tuple[Camera | None, ...] = ()
+    near = (path.parent, path.parent.parent / "cam0", path.parent / "cam0")
+    for sensor in filter(Path.is_file, (folder / "sensor.yaml" for folder in near)):
+        data = read_yaml(sensor)
+        if data.get("sensor_type", "camera") != "camera":
+            continue
+        matrix = np.array(data["T_BS"]["data"], np.float64).reshape(1, 4, 4)
+        body_from_cam = homogeneous(checked_rigid(matrix, [f"{sensor}, T_BS"]))
+        world_from_cam = (homogeneous(world_from_cam) @ body_from_cam)[:, :3]
+        cameras = (camera_of_keys(data, size),)
+        messages += (f"{path}: T_BS and intrinsics of {sensor}",)
+        break
+    else:
         messages += (
             f"{path}: poses of the body, and no sensor.yaml with the camera's T_BS beside it: body "
             "taken for camera",
         )
-    else:
-        data = read_yaml(sensor)
-        try:
-            matrix = np.array(data["T_BS"]["data"], np.float64).reshape(1, 4, 4)
-        except (KeyError, TypeError, ValueError):
-            raise ReobjError(f"{sensor}: expected T_BS with data of 16 numbers") from None
-        body_from_cam = checked_rigid(matrix, [f"{sensor}, T_BS"])[0]
-        turn = world_from_cam[:, :, :3]
-        centre = turn @ body_from_cam[:, 3:] + world_from_cam[:, :, 3:]
-        world_from_cam = np.concatenate([turn @ body_from_cam[:, :3], centre], 2)
-        camera = camera_from_yaml(data, size)
     return PoseFile(
-        invert_rigid(world_from_cam)[kept], () if camera is None else (camera,),
-        stamps=rows[kept, 0], unit="ns", metric=True, kind="EuRoC rows", messages=messages,
+        invert_rigid(world_from_cam)[kept], cameras, stamps=rows[kept, 0], unit="ns",
+        metric=True, kind="EuRoC rows", messages=messages,
     )  # fmt: skip
-
-
-def _sensor_of(path: Path) -> Path | None:
-    """Find the sensor.yaml of a camera: in the folder of the poses, or in cam0 near it."""
-    near = (path.parent, *(folder / "cam0" for folder in (path.parent.parent, path.parent)))
-    for sensor in (folder / "sensor.yaml" for folder in near):
-        if sensor.is_file() and read_yaml(sensor).get("sensor_type", "camera") == "camera":
-            return sensor
-    return None
 
 
 def read_matrices(path: Path, size: tuple[int, int]) -> PoseFile:
     """Read rows of 12 (KITTI) or 16 numbers (Replica, NICE-SLAM): world_from_cam, OpenCV axes."""
-    rows, where = matrix_rows(path)
+    rows, where = matrix_rows(table_file(path))
     return PoseFile(invert_rigid(checked_rigid(rows, where)), metric=True, kind="rows of matrices")
 
 
 def matrix_rows(path: Path) -> tuple[Array, list[str]]:
     """Read rows of 12 or 16 numbers: matrices (N, 4, 4), not finite where lost, and locations."""
-    rows, where = read_table(path, (12, 16), "12 or 16 numbers a row", finite=False)
+    rows, where, _ = read_table(path, (12, 16), finite=False)
     whole = np.tile(np.eye(4), (len(rows), 1, 1))
     whole.reshape(-1, 16)[:, : rows.shape[1]] = rows
     return whole, where
@@ -372,18 +294,16 @@ def matrix_rows(path: Path) -> tuple[Array, list[str]]:
 def read_traj(path: Path, size: tuple[int, int]) -> PoseFile:
     """Read ARKitScenes' .traj: s, axis-angle, translation of cam_from_world; .pincam beside it."""
     path = next(iter(sorted(path.glob("*.traj"))), path) if path.is_dir() else path
-    rows, where = read_table(path, (7,), "ARKitScenes rows: t rx ry rz tx ty tz")
+    rows, where, _ = read_table(path, (7,))
     kept, messages = _by_time(rows[:, 0], path)
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, :3] = Rotation.from_rotvec(rows[:, 1:4]).as_matrix()
-    poses[:, :3, 3] = rows[:, 4:]
+    poses = from_rotations(Rotation.from_rotvec(rows[:, 1:4]), rows[:, 4:])
     files = sorted(path.parent.glob("*_intrinsics/*.pincam")) or sorted(
         path.parent.glob("*.pincam")
     )
     cameras = []
     for file in files:
-        (width, height, *params), *_ = read_table(file, (6,), "w h fx fy cx cy")[0].tolist()
-        cameras.append(Camera("PINHOLE", image_side(width), image_side(height), tuple(params)))
+        (width, height, *params), *_ = read_table(file, (6,))[0].tolist()
+        cameras.append(brown_camera((image_side(width), image_side(height)), *params))
     return PoseFile(
         checked_rigid(poses, where)[kept], tuple(cameras), stamps=rows[kept, 0], unit="s",
         metric=True, up_in_world=Z_UP, kind="ARKitScenes poses", messages=messages,
@@ -399,30 +319,21 @@ def read_stray(path: Path, size: tuple[int, int]) -> PoseFile:
     OpenCV axes, quaternion x first, a row for each frame of rgb.mp4, numbered from 0.
     """
     path = path / "odometry.csv" if path.is_dir() else path
-    head, *records = [line for line in read_lines(path) if line.strip()]
-    columns = [word.strip().lower() for word in head.split(",")]
-    wanted = ("frame", "x", "y", "z", "qx", "qy", "qz", "qw")
-    if missing := [name for name in wanted if name not in columns]:
-        raise ReobjError(f"{path}: no column {', '.join(missing)}; expected {', '.join(wanted)}")
-    indices = [columns.index(name) for name in wanted]
-    where = [f"{path}, line {i}" for i in range(2, len(records) + 2)]
-    table = []
-    for text, line in zip(records, where, strict=True):
-        words = text.split(",")
-        if len(words) <= max(indices):
-            raise ReobjError(f"{line}: {len(words)} columns; expected {len(columns)}")
-        table.append(numbers([words[i] for i in indices], line, ", ".join(wanted)))
-    rows = np.array(table).reshape(-1, 8)
-    world_from_cam = from_quaternions(rows[:, 4:], rows[:, 1:4], where)
-    names = tuple(f"{number:06d}" for number in rows[:, 0].astype(int).tolist())
+    names = [word.strip().lower() for word in read_lines(path)[0].split(",")]
+    rows, where, header = read_table(path, (len(names),), finite=False)
+    columns = named_columns(header, len(names))
+    if columns is None or "frame" not in names:
+        raise ReobjError(f"{path}: expected columns frame, x, y, z, qx, qy, qz, qw")
+    world_from_cam = from_quaternions(rows[:, columns[3:]], rows[:, columns[:3]], where)
+    numbers = tuple(f"{number:06.0f}" for number in rows[:, names.index("frame")])
     matrix = path.with_name("camera_matrix.csv")
     cameras = list[Camera]()
     if matrix.is_file():
-        K = read_table(matrix, (3,), "3 rows of 3 numbers")[0]
+        K = read_table(matrix, (3,))[0]
         raise_where([K.shape != (3, 3)], [str(matrix)], "expected 3 rows of 3 numbers")
         cameras.append(brown_camera(_size_of(K, size), K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
     return PoseFile(
-        invert_rigid(world_from_cam), tuple(cameras), names, metric=True, up_in_world=Y_UP,
+        invert_rigid(world_from_cam), tuple(cameras), numbers, metric=True, up_in_world=Y_UP,
         kind="Stray Scanner folder",
     )  # fmt: skip
 
@@ -443,33 +354,27 @@ def read_record3d(path: Path, size: tuple[int, int]) -> PoseFile:
     The file `metadata`, its folder, or an .r3d, which is a zip of the folder.
     """
     path = path / "metadata" if path.is_dir() else path
-    data = _metadata_of_r3d(path) if path.suffix.lower() == ".r3d" else json_object(path)
-    try:
-        rows = np.array(data["poses"], np.float64).reshape(-1, 7)
-        fx, fy, cx, cy = (float(data["K"][i]) for i in (0, 4, 6, 7))
-        camera = Camera("PINHOLE", image_side(data["w"]), image_side(data["h"]), (fx, fy, cx, cy))
-    except (KeyError, TypeError, ValueError, IndexError):
-        raise ReobjError(
-            f"{path}: no Record3D metadata; expected numbers poses (N x 7), K (9), w and h"
-        ) from None
-    where = [f"{path}, poses[{i}]" for i in range(len(rows))]
-    world_from_gl = from_quaternions(rows[:, :4], rows[:, 4:], where)
-    poses = CV_FROM_GL @ invert_rigid(world_from_gl)
-    return PoseFile(poses, (camera,), metric=True, up_in_world=Y_UP, kind="Record3D metadata")
-
-
-def _metadata_of_r3d(path: Path) -> dict[str, Any]:
-    """Read the metadata in an .r3d file."""
-    try:
+    if path.suffix.lower() == ".r3d":
         with zipfile.ZipFile(path) as file:
             name = next(n for n in file.namelist() if n.rpartition("/")[2] == "metadata")
             check_unpacked(file.getinfo(name).file_size, MEMORY_MAX // 8)
             data = json.loads(file.read(name))
-    except (zipfile.BadZipFile, StopIteration, OSError, ValueError, RecursionError) as error:
-        raise ReobjError(f"{path}: not an .r3d of Record3D: no JSON `metadata` in it") from error
-    if not isinstance(data, dict):
-        raise ReobjError(f"{path}: `metadata` is not a JSON object")
-    return data
+    else:
+        data = load_json(path)
+    rows = np.array(data["poses"], np.float64).reshape(-1, 7)
+    where = [f"{path}, poses[{i}]" for i in range(len(rows))]
+    poses = CV_FROM_GL @ invert_rigid(from_quaternions(rows[:, :4], rows[:, 4:], where))
+    camera = camera_of_keys({key: data[key] for key in ("K", "w", "h")}, None)
+    return PoseFile(
+        poses, (camera,), metric=True, up_in_world=Y_UP, axes=CV_FROM_GL, kind="Record3D metadata"
+    )
+
+
+def scannet_files(path: Path) -> list[Path]:
+    """List the poses of ScanNet's folder, `pose/<frame>.txt`, or of 7-Scenes', `*.pose.txt`."""
+    folder = path / "pose" if (path / "pose").is_dir() else path
+    form = r"\d+\.txt" if folder.name == "pose" else r".*\.pose\.txt"
+    return sorted(f for f in folder.glob("*.txt") if re.fullmatch(form, f.name))
 
 
 def read_scannet(path: Path, size: tuple[int, int]) -> PoseFile:
@@ -478,27 +383,24 @@ def read_scannet(path: Path, size: tuple[int, int]) -> PoseFile:
     Metres; inf: no pose. ScanNet's intrinsics have the centre of the first pixel at (0, 0).
     """
     path = path.parent if path.name == "pose" else path
-    folder = path / "pose" if (path / "pose").is_dir() else path
-    files = sorted(f for f in folder.glob("*.txt") if re.search(r"(\d|\.pose)$", f.stem))
+    files = scannet_files(path)
     if not files:
-        raise ReobjError(f"{folder}: no <frame number>.txt in it; expected a ScanNet pose folder")
+        raise ReobjError(f"{path}: no pose/<frame number>.txt or *.pose.txt in it")
     where = [str(file) for file in files]
-    expected = "4 rows of 4 numbers"
-    tables = [read_table(file, (4,), expected, finite=False)[0] for file in files]
-    raise_where([len(table) != 4 for table in tables], where, f"expected {expected}")
-    world_from_cam = checked_rigid(np.array(tables), where)
+    tables = [read_table(file, (4,), finite=False)[0] for file in files]
+    raise_where([len(table) != 4 for table in tables], where, "expected 4 rows of 4 numbers")
+    poses = invert_rigid(checked_rigid(np.array(tables), where))
     intrinsic = path / "intrinsic" / "intrinsic_color.txt"
-    camera = None
+    cameras = list[Camera]()
     if intrinsic.exists():
-        K, where_K = read_table(intrinsic, (3, 4), "a 3x3 or 4x4 matrix")
+        K, where_K, _ = read_table(intrinsic, (3, 4))
         raise_where([len(K) != K.shape[1]], where_K, f"{len(K)} rows, expected 3x3 or 4x4")
-        camera = Camera("PINHOLE", *size, (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5))
-    up = Z_UP if folder.name == "pose" else None
+        cameras.append(brown_camera(size, K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5))
+    is_scannet = files[0].parent.name == "pose"
     names = tuple(file.stem for file in files)
-    kind = "ScanNet poses" if folder.name == "pose" else "7-Scenes poses"
-    poses = invert_rigid(world_from_cam)
-    cameras = () if camera is None else (camera,)
-    return PoseFile(poses, cameras, names, metric=True, up_in_world=up, kind=kind)
+    kind = "ScanNet poses" if is_scannet else "7-Scenes poses"
+    up = Z_UP if is_scannet else None
+    return PoseFile(poses, tuple(cameras), names, metric=True, up_in_world=up, kind=kind)
 
 
 def arkit_files(path: Path) -> list[Path]:
@@ -515,28 +417,42 @@ def read_arkit(path: Path, size: tuple[int, int]) -> PoseFile:
     OpenGL), metres, y up.
     """
     files = arkit_files(path)
-    if not files:
-        raise ReobjError(f"{path}: no frame_*.json, nor keyframes/cameras/*.json in it")
-    data = [json_object(file) for file in files]
-    where = [str(file) for file in files]
-    matrices = []
-    cameras = []
-    for file, entry in zip(where, data, strict=True):
+
+    def read(entry: dict[str, Any]) -> tuple[Any, Camera | None]:
+        rows = entry.get("cameraPoseARFrame") or [
+            entry[f"t_{i}{j}"] for i in range(3) for j in range(4)
+        ]
+        return [*rows, 0, 0, 0, 1][:16], camera_of_keys(entry, size)
+
+    return _listed(
+        {str(file): load_json(file) for file in files}, read, CV_FROM_GL,
+        names=tuple(file.stem for file in files), metric=True, up_in_world=Y_UP,
+        kind="raw ARKit export",
+    )  # fmt: skip
+
+
+def _listed(
+    entries: dict[str, Any],
+    read: Callable[[Any], tuple[Any, Camera | None]],
+    axes: Array,
+    **more: Any,
+) -> PoseFile:
+    """Read entries, by their location: world_from_cam, 12 or 16 numbers row by row, and camera."""
+    matrices = np.tile(np.eye(4).ravel(), (len(entries), 1))  # (N, 16)
+    cameras = list[Camera | None]()
+    for row, (where, entry) in enumerate(entries.items()):
         try:
-            rows = entry.get("cameraPoseARFrame") or [
-                entry[f"t_{i}{j}"] for i in range(3) for j in range(4)
-            ]
-            matrices.append(np.array([*rows, 0, 0, 0, 1][:16], np.float64).reshape(4, 4))
-            cameras.append(camera_from_json(entry, size))
-        except (KeyError, TypeError, ValueError):
-            raise ReobjError(
-                f"{file}: no camera; expected numbers 4x4 cameraPoseARFrame or t_00 to t_23, and "
-                "intrinsics"
-            ) from None
-    poses = CV_FROM_GL @ invert_rigid(checked_rigid(np.array(matrices), where))
-    names = tuple(path.stem for path in files)
-    kind = "raw ARKit export"
-    return PoseFile(poses, tuple(cameras), names, metric=True, up_in_world=Y_UP, kind=kind)
+            numbers, camera = read(entry)
+            numbers = np.array(numbers, np.float64).ravel()
+            matrices[row, : 12 if numbers.size == 12 else 16] = numbers
+            cameras.append(camera)
+        except ReobjError as error:
+            raise ReobjError(f"{where}: {error}") from None
+        except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
+            raise ReobjError(f"{where}: no pose and camera as the format has them "
+                             f"({error!r:.100})") from None  # fmt: skip
+    poses = axes @ invert_rigid(checked_rigid(matrices.reshape(-1, 4, 4), list(entries)))
+    return PoseFile(poses, tuple(cameras), axes=axes, **more)
 
 
 def read_transforms(path: Path, size: tuple[int, int]) -> PoseFile:
@@ -546,35 +462,20 @@ def read_transforms(path: Path, size: tuple[int, int]) -> PoseFile:
     world_from_cv = inv(A) world_from_gl diag(1, -1, -1, 1).
     """
     path = path / "transforms.json" if path.is_dir() else path
-    data = json_object(path)
-    frames = data.get("frames")
-    if not isinstance(frames, list) or not frames:
-        raise ReobjError(f"{path}: no `frames`; expected nerfstudio's or ngp's transforms.json")
-    where = [f"{path}, frames[{i}]" for i in range(len(frames))]
-    matrices = list[Array]()
-    names = list[str]()
-    cameras = list[Camera | None]()
-    for key, frame in zip(where, frames, strict=True):
-        try:
-            matrices.append(np.array(frame["transform_matrix"], np.float64).reshape(4, 4))
-            names.append(str(frame["file_path"]))
-            cameras.append(camera_from_json({**data, **frame}, size))
-        except ReobjError as error:
-            raise ReobjError(f"{key}: {error}") from None
-        except (KeyError, TypeError, ValueError, IndexError):
-            expected = "a 4x4 transform_matrix, file_path, and intrinsics that are numbers"
-            raise ReobjError(f"{key}: expected {expected}") from None
+    data = load_json(path)
+    shared = {key: value for key, value in data.items() if key != "frames"}
+    found = _listed(
+        {f"{path}, frames[{i}]": frame for i, frame in enumerate(data["frames"])},
+        lambda frame: (frame["transform_matrix"], camera_of_keys({**shared, **frame}, size)),
+        CV_FROM_GL, names=tuple(str(frame["file_path"]) for frame in data["frames"]),
+        kind="transforms",
+    )  # fmt: skip
+    where = [f"{path}, applied_transform"]
     applied = np.eye(4)
-    try:
-        applied[:3] = np.array(data.get("applied_transform", applied), np.float64)[:3]
-    except (TypeError, ValueError, IndexError):
-        applied[:] = np.nan
-    if not np.isfinite(applied).all():
-        raise ReobjError(f"{path}: applied_transform: expected 3x4 or 4x4 finite numbers")
-    applied[:3] = checked_rigid(applied[None], [f"{path}, applied_transform"])[0]
-    world_from_gl = checked_rigid(np.array(matrices), where)
-    poses = CV_FROM_GL @ invert_rigid(world_from_gl) @ applied  # (N, 3, 4)
-    return PoseFile(poses, tuple(cameras), tuple(names), kind="transforms")
+    applied[:3] = np.array(data.get("applied_transform", applied), np.float64)[:3]
+    raise_where([not np.isfinite(applied).all()], where, "expected 3x4 or 4x4 finite numbers")
+    applied[:3] = checked_rigid(applied[None], where)[0]
+    return dataclasses.replace(found, cam_from_world=found.cam_from_world @ applied)
 
 
 # ---- Datasets and radiance fields ----------------------------------------------------------------
@@ -586,53 +487,41 @@ def read_scannetpp(path: Path, size: tuple[int, int]) -> PoseFile:
     `aligned_pose` (of the laser scan) or else `pose`, and `intrinsic`; OpenCV axes, metres.
     """
     path = path / "pose_intrinsic_imu.json" if path.is_dir() else path
-    data = json_object(path)
-    names = tuple(data)
-    where = [f"{path}, {name}" for name in data]
-    matrices = []
-    cameras = []
-    for name, key in zip(names, where, strict=True):
-        try:
-            matrix = data[name].get("aligned_pose", data[name].get("pose"))
-            matrices.append(np.array(matrix, np.float64).reshape(4, 4))
-            K = np.array(data[name]["intrinsic"], np.float64).reshape(3, 3)
-            cameras.append(brown_camera(_size_of(K, size), *K[[0, 1, 0, 1], [0, 1, 2, 2]]))
-        except (KeyError, TypeError, ValueError, AttributeError):
-            expected = "4x4 aligned_pose or pose, and 3x3 intrinsic"
-            raise ReobjError(f"{key}: expected {expected}, numbers") from None
-    raise_where([not names], [str(path)], "no frames in it")
-    poses = invert_rigid(checked_rigid(np.array(matrices), where))
-    is_aligned = all("aligned_pose" in data[name] for name in names)
-    up = Z_UP if is_aligned else None
-    kind = "ScanNet++ iPhone poses"
-    return PoseFile(poses, tuple(cameras), names, metric=True, up_in_world=up, kind=kind)
+    data = load_json(path)
+
+    def read(entry: dict[str, Any]) -> tuple[Any, Camera]:
+        K = np.array(entry["intrinsic"], np.float64).reshape(3, 3)
+        camera = brown_camera(_size_of(K, size), *K[[0, 1, 0, 1], [0, 1, 2, 2]])
+        return entry.get("aligned_pose", entry.get("pose")), camera
+
+    is_aligned = all("aligned_pose" in entry for entry in data.values())
+    return _listed(
+        {f"{path}, {name}": entry for name, entry in data.items()}, read, np.eye(3),
+        names=tuple(data), metric=True, up_in_world=Z_UP if is_aligned else None,
+        kind="ScanNet++ iPhone poses",
+    )  # fmt: skip
 
 
 def read_llff(path: Path, size: tuple[int, int]) -> PoseFile:
     """Read LLFF's poses_bounds.npy: (N, 17), 3x5 [R | t | h, w, f] and two depths; no scale.
 
-    world_from_cam with the axes down, right, backwards. One row per image, by name.
+    world_from_cam with the axes down, right, backwards. One row per image, in the order of the
+    names as text.
     """
     path = path / "poses_bounds.npy" if path.is_dir() else path
-    try:
-        rows = np.load(path, allow_pickle=False)
-    except (OSError, ValueError) as error:
-        raise ReobjError(f"{path}: not a .npy file of numbers ({error})") from None
-    if rows.ndim != 2 or rows.shape[1] not in (15, 17) or rows.dtype.kind not in "fiu":
-        raise ReobjError(f"{path}: an array of shape {rows.shape}; expected (N, 17), LLFF's")
-    table = rows[:, :15].astype(np.float64).reshape(-1, 3, 5)
-    where = [f"{path}, row {i}" for i in range(len(rows))]
-    world_from_cam = np.tile(np.eye(4), (len(rows), 1, 1))
-    down, right, back = (table[:, :, k] for k in range(3))
-    world_from_cam[:, :3, :3] = np.stack([right, down, -back], 2)
-    world_from_cam[:, :3, 3] = table[:, :, 3]
-    raise_where(~np.isfinite(table).all((1, 2)), where, "a number is not finite")
-    cameras = [
-        Camera("SIMPLE_PINHOLE", image_side(w), image_side(h), (f, w / 2, h / 2))
-        for h, w, f in table[:, :, 4].tolist()
-    ]
-    poses = invert_rigid(checked_rigid(world_from_cam, where))
-    return PoseFile(poses, tuple(cameras), kind="LLFF poses")
+    rows = np.load(path, allow_pickle=False)
+
+    def read(row: Array) -> tuple[Array, Camera]:
+        table = row[:15].astype(np.float64).reshape(3, 5)
+        raise_where([not np.isfinite(table).all()], ["LLFF"], "a number is not finite")
+        h, w, f = table[:, 4].tolist()
+        camera = Camera("SIMPLE_PINHOLE", image_side(w), image_side(h), (f, w / 2, h / 2))
+        return table[:, :4], camera
+
+    return _listed(
+        {f"{path}, row {i}": row for i, row in enumerate(rows)}, read, CV_FROM_LLFF,
+        by_text=True, kind="LLFF poses",
+    )  # fmt: skip
 
 
 def read_splatting(path: Path, size: tuple[int, int]) -> PoseFile:
@@ -642,26 +531,13 @@ def read_splatting(path: Path, size: tuple[int, int]) -> PoseFile:
     """
     path = path / "cameras.json" if path.is_dir() else path
     data = load_json(path)
-    matrices = list[Array]()
-    names = list[str]()
-    cameras = list[Camera | None]()
-    where = list[str]()
-    for i, entry in enumerate(data if isinstance(data, list) else []):
-        where.append(f"{path}, entry {i}")
-        try:
-            matrix = np.eye(4)
-            matrix[:3, :3] = entry["rotation"]
-            matrix[:3, 3] = entry["position"]
-            width = image_side(entry["width"])
-            height = image_side(entry["height"])
-            focal = float(entry["fx"]), float(entry["fy"])
-            names.append(str(entry["img_name"]))
-        except (KeyError, TypeError, ValueError):
-            expected = "img_name, width, height, position, rotation, fx, fy"
-            raise ReobjError(f"{where[-1]}: expected {expected}") from None
-        matrices.append(matrix)
-        cameras.append(Camera("PINHOLE", width, height, (*focal, width / 2, height / 2)))
-    if not matrices:
-        raise ReobjError(f"{path}: expected a list of cameras, as Gaussian splatting writes it")
-    poses = invert_rigid(checked_rigid(np.array(matrices), where))
-    return PoseFile(poses, tuple(cameras), tuple(names), kind="Gaussian splatting cameras")
+
+    def read(entry: dict[str, Any]) -> tuple[Array, Camera]:
+        w, h = image_side(entry["width"]), image_side(entry["height"])
+        camera = brown_camera((w, h), float(entry["fx"]), float(entry["fy"]), w / 2, h / 2)
+        return np.column_stack([entry["rotation"], entry["position"]]), camera
+
+    return _listed(
+        {f"{path}, entry {i}": entry for i, entry in enumerate(data)}, read, np.eye(3),
+        names=tuple(str(entry["img_name"]) for entry in data), kind="Gaussian splatting cameras",
+    )  # fmt: skip

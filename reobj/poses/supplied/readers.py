@@ -1,52 +1,57 @@
-"""Read the poses of a video's frames from files of other tools.
+"""Read the poses of a video's frames from files of other tools: the registry POSES.
 
 The reader of each format converts its conventions to cam_from_world, OpenCV axes, COLMAP pixels
 (`pose_formats`, `colmap_model`); poses are then assigned to frames (`frame_assignment`). Whether
-the file follows its conventions is checked later, against the tracks (`interpretation`).
+the file follows its conventions is checked later, against images or tracks (`check`).
 """
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable
+import dataclasses
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from reobj.cameras import WORLD_MAX, Camera, Poses, usable
-from reobj.files import load_json, spans
+from reobj.files import spans
+from reobj.formats import AUTO, Format, Probe, Registry
 from reobj.poses.intrinsics import CAMERA_FORMS, fitted_camera, parse_camera
 from reobj.poses.supplied import pose_formats as formats
+from reobj.poses.supplied.check import Supplied
 from reobj.poses.supplied.colmap_model import find_models, read_colmap
 from reobj.poses.supplied.frame_assignment import (
     FrameAssignment,
     SourceFrames,
     assignments,
+    by_order,
     interpolated,
     source_of,
     unit_of_stamps,
 )
-from reobj.poses.supplied.interpretation import PoseReading, by_images
-from reobj.poses.supplied.pose_formats import PoseFile, one_camera
+from reobj.poses.supplied.orientation import turned, turns_of
+from reobj.poses.supplied.pose_formats import PoseFile
 from reobj.sources.image_files import TimeUnit
-from reobj.types import Array, IntArray, ReobjError
+from reobj.types import Array, BoolArray, IntArray, ReobjError
 
 
 def read_poses(
     path: str | Path,
     video: Any,
-    fmt: str = "auto",
+    fmt: str = AUTO,
     camera: str = "",
     metric: bool = False,
     frames_by: str = "",
+    camera_format: str = AUTO,
 ) -> Poses:
     """Read the poses of a video's frames from a file or folder of another tool.
 
     Args:
         path: file or folder. video: the frames they belong to.
-        fmt: auto (recognised), or a format of READERS.
-        camera: intrinsics in place of the file's, in the forms of `--camera`.
+        fmt: auto (recognised), or a format of POSES.
+        camera: intrinsics in place of the file's, in the forms of `--camera`. camera_format: auto,
+            or the format of its file, of CAMERAS.
         metric: the poses are in metres, whatever the format.
         frames_by: the assignment to frames, where the file is ambiguous: `number0`, `number1`,
             `time`, ... as listed in the error.
@@ -54,37 +59,25 @@ def read_poses(
         poses of all frames, NaN where the file has none (counted in `messages`).
     Raises:
         ReobjError: damaged, unknown, not rigid, without intrinsics, of another video, or with
-            several readings between which the images do not decide.
+            several formats or assignments to frames.
     """
-    readings = pose_readings(path, video, fmt, camera, metric, frames_by)
-    return the_reading(by_images(readings, video), Path(path))
+    return read_supplied(path, video, fmt, camera, metric, frames_by, camera_format).poses
 
 
-def the_reading(readings: list[PoseReading], path: Path) -> Poses:
-    """Return the poses of the only reading; refuse several."""
-    if len(readings) > 1:
-        choices = "; or ".join(f"{reading.key} ({reading.rule})" for reading in readings)
-        raise ReobjError(
-            f"{path}: its poses can be assigned to frames in {len(readings)} ways, and neither "
-            f"images nor tracks show which is right: {choices}; choose with --set "
-            f"poses.frames_by={readings[0].key}"
-        )
-    return readings[0].described_poses
-
-
-def pose_readings(
+def read_supplied(
     path: str | Path,
     video: Any,
-    fmt: str = "auto",
+    fmt: str = AUTO,
     camera: str = "",
     metric: bool = False,
     frames_by: str = "",
-) -> list[PoseReading]:
-    """Read poses as `read_poses` does; all readings that the file allows, at least one."""
+    camera_format: str = AUTO,
+) -> Supplied:
+    """Read poses as `read_poses` does, with what `check` needs to name a mistake."""
     path = Path(path)
     size = (int(video.size[0]), int(video.size[1]))
     pose_file = read_pose_file(path, fmt, size)
-    stated = parse_camera(camera, size)
+    stated = parse_camera(camera, size, camera_format)
     if stated is None and not any(pose_file.cameras):
         raise ReobjError(f"{path}: no intrinsics; add --camera {CAMERA_FORMS}")
     times = [(frame.index, frame.time_s) for frame in video]
@@ -94,38 +87,101 @@ def pose_readings(
     time_s = np.array([t for _, t in times])
     source = source_of(video, frame, time_s)
     stamps_s, messages = _in_seconds(pose_file, path, source)
-    count = len(pose_file.cam_from_world)
-    candidates = assignments(count, pose_file.names, stamps_s, source, str(path), pose_file.is_ours)
-    if not candidates:
-        compared = _compared(pose_file, stamps_s, source)
-        raise ReobjError(f"{path}: none of its {count} poses belongs to a frame ({compared})")
-    rows = np.unique(np.concatenate([candidate.row for candidate in candidates]))
-    intrinsics = stated
+    assignment = _assignment(pose_file, stamps_s, source, path, frames_by)
+    row = assignment.row
+    turns, turn_messages = (
+        turns_of(source, pose_file.cameras, row) if pose_file.stored_pixels else ({}, ())
+    )
+    cameras = pose_file.cameras
+    if len(cameras) == len(pose_file.cam_from_world) > 1:
+        cameras = tuple(turned(cameras[r], turns.get(f)) for f, r in enumerate(row) if r >= 0)
+    intrinsics = stated or one_camera(cameras, path)
     if intrinsics is None:
-        intrinsics = _intrinsics(pose_file, rows[rows >= 0], size, path)
+        raise ReobjError(f"{path}: no intrinsics; add --camera {CAMERA_FORMS}")
+    if stated is None:
+        intrinsics = fitted_camera(intrinsics, size, str(path))
     if not usable(intrinsics):
         raise ReobjError(f"{path}: {intrinsics}: expected finite numbers, focal lengths above 0")
-    orders = {"": pose_file.cam_from_world}
-    if pose_file.w_first is not None:
-        orders = {"w_last": pose_file.cam_from_world, "w_first": pose_file.w_first}
-    readings = []
-    for candidate, (order, by_order) in itertools.product(candidates, orders.items()):
-        cam_from_world, lost = _of_frames(by_order, stamps_s, candidate, source, path)
-        status = np.where(np.isfinite(cam_from_world).all((1, 2)), "supplied", "none")
-        poses = Poses(
-            intrinsics, frame, time_s, cam_from_world, status, "user",
-            metric=pose_file.metric or metric, up_in_world=pose_file.up_in_world,
-            points=pose_file.points, colors=pose_file.colors,
-            visibility=_in_frames(pose_file.visibility, candidate.row),
-            messages=(*pose_file.messages, *messages, *lost),
-        )  # fmt: skip
-        key = f"{candidate.key}.{order}".rstrip(".")
-        rule = f"{candidate.rule}, quaternions {order}".removesuffix(", quaternions ")
-        readings.append(PoseReading(key, rule, poses, pose_file.kind))
-    keys = ", ".join(reading.key for reading in readings)
-    if frames_by and not (readings := [r for r in readings if r.key == frames_by]):
-        raise ReobjError(f"--set poses.frames_by={frames_by}: {path} can be read by {keys}")
-    return readings
+    cam_from_world, lost = _of_frames(pose_file.cam_from_world, stamps_s, assignment, source, path)
+    if pose_file.lost:
+        lost = lost or f"{path}: a pose for each frame"
+        lost += f"; {pose_file.lost} poses of lost frames (the identity, zeros, not finite)"
+    for f, turn in turns.items():
+        cam_from_world[f, :2] = turn @ cam_from_world[f, :2]
+    poses = Poses(
+        intrinsics, frame, time_s, cam_from_world,
+        np.where(np.isfinite(cam_from_world).all((1, 2)), "supplied", "none"), "user",
+        metric=pose_file.metric or metric, up_in_world=pose_file.up_in_world,
+        points=pose_file.points, colors=pose_file.colors,
+        visibility=_in_frames(pose_file.visibility, row),
+        messages=(*pose_file.messages, *messages, *turn_messages, *[lost] * bool(lost)),
+        reading=f"{pose_file.kind}, frames by {assignment.rule}",
+    )  # fmt: skip
+    others = by_order(len(pose_file.cam_from_world), source, assignment.key == "order")
+    orders = {
+        f"the {one.rule} (--set poses.frames_by={one.key})": _of_frames(
+            pose_file.cam_from_world, None, one, source, path
+        )[0]
+        for one in others
+        if assignment.key in ("order", "text") and one.key != assignment.key
+    }
+    return Supplied(poses, pose_file.axes, orders)
+
+
+def _assignment(
+    pose_file: PoseFile, stamps_s: Array | None, source: SourceFrames, path: Path, frames_by: str
+) -> FrameAssignment:
+    """Return the only assignment to frames that the file allows, or the one that is named."""
+    count = len(pose_file.cam_from_world)
+    found = assignments(
+        count, pose_file.names, stamps_s, source, str(path), pose_file.is_ours, pose_file.by_text
+    )
+    if not found:
+        compared = _compared(pose_file, stamps_s, source)
+        raise ReobjError(f"{path}: none of its {count} poses belongs to a frame ({compared})")
+    if frames_by:
+        if not pose_file.names and stamps_s is None:
+            found += by_order(count, source, not pose_file.by_text)
+        chosen = [one for one in found if one.key == frames_by]
+        if not chosen:
+            keys = ", ".join(one.key for one in found)
+            raise ReobjError(f"--set poses.frames_by={frames_by}: {path} can be read by {keys}")
+        return chosen[0]
+    if len(found) > 1:
+        choices = "; or ".join(f"{one.key} ({one.rule})" for one in found)
+        raise ReobjError(
+            f"{path}: its poses can be assigned to frames in {len(found)} ways: {choices}; choose "
+            f"with --set poses.frames_by={found[0].key}"
+        )
+    return found[0]
+
+
+MAX_FOCAL_SPREAD = 0.02  # relative, over the images of one camera: autofocus (chosen)
+
+
+def one_camera(cameras: Sequence[Camera | None], path: Path) -> Camera | None:
+    """Return the single camera of images: the median of slightly different focal lengths.
+
+    Raises:
+        ReobjError: they differ by more than MAX_FOCAL_SPREAD in focal length or (in longer sides)
+            in the principal point, or in model or size.
+    """
+    found = sorted((c for c in cameras if c is not None), key=lambda c: c.params[0])
+    if not found:
+        return None
+    kinds = sorted({f"{c.model} {c.width}x{c.height}" for c in found})
+    K = np.array([camera.K for camera in found])  # (n, 3, 3)
+    spread = np.ptp(K[:, :2], axis=0) / max(found[0].width, found[0].height)
+    spread[[0, 1], [0, 1]] = np.ptp(K[:, [0, 1], [0, 1]], axis=0) / np.maximum(K[0, 0, 0], 1e-9)
+    if len(kinds) > 1 or spread.max() > MAX_FOCAL_SPREAD:
+        least, most = K[0, 0], K[-1, 0]
+        cameras_text = f"focal lengths {least[0]:.4g}-{most[0]:.4g}, centres {least[2]:.4g}-"
+        cameras_text = ", ".join(kinds[:3]) if len(kinds) > 1 else f"{cameras_text}{most[2]:.4g}"
+        raise ReobjError(
+            f"{path}: several different cameras took the frames ({cameras_text}); expected one: "
+            "give its intrinsics with --camera, or reconstruct with a single camera"
+        )
+    return found[len(found) // 2]
 
 
 def _in_seconds(
@@ -142,25 +198,18 @@ def _in_seconds(
     return pose_file.stamps / unit.value, messages
 
 
-def _intrinsics(pose_file: PoseFile, rows: IntArray, size: tuple[int, int], path: Path) -> Camera:
-    """Return the one camera of the poses in these rows, for frames of (w, h) `size`."""
-    cameras = pose_file.cameras
-    if len(cameras) == len(pose_file.cam_from_world):
-        cameras = tuple(cameras[row] for row in rows)
-    camera = one_camera(cameras, path)
-    if camera is None:
-        raise ReobjError(f"{path}: no intrinsics; add --camera {CAMERA_FORMS}")
-    return fitted_camera(camera, size, str(path))
-
-
 def _of_frames(
     cam_from_world: Array,
     stamps_s: Array | None,
     assignment: FrameAssignment,
     source: SourceFrames,
     path: Path,
-) -> tuple[Array, list[str]]:
-    """Return the poses (F, 3, 4) of the frames by one assignment, and report frames without one."""
+) -> tuple[Array, str]:
+    """Return the poses (F, 3, 4) of the frames by one assignment; report frames without, if any.
+
+    Returns:
+        the poses, and which frames have none: "" or a text.
+    """
     row = assignment.row
     known = row >= 0
     poses = np.full((len(row), 3, 4), np.nan)
@@ -172,10 +221,10 @@ def _of_frames(
     if (np.abs(poses[known]) >= WORLD_MAX).any():
         raise ReobjError(f"{path}: a camera is more than {WORLD_MAX:g} units away from the origin")
     if known.all():
-        return poses, []
+        return poses, ""
     step = int(np.median(np.diff(source.frame))) if len(row) > 1 else 1
     lost = spans(source.frame[~known].tolist(), step)
-    return poses, [f"{path}: poses for {known.sum()} of {len(row)} frames, none for {lost}"]
+    return poses, f"{path}: poses for {known.sum()} of {len(row)} frames, none for {lost}"
 
 
 def _compared(pose_file: PoseFile, stamps_s: Array | None, source: SourceFrames) -> str:
@@ -204,100 +253,133 @@ def _in_frames(visibility: IntArray, row: IntArray) -> IntArray:
 # ---- Formats -------------------------------------------------------------------------------------
 
 
-READERS: dict[str, Callable[[Path, tuple[int, int]], PoseFile]] = {
-    "colmap": read_colmap,
-    "tum": formats.read_tum,
-    "transforms": formats.read_transforms,
-    "scannet": formats.read_scannet,
-    "record3d": formats.read_record3d,
-    "arkit": formats.read_arkit,
-    "matrices": formats.read_matrices,
-    "euroc": formats.read_euroc,
-    "stray": formats.read_stray,
-    "arkitscenes": formats.read_traj,
-    "scannetpp": formats.read_scannetpp,
-    "llff": formats.read_llff,
-    "splatting": formats.read_splatting,
-    "rows": formats.read_rows,  # a table: tum, euroc or matrices, by its columns
-}
-
-
 def read_pose_file(path: Path, fmt: str, size: tuple[int, int]) -> PoseFile:
-    """Read a file or folder of poses in a format of READERS, or recognise it.
+    """Read a file or folder of poses in a format of POSES, or recognise it.
 
     Args:
         size: (w, h) of the images, for formats that do not state it.
     """
-    if not path.exists():
-        raise ReobjError(f"{path}: no such file; --poses takes auto, none, or a file of poses")
-    formats_of = _recognise(path) if fmt == "auto" else {fmt: path}
-    name, file = next(iter(formats_of.items()))
-    reader = READERS.get(name)
-    if reader is None:
-        raise ReobjError(f"--pose-format {fmt}: unknown; expected auto, {', '.join(READERS)}")
-    pose_file = reader(file, size)
-    if len(formats_of) > 1:
-        others = ", ".join(sorted(set(formats_of) - {name}))
-        note = f"{path}: read as {name}; it also has {others}: choose with --pose-format"
-        pose_file = pose_file.with_messages(note)
-    return pose_file
+    read = POSES.reader(path, fmt)
+    try:
+        return _without_lost(read(path, size), path)
+    except ReobjError:
+        raise
+    except Exception as error:  # files of other tools lack any key, or hold any type
+        name = POSES.find(path, fmt).name
+        raise ReobjError(f"{path}: damaged, or no file of format {name} ({error!r:.100})") from None
 
 
-def _recognise(path: Path) -> dict[str, Path]:
-    """Recognise the formats in a folder by its file names, or that of a file; at least one.
+def _without_lost(pose_file: PoseFile, path: Path) -> PoseFile:
+    """Remove poses that are the identity in the axes of the file, as of lost frames.
 
-    Returns:
-        the path for the reader of each format, the likeliest first.
+    It is a pose where it begins the path, and where it is the only one of poses with names.
     """
-    if not path.is_dir():
-        return {_format_of_file(path): path}
-    file_of = {
-        "transforms": "transforms.json",
-        "stray": "odometry.csv",
-        "scannetpp": "pose_intrinsic_imu.json",
-        "llff": "poses_bounds.npy",
-        "splatting": "cameras.json",
-        "record3d": "metadata",
-    }
-    found = {name: path for name, file in file_of.items() if (path / file).is_file()}
-    if path.name == "pose" or (path / "pose").is_dir() or any(path.glob("*.pose.txt")):
-        found["scannet"] = path
-    if formats.arkit_files(path):
-        found["arkit"] = path
-    if any(path.glob("*.traj")):
-        found["arkitscenes"] = path
-    if find_models(path):
-        found["colmap"] = path
-    if (path / "data.csv").is_file():
-        found["euroc"] = path
-    names = ("poses.txt", "groundtruth.txt", "traj.txt", "poses_c2w.txt")  # TUM; Replica; ours
-    tables = [path / name for name in names if (path / name).is_file()]
-    if tables:
-        found["rows"] = tables[0]
-    return found or {"colmap": path}
+    cam_from_world = pose_file.cam_from_world
+    whole = np.column_stack([pose_file.axes, np.zeros(3)])
+    same: BoolArray = np.all(np.abs(cam_from_world - whole) < 1e-9, axis=(1, 2))  # (N,)
+    begins = same[:1].any() and not same[1:2].any()
+    if begins or (pose_file.names and same.sum() == 1):
+        same[same.argmax()] = False
+    cam_from_world = np.where(same[:, None, None], np.nan, cam_from_world)
+    lost: BoolArray = ~np.all(np.isfinite(cam_from_world), axis=(1, 2))
+    if lost.all():
+        raise ReobjError(f"{path}: no poses in it, or only those of lost frames")
+    return dataclasses.replace(pose_file, cam_from_world=cam_from_world, lost=int(lost.sum()))
 
 
-def _format_of_file(path: Path) -> str:
-    """Recognise the format of a file by its name; of JSON also by its keys."""
-    suffixes = {".r3d": "record3d", ".traj": "arkitscenes", ".npy": "llff"}
-    if path.name.startswith("images.") or path.suffix == ".bin":
-        return "colmap"
-    if path.name == "odometry.csv":
-        return "stray"
-    if path.name == "transforms.json":
-        return "transforms"
-    if path.suffix == ".json" or path.name == "metadata":
-        content = load_json(path)
-        if isinstance(content, list):
-            return "splatting"
-        if isinstance(content, dict) and "poses" in content:
-            return "record3d"
-        first = next(iter(content.values()), None) if isinstance(content, dict) else None
-        if (
-            isinstance(first, dict)
-            and "frames" not in content
-            and {"pose", "aligned_pose"} & set(first)
-        ):
-            return "scannetpp"
-        return "transforms"
-    return suffixes.get(path.suffix.lower(), "rows")
+def _head(probe: Probe) -> tuple[str, list[str], str]:
+    """Return the header, and words and text of the first row, of a table; else "", [], ""."""
+    probe = Probe(formats.table_file(probe.path)) if probe.is_dir else probe
+    for k, line in enumerate(probe.lines):
+        words = line.replace(",", " ").split()
+        if words and all(map(formats.is_number, words)):
+            return "\n".join(probe.lines[:k]), words, line
+    return "", [], ""
+
+
+def _is_euroc(probe: Probe) -> bool:
+    """Test for 17 columns, a header with w first, or ns with commas and no header."""
+    header, words, line = _head(probe)
+    if "data.csv" in probe.names or len(words) == 17 or "_RS_" in header:
+        return True
+    named = formats.named_columns(header, 8)
+    in_ns = named is None and "," in line and len(words[0].partition(".")[0]) >= 16
+    return len(words) == 8 and (named[6] < named[3] if named else in_ns)
+
+
+def _is_tum(probe: Probe) -> bool:
+    header, words, _ = _head(probe)
+    named = formats.named_columns(header, 8)
+    w_last = named is None or named[3] < named[6]
+    return len(words) == 8 and w_last and "_RS_" not in header
+
+
+def _is_colmap(probe: Probe) -> bool:
+    """Test for a model; not that from which nerfstudio's transforms.json beside it was made."""
+    if probe.is_dir:
+        return not {"transforms.json", "colmap"} <= probe.names and bool(find_models(probe.path))
+    return probe.suffix == ".bin" or probe.path.name == "images.txt"
+
+
+def _has(probe: Probe, name: str, *keys: str) -> bool:
+    """Test for a folder with a file, or a JSON file of objects with these keys."""
+    return name in probe.names or (not probe.is_dir and bool(keys) and {*keys} <= probe.keys())
+
+
+ReadPoses = Callable[[Path, tuple[int, int]], PoseFile]
+NAME, TIME, ORDER = "name, number", "time", "order"
+METRES, UNKNOWN = "metres", "unknown"
+GIVE = "no intrinsics (`--camera`)"
+POSES: Registry[ReadPoses] = Registry("poses", "--pose-format", [
+    Format("colmap", "COLMAP: model, binary (preferred) or text, with its points", _is_colmap,
+           read_colmap, NAME, UNKNOWN, "cameras of images that are no frames"),
+    Format("tum", "TUM, ORB-SLAM3: rows `t tx ty tz qx qy qz qw`, or as a header names them",
+           _is_tum, formats.read_tum, TIME, f"{METRES}; ours, as its header says", GIVE),
+    Format("euroc", "EuRoC: CSV of 8 or 17 columns, ns, body, quaternion w first; `T_BS` of "
+           "`sensor.yaml` beside it or in `cam0`", _is_euroc, formats.read_euroc, TIME, METRES,
+           "velocities, biases"),
+    Format("matrices", "KITTI (12), Replica, NICE-SLAM (16): rows of matrices, row-major",
+           lambda p: len(_head(p)[1]) in (12, 16), formats.read_matrices, ORDER, METRES, GIVE),
+    Format("transforms", "nerfstudio, instant-ngp, NeRF synthetic: `transforms.json`, OpenGL axes; "
+           "`applied_transform` is undone", lambda p: _has(p, "transforms.json", "frames"),
+           formats.read_transforms, NAME, UNKNOWN, "`applied_scale`"),
+    Format("scannet", "ScanNet: folder `pose/N.txt`, z up; 7-Scenes: `*.pose.txt`",
+           lambda p: p.is_dir and bool(formats.scannet_files(p.path)), formats.read_scannet, NAME,
+           METRES, "7-Scenes: no intrinsics"),
+    Format("scannetpp", "ScanNet++ (iPhone): `pose_intrinsic_imu.json`, `aligned_pose` (z up) or "
+           "`pose`", lambda p: _has(p, "pose_intrinsic_imu.json") or _is_scannetpp(p),
+           formats.read_scannetpp, NAME, METRES, "IMU"),
+    Format("arkitscenes", "ARKitScenes: `.traj`, axis-angle of cam_from_world; `.pincam` beside it",
+           lambda p: any(name.endswith(".traj") for name in (*p.names, p.path.name)),
+           formats.read_traj, TIME, METRES),
+    Format("arkit", "Polycam (`keyframes/`), 3D Scanner App (`frame_*.json`): raw exports, OpenGL "
+           "axes, y up", lambda p: p.is_dir and bool(formats.arkit_files(p.path)),
+           formats.read_arkit, NAME, METRES),
+    Format("record3d", "Record3D: `metadata`, its folder, or `.r3d`; OpenGL axes, y up",
+           lambda p: p.suffix == ".r3d" or _has(p, "metadata", "poses", "K"),
+           formats.read_record3d, ORDER, METRES),
+    Format("stray", "Stray Scanner: `odometry.csv` with `camera_matrix.csv`, y up; its `rgb.mp4`",
+           lambda p: "odometry.csv" in {*p.names, p.path.name}, formats.read_stray, "number",
+           METRES, "IMU"),
+    Format("llff", "LLFF: `poses_bounds.npy`; axes down, right, backwards",
+           lambda p: p.suffix == ".npy" or _has(p, "poses_bounds.npy"), formats.read_llff,
+           "order of the names as text: 1, 10, 2", UNKNOWN, "depth bounds"),
+    Format("splatting", "3D Gaussian splatting: `cameras.json`",
+           lambda p: _has(p, "cameras.json", "img_name", "position"), formats.read_splatting, NAME,
+           UNKNOWN),
+    Format("", "OpenSfM's reconstruction.json", lambda p: _has(p, "reconstruction.json", "shots"),
+           None, advice="write a COLMAP model with `opensfm export_colmap`"),
+    Format("", "Metashape's cameras.xml", lambda p: p.root is not None and p.root.tag == "document",
+           None, advice="export the cameras as COLMAP: File, Export, Export Cameras"),
+    Format("", "Meshroom's cameras.sfm", lambda p: _has(p, "cameras.sfm", "views"), None,
+           advice="write a COLMAP model with the node ExportColmap"),
+    Format("", "cameras of `ns-export cameras` of nerfstudio",
+           lambda p: _has(p, "transforms_train.json", "file_path", "transform"), None,
+           advice="their world is scaled, and they have no intrinsics: give the transforms.json of "
+           "the data"),
+])  # fmt: skip
+
+
+def _is_scannetpp(probe: Probe) -> bool:
+    first = next(iter(probe.json.values()), None) if isinstance(probe.json, dict) else None
+    return isinstance(first, dict) and "intrinsic" in first
