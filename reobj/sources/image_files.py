@@ -207,7 +207,11 @@ def _kinds(files: Sequence[Path], headers: dict[Path, Header | None]) -> list[_K
         groups.setdefault(re.sub(r"\d+", "#", stem) + path.suffix.lower(), []).append((path, stem))
     kinds = []
     for text, members in groups.items():
-        numbers = {tuple(map(int, re.findall(r"\d+", stem))) for _, stem in members}
+        rows = [tuple(map(int, re.findall(r"\d+", stem))) for _, stem in members]
+        columns = [column for column in zip(*rows, strict=True) if len({*column}) > 1]
+        numbers = (
+            set(zip(*columns, strict=True)) if columns else set(rows)
+        )  # not r_5_depth_0000's 0
         known = [h for path, _ in members if (h := headers[path]) is not None]
         color = 2 * sum(h.channels == 1 for h in known) <= len(known)
         words = set(re.split(r"[^a-z]+", text.rpartition(".")[0]))
