@@ -21,6 +21,7 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
+from PIL import Image as PillowImage
 
 from reobj.types import Array, ReobjError
 
@@ -207,11 +208,7 @@ def _kinds(files: Sequence[Path], headers: dict[Path, Header | None]) -> list[_K
         groups.setdefault(re.sub(r"\d+", "#", stem) + path.suffix.lower(), []).append((path, stem))
     kinds = []
     for text, members in groups.items():
-        rows = [tuple(map(int, re.findall(r"\d+", stem))) for _, stem in members]
-        columns = [column for column in zip(*rows, strict=True) if len({*column}) > 1]
-        numbers = (
-            set(zip(*columns, strict=True)) if columns else set(rows)
-        )  # not r_5_depth_0000's 0
+        numbers = {tuple(map(int, re.findall(r"\d+", stem))) for _, stem in members}
         known = [h for path, _ in members if (h := headers[path]) is not None]
         color = 2 * sum(h.channels == 1 for h in known) <= len(known)
         words = set(re.split(r"[^a-z]+", text.rpartition(".")[0]))
@@ -342,6 +339,13 @@ class Header:
     size: tuple[int, int]
     channels: int = 3
     bits: int = 8
+
+
+def exif_orientation(path: Path) -> int:
+    """Return the EXIF orientation of a photo, 1 to 8; 1 (upright) where there is none."""
+    with contextlib.suppress(Exception), PillowImage.open(path) as image:
+        return int(image.getexif().get(274, 1))
+    return 1
 
 
 def header(path: Path) -> Header | None:

@@ -244,12 +244,3 @@ def test_poses_of_other_tools_are_named(
     (tmp_path / name).write_text(content)
     with pytest.raises(rt.ReobjError, match=named):
         rt.read_poses(tmp_path / name, rt.Video(folder_of(tmp_path)))
-
-
-def test_images_of_nerf_synthetic_are_frames_without_their_depth_maps(tmp_path: Path) -> None:
-    for i in range(12):
-        for kind in ("", "_depth_0000", "_normal_0000"):
-            picture = np.full((60, 80, 3), 90, np.uint8)
-            cv2.imwrite(str(tmp_path / f"r_{i}{kind}.png"), picture)
-    video = rt.Video(tmp_path)
-    assert [Path(name).name for name in video.names] == [f"r_{i}.png" for i in range(12)]
