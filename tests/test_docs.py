@@ -24,6 +24,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "docs"))
 
 import make_api  # noqa: E402
+import make_formats  # noqa: E402
 
 TUTORIALS = ROOT / "docs" / "tutorials"
 ROOM = ROOT / "examples" / "room"
@@ -292,6 +293,13 @@ def test_the_reference_has_all_public_names_and_is_up_to_date() -> None:
         names = [n for m, _, group in make_api.groups() if m == module.__name__ for n in group]
         assert sorted(names) == sorted(set(module.__all__) - explained)
     assert make_api.PAGE.read_text() == make_api.repository_page()
+
+
+def test_the_tables_of_formats_are_those_of_the_registries() -> None:
+    """If this fails: python docs/make_formats.py"""
+    text = make_formats.PAGE.read_text()
+    assert make_formats.filled(text) == text
+    assert all(table in text for table in make_formats.TABLES.values())
 
 
 def test_every_page_is_in_the_navigation() -> None:
