@@ -12,6 +12,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
+from reobj.poses.intrinsics import CAMERAS
+from reobj.poses.supplied.readers import POSES
 from reobj.results.truth import TRUTH
 from reobj.sources.detection_formats import DETECTIONS
 
@@ -19,6 +21,8 @@ PAGE = Path(__file__).parent / "input_formats.md"
 TABLES = {
     "detections": DETECTIONS.table(),
     "ground truth": dataclasses.replace(TRUTH, formats=TRUTH.readable).table(),
+    "poses": POSES.table(),
+    "cameras": CAMERAS.table(),
 }
 
 

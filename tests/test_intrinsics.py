@@ -140,6 +140,99 @@ def test_all_spellings_of_distortion_are_read(tmp_path, key, yaml):
     assert camera.model == "FULL_OPENCV" and camera.params[4:9] == tuple(LIST)
 
 
+XML = """<?xml version="1.0"?>
+<opencv_storage><image_width>640</image_width><image_height>480</image_height>
+<camera_matrix type_id="opencv-matrix"><rows>3</rows><cols>3</cols><dt>d</dt>
+  <data>500. 0. 320. 0. 510. 240. 0. 0. 1.</data></camera_matrix>
+<distortion_coefficients type_id="opencv-matrix"><rows>5</rows><cols>1</cols><dt>d</dt>
+  <data>-3.7e-01 0.14 -2e-4 -0.0004 -0.024</data></distortion_coefficients></opencv_storage>
+"""
+BLOCKS = """camera_matrix:
+- - 500.0
+  - 0.0
+  - 320.0
+- [0.0, 510.0, 240.0]
+- [0, 0, 1]
+dist_coeff:
+- - -3.7e-1
+  - 0.14
+  - -2e-4
+  - -0.0004
+  - -0.024
+"""
+VINS = """%YAML:1.0
+---
+model_type: PINHOLE
+image_width: 640
+image_height: 480
+distortion_parameters:
+   k1: -0.1
+   k2: 0.02
+   p1: 0.001
+   p2: 0.002
+projection_parameters:
+   fx: 500.
+   fy: 510.
+   cx: 320.
+   cy: 240.
+"""
+FULL = rt.Camera("FULL_OPENCV", *SIZE, (500, 510, 320, 240, *LIST, 0, 0, 0))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "camera"),
+    [
+        ("out_camera_data.xml", XML, FULL),  # OpenCV's calibration sample
+        ("blocks.yml", BLOCKS, FULL),  # PyYAML's default
+        ("vins.yaml", VINS, OPENCV),
+        ("mtx.json", json.dumps({"mtx": K, "dist": [LIST]}), FULL),
+        ("res.json", json.dumps({"cameraRes": [640, 480], "cameraMatrix": K, "dist": LIST}), FULL),
+        ("half.json", json.dumps({"cameraRes": [1280, 960], "K": (2 * np.array(K)).tolist()}),
+         PINHOLE),
+        ("fisheye.yaml", "%YAML:1.0\nCamera.type: KannalaBrandt8\nCamera.fx: 500\nCamera.fy: 510\n"
+         "Camera.cx: 320\nCamera.cy: 240\nCamera.k1: 0.1\nCamera.k4: 0.4\n",
+         rt.Camera("OPENCV_FISHEYE", *SIZE, (500, 510, 320, 240, 0.1, 0, 0, 0.4))),
+    ],
+)  # fmt: skip
+def test_camera_files_of_other_programs(tmp_path, name, content, camera):
+    path = tmp_path / name
+    path.write_text(content)
+    assert parse_camera(str(path), SIZE) == camera
+
+
+def test_arrays_of_a_calibration_are_read(tmp_path):
+    """As OpenCV's tutorial saves them; the matrix of undistorted images beside them is not."""
+    arrays = {"mtx": np.array(K, float), "dist": np.array([LIST]), "rvecs": np.ones((4, 3, 1))}
+    np.savez(tmp_path / "calib.npz", **arrays)
+    assert parse_camera(str(tmp_path / "calib.npz"), SIZE) == FULL
+    np.savez(tmp_path / "calib.npz", **arrays, newcameramtx=2 * np.eye(3))
+    with pytest.raises(rt.ReobjError, match="'newcameramtx' is not read"):
+        parse_camera(str(tmp_path / "calib.npz"), SIZE)
+
+
+def test_the_format_of_a_camera_file_may_be_named(tmp_path):
+    path = tmp_path / "camera.yaml"
+    path.write_text("500 510 320 240\n")
+    assert parse_camera(str(path), SIZE, "numbers") == PINHOLE
+    with pytest.raises(rt.ReobjError, match=r"camera.yaml: expected `key: value`"):
+        parse_camera(str(path), SIZE)
+    with pytest.raises(rt.ReobjError, match="--camera-format nonsense: no such format"):
+        parse_camera(str(path), SIZE, "nonsense")
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["a: &a [1, 1]\nfx: *a\n", "cam0: {intrinsics: [1]}\ncam1: {intrinsics: [1]}\n", "fx: [\n",
+     "fx: 500\ncx: 320\ncy: 240\nmirror_parameters: {xi: 1.2}\n"],
+)  # fmt: skip
+def test_yaml_that_is_no_camera_is_refused_in_one_line(tmp_path, text):
+    path = tmp_path / "camera.yaml"
+    path.write_text(text)
+    with pytest.raises(rt.ReobjError, match=r"^--camera .*camera.yaml: ") as refused:
+        parse_camera(str(path), SIZE)
+    assert "\n" not in str(refused.value)
+
+
 @pytest.mark.parametrize(
     "more, key",
     [

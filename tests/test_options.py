@@ -826,10 +826,10 @@ def _(lab: Lab) -> None:
     video = rt.Video(images(lab.path / "images", 4))
     path = tum_file(lab.path / "cams.txt", arc(4))
     config = lab.config(path, poses__camera=CAMERA_TEXT)
-    (found,) = stage.supplied_poses(video, config.poses)
+    found = stage.supplied_poses(video, config.poses)
     assert found.poses.known.all() and found.poses.source == "user"
     for mode in ("auto", "none"):
-        assert stage.supplied_poses(video, lab.config(mode).poses) == []
+        assert stage.supplied_poses(video, lab.config(mode).poses) is None
     asked = lab.caught(rt, "reconstruct_cached", "video")
     for mode, count in (("none", 0), ("auto", 1)):
         config = lab.config(mode, embed__model="none", output__overlay="none", output__scene=False)
@@ -842,7 +842,7 @@ def _(lab: Lab) -> None:
     video = rt.Video(images(lab.path / "images", 4))
     path = tum_file(lab.path / "cams.dat", arc(4))
     options = {"poses__mode": path, "poses__camera": CAMERA_TEXT}
-    assert len(stage.supplied_poses(video, lab.config("tum", **options).poses)) == 1
+    assert stage.supplied_poses(video, lab.config("tum", **options).poses) is not None
     for fmt in ("transforms", "nonsense"):
         with pytest.raises(rt.ReobjError, match=r"JSON|format nonsense"):
             stage.supplied_poses(video, lab.config(fmt, **options).poses)
@@ -853,12 +853,28 @@ def _(lab: Lab) -> None:
     """Of supplied poses and of a reconstruction."""
     video = rt.Video(images(lab.path / "images", 4))
     path = tum_file(lab.path / "cams.txt", arc(4))
-    (found,) = stage.supplied_poses(video, lab.config(CAMERA_TEXT, poses__mode=path).poses)
+    found = stage.supplied_poses(video, lab.config(CAMERA_TEXT, poses__mode=path).poses)
     assert found.poses.camera == CAMERA
     with pytest.raises(rt.ReobjError, match="no intrinsics"):
         stage.supplied_poses(video, lab.config("", poses__mode=path).poses)
     poses = rt.estimate_poses(video, lab.config(CAMERA_TEXT).poses, lab.path / "work")
     assert poses.camera == CAMERA
+
+
+@shows("poses.camera_format")
+def _(lab: Lab) -> None:
+    """A matrix in a file whose name says something else."""
+    video = rt.Video(images(lab.path / "images", 4))
+    path = tum_file(lab.path / "cams.txt", arc(4))
+    camera = lab.path / "camera.pincam"
+    np.savetxt(camera, CAMERA.K)
+    options = {"poses__mode": path, "poses__camera": str(camera)}
+    found = stage.supplied_poses(video, lab.config("matrix", **options).poses)
+    assert found.poses.camera == CAMERA
+    with pytest.raises(rt.ReobjError, match="images of 0 pixels"):
+        stage.supplied_poses(video, lab.config("auto", **options).poses)
+    with pytest.raises(rt.ReobjError, match="--camera-format nonsense"):
+        stage.supplied_poses(video, lab.config("nonsense", **options).poses)
 
 
 @shows("poses.size_px")
@@ -893,7 +909,7 @@ def _(lab: Lab) -> None:
     for depth in ("", "maps:5000"):
         own = lab.config(depth, **options).poses
         found = stage.supplied_poses(video, own)
-        stage.settled_poses(found, rt.Tracks.empty(), video, own, workspace)
+        stage.checked_poses(found, rt.Tracks.empty(), video, own, workspace)
         known = rt.Poses(CAMERA, np.arange(4), np.arange(4) / 30, arc(4), np.full(4, "pnp"), "x")
         lab.patch.setattr(stage, "estimate_poses", lambda *_, p=known, **__: write_model(p, lab))
         stage.reconstruct_cached(video, lab.config(depth).poses, workspace)
@@ -938,10 +954,10 @@ def _(lab: Lab) -> None:
     video = ImagelessVideo(lab.path / "model", (CAMERA.width, CAMERA.height), count=6)
     for value, first in (("number0", 1), ("number1", 0)):
         config = lab.config(value, poses__mode=str(lab.path / "model"))
-        (found,) = stage.supplied_poses(video, config.poses)
+        found = stage.supplied_poses(video, config.poses)
         assert np.flatnonzero(found.poses.known).tolist() == list(range(first, first + 4))
-    config = lab.config("", poses__mode=str(lab.path / "model"))
-    assert len(stage.supplied_poses(video, config.poses)) == 2
+    with pytest.raises(rt.ReobjError, match="frames_by=number0"):
+        stage.supplied_poses(video, lab.config("", poses__mode=str(lab.path / "model")).poses)
 
 
 @shows("poses.metric")
@@ -952,7 +968,7 @@ def _(lab: Lab) -> None:
     write_colmap(lab.path / "model", cams, video.names)
     for value in (False, True):
         config = lab.config(value, poses__mode=str(lab.path / "model"))
-        (found,) = stage.supplied_poses(video, config.poses)
+        found = stage.supplied_poses(video, config.poses)
         assert found.poses.known.all() and found.poses.metric is value
     with pytest.raises(rt.ReobjError, match="--metric"):
         stage.supplied_poses(video, lab.config(True).poses)

@@ -186,6 +186,7 @@ def _may_continue(folder: Path, job: dict[str, Any]) -> bool:
 # Fraction of the matched features that must be points of three images and more. Measured:
 # studio_room .73, redkitchen .55, hololens_kitchen .51; redkitchen with inverted poses .005.
 MIN_TRIANGULATED = 0.15
+CheckMatches = Callable[[IntArray, IntArray, Array], float]  # as `check_matches`
 
 
 def triangulate(
@@ -196,7 +197,7 @@ def triangulate(
     seed: int,
     work_dir: Path,
     progress: Callable[[str, int], Progress] = Progress,
-    check: Callable[[IntArray, IntArray, Array], float] = lambda *_: np.nan,
+    check: CheckMatches = lambda *_: np.nan,
 ) -> Poses:
     """Triangulate sparse points of the images from known poses.
 

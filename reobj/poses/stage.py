@@ -16,7 +16,7 @@ from reobj.cameras import Poses, import_pycolmap, load_poses, save_poses, write_
 from reobj.files import Progress, load_cached, load_npz, part_path
 from reobj.poses.estimate import PosesConfig, estimate_poses
 from reobj.poses.intrinsics import camera_line, parse_camera
-from reobj.poses.sfm import triangulate
+from reobj.poses.sfm import CheckMatches, triangulate
 from reobj.poses.supplied.check import Supplied, check_boxes, check_matches, without_frozen
 from reobj.poses.supplied.depth import add_depth
 from reobj.poses.supplied.readers import read_supplied
@@ -66,7 +66,9 @@ def checked_poses(
     """
     poses = without_frozen(supplied.poses, tracks)
     supplied = dataclasses.replace(supplied, poses=poses)
-    found = with_points(poses, video, config, workspace, progress, supplied)
+    confirmed = check_boxes(supplied, tracks, refuse=False)
+    check = functools.partial(check_matches, supplied, confirmed)
+    found = with_points(poses, video, config, workspace, progress, check)
     if len(poses.visibility) or config.depth or not len(found.visibility):  # not by images
         check_boxes(supplied, tracks)
     return found
@@ -78,12 +80,12 @@ def with_points(
     config: PosesConfig,
     workspace: StageCache,
     progress: MakeProgress = Progress,
-    supplied: Supplied | None = None,
+    check: CheckMatches = lambda *_: np.nan,
 ) -> Poses:
     """Add points to poses: triangulated where they have none, from depth maps, or cached.
 
     Args:
-        supplied: the poses are from a file, and checked against the images.
+        check: refuses poses that contradict matched features.
     """
     if (
         not video.has_images
@@ -94,7 +96,6 @@ def with_points(
     path = _points_path(poses, video, config, workspace)
     if (cached := load_cached(path, load_poses)) is not None:
         return cached
-    check = {"check": functools.partial(check_matches, supplied)} if supplied else {}
     depth_first = bool(config.depth) and poses.metric  # else the scale is estimated from points
     if depth_first:
         poses = add_depth(poses, config.depth, video)
@@ -106,7 +107,7 @@ def with_points(
             seed=config.seed,
             work_dir=workspace.cache / "sfm",
             progress=progress,
-            **check,
+            check=check,
         )
     if config.depth and not depth_first:
         poses = add_depth(poses, config.depth, video)

@@ -103,15 +103,18 @@ def _refuse(given: Supplied, likely: Sequence[str], measured: str) -> None:
 
 # ---- By images -----------------------------------------------------------------------------------
 
-EXPLAINED = 0.6  # of the matches; measured, right poses: .72 and more in 11 recordings
+EXPLAINED = 0.7  # of the matches; measured, right poses: .72 and more in 11 recordings
 BETTER = 0.15  # more than as given; right poses: all other conventions .17 and more below
-UNEXPLAINED = 0.2  # right poses with a focal length that is 15 % wrong: .24 and more
+UNEXPLAINED = 0.3  # right poses with a focal length that is 15 % wrong: .24 and more
 
 
-def check_matches(given: Supplied, rows: IntArray, match_rows: IntArray, rays: Array) -> float:
+def check_matches(
+    given: Supplied, confirmed: bool, rows: IntArray, match_rows: IntArray, rays: Array
+) -> float:
     """Refuse poses that contradict verified matches of features.
 
     Args:
+        confirmed: the boxes agree with the poses; then matches that fit in no convention are wrong.
         rows: (K,) poses of the keyframes. match_rows: (M, 2) keyframes of each match.
         rays: (M, 2, 2) of it in both cameras, z = 1.
     Returns:
@@ -129,7 +132,7 @@ def check_matches(given: Supplied, rows: IntArray, match_rows: IntArray, rays: A
     if best > max(EXPLAINED, found + BETTER):
         likely = [name for name, share in shares.items() if share > best - BETTER / 3]
         _refuse(given, likely, f"{measured}, then {100 * best:.0f} %")
-    if found < UNEXPLAINED:
+    if found < UNEXPLAINED and not confirmed:
         _refuse(given, [], measured)
     return found
 
@@ -167,21 +170,24 @@ WRONG_DEG = 6.0  # of poses that are certainly wrong; measured, right ones: up t
 MIN_TRACKS = 4  # chosen: three triangulate by chance in a trajectory read backwards
 
 
-def check_boxes(given: Supplied, tracks: Tracks) -> None:
+def check_boxes(given: Supplied, tracks: Tracks, refuse: bool = True) -> bool:
     """Refuse poses that contradict the boxes of tracks.
 
     Triangulates the box centres of each track. The residual is the angle between a viewing ray and
     the direction to the triangulated point (180 deg behind the camera), the median over rays and
     tracks. A track is used while consecutive boxes overlap: then they show one object.
+
+    Returns:
+        True if the boxes agree with the poses; False: they do not, or are too few.
     """
     runs = [_overlapping(tracks, rows) for rows in rows_by(tracks.tracklet_id)]
     found = [view for run in runs if (view := _rays(given.poses, tracks[run])) is not None]
     views = sorted(found, key=lambda view: -len(view[0]))[:60]  # the longest: all take long
     if len(views) < MIN_TRACKS:
-        return
+        return False
     as_given = _residual_deg(given.poses.cam_from_world, views)
-    if as_given < GOOD_DEG:
-        return
+    if as_given < GOOD_DEG or not refuse:
+        return as_given < GOOD_DEG
     residuals = {name: _residual_deg(poses, views) for name, poses in conventions(given)}
     best = min(residuals.values())
     measured = f"{len(views)} tracks triangulate within {as_given:.1f} deg"
@@ -190,6 +196,7 @@ def check_boxes(given: Supplied, tracks: Tracks) -> None:
         _refuse(given, likely, f"{measured}, then {best:.1f} deg")
     if as_given > WRONG_DEG:
         _refuse(given, [], measured)
+    return False
 
 
 def _overlapping(tracks: Tracks, rows: IntArray) -> IntArray:

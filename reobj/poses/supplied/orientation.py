@@ -2,41 +2,35 @@
 
 from __future__ import annotations
 
-import contextlib
 import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
-from PIL import Image as Pillow
 
 from reobj.cameras import Camera, camera_parameters
 from reobj.poses.supplied.frame_assignment import SourceFrames
+from reobj.sources.image_files import exif_orientation
 from reobj.types import Array, IntArray, ReobjError
 
 # upright_from_stored (2, 2): of offsets from the middle of the image
 TURNS = {3: -np.eye(2), 6: np.array([[0.0, -1], [1, 0]]), 8: np.array([[0.0, 1], [-1, 0]])}
 
 
-def exif_orientation(path: str) -> int:
-    """Return the EXIF orientation of an image file, 1 (none) to 8."""
-    with contextlib.suppress(OSError, ValueError, SyntaxError), Pillow.open(path) as image:
-        return int(image.getexif().get(0x0112, 1))
-    return 1
-
-
 def turns_of(
-    source: SourceFrames, cameras: Sequence[Camera | None], row: IntArray
+    source: SourceFrames, size: tuple[int, int], cameras: Sequence[Camera | None], row: IntArray
 ) -> tuple[Mapping[int, Array], tuple[str, ...]]:
     """Return the turns (2, 2) of the photos with an EXIF orientation, by frame row, and a message.
 
-    A camera with the aspect ratio of an image turned by 90 deg is one of upright pixels.
+    A camera of the shape of the upright photos, where a turn by 90 deg changes it, is not turned.
 
     Args:
+        size: (w, h) of the upright photos.
         cameras: of the stored pixels, of each pose. row: (F,) pose of each frame, -1: none.
     """
     turns: dict[int, Array] = {}
     for f in np.flatnonzero(row >= 0).tolist() if source.images else ():
-        path = source.images[int(source.frame[f])]
+        path = Path(source.images[int(source.frame[f])])
         orientation = exif_orientation(path)
         camera = cameras[row[f]]
         if orientation == 1 or camera is None:
@@ -46,19 +40,14 @@ def turns_of(
                 f"{path}: a mirrored EXIF orientation ({orientation}), which COLMAP ignores; store "
                 "the photos upright, without EXIF orientation, and reconstruct them again"
             )
-        stored = _stored_size(path)
-        if orientation == 3 or (camera.width > camera.height) == (stored[0] > stored[1]):
+        is_upright = size[0] != size[1] and (camera.width > camera.height) == (size[0] > size[1])
+        if orientation == 3 or not is_upright:
             turns[f] = TURNS[orientation]
     text = (
         f"{len(turns)} photos have an EXIF orientation, which COLMAP ignores: its cameras are "
         "turned with them"
     )
     return turns, (text,) * bool(turns)
-
-
-def _stored_size(path: str) -> tuple[int, int]:
-    with Pillow.open(path) as image:
-        return image.size
 
 
 def turned(camera: Camera | None, turn: Array | None) -> Camera | None:

@@ -90,7 +90,7 @@ def read_supplied(
     assignment = _assignment(pose_file, stamps_s, source, path, frames_by)
     row = assignment.row
     turns, turn_messages = (
-        turns_of(source, pose_file.cameras, row) if pose_file.stored_pixels else ({}, ())
+        turns_of(source, size, pose_file.cameras, row) if pose_file.stored_pixels else ({}, ())
     )
     cameras = pose_file.cameras
     if len(cameras) == len(pose_file.cam_from_world) > 1:

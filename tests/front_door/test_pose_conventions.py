@@ -1,0 +1,246 @@
+"""Poses in another convention than they are read with, of lost frames, and of turned photos."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+import reobj_track as rt
+from reobj.cameras import invert_rigid, write_colmap
+
+from .test_pose_files import (
+    ALL,
+    CAMERA,
+    FRAMES,
+    LINE,
+    as_poses,
+    assert_chairs_in_place,
+    assert_right,
+    folder_of,
+    images,
+    model,
+    path_of,
+    run,
+)
+
+Capture = pytest.CaptureFixture[str]
+
+
+def world_from_cam() -> np.ndarray:
+    whole = np.tile(np.eye(4), (FRAMES, 1, 1))
+    whole[:, :3] = invert_rigid(path_of())
+    return whole
+
+
+def flip(x: float, y: float, z: float) -> np.ndarray:
+    return np.diag([x, y, z, 1.0])
+
+
+def tum_of(path: Path, matrices: np.ndarray) -> Path:
+    xyzw = Rotation.from_matrix(matrices[:, :3, :3]).as_quat()
+    np.savetxt(path, np.column_stack([np.arange(FRAMES) / 30, matrices[:, :3, 3], xyzw]))
+    return path
+
+
+CONVENTIONS = {
+    "right": (lambda m: m, ""),
+    "Unity": (lambda m: np.eye(4)[[0, 2, 1, 3]] @ m @ flip(1, -1, 1), "(Unity)"),
+    "mirrored x": (lambda m: flip(-1, 1, 1) @ m @ flip(-1, 1, 1), "x left, y down, z forward"),
+    "mirrored z": (lambda m: flip(1, 1, -1) @ m @ flip(1, 1, -1), "x right, y down, z backward"),
+    "turned": (lambda m: m @ flip(-1, -1, 1), "turned by 180 deg"),
+    "OpenGL": (lambda m: m @ flip(1, -1, -1), "(OpenGL)"),
+    "inverse": (np.linalg.inv, "the inverse direction"),
+}
+
+
+@pytest.mark.parametrize("name", CONVENTIONS)
+def test_a_convention_is_named_by_boxes_alone(tmp_path: Path, name: str, capsys: Capture) -> None:
+    convert, named = CONVENTIONS[name]
+    path = tum_of(tmp_path / "poses.txt", convert(world_from_cam()))
+    code = run(tmp_path, None, path, "--camera", LINE)
+    error = capsys.readouterr().err
+    if name == "right":
+        assert code == 0
+        assert_chairs_in_place(tmp_path / "out")
+        return
+    assert code == 2 and "the poses look like ones with" in error and named in error
+    assert not (tmp_path / "out" / "objects.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("convert", "named"),
+    [
+        (lambda m: m @ flip(1, -1, -1), ""),  # as the format has it
+        (lambda m: m, "x right, y down, z forward (OpenCV)"),
+        (np.linalg.inv, "the inverse direction"),
+        (lambda m: flip(1, 1, -1) @ m @ flip(1, -1, 1), "(Unity)"),
+    ],
+)
+def test_a_convention_is_named_by_images_alone(
+    tmp_path: Path, convert: object, named: str, capsys: Capture
+) -> None:
+    source = folder_of(tmp_path, blank=False)
+    frames = [
+        {"file_path": f"images/{i:04d}.jpg", "transform_matrix": convert(matrix).tolist()}  # type: ignore[operator]
+        for i, matrix in enumerate(world_from_cam())
+    ]
+    facts = {"fl_x": 290, "cx": 160, "cy": 120, "w": 320, "h": 240, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(facts))
+    words = ["poses", str(source), "-o", str(tmp_path / "out"), "--poses",
+             str(tmp_path / "transforms.json")]  # fmt: skip
+    assert rt.main(words) == (2 if named else 0)
+    error = capsys.readouterr().err
+    assert named in error
+    assert ("read with camera axes x right, y up, z backward (OpenGL)" in error) == bool(named)
+
+
+# ---- Order ---------------------------------------------------------------------------------------
+
+
+def test_rows_of_llff_are_in_the_order_of_the_names_as_text(tmp_path: Path) -> None:
+    source = rt.Video(folder_of(tmp_path, "{}.jpg", first=1))
+    order = np.argsort([str(i + 1) for i in ALL])
+    w = invert_rigid(path_of()[order])
+    hwf = np.tile([240, 320, 290], (FRAMES, 1))
+    rows = np.stack([w[:, :, 1], w[:, :, 0], -w[:, :, 2], w[:, :, 3], hwf], 2)
+    np.save(tmp_path / "poses_bounds.npy", np.column_stack([rows.reshape(-1, 15), hwf[:, :2]]))
+    poses = rt.read_poses(tmp_path / "poses_bounds.npy", source)
+    assert_right(poses, ALL)
+    assert "as text" in poses.reading
+
+
+def test_rows_in_the_order_of_the_names_as_text_are_named(tmp_path: Path, capsys: Capture) -> None:
+    source = folder_of(tmp_path, "{}.jpg", first=1, blank=False)
+    order = np.argsort([str(i + 1) for i in ALL])
+    path = tmp_path / "traj.txt"
+    np.savetxt(path, world_from_cam()[order].reshape(-1, 16))
+    words = ["poses", str(source), "-o", str(tmp_path / "out"), "--poses", str(path),
+             "--camera", LINE]  # fmt: skip
+    assert rt.main(words) == 2
+    assert "--set poses.frames_by=text" in capsys.readouterr().err
+    poses = rt.read_poses(path, rt.Video(source), camera=LINE, frames_by="text")
+    assert_right(poses, ALL)
+    assert rt.main([*words, "--set", "poses.frames_by=text"]) == 0
+
+
+# ---- Lost frames ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["identity", "zeros", "nan", "repeated"])
+def test_poses_of_lost_frames_are_no_poses(tmp_path: Path, kind: str, capsys: Capture) -> None:
+    path = tum_of(tmp_path / "poses.txt", world_from_cam())
+    rows = np.loadtxt(path)
+    lost = list(range(12, 20))
+    rows[lost, 1:] = {"identity": [0, 0, 0, 0, 0, 0, 1], "zeros": 0, "nan": np.nan,
+                      "repeated": rows[11, 1:]}[kind]  # fmt: skip
+    np.savetxt(path, rows)
+    assert run(tmp_path, None, path, "--camera", LINE) == 0
+    assert_chairs_in_place(tmp_path / "out")
+    lines = (tmp_path / "out" / "poses.txt").read_text().splitlines()
+    assert len([line for line in lines if not line.startswith("#")]) == FRAMES - len(lost)
+    warnings = json.loads((tmp_path / "out" / "objects.json").read_text())["warnings"]
+    assert sum("8 poses" in text for text in warnings) == 1
+    assert capsys.readouterr().out.count("8 poses") <= 1
+
+
+def test_a_path_that_begins_at_the_identity_keeps_it(tmp_path: Path) -> None:
+    matrices = np.linalg.inv(world_from_cam()[0]) @ world_from_cam()
+    path = tum_of(tmp_path / "poses.txt", matrices)
+    assert rt.read_poses(path, rt.Video(folder_of(tmp_path)), camera=LINE).known.all()
+
+
+# ---- EXIF orientations ---------------------------------------------------------------------------
+
+# EXIF orientation: from the upright image to the stored one; rotation stored_from_upright
+STORED = {
+    1: (lambda image: image, np.eye(3)),
+    3: (lambda image: image[::-1, ::-1], np.diag([-1.0, -1, 1])),
+    6: (lambda image: np.rot90(image, 1), np.array([[0, 1.0, 0], [-1, 0, 0], [0, 0, 1]])),
+    8: (lambda image: np.rot90(image, -1), np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]])),
+}
+
+
+def turned_photos(folder: Path, orientations: list[int]) -> tuple[Path, Path]:
+    """Write photos and COLMAP's model of the stored pixels, with an off-centre lens."""
+    (folder / "img").mkdir()
+    poses = path_of().copy()
+    for i, (image, orientation) in enumerate(zip(images(), orientations, strict=True)):
+        exif = Image.Exif()
+        exif[0x0112] = orientation
+        turn, stored_from_upright = STORED[orientation]
+        stored = np.ascontiguousarray(turn(image))
+        Image.fromarray(stored).save(folder / "img" / f"{i:04d}.jpg", quality=95, exif=exif)
+        poses[i] = stored_from_upright @ poses[i]
+    path = folder / "model"
+    write_colmap(path, as_poses(poses), [f"{i:04d}.jpg" for i in ALL])
+    return folder / "img", path
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_cameras_of_stored_pixels_turn_with_the_photos(tmp_path: Path, orientation: int) -> None:
+    source, path = turned_photos(tmp_path, [orientation] * FRAMES)
+    upright = rt.Camera("OPENCV", 320, 240, (290, 291, 163.0, 118.0, 0.02, 0.01, 0.003, -0.002))
+    _, turn = STORED[orientation]
+    pixels = np.random.default_rng(0).uniform([-0.4, -0.3, 1], [0.4, 0.3, 1], (50, 3))
+    size = (240, 320) if orientation > 4 else (320, 240)
+    fx, fy = (291, 290) if orientation > 4 else (290, 291)
+    offset = turn[:2, :2] @ [3.0, -2.0]
+    p2, p1 = turn[:2, :2] @ [-0.002, 0.003]
+    params = (fx, fy, size[0] / 2 + offset[0], size[1] / 2 + offset[1], 0.02, 0.01, p1, p2)
+    line = " ".join(map(str, ("1 OPENCV", *size, *params)))
+    (path / "cameras.txt").write_text(f"{line}\n")
+    poses = rt.read_poses(path, rt.Video(source))
+    assert_right(poses, ALL)
+    np.testing.assert_allclose(poses.camera.params, upright.params, atol=1e-12)
+    assert poses.camera.project(pixels).shape == (50, 2)
+    assert any("EXIF orientation" in text for text in poses.messages) == (orientation > 1)
+    assert rt.main(["poses", str(source), "-o", str(tmp_path / "out"), "--poses", str(path),
+                    "--camera", LINE]) == 0  # fmt: skip
+
+
+def test_photos_of_several_orientations_and_mirrored_ones(tmp_path: Path) -> None:
+    source, path = turned_photos(tmp_path, [(1, 3)[i % 2] for i in ALL])
+    assert_right(rt.read_poses(path, rt.Video(source)), ALL)
+    exif = Image.Exif()
+    exif[0x0112] = 2
+    photo = cv2.cvtColor(images()[0], cv2.COLOR_BGR2RGB)
+    Image.fromarray(photo).save(source / "0000.jpg", exif=exif)
+    with pytest.raises(rt.ReobjError, match="mirrored EXIF orientation"):
+        rt.read_poses(path, rt.Video(source))
+
+
+def test_our_own_model_of_upright_photos_is_not_turned(tmp_path: Path) -> None:
+    """Its camera has the aspect ratio of the upright images."""
+    source, _ = turned_photos(tmp_path, [6] * FRAMES)
+    path = model(tmp_path / "own", ALL, [f"{i:04d}.jpg" for i in ALL])
+    poses = rt.read_poses(path, rt.Video(source))
+    assert_right(poses, ALL)
+    assert poses.camera == CAMERA
+
+
+# ---- Other tools ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "named"),
+    [
+        ("reconstruction.json", '[{"cameras": {}, "shots": {"a.jpg": {}}}]', "OpenSfM.*COLMAP"),
+        ("cameras.xml", "<?xml version='1.0'?>\n<document version='1.5.0'></document>",
+         "Metashape.*COLMAP"),
+        ("cameras.sfm", '{"version": ["1"], "views": [], "poses": []}', "Meshroom.*COLMAP"),
+        ("transforms_train.json", '[{"file_path": "a.jpg", "transform": [[1, 0, 0, 0]]}]',
+         "nerfstudio.*transforms.json"),
+    ],
+)  # fmt: skip
+def test_poses_of_other_tools_are_named(
+    tmp_path: Path, name: str, content: str, named: str
+) -> None:
+    (tmp_path / name).write_text(content)
+    with pytest.raises(rt.ReobjError, match=named):
+        rt.read_poses(tmp_path / name, rt.Video(folder_of(tmp_path)))
