@@ -76,7 +76,7 @@ from reobj.appearance.reid import (
     part_cosines,
 )  # fmt: skip
 from reobj.appearance.sampling import SamplingLayout
-from reobj.cameras import Camera, Poses, checked_pose, viewing_rays
+from reobj.cameras import Camera, Poses, checked_pose, viewing_rays, without_copies
 from reobj.commands import (
     SafeFormatter,
     apply_command,
@@ -1813,7 +1813,7 @@ def _views_once(poses: Poses | None, video: Video) -> tuple[Poses | None, list[s
     """Return the poses without those of copied images, and a warning about these."""
     if poses is None:
         return None, []
-    views = poses.without_copies(video.copies)
+    views = without_copies(poses, video.copies)
     names = [video.name(frame) for frame in views.frame[poses.known & ~views.known].tolist()]
     text = f"{len(names)} images are copies of others, of which each is one view: "
     return views, [text + shortened(names)] if names else []

@@ -393,31 +393,32 @@ class Poses:
             messages=(),
         )
 
-    def without_copies(self, copies: Mapping[int, int]) -> Poses:
-        """Return the poses without those of copies of an image, which show nothing new.
-
-        Args:
-            copies: numbers of frames, and of the frame that each is a copy of. Images to which the
-                user gave different poses are no copies.
-        """
-        row_of = {number: row for row, number in enumerate(self.frame.tolist())}
-        lost = np.zeros(len(self.frame), bool)
-        for copy, first in copies.items():
-            if copy in row_of and first in row_of:
-                pair = self.cam_from_world[[row_of[copy], row_of[first]]]
-                is_same = self.source != "user" or np.allclose(*pair)
-                lost[row_of[copy]] = np.isfinite(pair).all() and is_same
-        return dataclasses.replace(
-            self,
-            cam_from_world=np.where(lost[:, None, None], np.nan, self.cam_from_world),
-            status=np.where(lost, "none", self.status),
-            visibility=self.visibility[~lost[self.visibility[:, 0]]],
-        )
-
     @property
     def known(self) -> BoolArray:
         """(F,) True where the frame has a pose."""
         return np.asarray(np.isfinite(self.cam_from_world).all((1, 2)), bool)
+
+
+def without_copies(poses: Poses, copies: Mapping[int, int]) -> Poses:
+    """Return poses without those of copies of an image, which show nothing new.
+
+    Args:
+        copies: numbers of frames, and of the frame that each is a copy of. Images to which the user
+            gave different poses are no copies.
+    """
+    row_of = {number: row for row, number in enumerate(poses.frame.tolist())}
+    lost = np.zeros(len(poses.frame), bool)
+    for copy, first in copies.items():
+        if copy in row_of and first in row_of:
+            pair = poses.cam_from_world[[row_of[copy], row_of[first]]]
+            is_same = poses.source != "user" or np.allclose(*pair)
+            lost[row_of[copy]] = np.isfinite(pair).all() and is_same
+    return dataclasses.replace(
+        poses,
+        cam_from_world=np.where(lost[:, None, None], np.nan, poses.cam_from_world),
+        status=np.where(lost, "none", poses.status),
+        visibility=poses.visibility[~lost[poses.visibility[:, 0]]],
+    )
 
 
 def save_poses(path: Path, poses: Poses, **more: Any) -> None:

@@ -194,8 +194,8 @@ class Stored:
 
 def stored_in(path: str) -> Stored:
     """Read the packets of a file."""
-    found = _open_container(path, None)
-    assert found is not None
+    if (found := _open_container(path, None)) is None:
+        return Stored()
     file, video = found
     start_s = float((video.start_time or 0) * video.time_base)
     count = size = 0
