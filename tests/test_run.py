@@ -272,6 +272,7 @@ class CountingDetector:
     stop_at = -1
     class_names = rt.COCO_NAMES
     batch = 1
+    path = Path("fake.onnx")
 
     def __init__(self, *args: object) -> None: ...
 
