@@ -207,19 +207,13 @@ class OnnxDetector:
 
     def _trial_run(self) -> ModelProbe:
         """Run the model to get the shapes of its outputs."""
-        try:
+        with failing(f"{self.path}: no known object detector: a trial run", 1):
             (outputs,) = self._run_grey(1)
-        except Exception as error:
-            reason = f"a trial run with {self._inputs} failed: {str(error).splitlines()[0]}"
-            raise ReobjError(f"{self.path}: no known object detector: {reason}") from error
-        names = (output.name for output in self._session.get_outputs())
-        return ModelProbe(
-            self.path,
-            [name for name, _, _ in self._inputs],
-            dict(zip(names, outputs, strict=True)),
-            self._input_size(1, 1),
-            self._session.get_modelmeta().custom_metadata_map,
-        )
+            names = [output.name for output in self._session.get_outputs()]
+            metadata = self._session.get_modelmeta().custom_metadata_map
+        inputs = [name for name, _, _ in self._inputs]
+        of_name = dict(zip(names, outputs, strict=True))
+        return ModelProbe(self.path, inputs, of_name, self._input_size(1, 1), metadata)
 
     def _accepted(self, wanted: int) -> int:
         """Return how many images the model takes at once: `wanted`, or its fixed number, or 1.
