@@ -273,6 +273,7 @@ class CountingDetector:
     class_names = rt.COCO_NAMES
     batch = 1
     path = Path("fake.onnx")
+    messages = ()
 
     def __init__(self, *args: object) -> None: ...
 
