@@ -270,6 +270,8 @@ class CountingDetector:
     stop_at = -1
     class_names = rt.COCO_NAMES
     batch = 1
+    path = Path("fake.onnx")
+    messages = ()
 
     def __init__(self, *args: object) -> None: ...
 

@@ -93,8 +93,8 @@ class OnnxDetector:
         device: cpu, cuda, coreml, ... (`onnx_session`).
     Attributes:
         class_names: names by class id. layout: name of the layout. path: of the file.
-        batch: most images that `detect` gives the network at once. message: which layout was
-            recognised; "": it is declared.
+        batch: most images that `detect` gives the network at once. messages: which layout was
+            recognised; (): it is declared.
     Raises:
         ReobjError: no such file; outputs of no layout, or of several; or names of the classes that
             are not as many as the layout has.
@@ -207,19 +207,13 @@ class OnnxDetector:
 
     def _trial_run(self) -> ModelProbe:
         """Run the model to get the shapes of its outputs."""
-        try:
+        with failing(f"{self.path}: no known object detector: a trial run", 1):
             (outputs,) = self._run_grey(1)
-        except Exception as error:
-            reason = f"a trial run with {self._inputs} failed: {str(error).splitlines()[0]}"
-            raise ReobjError(f"{self.path}: no known object detector: {reason}") from error
-        names = (output.name for output in self._session.get_outputs())
-        return ModelProbe(
-            self.path,
-            [name for name, _, _ in self._inputs],
-            dict(zip(names, outputs, strict=True)),
-            self._input_size(1, 1),
-            self._session.get_modelmeta().custom_metadata_map,
-        )
+            names = [output.name for output in self._session.get_outputs()]
+            metadata = self._session.get_modelmeta().custom_metadata_map
+        inputs = [name for name, _, _ in self._inputs]
+        of_name = dict(zip(names, outputs, strict=True))
+        return ModelProbe(self.path, inputs, of_name, self._input_size(1, 1), metadata)
 
     def _accepted(self, wanted: int) -> int:
         """Return how many images the model takes at once: `wanted`, or its fixed number, or 1.
@@ -269,7 +263,7 @@ class OnnxDetector:
         self._model.count = len(names)
         unread = f"; not read: {layout.unread}" if layout.unread else ""
         text = f"{NOTE_START}{self.path}: read as {layout.name} ({layout.title}){unread}"
-        self.message = "" if declared else text
+        self.messages = () if declared else (text,)
         return layout, names
 
 
@@ -562,13 +556,11 @@ def as_source(detector: Any, class_names: Sequence[str] = ()) -> DetectionSource
                          "; a file is opened by read_detections(path, video)")  # fmt: skip
     answer = detector.detect if several else lambda images: map(detector, images)
     names = tuple(class_names) or _stated_names(detector)
-    source = DetectionSource(
-        *_checked(answer, names, bool(class_names)),
-        batch=getattr(detector, "batch", 1) if several else 1,
-        always_looks=isinstance(detector, OnnxDetector),
-        messages=[text] if (text := getattr(detector, "message", "")) else (),
-    )
-    return source
+    source = DetectionSource(*_checked(answer, names, bool(class_names)))
+    if not isinstance(detector, OnnxDetector):
+        return source
+    batch = detector.batch if several else 1
+    return dataclasses.replace(source, batch=batch, messages=detector.messages, always_looks=True)
 
 
 def _checked(

@@ -293,7 +293,7 @@ def _paste(maps: Any, boxes: Array, geometry: Geometry, ratio: Array) -> BoolArr
 
 def _keypoint_values(model: ModelProbe) -> int:
     """Return how many values a pose model has for the key points of a box; default: COCO's."""
-    return math.prod(map(int, re.findall(r"\d+", model.metadata.get("kpt_shape", "17, 3"))))
+    return math.prod(map(int, re.findall(r"\d{1,4}", model.metadata.get("kpt_shape", "17, 3"))))
 
 
 def _layout(

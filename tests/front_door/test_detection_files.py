@@ -732,39 +732,6 @@ def test_classes_of_identities_come_from_overlapping_detections(tmp_path: Path) 
     assert any("8 are `object`" in text for text in objects["warnings"])
 
 
-# ---- Class names ---------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("path: ../datasets/room\ntrain: images/train\nnames:\n  0: chair\n  1: table\n",
-         ("chair", "table")),
-        ("names: [chair, \"dining table\", 'tv''s stand']\n",
-         ("chair", "dining table", "tv's stand")),
-        ("names: {0: chair, 2: table}\n", ("chair", "class 1", "table")),
-        ("names: [\n  chair,\n  table,\n]\n", ("chair", "table")),
-        ("nc: 2\nnames:\n- chair # the first\n- table\nval: x\n", ("chair", "table")),
-        ("train: images\n", "no `names:` in it"),
-        ("names:\n", "lists no names"),
-        ("names: chair\n", "expected [a, b]"),
-        ("names:\n  99999: chair\n", "class number '99999'"),
-    ],
-)  # fmt: skip
-def test_class_names_of_a_yaml_file(
-    tmp_path: Path, text: str, expected: tuple[str, ...] | str
-) -> None:
-    (tmp_path / "data.yaml").write_text(text)
-    (tmp_path / "det.txt").write_text(mot(tail=".9,1"))
-    config = rt.DetectConfig(class_names=str(tmp_path / "data.yaml"))
-    video = rt.Video(write_clip(tmp_path / "v.avi"))
-    try:
-        found: Any = rt.read_detections(tmp_path / "det.txt", video, config).class_names
-    except rt.ReobjError as error:
-        found = str(error)
-    assert found == expected or (isinstance(expected, str) and expected in found), found
-
-
 # ---- Detectors whose labels are text -------------------------------------------------------------
 
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -219,6 +222,8 @@ YAML = {  # as yaml.dump writes it, and by hand; the names of classes 0 and 1
     "path: x\nnames:\n  0: &n chair  # the first\n  1: >-\n    dining\n    table\n": (
         "chair", "dining table"),
     "names: !!omap_is_not_known [1.0, 2024-01-01]\n": ("1.0", "2024-01-01"),
+    "nc: 2\nnames: [\n  chair,\n  'tv''s stand',\n]\nval: x\n": ("chair", "tv's stand"),
+    "names: {1: table}\n": ("class 0", "table"),
 }  # fmt: skip
 
 
@@ -241,6 +246,9 @@ def test_names_of_a_yaml_file(text: str, tmp_path: Path, detect: Any) -> None:
         ("names: *a\n", "invalid YAML"),
         ("names: " + 5000 * "[", "invalid YAML"),
         ("- a\n", "no `names:`"),
+        ("names:\n", "expected class names"),
+        ("names: chair\n", "expected class names"),
+        ("names:\n  99999: chair\n", "class number '99999'"),
     ],
 )
 def test_a_damaged_yaml_file_is_one_line(text: str, part: str, tmp_path: Path, detect: Any) -> None:
@@ -248,3 +256,34 @@ def test_a_damaged_yaml_file_is_one_line(text: str, part: str, tmp_path: Path, d
     path = write_model(tmp_path / "m.onnx", values(6))
     said = detect(path, "--set", f"detect.class_names={tmp_path / 'data.yaml'}")[1]
     assert "data.yaml" in said and part in said
+
+
+def test_names_in_a_locale_without_utf8(tmp_path: Path) -> None:
+    """LC_ALL=C, and Python's UTF-8 mode and coercion of the locale are off."""
+    folder = tmp_path / "Stühle"
+    folder.mkdir()
+    rows = ["frame,x1,y1,x2,y2,score,class"]
+    for index in range(6):
+        cv2.imwrite(str(folder / f"{index}.png"), np.zeros((120, 160, 3), np.uint8))
+        rows += [f"{index},20,30,60,70,.9,椅子", f"{index},90,30,130,70,.9,Stuhl grün"]
+    (tmp_path / "det.csv").write_text("\n".join(rows), encoding="utf-8")
+    off = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    program = [sys.executable, "-X", "warn_default_encoding", str(ROOT / "reobj_track.py")]
+
+    def run(*words: str) -> str:
+        done = subprocess.run([*program, *words], cwd=tmp_path, env=os.environ | off,
+                              capture_output=True, encoding="utf-8")  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        warned = [line for line in done.stderr.splitlines() if "EncodingWarning" in line]
+        assert not [line for line in warned if line.startswith(str(ROOT))], warned
+        return done.stdout
+
+    track = ["track", "Stühle", "--detections", "det.csv", *QUICK]
+    shown = run(*track, "-o", "out ü")
+    assert "1 椅子" in shown and "1 Stuhl grün" in shown and "out ü" in shown
+    assert "1 object: 1 椅子" in run(*track, "-o", "one", "--classes", "椅子")
+    for form, path in (("labelme", "labelme/labels.txt"), ("csv", "objects.csv")):
+        assert "out ü" in run("export", "out ü", "--to", form)
+        assert "Stuhl grün" in (tmp_path / "out ü" / path).read_text(encoding="utf-8-sig")
+    data = json.loads((tmp_path / "out ü/objects.json").read_text(encoding="utf-8"))
+    assert {entry["class"] for entry in data["objects"]} == {"椅子", "Stuhl grün"}
