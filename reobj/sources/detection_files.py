@@ -322,7 +322,8 @@ def _usable(
         raise ReobjError(f"{path}: {made_for}")
     if reading := _other_reading(recorded.xyxy, recorded.size):
         raise ReobjError(f"{path}: {reading}")
-    if 2 * (empty | outside).sum() > count or outside.sum() > max(10, 0.05 * count):
+    larger = outside.sum() > max(10, 0.05 * count) and not (high <= 0).any()
+    if 2 * (empty | outside).sum() > count or larger:
         raise ReobjError(
             f"{path}: {empty.sum()} of {count} boxes have no area and {outside.sum()} lie outside "
             f"the image of {recorded.size}: x, y, w, h where x1, y1, x2, y2 is expected, "

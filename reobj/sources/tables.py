@@ -139,6 +139,7 @@ def _number(cell: str, comma: bool = True) -> float:
 
 
 def are_numbers(cells: Sequence[str]) -> bool:
+    """Test whether all cells are numbers."""
     return not any(math.isnan(_number(cell)) for cell in cells)
 
 
