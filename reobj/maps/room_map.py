@@ -54,7 +54,7 @@ OBSERVATIONS: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {
     "quat_wxyz": (np.dtype(np.float32), (4,)),
     "cov": (np.dtype(np.float32), (9, 9)),
 }
-CONCATENATED = {
+CONCATENATED: dict[str, np.dtype[Any]] = {
     "foreground": np.dtype(np.float16), "background": np.dtype(np.float16),
     "picture": np.dtype(np.uint8),
 }  # fmt: skip
