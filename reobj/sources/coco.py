@@ -114,7 +114,7 @@ def converted(data: Any, kind: type[T], where: object) -> T:
     """Convert the content of a JSON file to a type; an error names the entry."""
     try:
         return msgspec.convert(data, kind)
-    except msgspec.ValidationError as error:
+    except ValueError as error:  # also a text that is no Unicode
         raise ReobjError(f"{where}: {error}") from error
 
 

@@ -339,7 +339,7 @@ def is_boxmot(probe: Probe) -> bool:
     """Test for nine columns: 1, a class, a score; no names of classes beside it, as CVAT's."""
     rows = _values(probe, 9)
     fits = (rows[:, 6] == 1) & (rows[:, 7] >= 0) & (rows[:, 7] % 1 == 0) & (rows[:, 8] <= 1)
-    beside = probe.path.with_name("labels.txt").exists()
+    beside = (probe.path.parent / "labels.txt").exists()
     return bool(len(rows) and fits.all() and not beside)
 
 
@@ -382,7 +382,7 @@ def read_mot(source: Source) -> RecordedDetections:
         source.say("columns 8 to 10 are x, y, z in the world, which are not read")
     elif "class" in table.cells:
         number = table.whole("class")
-    labels = source.path.with_name("labels.txt")
+    labels = source.path.parent / "labels.txt"
     if not source.names and labels.exists() and (number >= 0).any():
         source.names = load_class_names(labels)
         source.say("class names of labels.txt beside it, from 1")
