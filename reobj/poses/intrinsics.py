@@ -228,7 +228,7 @@ SIDES = ("resolution", "camerares", "imagesize", "imgsize", "imageresolution")
 # Keys that change the camera; not the matrices of rectified images in ROS's files
 CAMERA_LIKE = (
     r".*((?<!un)distort|focal|intrinsic|cam(era)?ma?t(ri)?x|principal|mirrorparam).*|[kps]\d|"
-    rf"[fc][xyuv]|[muv][0uv]|xi|skew|fov[xy]?|mtx|k|f|d|{DISTORTION}|{'|'.join(SIDES)}"
+    rf"[fc][xyuv]|[muv][0uv]|xi|skew|fov[xy]?|mtx|im(a)?ge?(shape|dim).*|k|f|d|{DISTORTION}|{'|'.join(SIDES)}"
 )
 
 
