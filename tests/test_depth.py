@@ -367,7 +367,7 @@ def other_matrix(folder):
         (strange, "d", "not a depth map"), (color_image, "d", "not a depth map"),
         (other_names, "d", "none of its 1 depth maps"), (other_sizes, "d", "32x24 pixels"),
         (other_json, "d", "expected fx, fy"), (lacking_json, "d", "intrinsics.json: expected fx"),
-        (other_matrix, "d", "3x3 or 4x4"),
+        (other_matrix, "d", "intrinsic_depth.txt: 3 numbers"),
     ],
 )  # fmt: skip
 def test_bad_input_gives_one_line(tmp_path, walk, make, text, expected):

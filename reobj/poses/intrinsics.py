@@ -57,22 +57,29 @@ def stated_camera(text: str, size: Size, fmt: str = AUTO) -> Camera | None:
     """
     if not text.strip():
         return None
-    where = f"--camera {text:.200}"
-    is_file = os.path.isfile(text)  # does not raise for long texts
-    if is_file and os.path.getsize(text) > CAMERA_MAX:
-        raise ReobjError(f"{where}: more than {CAMERA_MAX} bytes, not a camera file")
     try:
-        if is_file:
-            camera = CAMERAS.reader(Path(text), fmt)(Path(text), size)
-        else:
-            camera = _camera_of_rows(_rows(text), size)
-        if camera is None:
-            raise ReobjError(f"no focal length; expected {CAMERA_FORMS}")
+        if os.path.isfile(text):  # does not raise for long texts
+            return read_camera(Path(text), size, fmt)
+        return _camera_of_rows(_rows(text), size)
     except ReobjError as error:
-        raise ReobjError(f"{where}: {str(error).removeprefix(f'{text}: ')}") from None
-    except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError):
-        fault = "not a camera file" if is_file else "neither a file nor a camera"
-        raise ReobjError(f"{where}: {fault}; expected {CAMERA_FORMS}") from None
+        raise ReobjError(f"--camera {text:.200}: {str(error).removeprefix(f'{text}: ')}") from None
+    except (ValueError, IndexError):
+        fault = f"neither a file nor a camera; expected {CAMERA_FORMS}"
+        raise ReobjError(f"--camera {text:.200}: {fault}") from None
+
+
+def read_camera(path: Path, size: Size, fmt: str = AUTO) -> Camera:
+    """Read a camera file in a format of CAMERAS; size: of a camera without a size."""
+    if path.stat().st_size > CAMERA_MAX:
+        raise ReobjError(f"{path}: more than {CAMERA_MAX} bytes, not a camera file")
+    try:
+        camera = CAMERAS.reader(path, fmt)(path, size)
+    except ReobjError as error:
+        raise ReobjError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
+    except Exception:  # files of other programs hold any type
+        raise ReobjError(f"{path}: not a camera file; expected {CAMERA_FORMS}") from None
+    if camera is None:
+        raise ReobjError(f"{path}: no focal length; expected {CAMERA_FORMS}")
     return camera
 
 
@@ -228,7 +235,7 @@ SIDES = ("resolution", "camerares", "imagesize", "imgsize", "imageresolution")
 # Keys that change the camera; not the matrices of rectified images in ROS's files
 CAMERA_LIKE = (
     r".*((?<!un)distort|focal|intrinsic|cam(era)?ma?t(ri)?x|principal|mirrorparam).*|[kps]\d|"
-    rf"[fc][xyuv]|[muv][0uv]|xi|skew|fov[xy]?|mtx|k|f|d|{DISTORTION}|{'|'.join(SIDES)}"
+    rf"[fc][xyuv]|[muv][0uv]|xi|skew|fov[xy]?|mtx|im(a)?ge?(shape|dim).*|k|f|d|{DISTORTION}|{'|'.join(SIDES)}"
 )
 
 

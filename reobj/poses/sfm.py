@@ -46,7 +46,6 @@ from reobj.poses.features import (
 from reobj.poses.keyframes import choose_posed_keyframes, path_steps, sharpest_images
 from reobj.poses.mapping import Focal, MapperSearch, estimate_focal, without_poses
 from reobj.poses.redundancy import find_repeated, register
-from reobj.poses.supplied.check import EXPLAINED
 from reobj.poses.verification import FocalSource
 from reobj.poses.windows import map_keyframes
 from reobj.types import Array, IntArray
@@ -248,7 +247,7 @@ def triangulate(
         return _without_points(poses, f"no features of {len(rows)} images could be matched")
     if not triangulated or triangulated < MIN_TRIANGULATED * matched:
         cause = "are the poses of this video, in this order, with this camera?"
-        if explained > EXPLAINED:
+        if explained > 0.5:  # chosen; of right poses .6 and more
             cause = "the poses agree with the matches: too few views, or too little parallax"
         return _without_points(
             poses,

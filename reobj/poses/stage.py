@@ -43,10 +43,7 @@ def supplied_poses(video: Video, config: PosesConfig) -> Supplied | None:
                 "--metric applies to supplied poses only; a reconstruction has unknown scale"
             )
         return None
-    return read_supplied(
-        config.mode, video, config.fmt, config.camera, config.metric, config.frames_by,
-        config.camera_format,
-    )  # fmt: skip
+    return read_supplied(video, config)
 
 
 def checked_poses(

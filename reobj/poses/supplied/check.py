@@ -97,7 +97,7 @@ def _refuse(given: Supplied, likely: Sequence[str], measured: str) -> None:
         )
     raise ReobjError(
         f"the poses fit in no convention ({measured}): are they the poses of this video, in this "
-        "order, with this camera?"
+        "order, with this camera (--poses, --camera)?"
     )
 
 

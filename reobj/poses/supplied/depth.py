@@ -19,7 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from reobj.cameras import Camera, Poses, invert_rigid
-from reobj.files import load_json, read_lines
+from reobj.files import load_json
+from reobj.poses.intrinsics import camera_of_keys, read_camera
 from reobj.poses.supplied.frame_assignment import STAMP_TOLERANCE_S
 from reobj.sources.image_files import read_image
 from reobj.types import Array, BoolArray, Floats, IntArray, ReobjError, log
@@ -137,20 +138,19 @@ def _rows_of_maps(stems: Sequence[str], frame: IntArray, names: Sequence[str]) -
         return rows
     if images and all(re.fullmatch(r"\d+\.\d+", name) for name in (*images, *stems)):  # s (TUM)
         image_s = np.array(images, np.float64)
-        map_s = np.array(stems, np.float64)
-        nearest = np.abs(image_s - map_s[:, None]).argmin(1)  # (N,)
-        is_close = np.abs(image_s[nearest] - map_s) <= STAMP_TOLERANCE_S
-        return [int(row) for row in np.where(is_close, nearest, -1)]
-    numbers = [_last_number(name) for name in images] if images else frame.tolist()
-    row_of_number = dict(zip(numbers, range(len(frame)), strict=True))
-    row_of_number.pop(-1, None)
-    return [row_of_number.get(_last_number(stem), -1) for stem in stems]
+        distance = np.abs(image_s - np.array(stems, np.float64)[:, None])  # (N, F)
+        found = np.where(distance.min(1) <= STAMP_TOLERANCE_S, distance.argmin(1), -1)
+        return [int(row) for row in found]
+    row_of = {str(int(n)): row for row, n in enumerate(frame)}
+    if images:
+        row_of = {_last_number(name): row for row, name in enumerate(images)}
+    return [row_of.get(_last_number(stem), -1) for stem in stems]
 
 
-def _last_number(text: str) -> int:
-    """Return the last number in a text, -1 if there is none."""
+def _last_number(text: str) -> str:
+    """Return the last number in a text without leading zeros, or the text."""
     digits = re.findall(r"\d+", text)
-    return int(digits[-1]) if digits else -1
+    return str(int(digits[-1])) if digits else text
 
 
 def _core(stem: str) -> str:
@@ -166,16 +166,27 @@ def _depth_camera(folder: Path, size: tuple[int, int], color: Camera) -> tuple[C
     """
     same = np.eye(3, 4)
     for path in (folder, folder.parent, folder.parent / "intrinsic"):
-        if (path / "intrinsic_depth.txt").exists():  # ScanNet: first pixel's centre at (0, 0)
-            K = _matrix(path / "intrinsic_depth.txt")
-            return Camera("PINHOLE", *size, (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5)), same
+        if (file := path / "intrinsic_depth.txt").exists():  # ScanNet: first pixel's centre at 0, 0
+            fx, fy, cx, cy = read_camera(file, size, "matrix").params
+            return Camera("PINHOLE", *size, (fx, fy, cx + 0.5, cy + 0.5)), same
     for path in (folder / "intrinsics.json", folder.parent / "intrinsics.json"):
         content = load_json(path) if path.exists() else {}
         depth = content.get("depth") if isinstance(content, dict) else None
         if path.parent == folder and path.exists():
             depth = depth or content
-        if depth is not None:
-            return _camera_of(path, content, depth, size)
+        if depth is None:
+            continue
+        try:
+            transform = np.array(content.get("T_color_from_depth", [0, 0, 0]), np.float64)
+            if transform.shape == (3,):
+                transform = np.column_stack([np.eye(3), transform])
+            camera = camera_of_keys({key: depth[key] for key in depth if key != "depth"}, size)
+            if camera is not None and {"fy", "cx", "cy"} <= depth.keys():
+                return camera.resized(size), transform.reshape(-1, 4)[:3]
+        except (AttributeError, KeyError, TypeError, ValueError):
+            pass
+        expected = "fx, fy, cx, cy of the depth maps, T_color_from_depth: 3 or 3x4 numbers in m"
+        raise ReobjError(f"{path}: expected {expected}")
     if abs(color.width * size[1] - color.height * size[0]) > max(color.width, color.height, *size):
         raise ReobjError(
             f"{folder}: depth maps of {size[0]}x{size[1]}, frames of {color.width}x{color.height}: "
@@ -183,34 +194,6 @@ def _depth_camera(folder: Path, size: tuple[int, int], color: Camera) -> tuple[C
             "fx, fy, cx, cy"
         )
     return color.resized(size), same
-
-
-def _matrix(path: Path) -> Array:
-    """Read a 3x3 or 4x4 matrix of intrinsics."""
-    with contextlib.suppress(ValueError):
-        K = np.array([row.split() for row in read_lines(path) if row.strip()], float)
-        if K.shape in ((3, 3), (4, 4), (3, 4)) and min(K[0, 0], K[1, 1]) > 0:
-            return K
-    raise ReobjError(f"{path}: expected a 3x3 or 4x4 matrix of intrinsics")
-
-
-def _camera_of(path: Path, content: Any, depth: Any, size: tuple[int, int]) -> tuple[Camera, Array]:
-    """Read an intrinsics.json: fx, fy, cx, cy of maps w x h, and T_color_from_depth if given."""
-    color_from_depth = np.eye(3, 4)
-    try:
-        width = int(depth.get("w", size[0]))
-        height = int(depth.get("h", size[1]))
-        fx, fy, cx, cy = (float(depth[key]) for key in ("fx", "fy", "cx", "cy"))
-        camera = Camera("PINHOLE", width, height, (fx, fy, cx, cy))
-        transform = np.array(content.get("T_color_from_depth", [0, 0, 0]), np.float64)
-        if transform.shape == (3,):
-            color_from_depth[:, 3] = transform
-        else:
-            color_from_depth[:] = transform.reshape(-1, 4)[:3]
-        return camera.resized(size), color_from_depth
-    except (AttributeError, KeyError, TypeError, ValueError):
-        expected = "fx, fy, cx, cy of the depth maps, T_color_from_depth: 3 or 3x4 numbers in m"
-        raise ReobjError(f"{path}: expected {expected}") from None
 
 
 # ---- Scale and points ----------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from reobj.cameras import invert_rigid
 from reobj.frame_lookup import frames_by_name
@@ -336,23 +336,19 @@ def interpolated(
         cam_from_world (n, 3, 4), and the mask (F,) of the times that are interpolated: between two
         such poses and at the time of neither.
     """
-    after = np.searchsorted(stamps_s, time_s, side="right").clip(1, len(stamps_s) - 1)
-    a = after - 1
-    b = after
+    known = np.isfinite(cam_from_world).all((1, 2))
+    stamps_s = stamps_s[known]
+    world_from_cam = invert_rigid(cam_from_world[known])
+    if len(stamps_s) < 2:
+        return np.empty((0, 3, 4)), np.zeros(len(time_s), bool)
+    after = np.searchsorted(stamps_s, time_s, side="right").clip(1, len(stamps_s) - 1)  # (F,)
+    start, end = stamps_s[after - 1], stamps_s[after]
     same_s = 5e-4  # times in files and containers are rounded to a ms
-    use = (time_s - stamps_s[a] > same_s) & (stamps_s[b] - time_s > same_s)
-    use &= stamps_s[b] - stamps_s[a] <= max_step_s
-    use &= np.isfinite(cam_from_world[a] + cam_from_world[b]).all((1, 2))
-    a = a[use]
-    b = b[use]
-    fraction = ((time_s[use] - stamps_s[a]) / (stamps_s[b] - stamps_s[a]))[:, None]  # (n, 1)
-    start = invert_rigid(cam_from_world[a])
-    end = invert_rigid(cam_from_world[b])
-    turn = Rotation.from_matrix(start[:, :, :3])
-    step = (turn.inv() * Rotation.from_matrix(end[:, :, :3])).as_rotvec()
-    turned = (turn * Rotation.from_rotvec(fraction * step)).as_matrix()
-    centre = start[:, :, 3] + fraction * (end[:, :, 3] - start[:, :, 3])
-    return invert_rigid(np.concatenate([turned, centre[:, :, None]], 2)), use
+    use = (time_s - start > same_s) & (end - time_s > same_s) & (end - start <= max_step_s)
+    at = time_s[use]
+    turn = Slerp(stamps_s, Rotation.from_matrix(world_from_cam[:, :, :3]))(at).as_matrix()
+    centre = [np.interp(at, stamps_s, axis) for axis in world_from_cam[:, :, 3].T]
+    return invert_rigid(np.concatenate([turn, np.transpose([centre], (2, 1, 0))], 2)), use
 
 
 # ---- Order ---------------------------------------------------------------------------------------

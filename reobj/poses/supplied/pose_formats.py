@@ -38,6 +38,7 @@ class PoseFile:
         is_ours: this tool wrote the stamps, for the same video.
         visibility: (M, 2) row of the pose that observed a point, and row of the point.
         axes: (3, 3) OpenCV's camera axes from those of the file, as it was read.
+        identity: (3, 4) the identity in the file, as it was read; None: that in these axes.
         by_text: without names, poses are in the order of the images' names as text: 1, 10, 2.
         stored_pixels: cameras are those of images as they are stored, without their EXIF turn.
         lost: number of poses that are missing.
@@ -56,6 +57,7 @@ class PoseFile:
     colors: npt.NDArray[np.uint8] = field(default_factory=lambda: np.empty((0, 3), np.uint8))
     visibility: IntArray = field(default_factory=lambda: np.empty((0, 2), np.int64))
     axes: Array = field(default_factory=lambda: np.eye(3))
+    identity: Array | None = None
     by_text: bool = False
     stored_pixels: bool = False
     lost: int = 0
@@ -255,6 +257,7 @@ def read_euroc(path: Path, size: tuple[int, int]) -> PoseFile:
     world_from_cam = from_quaternions(rows[:, columns[3:]], rows[:, columns[:3]], where)
     kept, messages = _by_time(rows[:, 0], path)
     cameras: tuple[Camera | None, ...] = ()
+    body_from_cam = np.eye(4)[None]
     near = (path.parent, path.parent.parent / "cam0", path.parent / "cam0")
     for sensor in filter(Path.is_file, (folder / "sensor.yaml" for folder in near)):
         data = read_yaml(sensor)
@@ -273,7 +276,8 @@ def read_euroc(path: Path, size: tuple[int, int]) -> PoseFile:
         )
     return PoseFile(
         invert_rigid(world_from_cam)[kept], cameras, stamps=rows[kept, 0], unit="ns",
-        metric=True, kind="EuRoC rows", messages=messages,
+        metric=True, identity=invert_rigid(body_from_cam[0, :3]), kind="EuRoC rows",
+        messages=messages,
     )  # fmt: skip
 
 

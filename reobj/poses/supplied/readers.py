@@ -17,6 +17,7 @@ import numpy as np
 from reobj.cameras import WORLD_MAX, Camera, Poses, usable
 from reobj.files import spans
 from reobj.formats import AUTO, Format, Probe, Registry
+from reobj.poses.estimate import PosesConfig
 from reobj.poses.intrinsics import CAMERA_FORMS, fitted_camera, parse_camera
 from reobj.poses.supplied import pose_formats as formats
 from reobj.poses.supplied.check import Supplied
@@ -61,23 +62,16 @@ def read_poses(
         ReobjError: damaged, unknown, not rigid, without intrinsics, of another video, or with
             several formats or assignments to frames.
     """
-    return read_supplied(path, video, fmt, camera, metric, frames_by, camera_format).poses
+    config = PosesConfig(str(path), fmt, frames_by, camera, camera_format, metric)
+    return read_supplied(video, config).poses
 
 
-def read_supplied(
-    path: str | Path,
-    video: Any,
-    fmt: str = AUTO,
-    camera: str = "",
-    metric: bool = False,
-    frames_by: str = "",
-    camera_format: str = AUTO,
-) -> Supplied:
+def read_supplied(video: Any, config: PosesConfig) -> Supplied:
     """Read poses as `read_poses` does, with what `check` needs to name a mistake."""
-    path = Path(path)
+    path = Path(config.mode)
     size = (int(video.size[0]), int(video.size[1]))
-    pose_file = read_pose_file(path, fmt, size)
-    stated = parse_camera(camera, size, camera_format)
+    pose_file = read_pose_file(path, config.fmt, size)
+    stated = parse_camera(config.camera, size, config.camera_format)
     if stated is None and not any(pose_file.cameras):
         raise ReobjError(f"{path}: no intrinsics; add --camera {CAMERA_FORMS}")
     times = [(frame.index, frame.time_s) for frame in video]
@@ -87,7 +81,7 @@ def read_supplied(
     time_s = np.array([t for _, t in times])
     source = source_of(video, frame, time_s)
     stamps_s, messages = _in_seconds(pose_file, path, source)
-    assignment = _assignment(pose_file, stamps_s, source, path, frames_by)
+    assignment = _assignment(pose_file, stamps_s, source, path, config.frames_by)
     row = assignment.row
     turns, turn_messages = (
         turns_of(source, size, pose_file.cameras, row) if pose_file.stored_pixels else ({}, ())
@@ -111,7 +105,7 @@ def read_supplied(
     poses = Poses(
         intrinsics, frame, time_s, cam_from_world,
         np.where(np.isfinite(cam_from_world).all((1, 2)), "supplied", "none"), "user",
-        metric=pose_file.metric or metric, up_in_world=pose_file.up_in_world,
+        metric=pose_file.metric or config.metric, up_in_world=pose_file.up_in_world,
         points=pose_file.points, colors=pose_file.colors,
         visibility=_in_frames(pose_file.visibility, row),
         messages=(*pose_file.messages, *messages, *turn_messages, *[lost] * bool(lost)),
@@ -275,8 +269,9 @@ def _without_lost(pose_file: PoseFile, path: Path) -> PoseFile:
     It is a pose where it begins the path, and where it is the only one of poses with names.
     """
     cam_from_world = pose_file.cam_from_world
-    whole = np.column_stack([pose_file.axes, np.zeros(3)])
-    same: BoolArray = np.all(np.abs(cam_from_world - whole) < 1e-9, axis=(1, 2))  # (N,)
+    identity = np.column_stack([pose_file.axes, np.zeros(3)])
+    identity = identity if pose_file.identity is None else pose_file.identity
+    same: BoolArray = np.all(np.abs(cam_from_world - identity) < 1e-9, axis=(1, 2))  # (N,)
     begins = same[:1].any() and not same[1:2].any()
     if begins or (pose_file.names and same.sum() == 1):
         same[same.argmax()] = False
