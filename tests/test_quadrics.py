@@ -9,7 +9,6 @@ LfD authors' published demo (../shared/data/lfd_aldoma).
 from __future__ import annotations
 
 import ast
-import dataclasses
 import itertools
 import json
 import re
@@ -580,9 +579,7 @@ def test_points_that_are_seen_lie_on_the_front() -> None:
     faces_us = (along * on_face)[:, np.arange(200), face] < 0  # (O, P)
     points[~faces_us] = np.nan
     seen = np.concatenate([points, sight], 2)
-    wide = dataclasses.replace(
-        priors, log_mean=priors.log_mean + 0.4
-    )  # usual sizes too large by half
+    wide = replace(priors, log_mean=priors.log_mean + 0.4)  # usual sizes too large by half
     given = (joint, flat, syn.IMAGE, names, wide)
     fits = [q.fit_objects(*given, up=UP, points=p) for p in (points, seen)]
     error = [np.abs(np.log(f.ellipsoids.half_axes / truth.half_axes)).mean(1) for f in fits]
