@@ -1205,7 +1205,7 @@ class _Problem(_Rows):
     vertical: Array  # (B, 3) 1 for the vertical axis
     floor: Array  # (B, 4) plane n, d: n x = d
     floor_info: Array  # (B,) 1 / sigma^2 of the height of the lower side over the floor; 0: free
-    points: Array  # (B, P, 6) that may lie on the object, and the directions in which they are seen
+    points: Array  # (B, P, 3) that may lie on the object
     point_weight: Array  # (B, P) of the points, 0: no point
     point_sigma: Array  # (B,) of a point's distance outside the solid, world units
 
@@ -1361,13 +1361,10 @@ def _normal_equations(
     cost += rho.sum(1)
     if not prob.points.shape[1]:
         return _Normal(cost, hessian, gradient)
-    value, jacobian = _point_distances(state, prob)
-    on_front = (1.0 - POINT_INSIDE) * np.exp(-0.5 * value[..., 3] ** 2)  # (B, P)
-    on_it = (1.0 - POINT_ELSEWHERE) * np.exp(-0.5 * (value[..., :3] ** 2).sum(2))
-    on_it *= on_front + POINT_INSIDE
-    weight = np.repeat((prob.point_weight * on_it / (on_it + POINT_ELSEWHERE))[..., None], 4, 2)
-    weight[..., 3] *= on_front / (on_front + POINT_INSIDE)
-    weighted = jacobian * weight[..., None]  # (B, P, 4, 9)
+    value, jacobian = _points_outside(state, prob)
+    on_it = (1.0 - POINT_ELSEWHERE) * np.exp(-0.5 * (value**2).sum(2))  # (B, P)
+    weight = prob.point_weight * on_it / (on_it + POINT_ELSEWHERE)
+    weighted = jacobian * weight[..., None, None]  # (B, P, 3, 9)
     hessian += np.einsum("bpki,bpkj->bij", weighted, jacobian, optimize=True)
     gradient += np.einsum("bpki,bpk->bi", weighted, value, optimize=True)
     cost -= 2.0 * (prob.point_weight * np.log(on_it + POINT_ELSEWHERE)).sum(1)
@@ -1393,41 +1390,21 @@ def _prior_terms(state: _State, prob: _Problem) -> _Normal:
     return _Normal(cost + (tilt * up * up).sum(1) + prob.floor_info * height**2, hessian, gradient)
 
 
-def _point_distances(state: _State, prob: _Problem) -> tuple[Array, Array]:
-    """Compute how far points lie outside the box around a solid, and behind its front.
-
-    Outside: along the three axes, 0 inside. Behind the front: along the line of sight, from the
-    face through which it enters the box; 0 outside, and where the direction is unknown. A point
-    that is seen lies on the front, or in the concave part of an object that is no box.
+def _points_outside(state: _State, prob: _Problem) -> tuple[Array, Array]:
+    """Compute how far points lie outside the box around a solid, along its axes; 0 inside.
 
     Returns:
-        value (B, P, 4) in sigma, the last one behind the front; jacobian (B, P, 4, 9).
+        value (B, P, 3) in sigma; jacobian (B, P, 3, 9).
     """
-    at = (prob.points[..., :3] - state.center[:, None]) @ state.rot  # (B, P, 3)
-    sight = prob.points[..., 3:] @ state.rot
+    at = (prob.points - state.center[:, None]) @ state.rot  # (B, P, 3)
     half = np.exp(state.log_half)[:, None]  # (B, 1, 3)
     beyond = np.abs(at) - half
-    sigma = prob.point_sigma[:, None, None]
-    side = np.where(beyond > 0, np.sign(at), 0.0) / sigma
-    jacobian = np.zeros((*at.shape[:2], 4, 9))
-    outside = jacobian[..., :3, :]
-    outside[..., :3] = -side[..., None] * state.rot.transpose(0, 2, 1)[:, None]
-    outside[..., [0, 1, 2], [3, 4, 5]] = -np.abs(side) * half
-    turned = _skew(at)  # (B, P, 3, 3): d at / d rotvec
-    outside[..., 6:] = side[..., None] * turned
-    toward = np.copysign(1.0, sight)
-    slope = np.maximum(np.abs(sight), 1e-3)  # less: parallel to the faces
-    depth = (half + toward * at) / slope  # (B, P, 3) behind the faces
-    face = depth.argmin(2)[..., None]  # (B, P, 1)
-    behind = (beyond <= 0).all(2, keepdims=True) & sight.any(2, keepdims=True)  # (B, P, 1)
-    scale = np.where(behind, 1.0 / (POINT_BEHIND * sigma * slope), 0.0)  # (B, P, 3)
-    each = np.empty((*at.shape, 9))
-    each[..., :3] = -(scale * toward)[..., None] * state.rot.transpose(0, 2, 1)[:, None]
-    each[..., 3:6] = (scale * half)[..., None] * np.eye(3)
-    each[..., 6:] = (scale * toward)[..., None] * (turned - depth[..., None] * _skew(sight))
-    jacobian[..., 3, :] = np.take_along_axis(each, face[..., None], 2)[..., 0, :]
-    front = np.take_along_axis(scale * slope * depth, face, 2)  # (B, P, 1)
-    return np.concatenate([np.abs(side) * beyond, front], 2), jacobian
+    side = np.where(beyond > 0, np.sign(at), 0.0) / prob.point_sigma[:, None, None]
+    jacobian = np.zeros((*at.shape, 9))
+    jacobian[..., :3] = -side[..., None] * state.rot.transpose(0, 2, 1)[:, None]
+    jacobian[..., [0, 1, 2], [3, 4, 5]] = -np.abs(side) * half
+    jacobian[..., 6:] = side[..., None] * _skew(at)
+    return np.abs(side) * beyond, jacobian
 
 
 def _size_prior(state: _State, prob: _Problem) -> tuple[Array, Array, Array]:
@@ -1514,8 +1491,6 @@ START_OFFSET = 0.5  # box sizes, inlier threshold of the distance of a ray from 
 # insensitive within .05 to .15, to .3, and 10 to 60 (docs/quadrics.md).
 POINT_REL = 0.08  # sigma of a point's distance, over the usual half width of the category
 POINT_ELSEWHERE = 0.1  # prior odds of a point on another object, uniform in space
-POINT_INSIDE = 0.5  # probability that a point on an object lies in a concave part of it
-POINT_BEHIND = 2.0  # sigma of the distance behind the front, over that outside (1 to 4 are alike)
 POINTS_WORTH = 20.0  # total weight of an object's points: the errors of neighbours correlate
 STANDING_REL = 0.012  # sigma of the lower side's height over the floor, over the object's height
 
@@ -1580,7 +1555,7 @@ class _Spec:
     tilt_rad: float  # sigma of an object's vertical axis about `up`
     floor: Array  # (4,) plane n, d: n x = d
     floor_sigma: Array  # (H,) of the height of an object's lower side; inf: need not stand there
-    points: Array  # (H, P, 6) that may lie on the object, and the directions in which they are seen
+    points: Array  # (H, P, 3) that may lie on the object
     point_weight: Array  # (H, P) of the points, 0: no point
 
     def overrules(self, fit: _Fit) -> BoolArray:
@@ -1609,7 +1584,7 @@ class _Given:
     categories: list[str | None]  # (L,)
     priors: Priors | None
     codes: IntArray  # (L,) `Shape`
-    points: Array  # (L, P, 6), NaN: no point; then the directions in which they are seen
+    points: Array  # (L, P, 3), NaN: no point
     sizes: list[tuple[int, int, float]]  # row, axis of the prior, metres
     wrong_class: float  # probability that a category is wrong
 
@@ -1708,13 +1683,12 @@ def _prior_spec(given: _Given, world: _World) -> _Spec:
         floor_sigma = np.where(stands, np.hypot(world.floor.sigma, standing_sigma), np.inf)
         elsewhere = 1.0 / np.exp(world.log_scale)  # 1 m, sigma of the height of other objects
         log_odds += np.where(stands, np.log(elsewhere / floor_sigma), 0.0)
-    is_point = _finite(points[..., :3], 2)  # (O, P)
-    points = np.where(is_point[..., None], np.nan_to_num(points), 0.0)
+    is_point = _finite(points, 2)  # (O, P)
     count = is_point.sum(1, keepdims=True)
     weight = is_point * np.minimum(POINTS_WORTH / np.maximum(count, 1), 1.0)
     return _Spec(
         obj, log_odds, size_mean, cov, rows, natural, allowed, round_, upright, world.up,
-        world.tilt_rad, plane, floor_sigma, points, weight,
+        world.tilt_rad, plane, floor_sigma, np.where(is_point[..., None], points, 0.0), weight,
     )  # fmt: skip
 
 
@@ -2650,8 +2624,8 @@ def _check_input(
         raise QuadricsError(f"image_size is {image_size}, expected (width, height)")
     if names is not None and len(names) != boxes.shape[1]:
         raise QuadricsError(f"{len(names)} categories given for {boxes.shape[1]} objects")
-    if points.ndim != 3 or points.shape[::2] != (boxes.shape[1], 6):
-        expected = f"({boxes.shape[1]}, points, 3 or 6)"
+    if points.ndim != 3 or points.shape[::2] != (boxes.shape[1], 3):
+        expected = f"({boxes.shape[1]}, points, 3)"
         raise QuadricsError(f"points has shape {points.shape}, expected {expected}")
 
 
@@ -2696,8 +2670,7 @@ def fit_objects(
         floor: plane of the objects whose category stands on the floor; used once the scale is
             given or estimated.
         points: (O, P, 3) sparse points that may lie on each object, padded with NaN; outliers are
-            down-weighted. Or (O, P, 6): with the unit directions in which they are seen, world
-            axes; such a point lies on the front of the object.
+            down-weighted.
     Returns:
         ObjectFits in world units; objects whose numbers are unusable have status "rejected".
     Raises:
@@ -2706,9 +2679,7 @@ def fit_objects(
     cfg = config or FitConfig()
     boxes = np.asarray(boxes_xyxy, np.float64)
     cameras = np.asarray(img_from_world, np.float64)
-    sparse = np.zeros((boxes.shape[1], 0, 6)) if points is None else np.asarray(points, np.float64)
-    if sparse.shape[-1:] == (3,):  # no directions
-        sparse = np.concatenate([sparse, np.zeros_like(sparse)], -1)
+    sparse = np.zeros((boxes.shape[1], 0, 3)) if points is None else np.asarray(points, np.float64)
     _check_input(boxes, cameras, image_size, categories, sparse)
     codes = _support_codes(support, boxes.shape[1])
     cams = _cameras(cameras)

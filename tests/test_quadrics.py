@@ -562,34 +562,6 @@ def test_points_improve_the_depth_despite_background_points() -> None:
     np.testing.assert_array_equal(depth_errors(far), depth_errors(None))  # NaN: no points
 
 
-def test_points_that_are_seen_lie_on_the_front() -> None:
-    """A solid that is too long or too near would hide them: without directions nothing tells."""
-    boxes, cams, truth, priors, names = syn.scenes(40, 6, 12, 0.02, "box", np.random.default_rng(5))
-    joint, flat = syn.as_one(boxes, cams)
-    centre = -np.linalg.solve(cams[:, :, :, :3], cams[:, :, :, 3:])[..., 0].mean(1)  # (O, 3)
-    rng = np.random.default_rng(6)
-    on_face = rng.uniform(-1, 1, (40, 200, 3))
-    on_face[:, np.arange(200), np.arange(200) % 3] = np.sign(rng.normal(size=(40, 200)))
-    offset = np.einsum("oij,opj->opi", truth.world_from_obj, on_face * truth.half_axes[:, None])
-    points = truth.center_in_world[:, None] + offset  # (O, P, 3)
-    sight = points - centre[:, None]
-    sight /= np.linalg.norm(sight, axis=2, keepdims=True)
-    along = np.einsum("oij,opi->opj", truth.world_from_obj, sight)
-    face = np.arange(200) % 3
-    faces_us = (along * on_face)[:, np.arange(200), face] < 0  # (O, P)
-    points[~faces_us] = np.nan
-    seen = np.concatenate([points, sight], 2)
-    wide = replace(priors, log_mean=priors.log_mean + 0.4)  # usual sizes too large by half
-    given = (joint, flat, syn.IMAGE, names, wide)
-    fits = [q.fit_objects(*given, up=UP, points=p) for p in (points, seen)]
-    error = [np.abs(np.log(f.ellipsoids.half_axes / truth.half_axes)).mean(1) for f in fits]
-    assert np.median(error[1]) < 0.9 * np.median(error[0])
-    away = [
-        np.linalg.norm(f.ellipsoids.center_in_world - truth.center_in_world, axis=1) for f in fits
-    ]
-    assert np.median(away[1]) < 0.8 * np.median(away[0])
-
-
 def test_points_do_not_make_a_size_more_certain() -> None:
     """They are a one-sided bound; but they do reduce the uncertainty of the prior."""
     boxes, cams, truth, priors, names = syn.scenes(40, 6, 12, 0.02, "box", np.random.default_rng(5))

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import sparse
 
 import quadrics
-from reobj.cameras import Poses, invert_rigid, place_of, undistort_boxes
+from reobj.cameras import Poses, place_of, undistort_boxes
 from reobj.types import Array, BoolArray, IntArray, Tracks, rows_by
 from reobj.visible_points import VisiblePoints, points_in_boxes
 
@@ -31,8 +31,7 @@ class Views:
         frame: (V,) source frames. boxes: (V, G, 4) xyxy in undistorted pixels, NaN where unseen.
         score: (V, G), 0 where unseen. img_from_world: (V, 3, 4) K @ cam_from_world.
         image_size: (w, h) px. occluded: (V, G, 4) edges of boxes caused by an occluder.
-        points: (G, P, 6) sparse points that may lie on each group's object, and the unit directions
-            in which they are seen, padded with NaN.
+        points: (G, P, 3) sparse points that may lie on each group's object, padded with NaN.
     """
 
     frame: IntArray
@@ -105,8 +104,7 @@ def points_on(
         ellipsoids: of the G groups, NaN where unknown.
         max_points: per object; more take more time.
     Returns:
-        (G, P, 6) points and the unit directions in which they are seen, spread over the points of
-        each group, padded with NaN.
+        (G, P, 3), spread over the points of each group, padded with NaN.
     """
     group, point = _points_inside_most_boxes(views, poses)
     in_obj = np.einsum(
@@ -119,23 +117,12 @@ def points_on(
     distance = np.linalg.norm((np.abs(in_obj) - half).clip(0), axis=1) / width
     order = np.lexsort((width, np.nan_to_num(distance, nan=np.inf), point))
     order = order[np.append(True, np.diff(point[order]) != 0)[: len(order)]]  # nearest group
-    seen = np.hstack([poses.points, _directions(poses)])  # (N, 6)
-    found = np.full((views.boxes.shape[1], max_points, 6), np.nan)
+    found = np.full((views.boxes.shape[1], max_points, 3), np.nan)
     for pairs in rows_by(group[order]):
         if len(pairs) >= MIN_POINTS:
             pairs = order[pairs[:: -(-len(pairs) // max_points)]]
-            found[group[pairs[0]], : len(pairs)] = seen[point[pairs]]
+            found[group[pairs[0]], : len(pairs)] = poses.points[point[pairs]]
     return found
-
-
-def _directions(poses: Poses) -> Array:
-    """Return the mean unit direction (N, 3) in which the sparse points are seen, world axes."""
-    row, point = poses.visibility.T
-    camera = invert_rigid(poses.cam_from_world)[:, :, 3]  # (F, 3)
-    ray = poses.points[point] - camera[row]
-    ray /= np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-12)
-    total = np.stack([np.bincount(point, x, len(poses.points)) for x in ray.T], 1)  # (N, 3)
-    return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12))
 
 
 def _points_inside_most_boxes(views: Views, poses: Poses) -> tuple[IntArray, IntArray]:
