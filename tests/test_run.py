@@ -525,9 +525,10 @@ def test_bad_detections(
 
 
 def assert_one_clear_line(capsys: pytest.CaptureFixture[str], message: str) -> None:
-    err = capsys.readouterr().err
-    assert re.search(message, err), err
-    assert err.startswith("error: ") and err.count("\n") == 1, err
+    shown = capsys.readouterr().err.splitlines()  # progress, and the error
+    errors = [line for line in shown if line.startswith("error: ")]
+    assert len(errors) == 1 and errors[0] == shown[-1] and re.search(message, errors[0]), shown
+    assert all("%" in line for line in shown[:-1]), shown
 
 
 def test_missing_frames_are_reported(

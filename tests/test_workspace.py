@@ -274,7 +274,7 @@ def test_the_source_file_is_written_atomically(
     space.bind(video)
     before = (space.cache / "source.json").read_bytes()
 
-    def full(path: Path, text: str) -> None:
+    def full(path: Path, text: str, **_: str) -> None:
         path.write_bytes(text.encode()[:10])
         raise OSError("No space left on device")
 

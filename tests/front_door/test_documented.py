@@ -540,6 +540,7 @@ def test_mistakes_of_the_first_hour(desk: Path, capsys: pytest.CaptureFixture[st
         (desk / name).symlink_to(ROOM / "room.mp4")
     shutil.copy(ROOM / "gt_mot.txt", desk / "livingroom_gt.txt")
     matrices = np.tile(np.eye(4).ravel(), (240, 1))
+    matrices[:, 3] = 0.01 * np.arange(240)
     np.savetxt(desk / "monday_poses.txt", matrices)
     (desk / "poses.txt").unlink()
     (desk / "livingroom").mkdir()
