@@ -653,6 +653,15 @@ def test_unread_images_are_counted(tmp_path: Path) -> None:
         rt.Video(tmp_path)
 
 
+def test_other_suffixes_of_jpeg(tmp_path: Path) -> None:
+    """They were passed over in silence, beside .jpg too."""
+    names = ["a1.jpg", "a2.jfif", "a3.jpe", "a4.MPO"]
+    write(tmp_path / "im", ["a1.jpg"])
+    for name in names[1:]:
+        shutil.copy(tmp_path / "im/a1.jpg", tmp_path / "im" / name)
+    assert [Path(name).name for name in rt.Video(tmp_path / "im").names] == names
+
+
 @pytest.mark.parametrize(
     "names",
     [
