@@ -176,7 +176,7 @@ def test_boxes_that_are_fractions_are_refused(count: int, tmp_path: Path, detect
     output[0, :4] /= SIDE
     metadata = {"names": NAMES} if count == 7 else {}
     found, said = detect(write_model(tmp_path / "m.onnx", output, **metadata))
-    assert not found and "boxes are no px of the input" in said
+    assert not found and "its boxes are fractions" in said
 
 
 def test_a_declared_layout_must_fit(tmp_path: Path, detect: Any) -> None:
