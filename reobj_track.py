@@ -1949,7 +1949,8 @@ def _cmd_eval(args: argparse.Namespace) -> int:
         beside = [args.gt_objects.with_name(n) for n in ("poses_c2w.txt", "poses.txt")]
         poses = next((p for p in beside if p.exists()), None)
     classes = [c.strip() for c in args.classes.split(",") if c.strip()]
-    more = (args.min_visibility, args.gt_format)
+    first = config_from_args(Config(), args).detect.first_frame
+    more = (args.min_visibility, args.gt_format, first)
     scores = evaluate(args.out, args.gt, args.gt_objects, poses, classes, *more)
     try:
         if args.out.is_dir():

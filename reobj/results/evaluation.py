@@ -374,6 +374,7 @@ def evaluate(
     classes: Sequence[str] = (),
     min_visibility: float = 0.0,
     gt_format: str = AUTO,
+    first_frame: str = "",
 ) -> dict[str, Any]:
     """Evaluate an output folder of `run`, or a tracks.txt, against ground truth.
 
@@ -387,6 +388,7 @@ def evaluate(
             auto.
         solids: gt_objects.json; truth_poses: TUM, or a 4x4 world_from_cam a line. classes: to
             evaluate, (): all. min_visibility: true boxes of lower visibility are ignored.
+        first_frame: number of the first frame in `gt`, 0 or 1; "": as its format says.
     Returns:
         {"tracks": scores by class, "ranks": Rank-k of the returns, "objects": scores in 3D,
         "missed": true identities without a match by class, "messages": assumptions about the
@@ -407,7 +409,7 @@ def evaluate(
         tracked = workspace.load_last()
         names = tracked.class_names
     size = (0, 0) if tracked is None else (tracked.video.width, tracked.video.height)
-    truth = read_truth(Path(gt), names, min_visibility, notes, size, gt_format)
+    truth = read_truth(Path(gt), names, min_visibility, notes, size, gt_format, first_frame)
     check_counts(truth, Path(gt))
     if tracked is not None:
         read = truth[_was_read(truth.frame - 1, workspace.source[1])]

@@ -85,6 +85,7 @@ def read_truth(
     notes: list[str] | None = None,
     size: tuple[int, int] = (0, 0),
     fmt: str = AUTO,
+    first: str = "",
 ) -> LabelledBoxes:
     """Read true boxes in any of the formats TRUTH.
 
@@ -92,13 +93,15 @@ def read_truth(
         class_names: by the numbers of files that do not name their classes (from 0).
         min_visibility: rows of lower visibility are Role.IGNORED.
         notes: assumptions about the file are appended. size: (w, h) of the video, (0, 0): unknown.
-        fmt: a format of TRUTH, or auto.
+        fmt: a format of TRUTH, or auto. first: number of the first frame, "": as the format says.
     Raises:
         ReobjError: the file cannot be read, or an identity has two boxes in a frame.
     """
     notes = [] if notes is None else notes
     reader = TRUTH.reader(path, fmt)
-    truth = reader(path, class_names, min_visibility, notes, size)
+    if first not in ("", "0", "1"):
+        raise ReobjError(f"detect.first_frame {first}: expected 0 or 1 for ground truth")
+    truth = reader(path, class_names, min_visibility, notes, size, first)
     _check_identities(truth, path)
     return truth
 
@@ -107,11 +110,11 @@ def _with_roles(entry: Format[Reader]) -> Format[TruthReader]:
     """Return a format of detections with identities as one of ground truth."""
 
     def read(
-        path: Path, _: Sequence[str], __: float, notes: list[str], size: tuple[int, int]
+        path: Path, _: Sequence[str], __: float, notes: list[str], size: tuple[int, int], first: str
     ) -> LabelledBoxes:
         video = SimpleNamespace(size=size, working_size=size, names=[], files=[], frame_count=0,
                                 times_s=None, source=path.stem)  # fmt: skip
-        source = Source(path, video, messages=notes, advice="expected frame_id, or names from 0")
+        source = Source(path, video, first=first, messages=notes)
         recorded = read_source(source, entry)
         check_rows(recorded, path)
         if not len(recorded.identity):
@@ -174,13 +177,14 @@ def _read_mot(
     min_visibility: float,
     notes: list[str],
     _: tuple[int, int],
+    first: str,
 ) -> LabelledBoxes:
     """Read MOTChallenge rows.
 
     Column 7 is a flag (0: the row does not count). In files of nine columns, column 8 is the class
     and column 9 the visibility; MOT15 has ten columns, with world coordinates instead.
     """
-    rows = _from_one(read_mot_rows(path), path, notes)
+    rows = _from_one(read_mot_rows(path), path, notes, first)
     flagged = rows[:, 6] == 0 if rows.shape[1] > 6 else np.zeros(len(rows), bool)
     sequence = _sequence(path)
     _check_length(rows, path, sequence)
@@ -232,19 +236,21 @@ TRUTH: Registry[TruthReader] = Registry("ground truth", "--gt-format", [
 ])  # fmt: skip
 
 
-def _from_one(rows: Array, path: Path, notes: list[str]) -> Array:
+def _from_one(rows: Array, path: Path, notes: list[str], begin: str = "") -> Array:
     """Return rows whose frames count from 1; convert those that count from 0."""
     first = rows[:, 0].min(initial=1)
-    if first < 0:
-        raise ReobjError(f"{path}: frame {first:.0f}; expected frames from 1, or from 0")
+    if first < int(begin or 0):
+        expected = f"from {begin}" if begin else "from 1, or from 0"
+        raise ReobjError(f"{path}: frame {first:.0f}; expected frames {expected}")
     if (rows[:, 4:6] < 0).any():
         at = int((rows[:, 4:6] < 0).any(1).argmax())
         where = f"frame {rows[at, 0]:.0f}, identity {rows[at, 1]:.0f}"
         raise ReobjError(
             f"{path}, {where}: width or height below 0; expected left,top,width,height"
         )
-    if first == 0:
-        notes.append(f"{path.name} has a frame 0: its frames are taken as 0-based")
+    if first == 0 or begin == "0":
+        why = f"{path.name} has a frame 0: its" if first == 0 else f"{path.name}: its"
+        notes.append(f"{why} frames are taken as 0-based")
         rows = rows + np.eye(1, rows.shape[1])
     return rows
 

@@ -20,8 +20,9 @@ def load_class_names(path: str | Path) -> tuple[str, ...]:
     """Read class names in the order of their numbers.
 
     Args:
-        path: text file with one name a line (empty lines are skipped); or data.yaml, whose `names`
-            are a list or a map from numbers; or JSON with the same content.
+        path: text file with one name, or `NUMBER: NAME`, a line (empty lines are skipped); or
+            data.yaml, whose `names` are a list or a map from numbers; or JSON with the same
+            content.
     Raises:
         ReobjError: as `names_by_number`, or a damaged file.
     """
@@ -36,7 +37,11 @@ def load_class_names(path: str | Path) -> tuple[str, ...]:
     if path.suffix.lower() == ".json":
         data = load_json(path)
         return names_by_number(data.get("names", data) if isinstance(data, dict) else data, where)
-    return names_by_number([line.strip() for line in read_lines(path) if line.strip()], where)
+    lines = [line.strip() for line in read_lines(path) if line.strip()]
+    numbered = [re.fullmatch(r"(\d+)\s*:\s*(\S.*)", line) for line in lines]
+    if lines and all(numbered):
+        return names_by_number({match[1]: match[2] for match in numbered if match}, where)
+    return names_by_number(lines, where)
 
 
 def is_yaml(path: Path) -> bool:

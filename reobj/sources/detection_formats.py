@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Callable
 
 from reobj.formats import Format, Probe, Registry
@@ -34,10 +35,18 @@ def _root(tag: str) -> Callable[[Probe], bool]:
     return lambda probe: probe.root is not None and probe.root.tag == tag
 
 
-def _is_voc(probe: Probe) -> bool:
-    """Test for a file, or a folder of nothing else."""
-    folder = probe.is_dir and bool(probe.names)
-    return _root("annotation")(probe) or (folder and all(n.endswith(".xml") for n in probe.names))
+@functools.lru_cache(maxsize=1)
+def _sample(probe: Probe) -> Probe:
+    """Return the deepest JSON or XML file in a folder without labels; else the same path."""
+    with contextlib.suppress(ReobjError):
+        if not probe.is_dir or label_folders.label_files(probe.path):
+            return probe
+    files = sorted(path for path in probe.path.rglob("*") if path.suffix in (".json", ".xml"))
+    if not files:
+        return probe
+    sample = Probe(max(files, key=lambda path: len(path.parts)))
+    probe.found = f", which has no label files, but {sample.path.name}{sample.found}"
+    return sample
 
 
 def _is_via(probe: Probe) -> bool:
@@ -52,14 +61,17 @@ def _is_cvat(probe: Probe) -> bool:
     return _root("annotations")(probe) or "annotations.xml" in probe.names
 
 
-def _keypoints(probe: Probe) -> bool | None:
-    with contextlib.suppress(ReobjError):
-        return label_folders.keypoints(probe.path)
-    return False
+def _labels(form: int) -> Callable[[Probe], bool]:
+    """Test for a folder of labels that may have a form of `label_folders.forms`."""
 
+    def recognise(probe: Probe) -> bool:
+        if not probe.is_dir or _sample(probe) is not probe:
+            return False
+        with contextlib.suppress(ReobjError):
+            return form in label_folders.forms(probe.path)
+        return not form
 
-def _is_labels(probe: Probe) -> bool:
-    return probe.is_dir and not _is_voc(probe)
+    return recognise
 
 
 FROM_1 = "from 1; from 0 if there is a 0"
@@ -91,23 +103,31 @@ DETECTIONS: Registry[Reader] = Registry("detections", "--detections-format", [
     Format("oa-slam", "OA-SLAM, VOOM", _has("file_name", "detections", listed=True),
            coco.read_oa_slam, NAMED, "px"),
     Format("yolo", "a folder of YOLO labels, boxes or polygons",
-           lambda probe: _is_labels(probe) and not _keypoints(probe),
-           label_folders.read_label_folder, f"{NAMED}; VIDEO_N.txt from 1", "fractions"),
+           _labels(0), label_folders.read_label_folder, f"{NAMED}; VIDEO_N.txt from 1",
+           "fractions"),
     Format("yolo-pose", "a folder of YOLO labels, boxes with keypoints",
-           lambda probe: _is_labels(probe) and _keypoints(probe) is not False,
-           label_folders.read_pose_folder, f"{NAMED}; VIDEO_N.txt from 1", "fractions",
+           _labels(3), label_folders.read_pose_folder, f"{NAMED}; VIDEO_N.txt from 1", "fractions",
            "keypoints"),
+    Format("yolo-pose-2d", "a folder of YOLO labels, boxes with keypoints without visibility",
+           _labels(2), label_folders.read_pose_2d_folder, f"{NAMED}; VIDEO_N.txt from 1",
+           "fractions", "keypoints"),
     Format("cvat", "CVAT for video 1.1 and for images 1.1, XML or zip", _is_cvat, cvat.read_cvat,
            f"from 0; images {NAMED}", "px", "skeletons"),
     Format("npz", "`rt.write_detections_npz`", lambda probe: probe.suffix == ".npz", _read_npz,
            "from 0", "px"),
-    *(Format(name, title, recognise, None, advice=f"export it {advice}")
+    *(Format(name, title, lambda probe, test=recognise: test(_sample(probe)), None,  # type: ignore[misc]
+             advice=f"export it {advice}")
       for name, title, recognise, advice in (
-        ("label-studio", "Label Studio's JSON", lambda probe: _has("data", listed=True)(probe)
-         and bool(probe.keys() & {"annotations", "predictions", "completions"}), COCO),
+        ("label-studio", "Label Studio's JSON", lambda probe: (_has("data", listed=True)(probe)
+         and bool(probe.keys() & {"annotations", "predictions", "completions"}))
+         or _has("annotation_id", "annotator", listed=True)(probe), COCO),
+        ("fiftyone", "FiftyOne's JSON", lambda probe: _has("classes", "labels", listed=False)(probe)
+         or _has("samples", listed=False)(probe), COCO),
+        ("youtube-vis", "YouTube-VIS' JSON", lambda probe: _has("videos", "annotations")(probe)
+         and "images" not in probe.keys(), "as COCO-VID, with images that have frame_id"),
         ("scalabel", "Scalabel's or BDD100K's JSON", lambda probe: _has("labels", "name")(probe)
          or _has("frames", "config")(probe), COCO),
-        ("voc", "Pascal VOC's XML", _is_voc, YOLO),
+        ("voc", "Pascal VOC's XML", _root("annotation"), YOLO),
         ("detrac", "UA-DETRAC's XML", _root("sequence"), "as MOTChallenge rows"),
         ("datumaro", "Datumaro's JSON", _has("items", "categories"), COCO),
         ("labelme", "labelme's JSON", _has("shapes", "imagePath"), COCO),

@@ -28,7 +28,7 @@ from reobj.files import shortened
 from reobj.types import Array, ReobjError
 
 IMAGE_FPS = 30.0  # Hz, rate of images without times; chosen: most phones record at 30 Hz
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
+IMAGE_SUFFIXES = tuple(".jpg .jpeg .jpe .jfif .mpo .png .bmp .webp .tif .tiff".split())
 
 
 @dataclass(frozen=True, slots=True)

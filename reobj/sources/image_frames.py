@@ -65,7 +65,8 @@ def frames_of_numbers(numbers: IntArray, source: Source, usual: int | None) -> I
     if begin is None:
         raise ReobjError(
             f"{source.path}: numbers {low} to {high} count frames from 0, or from 1 (then the "
-            f"first of them is frame {low - 1}); {source.advice}"
+            f"first of them is frame {low - 1}); say which with --set detect.first_frame=0 or "
+            "detect.first_frame=1"
         )
     unclear = not begin and low == 1 and not source.first
     if unclear or (begin != usual and not source.first):

@@ -20,7 +20,9 @@ from reobj.types import COCO_NAMES, Array, IntArray, ReobjError, xyxy_from_cxcyw
 
 NO_LABELS = ("classes.txt train.txt val.txt valid.txt test.txt readme.txt readme.dataset.txt "
              "readme.roboflow.txt requirements.txt labels.txt").split()  # fmt: skip
-NAMES_FILES = "classes.txt obj.names data.yaml dataset.yaml data.yml dataset.yml".split()
+NAMES_FILES = (
+    "classes.txt obj.names data.yaml dataset.yaml data.yml dataset.yml labels.txt _darknet.labels"
+).split()
 
 
 def label_files(path: Path) -> list[Path]:
@@ -40,19 +42,19 @@ def names_file(path: Path) -> Path | None:
     """Find the file of class names of a folder of labels: in it, or in one of two folders above."""
     labels = path.resolve()
     for folder in (labels, *labels.parents[:2]):
-        known = [folder / name for name in NAMES_FILES]
+        known = [*(folder / name for name in NAMES_FILES), *sorted(folder.glob("*.names"))]
         for file in (*filter(Path.is_file, known), *sorted(filter(is_yaml, folder.glob("*")))):
             if file in known or any(line.startswith("names") for line in read_lines(file)):
                 return file
     return None
 
 
-def read_label_folder(source: Source, pose: bool = False) -> RecordedDetections:
+def read_label_folder(source: Source, pose: int = 0) -> RecordedDetections:
     """Read a folder of YOLO labels.
 
     NAME.txt belongs to the image of that name; NAME_N.txt to frame N of a video (from 1, as in
     ultralytics, if NAME is that of the video). Class names are the user's, or those of a file
-    beside the labels, else COCO's. pose: keypoints lie between boxes and confidence.
+    beside the labels, else COCO's. pose: numbers of each keypoint between box and confidence.
     """
     path, video = source.path, source.video
     files = label_files(path)
@@ -82,7 +84,7 @@ def read_label_folder(source: Source, pose: bool = False) -> RecordedDetections:
         if len(rows) > LINES_MAX:
             raise ReobjError(f"{path}: more than {LINES_MAX} boxes; take fewer frames")
     if pose:
-        rows = [row[:5] + row[len(row) - (len(row) - 5) % 3 :] for row in rows]
+        rows = [row[:5] + row[len(row) - (len(row) - 5) % pose :] for row in rows]
         source.say("keypoints after class cx cy w h are not read")
     box, score, identity, polygons = _columns(rows, [f"{path}, line {line}" for line in lines])
     stems = [str(file.relative_to(path)) for file in files]
@@ -115,25 +117,41 @@ def _row(cells: Sequence[str], where: str) -> list[float]:
     return row
 
 
-def keypoints(path: Path) -> bool | None:
-    """Test the first label files for keypoints x y visibility after boxes; None: open.
+def forms(path: Path) -> frozenset[int]:
+    """Return what may follow the class in the first label files.
 
-    Visibilities are 0, 1 or 2. Where they are confidences, polygons of as many corners each are
-    possible too.
+    0: a box or a polygon; 3: a box with keypoints x y visibility; 2: one with keypoints x y.
+    Visibilities are 0, 1 or 2. Where they are confidences, or missing, polygons of as many corners
+    each are possible too.
     """
     lines = [line for file in label_files(path)[:50] for line in read_lines(file)]
     rows = [line.split() for line in lines if line.strip()]
-    count = len(rows[0]) if rows else 0
-    if count < 8 or any(len(row) != count for row in rows):
-        return False
-    if count % 3 == 2 and all(cell in ("0", "1", "2") for row in rows for cell in row[7::3]):
-        return True
-    return None if count >= 14 and count % 3 != 1 and len(rows) > 1 else False
+    try:
+        values = np.array(rows, np.float64)  # (N, count)
+    except ValueError:  # rows of other lengths, or text
+        return frozenset({0})
+    count = values.shape[1] if rows else 0
+    if count >= 8 and count % 3 == 2 and all(c in ("0", "1", "2") for r in rows for c in r[7::3]):
+        return frozenset({3})
+    found = {0} | ({3} if count >= 14 and count % 3 != 1 and len(rows) > 1 else set())
+    return frozenset(found | ({2} if count >= 11 and _points_in_boxes(values) else set()))
+
+
+def _points_in_boxes(rows: Array) -> bool:
+    """Test whether all points x y after class cx cy w h of (N, count) are in their box, or 0."""
+    points = rows[:, 5 : 5 + (rows.shape[1] - 5) // 2 * 2].reshape(len(rows), -1, 2)  # (N, K, 2)
+    inside = np.abs(points - rows[:, None, 1:3]) <= rows[:, None, 3:5] / 2 + 1e-3
+    return bool((inside | (points == 0)).all())
 
 
 def read_pose_folder(source: Source) -> RecordedDetections:
-    """Read a folder of YOLO labels with keypoints, which are not read."""
-    return read_label_folder(source, True)
+    """Read a folder of YOLO labels with keypoints x y visibility, which are not read."""
+    return read_label_folder(source, 3)
+
+
+def read_pose_2d_folder(source: Source) -> RecordedDetections:
+    """Read a folder of YOLO labels with keypoints x y, which are not read."""
+    return read_label_folder(source, 2)
 
 
 def _columns(

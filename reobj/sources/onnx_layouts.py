@@ -88,6 +88,13 @@ class ModelProbe(Probe):
         first = next(iter(self.outputs.values()))
         return bool(np.median(np.abs(first[0, :, :2])) >= 8)  # offsets: below 2
 
+    @functools.cached_property
+    def in_fractions(self) -> bool:
+        """Whether all boxes, the first four values of the cells, are fractions of the input."""
+        rows = next(iter(self.outputs.values()))[0]
+        rows = rows if len(rows) > rows.shape[1] else rows.T  # (cells, values)
+        return bool(0 < np.abs(rows[:, :4]).max() <= 1.5)
+
 
 Decode = Callable[[Sequence[Any], Geometry, ModelProbe], Decoded]
 
@@ -326,16 +333,18 @@ LAYOUTS: Registry[Decode] = Registry("detector outputs", "--detector-layout", [
             _decode_detr, nms_iou=None),
     _layout("yolo", f"{YOLO}, also -seg", "(1, 4 + classes [+ 32], cells)[, (1, 32, h, w)]",
             lambda m: m.values(0) - 4 - sum(shape[1] for shape in m.shapes[1:] if len(shape) == 4),
-            _decode_yolo, ("", "detect", "segment"), fit="centre"),
+            _decode_yolo, ("", "detect", "segment"), also=lambda m: not m.in_fractions,
+            fit="centre"),
     _layout("yolo-rows", f"{YOLO}, transposed", "(1, cells, 4 + classes)",
             lambda m: m.values(1) - 4,
-            lambda outs, *more: _decode_yolo([outs[0].swapaxes(1, 2)], *more), fit="centre"),
+            lambda outs, *more: _decode_yolo([outs[0].swapaxes(1, 2)], *more),
+            also=lambda m: not m.in_fractions, fit="centre"),
     _layout("yolo-obb", f"{YOLO}, rotated boxes: the upright one around each",
             "(1, 4 + classes + 1, cells)", lambda m: m.values(0) - 5, _decode_rotated, ("obb",),
-            fit="centre"),
+            also=lambda m: not m.in_fractions, fit="centre"),
     _layout("yolo-pose", f"{YOLO}, key points", "(1, 4 + classes + key points, cells)",
             lambda m: m.values(0) - 4 - _keypoint_values(m), _decode_yolo, ("pose",),
-            fit="centre", unread="the key points"),
+            also=lambda m: not m.in_fractions, fit="centre", unread="the key points"),
     _layout("yolov5", "YOLOv5, YOLOv7, YOLOv6", "(1, cells or 3 * cells, 5 + classes)",
             lambda m: max(m.values(1), m.values(1, boxes=3)) - 5, _decode_yolov5,
             also=lambda m: m.in_px and ("output" not in m.outputs or not m.values(1)),
@@ -369,9 +378,11 @@ def find_layout(model: ModelProbe, declared: str, names_of: str) -> Layout:
             raise ReobjError(f"{model.path}: {shapes}: not the outputs of layout {declared}, "
                              f"{entry.shape}")  # fmt: skip
         near += [f"{entry.name} with {count} classes"] if count and count > 0 else []
+    small = near and near[0].startswith("yolo ") and model.in_fractions
+    fractions = ", but its boxes are fractions: export them in px of the input" * bool(small)
     task = f" and task {task}" if (task := model.metadata.get("task")) else ""
     model.found = (f": {shapes} with {model.count} class names ({names_of}){task}; by its shape "
-                   f"{' or '.join(near) or 'none'}")  # fmt: skip
+                   f"{' or '.join(near) or 'none'}{fractions}")  # fmt: skip
     layout = LAYOUTS.choose(model, declared)
     assert isinstance(layout, Layout)
     return layout

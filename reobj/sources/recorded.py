@@ -100,7 +100,6 @@ class Source:
         names: class names by number, (): not given. first: number of the first frame, "": as the
             format says, or "order": listed images are the frames in this order.
         poses: cameras that project boxes in 3D. messages: about assumptions, for the user.
-        advice: in the error about frame numbers that may count from 0 or from 1.
     """
 
     path: Path
@@ -109,7 +108,6 @@ class Source:
     first: str = ""
     poses: Sequence[Poses] = ()
     messages: list[str] = field(default_factory=list)
-    advice: str = "say which with --set detect.first_frame=0 or detect.first_frame=1"
 
     def say(self, *texts: str) -> None:
         """Add messages, without empty ones."""

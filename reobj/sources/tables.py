@@ -59,8 +59,10 @@ ALIASES: dict[str, str] = {  # names of columns; the first one with values is us
     "y2": "y2 y_max ymax bottom bb_bottom bbox_bottom box_bottom y_bottom ybr bbox_y2 bbox_ymax",
     "w": "w bb_width bbox_width box_width bbox_w bb_w width",
     "h": "h bb_height bbox_height box_height bbox_h bb_h height",
-    "image w": "img_width image_width img_w image_w frame_width original_width width",
-    "image h": "img_height image_height img_h image_h frame_height original_height height",
+    "image w": "img_width image_width img_w image_w frame_width original_width imw im_w "
+               "im_width imgw width w",
+    "image h": "img_height image_height img_h image_h frame_height original_height imh im_h "
+               "im_height imgh height h",
     "cx": "cx xc x_center x_centre center_x xcenter bbox_cx",
     "cy": "cy yc y_center y_centre center_y ycenter bbox_cy",
     "score": "score confidence conf prob probability detection_score",
@@ -165,6 +167,7 @@ def split(lines: Sequence[str]) -> tuple[list[list[str]], IntArray, bool]:
         rows, the lines on which they end, and whether commas are no separators.
     """
     lines = ["\n" if _is_comment(line) else line for line in lines]
+    lines[:1] = ["\n" if re.match(r'"?sep=.', line) else line for line in lines[:1]]  # Excel's
     separator = _separator(next((line for line in lines if line.strip()), ""))
     reader: Any = csv.reader(lines, delimiter=separator, strict=True)
     split = [([cell.strip() for cell in cells], reader.line_num) for cells in reader]
@@ -193,7 +196,8 @@ def _columns(path: Path, roles: Sequence[str] = (), least: int = 0) -> Table:
     for cells, at in zip(rows, line.tolist(), strict=True):
         if len(cells) != count or not fits:
             expected = str(count) if fits else f"{least} to {len(names)}"
-            why = DECIMAL_COMMAS * (not comma and not any("." in cell for cell in cells))
+            commas = not comma and len(cells) > least and not any("." in cell for cell in cells)
+            why = DECIMAL_COMMAS * commas
             text = f"{len(cells)} columns, expected {expected}{why}"
             raise ReobjError(f"{path}, line {at}: {text}")
     columns = zip(*rows, strict=True) if rows else [()] * len(names)
@@ -209,6 +213,8 @@ def _header(cells: Sequence[str]) -> tuple[str, ...]:
     if "x0" in names and "y0" in names:  # corners counted from 0
         other = {"x0": "x1", "y0": "y1", "x1": "x2", "y1": "y2"}
         names = [other.get(name, name) for name in names]
+    if "detection_id" in names:  # Roboflow's inference: x, y is the centre
+        names = [{"x": "cx", "y": "cy"}.get(name, name) for name in names]
     return tuple(name if name not in names[:i] else f"column {i}" for i, name in enumerate(names))
 
 
@@ -275,13 +281,15 @@ def _unread(
 
     Left out are empty ones, and other names of the same classes and identities.
     """
-    kinds = r"class|label|categor|type|track|inst|obj|ident|width|height|size|(^|_)(id|w|h)($|_)"
+    sizes = r"width|height|size|resolution|(^|_)[wh]($|_)"
+    kinds = rf"class|label|categor|type|track|inst|obj|ident|(^|_)id($|_)|{sizes}"
     read = [cells[role] for role in ("class", "id") if role in cells]
     names = [name for name in by_name if name not in used and re.search(kinds, name)]
     names = [name for name in names if len(set(by_name[name]) - {"-1", ""}) > 0]
     return [
         name for name in names
-        if not any(len(set(zip(by_name[name], other, strict=True))) == len(set(by_name[name]))
+        if re.search(sizes, name)
+        or not any(len(set(zip(by_name[name], other, strict=True))) == len(set(by_name[name]))
                    == len(set(other)) for other in read)
     ]  # fmt: skip
 
@@ -443,6 +451,8 @@ def _read_named(table: Table, source: Source) -> RecordedDetections:
     """Convert a table with named columns to detections."""
     if table.unread:
         source.say(f"columns that are not read: {', '.join(table.unread)}")
+    if "detection_id" in table.header and _box_roles(table.cells)[0] == "cx":
+        source.say("x, y are the centres of boxes, as in all files with detection_id (Roboflow)")
     _drop_empty(table, source)
     if "id" in table.cells:
         table.cells["id"] = ["-1" if _is_empty(cell) else cell for cell in table.cells["id"]]

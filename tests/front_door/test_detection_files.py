@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
+import shutil
 import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -159,6 +160,10 @@ TABLES = {
     "Boxer's 2D boxes": csv(
         "time_ns,frame_id,sensor,device,img_width,img_height,x1,y1,x2,y2,name,instance,sem_id,prob",
         "-1,{f},rgb,iPad,320,240,{x1},{y1},{x2},{y2},chair,-1,56,0.9"),
+    "csv after Excel's separator": csv("sep=;\nframe;x1;y1;x2;y2;score;class",
+                                       "{f};{x1};{y1};{x2};{y2};0,9;chair"),
+    "Roboflow's inference: centres": csv("frame,x,y,width,height,confidence,class,detection_id",
+                                         "{f},{cx},{cy},{w},{h},.9,chair,a{f}"),
     "pandas' index": csv(",frame,x1,y1,x2,y2,score,class", "{n}," + CSV_ROW),
     "pandas' floats": csv("frame,x1,y1,x2,y2,score,class", "{f}.0,{x1}.0,{y1},{x2},{y2},.9,56.0"),
     "supervision's sink": csv(
@@ -318,6 +323,9 @@ NAMES = {
     "dataset.yaml": "nc: 2\nnames:\n  0: chair\n  1: lamp\nkpt: 3\n",
     "my.yml": "names:\n- chair\n- \"lamp\"\n",
     "obj.names": "chair\nlamp\n",
+    "room.names": "chair\nlamp\n",
+    "_darknet.labels": "chair\nlamp\n",
+    "labels.txt": "chair\nlamp\n",
 }  # fmt: skip
 
 
@@ -855,6 +863,8 @@ OTHER_TOOLS = {
     "VGG Image Annotator": {"0.jpg12": {"filename": "0.jpg", "size": 12, "regions": []}},
     "no image_id": [{"frame": 0, "track_id": 1, "bbox": [64, 96, 256, 288], "confidence": 0.9}],
     "Pascal VOC": "<annotation><object><bndbox/></object></annotation>",
+    "FiftyOne": {"classes": ["chair"], "labels": {"0": [{"label": "chair"}]}},
+    "YouTube-VIS": {"videos": [{"id": 1}], "categories": [], "annotations": []},
     "UA-DETRAC": '<?xml version="1.0"?>\n<sequence name="MVI_1"><frame/></sequence>',
 }
 
@@ -867,9 +877,15 @@ def test_files_of_other_tools_are_named(
     content: Any = OTHER_TOOLS[tool]
     path = tmp_path / ("a.xml" if isinstance(content, str) else "a.json")
     path.write_text(content if isinstance(content, str) else json.dumps(content))
-    made = tracked(write_clip(tmp_path / "v.avi"), "--detections", path)
-    assert made.code == 2 and tool in made.said and "export it" in made.said
-    assert made.said.count("\n") == 1
+    folder = tmp_path / "set/Annotations"  # of a dataset, beside lists of images
+    folder.mkdir(parents=True)
+    shutil.copy(path, folder)
+    (tmp_path / "set/ImageSets").mkdir()
+    (tmp_path / "set/ImageSets/train.txt").write_text("000001\n")
+    for given in (path, folder, tmp_path / "set"):
+        made = tracked(write_clip(tmp_path / "v.avi"), "--detections", given)
+        assert made.code == 2 and tool in made.said and "export it" in made.said
+        assert made.said.count("\n") == 1
 
 
 # ---- Names of images decide, never the order of a list -------------------------------------------
@@ -939,6 +955,8 @@ def test_the_dataset_beside_results_is_named(
         ("frame,x1,y1,x2,y2,class,image_width,image_height",
          "{f},{x1},{y1},{x2},{y2},chair,640,480"),
         ("frame,x,y,w,h,width,height,class", "{f},{x1},{y1},{w},{h},640,480,chair"),
+        ("frame,x1,y1,x2,y2,class,W,H", "{f},{x1},{y1},{x2},{y2},chair,640,480"),
+        ("frame,x1,y1,x2,y2,class,imw,imh", "{f},{x1},{y1},{x2},{y2},chair,640,480"),
     ],
 )  # fmt: skip
 def test_image_sizes_in_a_csv(
@@ -967,11 +985,11 @@ def test_columns_of_classes_and_identities_are_read_or_named(
     tmp_path: Path, tracked: Callable[..., Tracked]
 ) -> None:
     """Other names of the same classes are not; numbers of rows are neither."""
-    text = csv("frame,x1,y1,x2,y2,label,class_id,room_class,person_id",
-               "{f},{x1},{y1},{x2},{y2},chair,56,{f},{f}")  # fmt: skip
+    text = csv("frame,x1,y1,x2,y2,label,class_id,room_class,person_id,resolution",
+               "{f},{x1},{y1},{x2},{y2},chair,56,{f},{f},640x480")  # fmt: skip
     (tmp_path / "det.csv").write_text(text)
     made = tracked(write_clip(tmp_path / "v.avi"), "--detections", tmp_path / "det.csv")
-    assert is_truth(made) and "not read: room_class, person_id" in made.said
+    assert is_truth(made) and "not read: room_class, person_id, resolution" in made.said
 
 
 def test_labels_with_keypoints(tmp_path: Path, tracked: Callable[..., Tracked]) -> None:
@@ -984,20 +1002,27 @@ def test_labels_with_keypoints(tmp_path: Path, tracked: Callable[..., Tracked]) 
     assert is_truth(made) and "keypoints after class cx cy w h are not read" in made.said
 
 
+@pytest.mark.parametrize(
+    ("points", "form"),
+    [
+        (" .1 .2 .9 .3 .4 .8 .5 .6 .7 .95", "yolo-pose"),
+        (" .12 .1 .15 .2 .14 .24 .95", "yolo-pose-2d"),
+        (" .12 .1 .15 .2 0 0", "yolo-pose-2d"),
+    ],
+)
 def test_labels_with_keypoints_and_confidences(
-    tmp_path: Path, tracked: Callable[..., Tracked]
+    tmp_path: Path, tracked: Callable[..., Tracked], points: str, form: str
 ) -> None:
-    """Polygons have the same form: the user says which."""
-    points = " .1 .2 .9 .3 .4 .8 .5 .6 .7 .95"
+    """Polygons have the same form, also without visibilities: the user says which."""
     labels = yolo_folder(tmp_path / "labels", lambda f: yolo(f, 0, points), "v_{}.txt", 1)
     (labels / "classes.txt").write_text("chair\n")
     source = write_clip(tmp_path / "v.avi")
     made = tracked(source, "--detections", labels)
-    assert made.code == 2 and "yolo, yolo-pose; name one with" in made.said
-    made = tracked(source, "--detections", labels, "--detections-format", "yolo-pose")
+    assert made.code == 2 and f"yolo, {form}; name one with" in made.said
+    made = tracked(source, "--detections", labels, "--detections-format", form)
     assert is_truth(made) and "keypoints" in made.said
-    found = rt.read_detections(labels, rt.Video(source), rt.DetectConfig(format="yolo-pose"))
-    assert set(found.score.tolist()) == {0.95}
+    found = rt.read_detections(labels, rt.Video(source), rt.DetectConfig(format=form))
+    assert set(found.score.tolist()) == {0.95 if points.endswith(".95") else 1.0}
 
 
 def test_identities_at_the_end_of_label_rows(

@@ -456,6 +456,28 @@ def test_the_truth_in_formats_of_detections(
     assert "--gt-format kitty: no such format; did you mean kitti?" in capsys.readouterr().err
 
 
+def test_the_number_of_the_first_frame_of_the_truth(
+    result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The option that the note and the error name was not read."""
+    table = tmp_path / "truth.csv"
+    rows = [f"{f:.0f},{i:.0f},{x},{y},{x + w},{y + h}" for f, i, x, y, w, h in ROWS.tolist()]
+    table.write_text("frame,track_id,x1,y1,x2,y2\n" + "\n".join(rows))
+    named = coco_video(tmp_path / "named.json", ROWS[np.isin(ROWS[:, 0], LISTED)], LISTED)
+    data = json.loads(named.read_text())
+    for image in data["images"]:
+        image["file_name"] = f"a_{image.pop('frame_id') + 1}.png"
+    named.write_text(json.dumps(data))
+    for gt, code in ((table, 0), (named, 2)):
+        assert rt.main(["eval", str(result), "--gt", str(gt)]) == code
+        assert "--set detect.first_frame" in " ".join("".join(capsys.readouterr()).split())
+        words = ["eval", str(result), "--gt", str(gt), "--set", "detect.first_frame=1"]
+        assert rt.main(words) == 0
+        assert "100.0 100.0 100.0" in capsys.readouterr().out
+    words[-1] = "detect.first_frame=order"
+    assert rt.main(words) == 2
+
+
 @pytest.mark.parametrize("scale", [0.5, 2.0])
 def test_a_result_of_frames_of_another_size(tmp_path: Path, scale: float) -> None:
     rows = ROWS.copy()

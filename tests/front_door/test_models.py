@@ -169,6 +169,16 @@ def test_a_layout_that_is_left_open_is_declared(kind: str, tmp_path: Path, detec
             assert found[1:] == [*box] and "read as" not in said
 
 
+@pytest.mark.parametrize("count", [7, 84])
+def test_boxes_that_are_fractions_are_refused(count: int, tmp_path: Path, detect: Any) -> None:
+    """They were read as px: no object was found."""
+    output = values(count)
+    output[0, :4] /= SIDE
+    metadata = {"names": NAMES} if count == 7 else {}
+    found, said = detect(write_model(tmp_path / "m.onnx", output, **metadata))
+    assert not found and "its boxes are fractions" in said
+
+
 def test_a_declared_layout_must_fit(tmp_path: Path, detect: Any) -> None:
     path = write_model(tmp_path / "m.onnx", values(7), names=NAMES)
     assert "output0 (1, 7, 336): not the outputs" in detect(path, "--detector-layout", "picodet")[1]
@@ -184,6 +194,9 @@ def test_a_file_of_names_has_as_many_as_the_model(tmp_path: Path, detect: Any) -
     said = detect(path, *words)[1]
     assert f"4 class names ({tmp_path / 'data.yaml'})" in said and "yolo with 3 classes" in said
     (tmp_path / "data.yaml").write_text("names: [a, b, c]")
+    assert detect(path, *words)[0][0] == "b"
+    (tmp_path / "names.txt").write_text("0: a\n2: c\n1: b\n")
+    words = ("--set", f"detect.class_names={tmp_path / 'names.txt'}")
     assert detect(path, *words)[0][0] == "b"
 
 

@@ -11,6 +11,7 @@ import itertools
 import json
 import os
 import re
+import shutil
 import signal
 import socket
 import struct
@@ -651,6 +652,15 @@ def test_unread_images_are_counted(tmp_path: Path) -> None:
         rt.Video(phone / "IMG_0010.HEIC")
     with pytest.raises(rt.ReobjError, match=r"no images there .* its folders: phone"):
         rt.Video(tmp_path)
+
+
+def test_other_suffixes_of_jpeg(tmp_path: Path) -> None:
+    """They were passed over in silence, beside .jpg too."""
+    names = ["a1.jpg", "a2.jfif", "a3.jpe", "a4.MPO"]
+    write(tmp_path / "im", ["a1.jpg"])
+    for name in names[1:]:
+        shutil.copy(tmp_path / "im/a1.jpg", tmp_path / "im" / name)
+    assert [Path(name).name for name in rt.Video(tmp_path / "im").names] == names
 
 
 @pytest.mark.parametrize(
