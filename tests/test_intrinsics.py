@@ -176,6 +176,7 @@ projection_parameters:
    cx: 320.
    cy: 240.
 """
+FLAT = [v for row in K for v in row]
 REALSENSE = {"fx": 500, "fy": 510, "ppx": 320, "ppy": 240, "width": 640, "height": 480}
 FULL = rt.Camera("FULL_OPENCV", *SIZE, (500, 510, 320, 240, *LIST, 0, 0, 0))
 
@@ -195,7 +196,7 @@ FULL = rt.Camera("FULL_OPENCV", *SIZE, (500, 510, 320, 240, *LIST, 0, 0, 0))
          rt.Camera("OPENCV_FISHEYE", *SIZE, (500, 510, 320, 240, 0.1, 0, 0, 0.4))),
         ("sample.xml", XML.replace("<image_width>", "<fisheye_model>1</fisheye_model><image_width>")
          .replace(" -0.024", ""), rt.Camera("OPENCV_FISHEYE", *SIZE, FULL.params[:8])),
-        ("ros2.yaml", f"d: {LIST}\nk: {[v for row in K for v in row]}\nheight: 480\nwidth: 640\n---\n", FULL),
+        ("ros2.yaml", f"d: {LIST}\nk: {FLAT}\nheight: 480\nwidth: 640\n---\n", FULL),
         ("niceslam.yaml", "cam: {H: 480, W: 640, fx: 500, fy: 510, cx: 320, cy: 240}\n", PINHOLE),
         ("rectified.yaml", "%YAML:1.0\nCamera.type: Rectified\nCamera1.fx: 500\nCamera1.fy: 510\n"
          "Camera1.cx: 320\nCamera1.cy: 240\n", PINHOLE),
