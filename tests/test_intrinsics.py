@@ -176,6 +176,8 @@ projection_parameters:
    cx: 320.
    cy: 240.
 """
+FLAT = [v for row in K for v in row]
+REALSENSE = {"fx": 500, "fy": 510, "ppx": 320, "ppy": 240, "width": 640, "height": 480}
 FULL = rt.Camera("FULL_OPENCV", *SIZE, (500, 510, 320, 240, *LIST, 0, 0, 0))
 
 
@@ -192,6 +194,16 @@ FULL = rt.Camera("FULL_OPENCV", *SIZE, (500, 510, 320, 240, *LIST, 0, 0, 0))
         ("fisheye.yaml", "%YAML:1.0\nCamera.type: KannalaBrandt8\nCamera.fx: 500\nCamera.fy: 510\n"
          "Camera.cx: 320\nCamera.cy: 240\nCamera.k1: 0.1\nCamera.k4: 0.4\n",
          rt.Camera("OPENCV_FISHEYE", *SIZE, (500, 510, 320, 240, 0.1, 0, 0, 0.4))),
+        ("sample.xml", XML.replace("<image_width>", "<fisheye_model>1</fisheye_model><image_width>")
+         .replace(" -0.024", ""), rt.Camera("OPENCV_FISHEYE", *SIZE, FULL.params[:8])),
+        ("ros2.yaml", f"d: {LIST}\nk: {FLAT}\nheight: 480\nwidth: 640\n---\n", FULL),
+        ("niceslam.yaml", "cam: {H: 480, W: 640, fx: 500, fy: 510, cx: 320, cy: 240}\n", PINHOLE),
+        ("rectified.yaml", "%YAML:1.0\nCamera.type: Rectified\nCamera1.fx: 500\nCamera1.fy: 510\n"
+         "Camera1.cx: 320\nCamera1.cy: 240\n", PINHOLE),
+        ("realsense.json", json.dumps(REALSENSE | {"model": "Brown Conrady", "coeffs": LIST}),
+         FULL),
+        ("realsense.json", json.dumps(REALSENSE | {"coeffs": [0] * 5,
+         "model": "distortion.inverse_brown_conrady"}), PINHOLE),
     ],
 )  # fmt: skip
 def test_camera_files_of_other_programs(tmp_path, name, content, camera):
@@ -205,6 +217,8 @@ def test_arrays_of_a_calibration_are_read(tmp_path):
     arrays = {"mtx": np.array(K, float), "dist": np.array([LIST]), "rvecs": np.ones((4, 3, 1))}
     np.savez(tmp_path / "calib.npz", **arrays)
     assert parse_camera(str(tmp_path / "calib.npz"), SIZE) == FULL
+    np.save(tmp_path / "K.npy", arrays["mtx"])
+    assert parse_camera(str(tmp_path / "K.npy"), SIZE) == PINHOLE
     np.savez(tmp_path / "calib.npz", **arrays, newcameramtx=2 * np.eye(3))
     with pytest.raises(rt.ReobjError, match="'newcameramtx' is not read"):
         parse_camera(str(tmp_path / "calib.npz"), SIZE)
@@ -214,7 +228,7 @@ def test_the_format_of_a_camera_file_may_be_named(tmp_path):
     path = tmp_path / "camera.yaml"
     path.write_text("500 510 320 240\n")
     assert parse_camera(str(path), SIZE, "numbers") == PINHOLE
-    with pytest.raises(rt.ReobjError, match=r"camera.yaml: expected `key: value`"):
+    with pytest.raises(rt.ReobjError, match=r"camera.yaml: expected one document of `key: value`"):
         parse_camera(str(path), SIZE)
     with pytest.raises(rt.ReobjError, match="--camera-format nonsense: no such format"):
         parse_camera(str(path), SIZE, "nonsense")
@@ -239,7 +253,9 @@ def test_yaml_that_is_no_camera_is_refused_in_one_line(tmp_path, text):
         ({"distortion_params": LIST}, "distortion_params"),  # nerfstudio's have another order
         ({"lensDistortion": LIST}, "lensDistortion"),
         ({"radial_distortion": [0.1, 0.2]}, "radial_distortion"),
+        ({"radial": [0.1, 0.2]}, "radial"),
         ({"K1": 0.1}, "K1"),
+        ({"Camera2.fx": 501}, "Camera2.fx"),
         ({"dist_coeffs": LIST, "k7": 0.1}, "k7"),
         ({"dist_coeffs": LIST, "D": [0.1]}, "D"),
         ({"is_fisheye": True, "k1": 0.1, "p1": 0.1}, "p1"),
@@ -299,13 +315,27 @@ def test_a_camera_of_another_size_is_resized_and_of_another_shape_refused(tmp_pa
     [
         ("a.json", "{", "line 1: not valid JSON"),
         ("a.json", "[1, 2]", "no known format of cameras"),
-        ("a.json", "{}", "no focal length"),
-        ("a.json", '{"w": 640, "h": 480}', "no focal length"),
+        ("a.json", "{}", "no known focal length"),
+        ("a.json", '{"w": 640, "h": 480}', "no known focal length"),
         ("a.json", '{"fx": 500, "cx": 320}', "not a camera file"),
         ("a.json", '{"fx": "x"}', "not a camera file"),
         ("a.json", '{"fx": 500, "w": Infinity, "h": 480}', "images of inf pixels"),
         ("a.json", '{"fx": 500, "w": 640, "h": 0}', "images of 0 pixels"),
-        ("a.json", '{"K": [1, 2]}', "not a camera file"),
+        ("a.json", '{"K": [1, 2]}', "intrinsics of 2 numbers"),
+        ("a.json", '{"K": [500, 3, 320, 0, 500, 240, 0, 0, 1]}', "a skew of 3"),
+        (
+            "a.json",
+            '{"fc": [500, 510], "cc": [320, 240]}',
+            "no known focal length among cc, fc",
+        ),
+        ("a.json", '{"fx": 500, "cx": 320, "cy": 240, "k1": 0.1, "k4": 0.01}', "k4 without k5"),
+        (
+            "a.json",
+            '{"fx": 500, "coeffs": [1], "model": "distortion.inverse_brown_conrady"}',
+            "INVERSE_BROWN_CONRADY",
+        ),
+        ("mei.yaml", "model_type: MEI\nprojection_parameters: {gamma1: 500}\n", "model MEI"),
+        ("omni.yaml", "cam0: {camera_model: omni, intrinsics: [1, 500, 510, 320, 240]}", "OMNI"),
         ("a.json", '{"fx": 500, "model": "FOV"}', "no omega of a FOV camera"),
         ("a.json", '{"fx": 500, "model": "MAGIC"}', "no camera model MAGIC"),
         ("cameras.txt", "1 PINHOLE 640 480 500 510 320 240\n" * 2, "2 cameras; expected one"),

@@ -17,7 +17,7 @@ import numpy as np
 import yaml
 
 from reobj.cameras import Camera, camera_parameters, checked_camera
-from reobj.files import load_json, load_npz, read_text
+from reobj.files import load_json, load_npz, read_text, shortened
 from reobj.formats import AUTO, Format, Probe, Registry
 from reobj.types import COORDINATE_MAX, ReobjError
 
@@ -203,8 +203,12 @@ def _focal_and_centre(matrix: Any) -> tuple[float, ...]:
     flat = np.array(matrix, np.float64).ravel()
     if flat.size == 4:  # Kalibr, EuRoC
         return tuple(flat.tolist())
+    if flat.size not in (9, 16):
+        raise ReobjError(f"intrinsics of {flat.size} numbers; expected fx, fy, cx, cy or 3x3, 4x4")
     K = flat.reshape(4, 4)[:3, :3] if flat.size == 16 else flat.reshape(3, 3)
     K = K.T if K[2, :2].any() else K  # Open3D, Record3D
+    if abs(K[0, 1]) > 0.001 * abs(K[0, 0]):  # chosen: less than half a pixel at the border
+        raise ReobjError(f"a skew of {K[0, 1]:g} in the matrix, which no camera model here has")
     return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
 
 
@@ -227,15 +231,16 @@ def _sized(size: Size) -> tuple[int, int]:
 FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "EQUIDISTANT", "KANNALA_BRANDT4", "KANNALABRANDT8")
 BROWN = (
     "", "NONE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV",
-    "PERSPECTIVE", "PLUMB_BOB", "RATIONAL_POLYNOMIAL", "RADTAN", "RADIAL-TANGENTIAL",
-    "RADIAL_TANGENTIAL",
+    "PERSPECTIVE", "PLUMB_BOB", "RATIONAL_POLYNOMIAL", "RADTAN", "RADIAL_TANGENTIAL",
+    "BROWN_CONRADY", "RECTIFIED",
 )  # fmt: skip
 DISTORTION = r"dist(ortion)?(coef|coeffs?|coefs|coefficients?)?|coeffs?|kc"  # kc: Bouguet's toolbox
 SIDES = ("resolution", "camerares", "imagesize", "imgsize", "imageresolution")
 # Keys that change the camera; not the matrices of rectified images in ROS's files
 CAMERA_LIKE = (
     r".*((?<!un)distort|focal|intrinsic|cam(era)?ma?t(ri)?x|principal|mirrorparam).*|[kps]\d|"
-    rf"[fc][xyuv]|[muv][0uv]|xi|skew|fov[xy]?|mtx|im(a)?ge?(shape|dim).*|k|f|d|{DISTORTION}|{'|'.join(SIDES)}"
+    r"[fc][xyuv]|[muv][0uv]|xi|skew|fov[xy]?|mtx|im(a)?ge?(shape|dim).*|k|f|d|camera2.*|"
+    rf"(radial|tangential).*|{DISTORTION}|{'|'.join(SIDES)}"
 )
 
 
@@ -251,7 +256,7 @@ def _flat(data: dict[str, Any]) -> dict[str, tuple[str, Any]]:
     keys: dict[str, tuple[str, Any]] = {}
     for key, value in data.items():
         is_group = isinstance(value, dict) and "data" not in value
-        if is_group and re.fullmatch(f"camera|.*parameters|{CAMERA_LIKE}", _plain(key)):
+        if is_group and re.fullmatch(f"cam(era)?|.*parameters|{CAMERA_LIKE}", _plain(key)):
             keys |= _flat(value)
         else:
             keys[_plain(key)] = str(key), value
@@ -283,6 +288,16 @@ def _terms(keys: dict[str, tuple[str, Any]], *names: str) -> list[float]:
     return [float(keys.pop(name)[1]) if name in keys else value for name, value in pairs]
 
 
+def _brown_terms(keys: dict[str, tuple[str, Any]]) -> list[float]:
+    """Take the terms of OpenCV's model; refuse a k4 that may be one of a fisheye lens."""
+    first = _take(keys, "k")  # of SIMPLE_RADIAL
+    keys |= {} if first is None else {"k1": ("k", first)}
+    if not {"k5", "k6"} & keys.keys() and any(_numbers(keys.get("k4", ("", None))[1])):
+        raise ReobjError("k4 without k5 and k6: of a fisheye lens (camera_model OPENCV_FISHEYE), "
+                         "or of OpenCV's rational model (k5 and k6 too, if 0)")  # fmt: skip
+    return _terms(keys, "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+
+
 def _pinhole(keys: dict[str, tuple[str, Any]], size: Size) -> tuple[float, ...] | None:
     """Take fx, fy, cx, cy, or a matrix; None without a focal length."""
     matrix = _take(keys, "cameramatrix", "K", "intrinsicmatrix", "mtx", "intrinsics", "intrinsic")
@@ -301,6 +316,36 @@ def _pinhole(keys: dict[str, tuple[str, Any]], size: Size) -> tuple[float, ...] 
     if centre == [None, None]:
         centre = [0.5 * side for side in _sized(size)]
     return tuple(map(float, (fx, fx if fy is None else fy, *centre)))
+
+
+def _lens(keys: dict[str, tuple[str, Any]]) -> str:
+    """Take the name of the lens model, in capitals; "" without one.
+
+    Raises:
+        ReobjError: neither a model of pycolmap, nor one of FISHEYE and BROWN.
+    """
+    model = str(_take(keys, "cameramodel", "model", "modeltype") or "").upper()
+    lens = str(_take(keys, "distortionmodel") or "").upper()  # of ROS and Kalibr
+    model = lens if model in ("", "PINHOLE") and lens else model
+    model = re.sub("[ -]", "_", model.removeprefix("DISTORTION."))  # of RealSense
+    if re.fullmatch("(INVERSE|MODIFIED)_BROWN_CONRADY", model):
+        distorted = any(_numbers(keys.get("coeffs", ("", None))[1]))
+        model = model if distorted else "BROWN_CONRADY"
+    if model not in (*FISHEYE, *BROWN):
+        camera_parameters(model)  # refuses unknown ones
+    return model
+
+
+def _refuse_unread(keys: dict[str, tuple[str, Any]], camera: Camera) -> None:
+    """Refuse a key that is left, has a number that is not the camera's, and changes cameras."""
+    for plain, (key, value) in keys.items():
+        repeated = () if key[1:].isdecimal() else camera.params  # not those of k1, p1
+        lost = {*_numbers(value)} - {0.0, *repeated}
+        if lost and re.fullmatch(CAMERA_LIKE, plain, re.IGNORECASE):
+            raise ReobjError(
+                f"{key!r} is not read; expected fx, fy, cx, cy or a matrix K, k1, k2, p1, p2, k3 "
+                "or a list dist_coeffs in OpenCV's order, width, height"
+            )
 
 
 def camera_of_keys(data: dict[str, Any], size: Size) -> Camera | None:
@@ -323,27 +368,24 @@ def camera_of_keys(data: dict[str, Any], size: Size) -> Camera | None:
     if len(rigs) > 1:  # Kalibr
         raise ReobjError(f"cameras {', '.join(rigs)}; expected one: leave the others out")
     keys = _flat(data[rigs[0]] if rigs else data)
-    sides = _take(keys, *SIDES) or [
-        _take(keys, letter, word, f"image{word}", f"img{word}")
+    if "k" in keys and len(_numbers(keys["k"][1])) == 9:  # ROS 2: as K and D of ROS 1
+        keys |= {name.upper(): keys.pop(name) for name in ("k", "d") if name in keys}
+    sides = _numbers(_take(keys, *SIDES)) or [
+        _take(keys, letter, letter.upper(), word, f"image{word}", f"img{word}")
         for letter, word in (("w", "width"), ("h", "height"))
     ]
     size = size if None in sides else (image_side(sides[0]), image_side(sides[1]))
-    model = str(_take(keys, "cameramodel", "model", "modeltype") or "").upper()
-    lens = str(_take(keys, "distortionmodel") or "").upper()  # of ROS and Kalibr
-    model = lens if model in ("", "PINHOLE") and lens else model
+    model = _lens(keys)
     params = _take(keys, "params")
     if model and params is not None:
         camera = colmap_camera([model, *map(str, (*_sized(size), *params))])
     elif (pinhole := _pinhole(keys, size)) is None:
         return None
-    elif str(_take(keys, "isfisheye")).lower() in ("true", "1") or model in FISHEYE:
+    elif str(_take(keys, "isfisheye", "fisheyemodel")).lower() in ("true", "1") or model in FISHEYE:
         terms = _terms(keys, "k1", "k2", "k3", "k4")
         camera = Camera("OPENCV_FISHEYE", *_sized(size), (*pinhole, *terms))
     elif model in BROWN:
-        first = _take(keys, "k")  # of SIMPLE_RADIAL
-        keys |= {} if first is None else {"k1": ("k", first)}
-        terms = _terms(keys, "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-        camera = brown_camera(size, *pinhole, *terms)
+        camera = brown_camera(size, *pinhole, *_brown_terms(keys))
     else:
         known = dict(zip(("fx", "fy", "cx", "cy", "f"), (*pinhole, pinhole[0]), strict=True))
         names = camera_parameters(model)
@@ -352,14 +394,7 @@ def camera_of_keys(data: dict[str, Any], size: Size) -> Camera | None:
             missing = names[values.index(None)]
             raise ReobjError(f"no {missing} of a {model} camera")
         camera = Camera(model, *_sized(size), tuple(map(float, values)))
-    for plain, (key, value) in keys.items():
-        repeated = () if key[1:].isdecimal() else camera.params  # not those of k1, p1
-        lost = {*_numbers(value)} - {0.0, *repeated}
-        if lost and re.fullmatch(CAMERA_LIKE, plain, re.IGNORECASE):
-            raise ReobjError(
-                f"{key!r} is not read; expected fx, fy, cx, cy or a matrix K, k1, k2, p1, p2, k3 "
-                "or a list dist_coeffs in OpenCV's order, width, height"
-            )
+    _refuse_unread(keys, camera)
     return camera
 
 
@@ -376,12 +411,12 @@ def read_yaml(path: Path) -> dict[str, Any]:
     """Read YAML, also OpenCV's with `%YAML:1.0` and `!!opencv-matrix`; all scalars are text."""
     text = re.sub(r"\A\s*%YAML.*", "", read_text(path, CAMERA_MAX))
     try:
-        data = yaml.load(text, _Loader)
+        found = list(filter(None, yaml.load_all(text, _Loader)))  # ROS 2 ends with ---
     except yaml.YAMLError as error:
         raise ReobjError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from None
-    if not isinstance(data, dict):
-        raise ReobjError(f"{path}: expected `key: value`")
-    return data
+    if len(found) != 1 or not isinstance(found[0], dict):
+        raise ReobjError(f"{path}: expected one document of `key: value`")
+    return dict(found[0])
 
 
 def _of_xml(element: ElementTree.Element) -> Any:
@@ -392,7 +427,7 @@ def _of_xml(element: ElementTree.Element) -> Any:
 
 # ---- Formats of files ----------------------------------------------------------------------------
 
-ReadCamera = Callable[[Path, Size], Camera | None]
+ReadCamera = Callable[[Path, Size], Camera]
 
 
 def _text_rows(probe: Probe) -> list[list[str]]:
@@ -411,7 +446,20 @@ def _read_pincam(path: Path, size: Size) -> Camera:
 
 
 def _keys_of(read: Callable[[Path], dict[str, Any]]) -> ReadCamera:
-    return lambda path, size: camera_of_keys(read(path), size)
+    def read_camera(path: Path, size: Size) -> Camera:
+        data = read(path)
+        if camera := camera_of_keys(data, size):
+            return camera
+        raise ReobjError(f"no known focal length among {shortened(sorted(map(str, data)))}; "
+                         f"expected {CAMERA_FORMS}")  # fmt: skip
+
+    return read_camera
+
+
+def _arrays(path: Path) -> dict[str, Any]:
+    """Return the arrays of an npz file, or the matrix K of an npy file."""
+    is_npz = path.suffix.lower() == ".npz"
+    return load_npz(path)[0] if is_npz else {"K": np.load(path, allow_pickle=False)}
 
 
 FRAME_PX, OWN_PX, UNREAD = "px of the frames", "px of the size in it", "rectified images"
@@ -435,6 +483,6 @@ CAMERAS: Registry[ReadCamera] = Registry("cameras", "--camera-format", [
            _keys_of(read_yaml), units=OWN_PX, unread=UNREAD),
     Format("xml", "OpenCV: FileStorage", lambda p: getattr(p.root, "tag", "") == "opencv_storage",
            _keys_of(lambda path: _of_xml(ElementTree.fromstring(read_text(path)))), units=OWN_PX),
-    Format("npz", "OpenCV: arrays `mtx`, `dist`, or as in JSON", lambda p: p.suffix == ".npz",
-           _keys_of(lambda path: load_npz(path)[0]), units=OWN_PX),
+    Format("npz", "OpenCV: arrays `mtx`, `dist`, or as in JSON; `.npy`: matrix K",
+           lambda p: p.suffix in (".npz", ".npy"), _keys_of(_arrays), units=OWN_PX),
 ])  # fmt: skip

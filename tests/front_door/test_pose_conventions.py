@@ -27,6 +27,7 @@ from .test_pose_files import (
     model,
     path_of,
     run,
+    write_clip,
 )
 
 Capture = pytest.CaptureFixture[str]
@@ -40,6 +41,13 @@ def world_from_cam() -> np.ndarray:
 
 def flip(x: float, y: float, z: float) -> np.ndarray:
     return np.diag([x, y, z, 1.0])
+
+
+def parts(rotation: np.ndarray, translation: np.ndarray, scale: float = 1) -> np.ndarray:
+    """Matrices (F, 4, 4) of the rotations and the scaled translations of others."""
+    whole = rotation.copy()
+    whole[:, :3, 3] = scale * translation[:, :3, 3]
+    return whole
 
 
 def tum_of(path: Path, matrices: np.ndarray) -> Path:
@@ -56,6 +64,17 @@ CONVENTIONS = {
     "turned": (lambda m: m @ flip(-1, -1, 1), "turned by 180 deg"),
     "OpenGL": (lambda m: m @ flip(1, -1, -1), "(OpenGL)"),
     "inverse": (np.linalg.inv, "the inverse direction"),
+    "inverse rotations": (lambda m: parts(np.linalg.inv(m), m), "inverse rotations beside"),
+    "inverse translations": (
+        lambda m: parts(m, np.linalg.inv(m)),
+        "translations of cam_from_world",
+    ),
+    "reversed": (lambda m: m[::-1], "the order reversed"),
+    "late": (lambda m: np.concatenate([m[:1], m[:1], m[:1], m[:-3]]), "3 frames earlier"),
+    "early": (lambda m: np.concatenate([m[3:], m[-3:]]), "3 frames later"),
+    "as text": (lambda m: m[np.argsort([str(n) for n in ALL])], "as text (1, 10, 2)"),
+    "mm": (lambda m: parts(m, m, 1000), "expected metres (mm"),
+    "cm": (lambda m: parts(m, m, 100), "expected metres (mm, cm"),
 }
 
 
@@ -69,7 +88,8 @@ def test_a_convention_is_named_by_boxes_alone(tmp_path: Path, name: str, capsys:
         assert code == 0
         assert_chairs_in_place(tmp_path / "out")
         return
-    assert code == 2 and "the poses look like ones with" in error and named in error
+    assert code == 2 and named in error and error.count("\n") == 1
+    assert "the poses look like ones with" in error or "metres" in error
     assert not (tmp_path / "out" / "objects.json").exists()
 
 
@@ -79,6 +99,7 @@ def test_a_convention_is_named_by_boxes_alone(tmp_path: Path, name: str, capsys:
         (lambda m: m @ flip(1, -1, -1), ""),  # as the format has it
         (lambda m: m, "x right, y down, z forward (OpenCV)"),
         (np.linalg.inv, "the inverse direction"),
+        (lambda m: np.concatenate([m[1:], m[-1:]]) @ flip(1, -1, -1), "1 frames later"),
         (lambda m: flip(1, 1, -1) @ m @ flip(1, -1, 1), "(Unity)"),
     ],
 )
@@ -87,8 +108,8 @@ def test_a_convention_is_named_by_images_alone(
 ) -> None:
     source = folder_of(tmp_path, blank=False)
     frames = [
-        {"file_path": f"images/{i:04d}.jpg", "transform_matrix": convert(matrix).tolist()}  # type: ignore[operator]
-        for i, matrix in enumerate(world_from_cam())
+        {"file_path": f"images/{i:04d}.jpg", "transform_matrix": matrix.tolist()}
+        for i, matrix in enumerate(convert(world_from_cam()))  # type: ignore[operator]
     ]
     facts = {"fl_x": 290, "cx": 160, "cy": 120, "w": 320, "h": 240, "frames": frames}
     (tmp_path / "transforms.json").write_text(json.dumps(facts))
@@ -236,6 +257,12 @@ def test_our_own_model_of_upright_photos_is_not_turned(tmp_path: Path) -> None:
         ("cameras.sfm", '{"version": ["1"], "views": [], "poses": []}', "Meshroom.*COLMAP"),
         ("transforms_train.json", '[{"file_path": "a.jpg", "transform": [[1, 0, 0, 0]]}]',
          "nerfstudio.*transforms.json"),
+        ("sfm_data.json", '{"sfm_data_version": "0.3", "views": []}', "openMVG.*COLMAP"),
+        ("bundle.out", "# Bundle file v0.3\n1 0\n", "Bundler.*COLMAP"),
+        ("model.nvm", "NVM_V3\n\n1\n", "VisualSFM.*COLMAP"),
+        ("poses.csv", "#name,x,y,alt,heading,pitch,roll\na.jpg,0,0,0,0,0,0\n",
+         "RealityCapture.*COLMAP"),
+        ("poses.txt", "0,1 1,5 1,5 1,5 0,0 0,0 0,0 1,0\n", "decimal commas"),
     ],
 )  # fmt: skip
 def test_poses_of_other_tools_are_named(
@@ -244,3 +271,21 @@ def test_poses_of_other_tools_are_named(
     (tmp_path / name).write_text(content)
     with pytest.raises(rt.ReobjError, match=named):
         rt.read_poses(tmp_path / name, rt.Video(folder_of(tmp_path)))
+
+
+def test_matrices_in_an_npy_file_and_a_folder_of_splits_are_named(tmp_path: Path) -> None:
+    video = rt.Video(folder_of(tmp_path))
+    np.save(tmp_path / "poses.npy", world_from_cam())
+    with pytest.raises(rt.ReobjError, match=r"shape \(30, 4, 4\).*savetxt"):
+        rt.read_poses(tmp_path / "poses.npy", video)
+    for split in ("train", "test"):
+        (tmp_path / f"transforms_{split}.json").write_text('{"frames": []}')
+    with pytest.raises(rt.ReobjError, match=r"NeRF splits.*give the file"):
+        rt.read_poses(tmp_path, video)
+
+
+def test_a_header_with_w_first_and_seconds_is_read(tmp_path: Path) -> None:
+    path = tum_of(tmp_path / "poses.txt", world_from_cam())
+    rows = np.loadtxt(path)[:, [0, 1, 2, 3, 7, 4, 5, 6]]
+    np.savetxt(path, rows, header="timestamp tx ty tz qw qx qy qz")
+    assert_right(rt.read_poses(path, rt.Video(write_clip(tmp_path)), camera=LINE), ALL)

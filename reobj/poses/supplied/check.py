@@ -75,7 +75,31 @@ def conventions(given: Supplied) -> Iterator[tuple[str, Array]]:
         yield name + text, cv_from_read @ inverse * mirror
     for name, roll in (("first given as w last", -1), ("last given as w first", 1)):
         yield f"quaternions with w {name}", _rolled(poses, roll)
+    (R, c), (Q, t) = (np.split(some, [3], 2) for some in (inverse, poses))
+    yield "inverse rotations beside camera centres", np.concatenate([R, -R @ c], 2)
+    yield "camera centres beside rotations of cam_from_world", np.concatenate([Q, -Q @ t], 2)
+    yield (
+        "translations of cam_from_world beside rotations of world_from_cam",
+        np.concatenate([R.swapaxes(1, 2), c], 2),
+    )
+    yield from _orders(given)
+
+
+def _orders(given: Supplied) -> Iterator[tuple[str, Array]]:
+    """List the poses (F, 3, 4) in other orders; a frame that has none gets the one before."""
+    poses = given.poses.cam_from_world
+    at = np.arange(len(poses))
+    known = np.isfinite(poses).all((1, 2))
+    filled = np.maximum.accumulate(np.where(known, at, known.argmax()))  # (F,)
     yield from given.orders.items()
+    yield "the order reversed", poses[filled[::-1]]
+    for first in (0, 1) if not given.orders else ():
+        order = np.argsort(np.argsort([str(n + first) for n in at]))
+        yield f"the order of numbers from {first} as text (1, 10, 2)", poses[filled[order]]
+    for shift in (*range(-10, 0), *range(1, 11)):
+        frames = f"{abs(shift)} frames {'earlier' if shift > 0 else 'later'}"
+        text = f"the order shifted (each pose is that of {frames})"
+        yield text, poses[filled[(at + shift).clip(0, len(at) - 1)]]
 
 
 def _rolled(cam_from_world: Array, count: int) -> Array:
@@ -90,10 +114,12 @@ def _rolled(cam_from_world: Array, count: int) -> Array:
 def _refuse(given: Supplied, likely: Sequence[str], measured: str) -> None:
     """Refuse the poses; likely: conventions that fit, [] if none does."""
     if likely:
+        remedy = "convert them, or name their format with --pose-format"
+        if likely[0].startswith("the order"):
+            remedy = "give each frame its pose"
         raise ReobjError(
             f"the poses look like ones with {' or '.join(likely[:3])}; they were read with "
-            f"{_axes_text(given.axes)} ({measured}): convert them, or name their format with "
-            "--pose-format"
+            f"{_axes_text(given.axes)} ({measured}): {remedy}"
         )
     raise ReobjError(
         f"the poses fit in no convention ({measured}): are they the poses of this video, in this "
@@ -166,6 +192,8 @@ def _explained(cam_from_world: Array, views: IntArray, rays: Array) -> float:
 
 GOOD_DEG = 1.0  # residual of poses that are certainly right (chosen: 9 px at 500 px focal length)
 MAX_RATIO = 0.3  # of residuals of a clearly better convention (chosen; higher: refuses right poses)
+ORDER_DEG = 0.4  # least residual of a wrong order (chosen: above the noise of boxes)
+MAX_ORDER_RATIO = 0.6  # of residuals of a better order; measured, right poses: .92 and more
 WRONG_DEG = 6.0  # of poses that are certainly wrong; measured, right ones: up to 2.0
 MIN_TRACKS = 4  # chosen: three triangulate by chance in a trajectory read backwards
 
@@ -186,11 +214,18 @@ def check_boxes(given: Supplied, tracks: Tracks, refuse: bool = True) -> bool:
     if len(views) < MIN_TRACKS:
         return False
     as_given = _residual_deg(given.poses.cam_from_world, views)
-    if as_given < GOOD_DEG or not refuse:
+    if not refuse:
         return as_given < GOOD_DEG
+    measured = f"{len(views)} tracks triangulate within {as_given:.1f} deg"
+    residuals = {name: _residual_deg(poses, views) for name, poses in _orders(given)}
+    best = min(residuals.values())
+    if as_given > ORDER_DEG and best < MAX_ORDER_RATIO * as_given and best < GOOD_DEG:
+        _refuse(given, [min(residuals, key=residuals.__getitem__)],
+                f"{measured}, then {best:.1f} deg")  # fmt: skip
+    if as_given < GOOD_DEG:
+        return True
     residuals = {name: _residual_deg(poses, views) for name, poses in conventions(given)}
     best = min(residuals.values())
-    measured = f"{len(views)} tracks triangulate within {as_given:.1f} deg"
     if best <= min(MAX_RATIO * as_given, 2 * GOOD_DEG):
         likely = [name for name, value in residuals.items() if value <= 1.5 * best]
         _refuse(given, likely, f"{measured}, then {best:.1f} deg")

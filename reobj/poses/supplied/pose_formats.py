@@ -514,6 +514,9 @@ def read_llff(path: Path, size: tuple[int, int]) -> PoseFile:
     """
     path = path / "poses_bounds.npy" if path.is_dir() else path
     rows = np.load(path, allow_pickle=False)
+    if rows.ndim != 2 or rows.shape[1] != 17:
+        raise ReobjError(f"{path}: an array of shape {rows.shape}; expected LLFF's (N, 17); write "
+                         "matrices as text: np.savetxt(FILE, m.reshape(N, 16))")  # fmt: skip
 
     def read(row: Array) -> tuple[Array, Camera]:
         table = row[:15].astype(np.float64).reshape(3, 5)

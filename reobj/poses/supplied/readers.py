@@ -8,13 +8,14 @@ the file follows its conventions is checked later, against images or tracks (`ch
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from reobj.cameras import WORLD_MAX, Camera, Poses, usable
+from reobj.cameras import WORLD_MAX, Camera, Poses, invert_rigid, usable
 from reobj.files import spans
 from reobj.formats import AUTO, Format, Probe, Registry
 from reobj.poses.estimate import PosesConfig
@@ -111,6 +112,8 @@ def read_supplied(video: Any, config: PosesConfig) -> Supplied:
         messages=(*pose_file.messages, *messages, *turn_messages, *[lost] * bool(lost)),
         reading=f"{pose_file.kind}, frames by {assignment.rule}",
     )  # fmt: skip
+    if poses.metric:
+        _check_units(cam_from_world, path)
     others = by_order(len(pose_file.cam_from_world), source, assignment.key == "order")
     orders = {
         f"the {one.rule} (--set poses.frames_by={one.key})": _of_frames(
@@ -120,6 +123,22 @@ def read_supplied(video: Any, config: PosesConfig) -> Supplied:
         if assignment.key in ("order", "text") and one.key != assignment.key
     }
     return Supplied(poses, pose_file.axes, orders)
+
+
+LARGE_M, FAST_M = 100.0, 0.5  # radius of an indoor path, and of a step in it (chosen)
+
+
+def _check_units(cam_from_world: Array, path: Path) -> None:
+    """Refuse a path (F, 3, 4) in metres that no camera takes indoors."""
+    centre = invert_rigid(cam_from_world)[:, :, 3]
+    centre = centre[np.isfinite(centre).all(1)]  # (n, 3)
+    step = np.median(np.linalg.norm(np.diff(centre, axis=0), axis=1)) if len(centre) > 1 else 0.0
+    radius = np.linalg.norm(centre - np.median(centre, axis=0), axis=1).max(initial=0.0)
+    if radius > LARGE_M and step > FAST_M:
+        raise ReobjError(
+            f"{path}: the cameras move by {step:.3g} between frames, within a radius of "
+            f"{radius:.3g}; expected metres (mm, cm? divide the translations by 1000, 100)"
+        )
 
 
 def _assignment(
@@ -287,26 +306,29 @@ def _head(probe: Probe) -> tuple[str, list[str], str]:
     probe = Probe(formats.table_file(probe.path)) if probe.is_dir else probe
     for k, line in enumerate(probe.lines):
         words = line.replace(",", " ").split()
+        if re.fullmatch(r"(\S*\d,\d\S*\s+){6,}\S+", line) and "." not in line:
+            raise ReobjError(f"{probe.path}: decimal commas ({line:.30} ...); expected points")
         if words and all(map(formats.is_number, words)):
             return "\n".join(probe.lines[:k]), words, line
     return "", [], ""
 
 
 def _is_euroc(probe: Probe) -> bool:
-    """Test for 17 columns, a header with w first, or ns with commas and no header."""
+    """Test for 17 columns, or for 8 with ns, and w first by a header, or commas without one."""
     header, words, line = _head(probe)
     if "data.csv" in probe.names or len(words) == 17 or "_RS_" in header:
         return True
     named = formats.named_columns(header, 8)
-    in_ns = named is None and "," in line and len(words[0].partition(".")[0]) >= 16
-    return len(words) == 8 and (named[6] < named[3] if named else in_ns)
+    w_first = named[6] < named[3] if named else "," in line
+    in_ns = "ns" in re.split("[^a-z]+", header.lower())
+    return len(words) == 8 and w_first and (in_ns or len(words[0].partition(".")[0]) >= 16)
 
 
 def _is_tum(probe: Probe) -> bool:
+    """Test for 8 columns; without a header ns with commas may be EuRoC's as well."""
     header, words, _ = _head(probe)
-    named = formats.named_columns(header, 8)
-    w_last = named is None or named[3] < named[6]
-    return len(words) == 8 and w_last and "_RS_" not in header
+    is_euroc = formats.named_columns(header, 8) is not None and _is_euroc(probe)
+    return len(words) == 8 and not is_euroc and "_RS_" not in header
 
 
 def _is_colmap(probe: Probe) -> bool:
@@ -314,6 +336,11 @@ def _is_colmap(probe: Probe) -> bool:
     if probe.is_dir:
         return not {"transforms.json", "colmap"} <= probe.names and bool(find_models(probe.path))
     return probe.suffix == ".bin" or probe.path.name == "images.txt"
+
+
+def _is_reality_capture(probe: Probe) -> bool:
+    first = "".join(probe.lines[:1]).lower().replace(" ", "")
+    return probe.suffix == ".xmp" or first.startswith(("#name,x,y,", "#cameras"))
 
 
 def _has(probe: Probe, name: str, *keys: str) -> bool:
@@ -366,10 +393,20 @@ POSES: Registry[ReadPoses] = Registry("poses", "--pose-format", [
            None, advice="write a COLMAP model with `opensfm export_colmap`"),
     Format("", "Metashape's cameras.xml", lambda p: p.root is not None and p.root.tag == "document",
            None, advice="export the cameras as COLMAP: File, Export, Export Cameras"),
-    Format("", "Meshroom's cameras.sfm", lambda p: _has(p, "cameras.sfm", "views"), None,
+    Format("", "Meshroom's cameras.sfm", lambda p: _has(p, "cameras.sfm", "views", "version"), None,
            advice="write a COLMAP model with the node ExportColmap"),
+    Format("", "openMVG's sfm_data.json", lambda p: "sfm_data_version" in p.keys(), None,
+           advice="write a COLMAP model with openMVG_main_openMVG2Colmap"),
+    Format("", "Bundler's bundle.out, VisualSFM's .nvm", lambda p: "".join(p.lines[:1]).startswith(
+           ("# Bundle file", "NVM_V3")), None,
+           advice="reconstruct the images with COLMAP"),
+    Format("", "RealityCapture's CSV or XMP", _is_reality_capture, None,
+           advice="export the registration as COLMAP"),
+    Format("", "a folder of NeRF splits", lambda p: "transforms_train.json" in p.names
+           and "transforms.json" not in p.names, None,
+           advice="give the file transforms_....json of the images"),
     Format("", "cameras of `ns-export cameras` of nerfstudio",
-           lambda p: _has(p, "transforms_train.json", "file_path", "transform"), None,
+           lambda p: not p.is_dir and {"file_path", "transform"} <= p.keys(), None,
            advice="their world is scaled, and they have no intrinsics: give the transforms.json of "
            "the data"),
 ])  # fmt: skip
