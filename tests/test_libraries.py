@@ -187,7 +187,7 @@ def test_a_missing_library_is_one_line_with_the_command(
 def test_a_missing_package_of_one_model_is_not_taken_for_the_library(
     video: rt.Video, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def without_clip(_: libraries.LibraryOptions) -> libraries.LibraryDetector:
+    def without_clip(*_: Any) -> libraries.LibraryDetector:
         raise ModuleNotFoundError("No module named 'clip'", name="clip")
 
     broken = libraries.Library(without_clip, "ultralytics", "yolo11n.pt", "yolov8s-worldv2.pt")
@@ -244,8 +244,8 @@ def test_names_of_libraries() -> None:
 def test_a_library_without_a_file_is_one_line(
     video: rt.Video, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def missing(options: libraries.LibraryOptions) -> libraries.LibraryDetector:
-        raise FileNotFoundError(f"no such file: {options.model}")
+    def missing(name: str, *_: Any) -> libraries.LibraryDetector:
+        raise FileNotFoundError(f"no such file: {name}")
 
     stub = libraries.Library(missing, "ultralytics", "")
     monkeypatch.setitem(libraries.LIBRARIES, "ultralytics", stub)
@@ -312,8 +312,8 @@ def test_a_failure_of_a_library_is_one_line(
             raise error
         return [np.empty((0, 6))]
 
-    def opens(options: libraries.LibraryOptions) -> libraries.LibraryDetector:
-        if options.model == "broken":
+    def opens(name: str, *_: Any) -> libraries.LibraryDetector:
+        if name == "broken":
             raise error
         return libraries.LibraryDetector(detect, ("cup",))
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from reobj.cameras import Poses
 from reobj.files import did_you_mean, last_name, shortened
-from reobj.formats import AUTO, Format
+from reobj.formats import AUTO
 from reobj.sources import coco
 from reobj.sources.class_names import check_length, load_class_names
 from reobj.sources.detection_formats import DETECTIONS, Reader
@@ -164,16 +164,14 @@ def _read(
     if config.first_frame not in ("", "0", "1", "order"):
         raise ReobjError(f"detect.first_frame {config.first_frame}: expected 0, 1 or order")
     names = load_class_names(config.class_names) if config.class_names else ()
-    source = Source(path, video, names, config.first_frame, [poses] if poses else [])
-    return read_source(source, DETECTIONS.find(path, config.format))
+    source = Source(path, video, names, config.first_frame, poses)
+    return read_source(source, DETECTIONS.reader(path, config.format))
 
 
-def read_source(source: Source, entry: Format[Reader]) -> RecordedDetections:
+def read_source(source: Source, read: Reader) -> RecordedDetections:
     """Read a file in its format."""
-    if entry.read is None:
-        raise ReobjError(f"{source.path}: {entry.title}, not read; {entry.advice}")
     try:
-        return entry.read(source)
+        return read(source)
     except ReobjError:
         raise
     except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
@@ -310,35 +308,38 @@ def _usable(
 ) -> BoolArray:
     """Test which boxes (N,) have an area, overlap the image and belong to a frame of the video."""
     count = len(recorded)
-    low = recorded.xyxy[:, :2]
-    high = recorded.xyxy[:, 2:]
-    empty = (high <= low).any(1)  # (N,)
-    outside = np.logical_and(~empty, ((high <= 0) | (low >= np.array(recorded.size))).any(1))
+    xyxy, size = recorded.xyxy, recorded.size
+    low, high = xyxy[:, :2], xyxy[:, 2:]
+    empty: BoolArray = np.any(high <= low, axis=1)  # (N,)
+    outside = ~empty & ((high <= 0) | (low >= np.array(size))).any(1)
     missing = (recorded.frame < 0) | (recorded.frame >= (frame_count or sys.maxsize))
-    if count and recorded.xyxy.max() <= NORMALISED_MAX:
-        raise ReobjError(f"{path}: no coordinate above {NORMALISED_MAX}: normalised to 0..1? "
-                         "Multiply them by the image size")  # fmt: skip
-    if checks_size and (made_for := _other_size(recorded.xyxy[~empty], recorded.size)):
-        raise ReobjError(f"{path}: {made_for}")
-    if reading := _other_reading(recorded.xyxy, recorded.size):
-        raise ReobjError(f"{path}: {reading}")
     larger = outside.sum() > max(10, 0.05 * count) and not (high <= 0).any()
-    if 2 * (empty | outside).sum() > count or larger:
-        raise ReobjError(
-            f"{path}: {empty.sum()} of {count} boxes have no area and {outside.sum()} lie outside "
-            f"the image of {recorded.size}: x, y, w, h where x1, y1, x2, y2 is expected, "
-            "frames of another size (--set detect.image_size=WIDTHxHEIGHT), or another video?"
-        )
     numbers = shortened(np.unique(recorded.frame[missing]).tolist())
     text = f"of frames that the video lacks (0-based: {numbers}; it has {frame_count or 'some'})"
-    if count and missing.all():
-        raise ReobjError(f"{path}: all detections are {text}: detections of another video?")
-    reach = recorded.xyxy[:, 2:].max(0, initial=0)
+    fault = ""
+    if count and xyxy.max() <= NORMALISED_MAX:
+        fault = f"no coordinate above {NORMALISED_MAX}: normalised to 0..1? "
+        fault += "Multiply them by the image size"
+    elif checks_size and (other := _other_size(xyxy[~empty], size)):
+        fault = other
+    elif other := _other_reading(xyxy, size):
+        fault = other
+    elif 2 * (empty | outside).sum() > count or larger:
+        fault = (
+            f"{empty.sum()} of {count} boxes have no area and {outside.sum()} lie outside "
+            f"the image of {size}: x, y, w, h where x1, y1, x2, y2 is expected, "
+            "frames of another size (--set detect.image_size=WIDTHxHEIGHT), or another video?"
+        )
+    elif count and missing.all():
+        fault = f"all detections are {text}: detections of another video?"
+    if fault:
+        raise ReobjError(f"{path}: {fault}")
+    reach = high.max(0, initial=0)
     begins = bool(count) and (low.min(0) <= 0.02 * reach).any()
-    if checks_size and count >= 50 and begins and (reach < np.multiply(0.9, recorded.size)).all():
+    if checks_size and count >= 50 and begins and (reach < np.multiply(0.9, size)).all():
         recorded.messages.append(
             f"no box of {count} ends beyond x = {reach[0]:.0f} or y = {reach[1]:.0f} in images of "
-            f"{recorded.size}: boxes of frames of another size (detect.image_size)?"
+            f"{size}: boxes of frames of another size (detect.image_size)?"
         )
     for bad, fault in ((empty, "without area"), (outside, "wholly outside the image"),
                        (missing, text)):  # fmt: skip

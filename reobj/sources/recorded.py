@@ -99,7 +99,8 @@ class Source:
         path: of the file. video: whose frames the boxes belong to (attributes of `Video`).
         names: class names by number, (): not given. first: number of the first frame, "": as the
             format says, or "order": listed images are the frames in this order.
-        poses: cameras that project boxes in 3D. messages: about assumptions, for the user.
+        poses: cameras that project boxes in 3D; None: unknown.
+        messages: about assumptions, for the user.
         advice: in the error about frame numbers that may count from 0 or from 1.
     """
 
@@ -107,7 +108,7 @@ class Source:
     video: Any
     names: Sequence[str] = ()
     first: str = ""
-    poses: Sequence[Poses] = ()
+    poses: Poses | None = None
     messages: list[str] = field(default_factory=list)
     advice: str = "say which with --set detect.first_frame=0 or detect.first_frame=1"
 

@@ -31,6 +31,7 @@ from reobj.types import (
     BoolArray,
     IntArray,
     ReobjError,
+    nearest_of,
     printable,
     xyxy_from_cxcywh,
 )
@@ -527,11 +528,8 @@ def nearest_times(times_s: Array, time_s: Array, alone_s: float) -> IntArray:
     if not len(times_s):
         return np.full(len(time_s), -1)
     half = 0.5 * float(np.median(np.diff(times_s))) if len(times_s) > 1 else alone_s
-    after = np.searchsorted(times_s, time_s).clip(max=len(times_s) - 1)  # (N,)
-    pair = np.stack([(after - 1).clip(0), after], 1)  # (N, 2)
-    offset = np.abs(times_s[pair] - time_s[:, None])
-    nearest = np.take_along_axis(pair, offset.argmin(1)[:, None], 1)[:, 0]
-    return np.asarray(np.where(offset.min(1) <= half, nearest, -1), np.int64)
+    nearest = nearest_of(time_s, times_s)
+    return np.where(np.abs(times_s[nearest] - time_s) <= half, nearest, -1)
 
 
 # ---- Classes -------------------------------------------------------------------------------------

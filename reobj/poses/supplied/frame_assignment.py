@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from reobj.cameras import invert_rigid
 from reobj.frame_lookup import frames_by_name
 from reobj.sources.image_files import LEAST_STAMP, TimeUnit, is_date
-from reobj.types import Array, BoolArray, IntArray, ReobjError
+from reobj.types import Array, BoolArray, IntArray, ReobjError, nearest_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -315,12 +315,9 @@ def rows_by_time(stamps_s: Array, frame: IntArray, time_s: Array) -> IntArray:
     """
     steps = np.diff(time_s) / np.maximum(np.diff(frame), 1)
     half = 0.5 * float(np.median(steps)) if len(steps) else 1 / 60  # 30 Hz
-    after = np.searchsorted(stamps_s, time_s).clip(1, max(len(stamps_s) - 1, 1))  # (F,)
-    pair = np.stack([after - 1, after], 1).clip(max=len(stamps_s) - 1)  # (F, 2)
-    offset = np.abs(stamps_s[pair] - time_s[:, None])
-    nearest = np.take_along_axis(pair, offset.argmin(1)[:, None], 1)[:, 0]
+    nearest = nearest_of(time_s, stamps_s)  # (F,)
     tolerance = min(half, STAMP_TOLERANCE_S) * (1 + 1e-6)
-    return np.where(offset.min(1) <= tolerance, nearest, -1)
+    return np.where(np.abs(stamps_s[nearest] - time_s) <= tolerance, nearest, -1)
 
 
 def interpolated(
