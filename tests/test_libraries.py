@@ -266,7 +266,7 @@ def test_a_library_gets_batches(
             raise RuntimeError("CUDA out of memory.")
         return [[[-5, 5, 20 + image[0, 0, 0], 40, 0.9, 0]] for image in images]
 
-    stub = libraries.Library(lambda options: libraries.LibraryDetector(run, ("cup",)), "", "")
+    stub = libraries.Library(lambda *_: libraries.LibraryDetector(run, ("cup",)), "", "")
     monkeypatch.setitem(libraries.LIBRARIES, "ultralytics", stub)
     monkeypatch.setattr(libraries.importlib.metadata, "version", lambda name: "1")
     images = tmp_path / "five"

@@ -423,11 +423,7 @@ def read_tracks(
     _check(recorded, path, limit, video.frame_count)
     if len(recorded):
         _check_identities(recorded, path)
-    start = video.config.start
-    stop = video.config.stop
-    every = video.config.every
-    use = (recorded.frame >= start) & ((recorded.frame - start) % every == 0)
-    use &= recorded.frame < (stop or sys.maxsize)
+    use = video.config.selects(recorded.frame)
     pairs = np.column_stack([recorded.frame, recorded.identity])[use]  # (N, 2)
     unique, first, count = np.unique(pairs, axis=0, return_index=True, return_counts=True)
     if (count > 1).any():

@@ -83,7 +83,7 @@ def polygon_runs(rings: Sequence[Sequence[float]], size: tuple[int, int]) -> Cou
     corners = [np.reshape(np.asarray(ring, np.float64), (-1, 2)) for ring in rings]
     flat = np.concatenate([np.empty((0, 2)), *corners])
     if not (np.abs(flat) <= COORDINATE_MAX).all():
-        raise ValueError(f"a polygon with corners that are not finite, or beyond 1e7 px")
+        raise ValueError("a polygon with corners that are not finite, or beyond 1e7 px")
     if not len(flat):
         return NO_RUNS
     low = np.clip(np.floor(flat.min(0)) - 1, 0, size).astype(int)  # only the part with the polygon

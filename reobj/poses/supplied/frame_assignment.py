@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from reobj.cameras import invert_rigid
 from reobj.frame_lookup import frames_by_name
@@ -191,13 +191,13 @@ def numbers_of_names(names: Sequence[str], where: str) -> IntArray:
             return np.array(number, np.int64)
     if not numbered:
         return np.full(len(names), -1)
-    number = [int(found[-1][-18:]) if found else -1 for found in digits]
-    first: dict[int, str] = {}
-    for name, n in zip(names, number, strict=True):
-        if n >= 0 and first.setdefault(n, name) != name:
+    first: dict[str, str] = {}
+    for name, found in zip(names, digits, strict=True):
+        if found and first.setdefault(found[-1].lstrip("0"), name) != name:
             raise ReobjError(
-                f"{where}: {first[n]!r} and {name!r} have the same number, and neither is the name "
-                "of a frame; give the poses of one camera, or a folder of images with these names"
+                f"{where}: {first[found[-1].lstrip('0')]!r} and {name!r} have the same number, and "
+                "neither is the name of a frame; give the poses of one camera, or a folder of "
+                "images with these names"
             )
     raise ReobjError(f"{where}: {names[0]!r} appears twice; expected each image once")
 
@@ -280,22 +280,18 @@ def _by_stamps(stamps_s: Array, source: SourceFrames, is_ours: bool) -> list[Fra
         found.append(FrameAssignment("time", "time stamps", row, int(outside.sum())))
     if found and (is_ours or (found[0].row < 0).all()):  # the same clock, none within the tolerance
         return found
-    clock = (
-        ""
-        if found or not source.timed
-        else ", the time stamps are of another clock than the frames"
-    )
+    other_clock = not found and source.timed
+    clock = ", the time stamps are of another clock than the frames" * other_clock
     if is_whole(stamps_s) and 0 <= stamps_s[0] and stamps_s[-1] < LEAST_STAMP:
         noun = "whole numbers in place of time stamps"
         found += by_numbers(stamps_s.astype(np.int64), source, noun)
     elif not source.timed and count != source.count:
-        number = _even_numbers(stamps_s)
-        if number is not None:
+        if (number := _even_numbers(stamps_s)) is not None:
             noun = f"time stamps as multiples of {float(np.median(np.diff(stamps_s))):.4g} s"
-            found.append(_assignment("number0", f"{noun}, from 0", number, source))
-            found.append(
-                _assignment("first0", f"{noun}, from the first", number - number[0], source)
-            )
+            found += [
+                _assignment("number0", f"{noun}, from 0", number, source),
+                _assignment("first0", f"{noun}, from the first", number - number[0], source),
+            ]
     if count == source.count:
         rule = f"order, one row for each frame of the source{clock}"
         found.append(_assignment("order", rule, np.arange(count), source))
@@ -334,22 +330,17 @@ def interpolated(
         such poses and at the time of neither.
     """
     after = np.searchsorted(stamps_s, time_s, side="right").clip(1, len(stamps_s) - 1)
-    a = after - 1
-    b = after
+    way_s = np.stack([time_s - stamps_s[after - 1], stamps_s[after] - time_s])  # (2, F)
     same_s = 5e-4  # times in files and containers are rounded to a ms
-    use = (time_s - stamps_s[a] > same_s) & (stamps_s[b] - time_s > same_s)
-    use &= stamps_s[b] - stamps_s[a] <= max_step_s
-    use &= np.isfinite(cam_from_world[a] + cam_from_world[b]).all((1, 2))
-    a = a[use]
-    b = b[use]
-    fraction = ((time_s[use] - stamps_s[a]) / (stamps_s[b] - stamps_s[a]))[:, None]  # (n, 1)
-    start = invert_rigid(cam_from_world[a])
-    end = invert_rigid(cam_from_world[b])
-    turn = Rotation.from_matrix(start[:, :, :3])
-    step = (turn.inv() * Rotation.from_matrix(end[:, :, :3])).as_rotvec()
-    turned = (turn * Rotation.from_rotvec(fraction * step)).as_matrix()
-    centre = start[:, :, 3] + fraction * (end[:, :, 3] - start[:, :, 3])
-    return invert_rigid(np.concatenate([turned, centre[:, :, None]], 2)), use
+    known = np.isfinite(cam_from_world).all((1, 2))
+    use: BoolArray = np.all(way_s > same_s, axis=0) & (way_s.sum(0) <= max_step_s)
+    use &= known[after - 1] & known[after]
+    if not use.any():
+        return np.empty((0, 3, 4)), use
+    pose = invert_rigid(np.where(known[:, None, None], cam_from_world, np.eye(3, 4)))  # (N, 3, 4)
+    turn = Slerp(stamps_s, Rotation.from_matrix(pose[:, :, :3]))(time_s[use]).as_matrix()
+    centre = [np.interp(time_s[use], stamps_s, column) for column in pose[:, :, 3].T]
+    return invert_rigid(np.dstack([turn, np.transpose(centre)])), use
 
 
 # ---- Order ---------------------------------------------------------------------------------------
@@ -403,9 +394,8 @@ def _by_picked_images(count: int, source: SourceFrames) -> list[FrameAssignment]
             frame_of = {n - first: frame for frame, n in enumerate(number.tolist())}
             frame = np.array([frame_of.get(n, -1) for n in range(count)], np.int64)
             rule = f"numbers in the image names, rows counted from {first}"
-            found.append(
-                FrameAssignment(f"number{first}", rule, _assignment("", "", frame, source).row, 0)
-            )
+            one = _assignment(f"number{first}", rule, frame, source)
+            found.append(replace(one, outside=0))
     return found
 
 
