@@ -63,8 +63,7 @@ class RecordedDetections:
     def select(self, rows: IntArray) -> None:
         """Select rows (n,), in this order."""
         count = len(self)
-        columns = ("frame", "xyxy", "score", "class_id", "line", "identity", "boxes_3d", "ignored")
-        for name in columns:
+        for name in "frame xyxy score class_id line identity boxes_3d ignored".split():
             values = getattr(self, name)
             setattr(self, name, values[rows] if len(values) == count else values)
         self.runs = [self.runs[row] for row in rows]
@@ -72,9 +71,8 @@ class RecordedDetections:
     def fingerprint(self) -> str:
         """Hash the detections, independently of the format of the file."""
         digest = hashlib.sha256(repr((self.class_names, self.size)).encode())
-        arrays: list[npt.NDArray[Any]] = [self.frame, self.xyxy, self.score, self.class_id]
-        arrays += [self.boxes_3d] if len(self.boxes_3d) else []
-        for values in arrays + list(self.runs):
+        given = [self.boxes_3d] if len(self.boxes_3d) else []
+        for values in (self.frame, self.xyxy, self.score, self.class_id, *given, *self.runs):
             digest.update(repr(values.shape).encode() + np.ascontiguousarray(values).tobytes())
         return digest.hexdigest()[:16]
 
@@ -181,18 +179,16 @@ def pack_detections(
         mask_counts[mask_offsets[i] : mask_offsets[i + 1]].
     """
     parts = [Detections.empty(), *(detections for _, detections in frames)]
+    index = np.array([i for i, _ in frames], np.int64)  # (F,)
     runs = [NO_RUNS]
     for detections in parts:
         masks = detections.masks
         expected = (len(detections), size[1], size[0])
-        if masks is None:
-            runs += [NO_RUNS] * len(detections)
-        elif masks.shape != expected:
+        if masks is not None and masks.shape != expected:
             raise ReobjError(f"masks are {masks.shape}, expected (D, H, W) = {expected}")
-        else:
-            runs += map(rle_encode, masks)
+        runs += [NO_RUNS] * len(detections) if masks is None else map(rle_encode, masks)
     return {
-        "frame": np.repeat([i for i, _ in frames], [len(d) for _, d in frames]).astype(np.int64),
+        "frame": np.repeat(index, list(map(len, parts[1:]))),
         "xyxy": np.concatenate([d.xyxy for d in parts]).astype(np.float64),
         "score": np.concatenate([d.score for d in parts]).astype(np.float64),
         "class_id": np.concatenate([d.class_id for d in parts]).astype(np.int64),
@@ -200,7 +196,7 @@ def pack_detections(
         "image_size": np.array(size, np.int64),
         "mask_counts": np.concatenate(runs),
         "mask_offsets": np.cumsum([len(run) for run in runs]),
-        "done": np.unique(np.array([i for i, _ in frames], np.int64)),
+        "done": np.unique(index),
     }
 
 

@@ -54,10 +54,11 @@ class DepthMaps:
                 f"{size[0]}x{size[1]} as the other maps"
             )
         step = -(-max(size) // 320)
-        xy = np.stack(np.meshgrid(*(np.arange(0, side, step) for side in size)), -1)  # (h, w, 2)
+        sides = (np.arange(0.5, side, step) for side in size)
         # pixels of an ideal pinhole camera lie elsewhere in the distorted image; NaN: outside
-        at = np.nan_to_num(self.camera.distort(xy + 0.5) - 0.5, nan=-9).astype(np.float32)
-        depth = cv2.remap(image, at, None, cv2.INTER_NEAREST).astype(np.float32)  # outside: 0
+        at = self.camera.distort(np.stack(np.meshgrid(*sides), -1)) - 0.5  # (h, w, 2)
+        x, y = np.moveaxis(np.nan_to_num(at, nan=-9).astype(np.float32), -1, 0)
+        depth = np.float32(cv2.remap(image, x, y, cv2.INTER_NEAREST))  # outside: 0
         depth[depth == 65535] = 0  # 7-Scenes: none
         # a pixel x of the subsampled map has its centre at step x + .5 of the whole one
         small_from_full = np.diag([1 / step, 1 / step, 1])

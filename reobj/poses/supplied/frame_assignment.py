@@ -332,7 +332,7 @@ def interpolated(
     after = np.searchsorted(stamps_s, time_s, side="right").clip(1, len(stamps_s) - 1)
     way_s = np.stack([time_s - stamps_s[after - 1], stamps_s[after] - time_s])  # (2, F)
     same_s = 5e-4  # times in files and containers are rounded to a ms
-    known = np.isfinite(cam_from_world).all((1, 2))
+    known: BoolArray = np.all(np.isfinite(cam_from_world), axis=(1, 2))
     use: BoolArray = np.all(way_s > same_s, axis=0) & (way_s.sum(0) <= max_step_s)
     use &= known[after - 1] & known[after]
     if not use.any():
