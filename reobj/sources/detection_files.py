@@ -253,22 +253,21 @@ def check_rows(recorded: RecordedDetections, path: Path) -> None:
         finite = np.isfinite(recorded.xyxy.sum(1) + recorded.score)  # (N,)
     finite &= (np.abs(recorded.xyxy) <= COORDINATE_MAX).all(1)
     named = (recorded.class_id >= 0) & (recorded.class_id < len(names))
-    pixels = np.array([runs.sum() for runs in recorded.runs], np.int64)  # (N,)
-    masked = np.array([len(runs) > 0 for runs in recorded.runs], bool)
-    unfit = masked & (pixels != math.prod(recorded.size))
-    for row in np.flatnonzero(~finite | ~named | unfit)[:1]:
-        text = f"mask of {pixels[row]} pixels in a video of {recorded.size}"
+    is_long = np.array([len(name) > CLASS_NAME_MAX for name in (*names, "")], bool)
+    long = is_long[np.where(named, recorded.class_id, -1)]
+    whole = math.prod(recorded.size)
+    unfit = np.array([len(runs) > 0 and runs.sum() != whole for runs in recorded.runs], bool)
+    for row in np.flatnonzero(~finite | ~named | long | unfit)[:1]:
+        where = f"{path}, {recorded.unit} {recorded.line[row]}"
+        text = f"mask of {recorded.runs[row].sum()} pixels in a video of {recorded.size}"
         if not finite[row]:
             values = f"{recorded.xyxy[row]}, {recorded.score[row]}"
             text = f"{values}: NaN, infinite or beyond 1e7 pixels"
         elif not named[row]:
             text = unnamed_class(int(recorded.class_id[row]), len(names))
-        raise ReobjError(f"{path}, {recorded.unit} {recorded.line[row]}: {text}")
-    long = [number for number, name in enumerate(names) if len(name) > CLASS_NAME_MAX]
-    for number in long:
-        rows = np.flatnonzero(recorded.class_id == number)[:1]
-        where = f"{recorded.unit} {recorded.line[rows[0]]}" if len(rows) else "class names"
-        check_length(names[number], f"{path}, {where}")
+        elif long[row]:
+            check_length(names[recorded.class_id[row]], where)
+        raise ReobjError(f"{where}: {text}")
 
 
 def _check_scores(recorded: RecordedDetections, most: float, path: Path) -> None:

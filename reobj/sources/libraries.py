@@ -69,13 +69,12 @@ class Library:
     Attributes:
         open: makes a detector of a model (name or file, as the library expects it), words that it
             looks for ((): its classes), least score, and device of PyTorch.
-        install: what pip installs. models: examples of names.
-        takes_words: the example that finds free text; "": none.
+        install: what pip installs.
+        takes_words: an example of a model that finds free text; "": none.
     """
 
     open: Callable[[str, list[str], float, str], LibraryDetector]
     install: str
-    models: str
     takes_words: str = ""
 
 
@@ -193,14 +192,11 @@ def _with_words(image: Any, words: list[str]) -> dict[str, Any]:
 
 
 LIBRARIES = {
-    "ultralytics": Library(_ultralytics, "ultralytics", "yolo11n.pt", "yolov8s-worldv2.pt"),
-    "rfdetr": Library(_rfdetr, "rfdetr", "nano, seg-nano, nano=WEIGHTS.pth"),
-    "torchvision": Library(_torchvision, "torchvision", "fasterrcnn_resnet50_fpn_v2"),
-    "hf": Library(
-        _transformers, "transformers torchvision", "PekingU/rtdetr_v2_r18vd or a folder",
-        "IDEA-Research/grounding-dino-tiny",
-    ),
-}  # fmt: skip
+    "ultralytics": Library(_ultralytics, "ultralytics", "yolov8s-worldv2.pt"),
+    "rfdetr": Library(_rfdetr, "rfdetr"),
+    "torchvision": Library(_torchvision, "torchvision"),
+    "hf": Library(_transformers, "transformers torchvision", "IDEA-Research/grounding-dino-tiny"),
+}
 
 
 def library_of(detector: str) -> tuple[str, str] | None:
