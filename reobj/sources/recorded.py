@@ -71,8 +71,9 @@ class RecordedDetections:
     def fingerprint(self) -> str:
         """Hash the detections, independently of the format of the file."""
         digest = hashlib.sha256(repr((self.class_names, self.size)).encode())
-        given = [self.boxes_3d] if len(self.boxes_3d) else []
-        for values in (self.frame, self.xyxy, self.score, self.class_id, *given, *self.runs):
+        given: list[npt.NDArray[Any]] = [self.boxes_3d] if len(self.boxes_3d) else []
+        given = [self.frame, self.xyxy, self.score, self.class_id, *given, *self.runs]
+        for values in given:
             digest.update(repr(values.shape).encode() + np.ascontiguousarray(values).tobytes())
         return digest.hexdigest()[:16]
 

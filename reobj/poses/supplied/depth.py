@@ -58,7 +58,7 @@ class DepthMaps:
         # pixels of an ideal pinhole camera lie elsewhere in the distorted image; NaN: outside
         at = self.camera.distort(np.stack(np.meshgrid(*sides), -1)) - 0.5  # (h, w, 2)
         x, y = np.moveaxis(np.nan_to_num(at, nan=-9).astype(np.float32), -1, 0)
-        depth = np.float32(cv2.remap(image, x, y, cv2.INTER_NEAREST))  # outside: 0
+        depth = cv2.remap(image, x, y, cv2.INTER_NEAREST).astype(np.float32)  # outside: 0
         depth[depth == 65535] = 0  # 7-Scenes: none
         # a pixel x of the subsampled map has its centre at step x + .5 of the whole one
         small_from_full = np.diag([1 / step, 1 / step, 1])
