@@ -712,7 +712,7 @@ class Existence(float):
         self.see_through = see_through
 
 
-def nearest_of(values: IntArray, known: IntArray) -> IntArray:
+def nearest_of(values: npt.NDArray[Any], known: npt.NDArray[Any]) -> IntArray:
     """Return the index of the nearest of K known values, ascending, to each value (N,).
 
     Of two equally near ones it is the first.

@@ -176,7 +176,7 @@ def test_scannets_intrinsics_have_another_pixel_centre(tmp_path, walk):
     folder = write_maps(tmp_path / "depth", walk.cam_from_world[:1], ["0.png"])
     (tmp_path / "intrinsic").mkdir()
     np.savetxt(tmp_path / "intrinsic" / "intrinsic_depth.txt", K)
-    maps = find_depth_maps(str(folder), walk, ())
+    maps = find_depth_maps(str(folder), walk, video_of(()))
     assert maps.camera.params == (240, 240, 100, 80)
 
 
@@ -194,7 +194,7 @@ def test_subsampled_maps_have_no_pixel_offset(tmp_path, walk):
     """Every 3rd pixel of 960: half a pixel off would show."""
     camera = CAMERA.resized((960, 720))
     folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS, camera=camera)
-    maps = find_depth_maps(str(folder), walk, ())
+    maps = find_depth_maps(str(folder), walk, video_of(()))
     depth, K = maps.read(5)
     assert depth.shape == (240, 320)
     y, x = np.mgrid[30:200:10, 40:300:10].reshape(2, -1)
@@ -242,7 +242,7 @@ def test_a_reconstruction_becomes_metric(tmp_path, walk, unit_m, noise):
 
 def test_the_sigma_of_the_scale_is_calibrated(tmp_path, walk):
     folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS)
-    maps = find_depth_maps(str(folder), walk, ())
+    maps = find_depth_maps(str(folder), walk, video_of(()))
     errors = []
     for seed in range(10):
         scale, sigma, used = depth_scale(with_points(walk, 0.5, 0.1, seed), maps)
@@ -317,7 +317,7 @@ def test_maps_are_assigned_to_frames(tmp_path, maps, names, expected):
     count = len(names) or 9
     poses = supplied(motion("walk", count), CAMERA)
     write_maps(tmp_path / "d", poses.cam_from_world[: len(maps)], maps)
-    found = find_depth_maps(str(tmp_path / "d"), poses, names)
+    found = find_depth_maps(str(tmp_path / "d"), poses, NamedVideo([], names))
     assert sorted(found.files) == expected
 
 

@@ -187,10 +187,10 @@ def test_a_missing_library_is_one_line_with_the_command(
 def test_a_missing_package_of_one_model_is_not_taken_for_the_library(
     video: rt.Video, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def without_clip(_: libraries.LibraryOptions) -> libraries.LibraryDetector:
+    def without_clip(*_: Any) -> libraries.LibraryDetector:
         raise ModuleNotFoundError("No module named 'clip'", name="clip")
 
-    broken = libraries.Library(without_clip, "ultralytics", "yolo11n.pt", "yolov8s-worldv2.pt")
+    broken = libraries.Library(without_clip, "ultralytics", "yolov8s-worldv2.pt")
     monkeypatch.setitem(libraries.LIBRARIES, "ultralytics", broken)
     with pytest.raises(rt.ReobjError, match="'clip'; ultralytics needs it for this model"):
         detect(video, "ultralytics:yolov8s-worldv2.pt", words="toolbox")
@@ -244,10 +244,10 @@ def test_names_of_libraries() -> None:
 def test_a_library_without_a_file_is_one_line(
     video: rt.Video, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def missing(options: libraries.LibraryOptions) -> libraries.LibraryDetector:
-        raise FileNotFoundError(f"no such file: {options.model}")
+    def missing(name: str, *_: Any) -> libraries.LibraryDetector:
+        raise FileNotFoundError(f"no such file: {name}")
 
-    stub = libraries.Library(missing, "ultralytics", "")
+    stub = libraries.Library(missing, "ultralytics")
     monkeypatch.setitem(libraries.LIBRARIES, "ultralytics", stub)
     monkeypatch.setattr(libraries.importlib.metadata, "version", lambda name: "1")
     with pytest.raises(rt.ReobjError, match=r"^--detector no\.pt: no such file: no\.pt$"):
@@ -266,7 +266,7 @@ def test_a_library_gets_batches(
             raise RuntimeError("CUDA out of memory.")
         return [[[-5, 5, 20 + image[0, 0, 0], 40, 0.9, 0]] for image in images]
 
-    stub = libraries.Library(lambda options: libraries.LibraryDetector(run, ("cup",)), "", "")
+    stub = libraries.Library(lambda *_: libraries.LibraryDetector(run, ("cup",)), "")
     monkeypatch.setitem(libraries.LIBRARIES, "ultralytics", stub)
     monkeypatch.setattr(libraries.importlib.metadata, "version", lambda name: "1")
     images = tmp_path / "five"
@@ -312,12 +312,12 @@ def test_a_failure_of_a_library_is_one_line(
             raise error
         return [np.empty((0, 6))]
 
-    def opens(options: libraries.LibraryOptions) -> libraries.LibraryDetector:
-        if options.model == "broken":
+    def opens(name: str, *_: Any) -> libraries.LibraryDetector:
+        if name == "broken":
             raise error
         return libraries.LibraryDetector(detect, ("cup",))
 
-    stub = libraries.Library(opens, "ultralytics", "yolo11n.pt")
+    stub = libraries.Library(opens, "ultralytics")
     monkeypatch.setitem(libraries.LIBRARIES, "ultralytics", stub)
     monkeypatch.setattr(libraries.importlib.metadata, "version", lambda name: "1")
     images = tmp_path / "two"

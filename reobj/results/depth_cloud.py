@@ -14,13 +14,15 @@ from reobj.poses.supplied.depth import (
     DepthMaps,
     compared,
     composed,
-    depth_maps_of,
+    find_depth_maps,
     look_up_depth,
+    moved,
+    points_of,
     smooth_pixels,
 )
 from reobj.results.cloud import DenseFrames, FlowFrames, Points, evenly
 from reobj.sources.video import Video
-from reobj.types import Array, ReobjError, log
+from reobj.types import ReobjError, log
 
 NEIGHBOURS = 4  # maps that a point is compared with
 
@@ -37,7 +39,7 @@ def dense_frames(poses: Poses, video: Video, depth: str) -> DenseFrames:
     try:
         if not poses.metric and poses.scale is None:
             raise ReobjError("--depth: the scale of the cameras is unknown")
-        return DepthFrames(poses, depth_maps_of(video, poses, depth))
+        return DepthFrames(poses, find_depth_maps(depth, poses, video))
     except ReobjError as error:
         log.warning("%s; dense points are made from optical flow, not from depth maps", error)
         return FlowFrames(poses)
@@ -76,22 +78,20 @@ class DepthFrames(DenseFrames):
         if image is None:
             return None
         depth, K = self.maps[row]
-        y, x = np.nonzero(smooth_pixels(depth))
-        if not len(x):
+        in_depth = points_of(depth, K, smooth_pixels(depth))
+        if not len(in_depth):
             return None
-        rays = np.column_stack([x + 0.5, y + 0.5, np.ones(len(x))]) @ np.linalg.inv(K).T  # (N, 3)
-        in_depth = rays * depth[y, x][:, None]
-        xyw = _moved(in_depth, self.color_from_depth) @ self._K(image).T
+        xyw = moved(in_depth, self.color_from_depth) @ self._K(image).T
         xy = np.floor(xyw[:, :2] / np.maximum(xyw[:, 2:], 1e-9)).astype(np.int64)
         inside = (xyw[:, 2] > 0) & ((xy >= 0) & (xy < image.shape[1::-1])).all(1)
         world_from_depth = invert_rigid(self.depth_from_world[row])
-        world = _moved(in_depth[inside], world_from_depth)  # (N, 3), m
+        world = moved(in_depth[inside], world_from_depth)  # (N, 3), m
         xy = xy[inside]
         rgb = image[xy[:, 1], xy[:, 0], ::-1]
         agree = np.zeros(len(world), np.int64)
         through = np.zeros(len(world), np.int64)
         for other in self._neighbours(row):
-            there = _moved(world, self.depth_from_world[other])
+            there = moved(world, self.depth_from_world[other])
             agrees, seen_through = compared(look_up_depth(*self.maps[other], there), there[:, 2])
             agree += agrees
             through += seen_through
@@ -114,8 +114,3 @@ class DepthFrames(DenseFrames):
         base = self.metres * np.linalg.norm(self.centers[others] - self.centers[row], axis=1)
         cost = base / self._median_depth(row) + 4 * (1 - axis[others] @ axis[row])  # as for flow
         return [others[k] for k in np.argsort(cost, kind="stable")[:NEIGHBOURS]]
-
-
-def _moved(points: Array, b_from_a: Array) -> Array:
-    """Move points (N, 3) by a rigid transform (3, 4)."""
-    return np.asarray(points @ b_from_a[:, :3].T + b_from_a[:, 3])

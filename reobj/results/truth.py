@@ -115,7 +115,8 @@ def _with_roles(entry: Format[Reader]) -> Format[TruthReader]:
         video = SimpleNamespace(size=size, working_size=size, names=[], files=[], frame_count=0,
                                 times_s=None, source=path.stem)  # fmt: skip
         source = Source(path, video, first=first, messages=notes)
-        recorded = read_source(source, entry)
+        assert entry.read is not None
+        recorded = read_source(source, entry.read)
         check_rows(recorded, path)
         if not len(recorded.identity):
             raise ReobjError(f"{path}: boxes without identities; expected tracks")

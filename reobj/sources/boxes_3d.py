@@ -10,7 +10,6 @@ quaternions w first.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -76,43 +75,28 @@ def is_boxes_3d(probe: Probe) -> bool:
 
 
 def read_source_3d(source: Source) -> RecordedDetections:
-    """Read boxes in 3D with the cameras of the source."""
-    if not source.poses:
-        fault = "these are 3D boxes in the world, which need its cameras"
-        raise ReobjError(f"{source.path}, line 1: {fault}: `run` with --detections and --poses "
-                         "FILE")  # fmt: skip
-    return read_boxes_3d(source.path, source.video, source.poses, source.names)[0]
-
-
-def read_boxes_3d(
-    path: Path, video: Video, poses: Sequence[Poses], names: Sequence[str] = ()
-) -> tuple[RecordedDetections, int]:
     """Read boxes in 3D and project them to the frames of their time stamps.
 
-    Args:
-        poses: readings of the supplied poses; the one in which most boxes are visible is used.
-        names: class names by number, (): not given.
-    Returns:
-        detections in px of the source, and the number of the reading.
     Raises:
-        ReobjError: a value is invalid, or no box is visible in its frame.
+        ReobjError: no cameras, an invalid value, or no box that is visible in its frame.
     """
+    path, video, poses = source.path, source.video, source.poses
+    if poses is None:
+        fault = "these are 3D boxes in the world, which need its cameras"
+        raise ReobjError(f"{path}, line 1: {fault}: `run` with --detections and --poses FILE")
     table = read_cells_3d(path)
     box = _boxes(table)
     time_s = seconds(table)
-    projected = [_projected(box, time_s, one, video) for one in poses]
-    best = int(np.argmax([np.isfinite(xyxy[:, 0]).sum() for _, xyxy in projected]))
-    frame, xyxy = projected[best]
+    frame, xyxy = _projected(box, time_s, poses, video)
     visible = np.isfinite(xyxy[:, 0])
     if len(box) and (frame < 0).all():
         span = f"{time_s.min():.3f} to {time_s.max():.3f} s"
-        ours = _frame_times(poses[best], video)[1]
+        ours = _frame_times(poses, video)[1]
         raise ReobjError(f"{path}: no time stamp ({span}) is that of a frame with a pose "
                          f"({ours.min(initial=0):.3f} to {ours.max(initial=0):.3f} s)")  # fmt: skip
     if len(box) and not visible.any():
         raise ReobjError(f"{path}: no box is in the image of its frame: expected boxes in the "
                          "world of --poses, at the times of its frames")  # fmt: skip
-    source = Source(path, video, names)
     recorded = source.recorded(
         frame, xyxy, text_classes(table, source, COCO_NAMES), table.numbers("score"),
         line=table.line, unit=table.unit, boxes_3d=box,
@@ -123,7 +107,7 @@ def read_boxes_3d(
     if hidden := (~visible & (frame >= 0)).sum():
         recorded.messages.append(f"{hidden} boxes outside the image of their frame left out")
     recorded.select(np.flatnonzero(visible))
-    return recorded, best
+    return recorded
 
 
 def _boxes(table: Table) -> Array:

@@ -51,12 +51,12 @@ class Opened:
     pixel_aspect: Fraction = Fraction(1)
 
 
-def open_camera(number: int) -> Opened | None:
-    """Open a camera; None if there is none."""
+def open_camera(number: int) -> Opened:
+    """Open a camera."""
     with quiet_opencv():
         capture = cv2.VideoCapture(number)
     if not capture.isOpened():
-        return None
+        raise ReobjError("cannot be opened as a camera (is it connected?)")
     return Opened(_camera_frames(capture), fps=capture.get(cv2.CAP_PROP_FPS))
 
 
@@ -88,19 +88,21 @@ def _animation_frames(path: Path) -> Generator[Decoded]:
             milliseconds += image.info.get("duration", 0)
 
 
-def _open_container(address: str, timeout_s: float | None) -> tuple[Any, Any] | None:
-    """Open a container and its first video stream that is no cover picture; None: no container.
+def _open_container(address: str, timeout_s: float | None) -> tuple[Any, Any]:
+    """Open a container and its first video stream that is no cover picture.
 
     Raises:
-        ReobjError: there is no such stream, or no decoder. The source is not named.
+        ReobjError: no container, no such stream, or no decoder. The source is not named.
     """
     import av
 
     try:  # tags in other encodings than UTF-8 are no error
         options = {"rtsp_flags": "prefer_tcp"}
         file = av.open(address, options=options, timeout=timeout_s, metadata_errors="replace")
-    except (av.FFmpegError, OSError, ValueError):
-        return None
+    except (av.FFmpegError, OSError, ValueError) as error:
+        late = isinstance(error, av.error.ExitError)
+        reason = "no answer in time" if late else getattr(error, "strerror", "") or error
+        raise ReobjError(f"cannot be opened as a video ({reason})") from None
     cover = av.stream.Disposition.attached_pic
     streams = [stream for stream in file.streams.video if not stream.disposition & cover]
     if streams and streams[0].codec_context is not None:
@@ -111,15 +113,13 @@ def _open_container(address: str, timeout_s: float | None) -> tuple[Any, Any] | 
     raise ReobjError(decoder if streams else fault)
 
 
-def open_file(address: str, timeout_s: float | None = None) -> Opened | None:
-    """Open a video file, or with `timeout_s` the URL of a stream or file; None if it is no video.
+def open_file(address: str, timeout_s: float | None = None) -> Opened:
+    """Open a video file, or with `timeout_s` the URL of a stream or file.
 
     Raises:
-        ReobjError: there is no video stream, or no decoder. The source is not named.
+        ReobjError: as `_open_container` does.
     """
-    if (found := _open_container(address, timeout_s)) is None:
-        return None
-    file, stream = found
+    file, stream = _open_container(address, timeout_s)
     fps = float(stream.guessed_rate or 0)
     duration_s = float((stream.duration or 0) * stream.time_base) or (file.duration or 0) / 1e6
     count = stream.frames or round(duration_s * fps)
@@ -194,9 +194,7 @@ class Stored:
 
 def stored_in(path: str) -> Stored:
     """Read the packets of a file."""
-    if (found := _open_container(path, None)) is None:
-        return Stored()
-    file, video = found
+    file, video = _open_container(path, None)
     start_s = float((video.start_time or 0) * video.time_base)
     count = size = 0
     last_s = end_s = 0.0

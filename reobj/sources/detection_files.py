@@ -19,7 +19,7 @@ import numpy as np
 
 from reobj.cameras import Poses
 from reobj.files import did_you_mean, last_name, shortened
-from reobj.formats import AUTO, Format
+from reobj.formats import AUTO
 from reobj.sources import coco
 from reobj.sources.class_names import check_length, load_class_names
 from reobj.sources.detection_formats import DETECTIONS, Reader
@@ -164,16 +164,14 @@ def _read(
     if config.first_frame not in ("", "0", "1", "order"):
         raise ReobjError(f"detect.first_frame {config.first_frame}: expected 0, 1 or order")
     names = load_class_names(config.class_names) if config.class_names else ()
-    source = Source(path, video, names, config.first_frame, [poses] if poses else [])
-    return read_source(source, DETECTIONS.find(path, config.format))
+    source = Source(path, video, names, config.first_frame, poses)
+    return read_source(source, DETECTIONS.reader(path, config.format))
 
 
-def read_source(source: Source, entry: Format[Reader]) -> RecordedDetections:
+def read_source(source: Source, read: Reader) -> RecordedDetections:
     """Read a file in its format."""
-    if entry.read is None:
-        raise ReobjError(f"{source.path}: {entry.title}, not read; {entry.advice}")
     try:
-        return entry.read(source)
+        return read(source)
     except ReobjError:
         raise
     except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
@@ -255,22 +253,21 @@ def check_rows(recorded: RecordedDetections, path: Path) -> None:
         finite = np.isfinite(recorded.xyxy.sum(1) + recorded.score)  # (N,)
     finite &= (np.abs(recorded.xyxy) <= COORDINATE_MAX).all(1)
     named = (recorded.class_id >= 0) & (recorded.class_id < len(names))
-    pixels = np.array([runs.sum() for runs in recorded.runs], np.int64)  # (N,)
-    masked = np.array([len(runs) > 0 for runs in recorded.runs], bool)
-    unfit = masked & (pixels != math.prod(recorded.size))
-    for row in np.flatnonzero(~finite | ~named | unfit)[:1]:
-        text = f"mask of {pixels[row]} pixels in a video of {recorded.size}"
+    is_long = np.array([len(name) > CLASS_NAME_MAX for name in (*names, "")], bool)
+    long = is_long[np.where(named, recorded.class_id, -1)]
+    whole = math.prod(recorded.size)
+    unfit = np.array([len(runs) > 0 and runs.sum() != whole for runs in recorded.runs], bool)
+    for row in np.flatnonzero(~finite | ~named | long | unfit)[:1]:
+        where = f"{path}, {recorded.unit} {recorded.line[row]}"
+        text = f"mask of {recorded.runs[row].sum()} pixels in a video of {recorded.size}"
         if not finite[row]:
             values = f"{recorded.xyxy[row]}, {recorded.score[row]}"
             text = f"{values}: NaN, infinite or beyond 1e7 pixels"
         elif not named[row]:
             text = unnamed_class(int(recorded.class_id[row]), len(names))
-        raise ReobjError(f"{path}, {recorded.unit} {recorded.line[row]}: {text}")
-    long = [number for number, name in enumerate(names) if len(name) > CLASS_NAME_MAX]
-    for number in long:
-        rows = np.flatnonzero(recorded.class_id == number)[:1]
-        where = f"{recorded.unit} {recorded.line[rows[0]]}" if len(rows) else "class names"
-        check_length(names[number], f"{path}, {where}")
+        elif long[row]:
+            check_length(names[recorded.class_id[row]], where)
+        raise ReobjError(f"{where}: {text}")
 
 
 def _check_scores(recorded: RecordedDetections, most: float, path: Path) -> None:
@@ -310,35 +307,38 @@ def _usable(
 ) -> BoolArray:
     """Test which boxes (N,) have an area, overlap the image and belong to a frame of the video."""
     count = len(recorded)
-    low = recorded.xyxy[:, :2]
-    high = recorded.xyxy[:, 2:]
-    empty = (high <= low).any(1)  # (N,)
-    outside = np.logical_and(~empty, ((high <= 0) | (low >= np.array(recorded.size))).any(1))
+    xyxy, size = recorded.xyxy, recorded.size
+    low, high = xyxy[:, :2], xyxy[:, 2:]
+    empty: BoolArray = np.any(high <= low, axis=1)  # (N,)
+    outside = ~empty & ((high <= 0) | (low >= np.array(size))).any(1)
     missing = (recorded.frame < 0) | (recorded.frame >= (frame_count or sys.maxsize))
-    if count and recorded.xyxy.max() <= NORMALISED_MAX:
-        raise ReobjError(f"{path}: no coordinate above {NORMALISED_MAX}: normalised to 0..1? "
-                         "Multiply them by the image size")  # fmt: skip
-    if checks_size and (made_for := _other_size(recorded.xyxy[~empty], recorded.size)):
-        raise ReobjError(f"{path}: {made_for}")
-    if reading := _other_reading(recorded.xyxy, recorded.size):
-        raise ReobjError(f"{path}: {reading}")
     larger = outside.sum() > max(10, 0.05 * count) and not (high <= 0).any()
-    if 2 * (empty | outside).sum() > count or larger:
-        raise ReobjError(
-            f"{path}: {empty.sum()} of {count} boxes have no area and {outside.sum()} lie outside "
-            f"the image of {recorded.size}: x, y, w, h where x1, y1, x2, y2 is expected, "
-            "frames of another size (--set detect.image_size=WIDTHxHEIGHT), or another video?"
-        )
     numbers = shortened(np.unique(recorded.frame[missing]).tolist())
     text = f"of frames that the video lacks (0-based: {numbers}; it has {frame_count or 'some'})"
-    if count and missing.all():
-        raise ReobjError(f"{path}: all detections are {text}: detections of another video?")
-    reach = recorded.xyxy[:, 2:].max(0, initial=0)
+    fault = ""
+    if count and xyxy.max() <= NORMALISED_MAX:
+        fault = f"no coordinate above {NORMALISED_MAX}: normalised to 0..1? "
+        fault += "Multiply them by the image size"
+    elif checks_size and (other := _other_size(xyxy[~empty], size)):
+        fault = other
+    elif other := _other_reading(xyxy, size):
+        fault = other
+    elif 2 * (empty | outside).sum() > count or larger:
+        fault = (
+            f"{empty.sum()} of {count} boxes have no area and {outside.sum()} lie outside "
+            f"the image of {size}: x, y, w, h where x1, y1, x2, y2 is expected, "
+            "frames of another size (--set detect.image_size=WIDTHxHEIGHT), or another video?"
+        )
+    elif count and missing.all():
+        fault = f"all detections are {text}: detections of another video?"
+    if fault:
+        raise ReobjError(f"{path}: {fault}")
+    reach = high.max(0, initial=0)
     begins = bool(count) and (low.min(0) <= 0.02 * reach).any()
-    if checks_size and count >= 50 and begins and (reach < np.multiply(0.9, recorded.size)).all():
+    if checks_size and count >= 50 and begins and (reach < np.multiply(0.9, size)).all():
         recorded.messages.append(
             f"no box of {count} ends beyond x = {reach[0]:.0f} or y = {reach[1]:.0f} in images of "
-            f"{recorded.size}: boxes of frames of another size (detect.image_size)?"
+            f"{size}: boxes of frames of another size (detect.image_size)?"
         )
     for bad, fault in ((empty, "without area"), (outside, "wholly outside the image"),
                        (missing, text)):  # fmt: skip
@@ -422,11 +422,7 @@ def read_tracks(
     _check(recorded, path, limit, video.frame_count)
     if len(recorded):
         _check_identities(recorded, path)
-    start = video.config.start
-    stop = video.config.stop
-    every = video.config.every
-    use = (recorded.frame >= start) & ((recorded.frame - start) % every == 0)
-    use &= recorded.frame < (stop or sys.maxsize)
+    use = video.config.selects(recorded.frame)
     pairs = np.column_stack([recorded.frame, recorded.identity])[use]  # (N, 2)
     unique, first, count = np.unique(pairs, axis=0, return_index=True, return_counts=True)
     if (count > 1).any():

@@ -58,8 +58,8 @@ def list_images(source: str) -> ImageList:
             sizes.
     """
     unread = (  # of images that not every build of OpenCV reads
-        *(".heic", ".heif", ".avif", ".gif", ".jxl", ".jp2", ".exr", ".hdr", ".ppm", ".pgm"),
-        *(".tga", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".raw"),
+        ".heic .heif .avif .gif .jxl .jp2 .exr .hdr .ppm .pgm .tga .dng .cr2 .cr3 .nef .arw .raf "
+        ".orf .rw2 .raw".split()
     )
     path = Path(source)
     if path.is_file():

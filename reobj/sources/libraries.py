@@ -22,21 +22,6 @@ from reobj.sources.class_names import names_by_number
 from reobj.types import Image, ReobjError
 
 
-@dataclass(frozen=True, slots=True)
-class LibraryOptions:
-    """What an adapter gets.
-
-    Attributes:
-        model: name or file, as the library expects it. words: that a detector of free text looks
-            for; (): the model's own classes. min_score: least score. device: of PyTorch.
-    """
-
-    model: str
-    words: tuple[str, ...] = ()
-    min_score: float = 0.1
-    device: str = "cpu"
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class LibraryDetector:
     """Detector of another library.
@@ -82,115 +67,114 @@ class Library:
     """A library whose detectors can be used.
 
     Attributes:
-        open: makes a detector. install: what pip installs. models: examples of names.
-        takes_words: the example that finds free text; "": none.
+        open: makes a detector of a model (name or file, as the library expects it), words that it
+            looks for ((): its classes), least score, and device of PyTorch.
+        install: what pip installs.
+        takes_words: an example of a model that finds free text; "": none.
     """
 
-    open: Callable[[LibraryOptions], LibraryDetector]
+    open: Callable[[str, list[str], float, str], LibraryDetector]
     install: str
-    models: str
     takes_words: str = ""
 
 
-def _ultralytics(options: LibraryOptions) -> LibraryDetector:
+def _ultralytics(name: str, words: list[str], min_score: float, device: str) -> LibraryDetector:
     from ultralytics import YOLO
 
-    model = YOLO(options.model)
-    if options.words:
+    model = YOLO(name)
+    if words:
         if not hasattr(model.model, "set_classes"):
-            raise fixed_classes(f"ultralytics:{options.model}")
-        model.set_classes(list(options.words))
+            raise fixed_classes(f"ultralytics:{name}")
+        model.set_classes(words)
 
     def run(images: list[Image]) -> Any:
         return model.predict(
-            images, conf=options.min_score, device=options.device, retina_masks=True, verbose=False
+            images, conf=min_score, device=device, retina_masks=True, verbose=False
         )
 
     return LibraryDetector(run, names_by_number(model.names))
 
 
-def _rfdetr(options: LibraryOptions) -> LibraryDetector:
+def _rfdetr(name: str, _: list[str], min_score: float, device: str) -> LibraryDetector:
     import rfdetr
 
-    name, _, weights = options.model.partition("=")
+    name, given, weights = name.partition("=")
     classes = {key[6:].lower(): key for key in dir(rfdetr) if key[:6] == "RFDETR" and key[6:]}
     wanted = name.lower().replace("-", "")
     if wanted not in classes:
         raise _unknown(f"rfdetr:{name}", classes)
-    given = {"pretrain_weights": weights or None} if "=" in options.model else {}
-    model = getattr(rfdetr, classes[wanted])(device=options.device, **given)
+    options = {"pretrain_weights": weights or None} if given else {}
+    model = getattr(rfdetr, classes[wanted])(device=device, **options)
 
     def run(images: list[Image]) -> Iterator[Any]:
         rgb = [image[..., ::-1].copy() for image in images]
-        answer = model.predict(rgb, threshold=options.min_score)
+        answer = model.predict(rgb, threshold=min_score)
         for found in answer if isinstance(answer, list) else [answer]:  # of one image: no list
             yield found[np.array([bool(name) for name in found.data["class_name"]], bool)]
 
     return LibraryDetector(run, tuple(map(str, model.class_names)))
 
 
-def _torchvision(options: LibraryOptions) -> LibraryDetector:
+def _torchvision(name: str, _: list[str], min_score: float, device: str) -> LibraryDetector:
     import torch
     from torchvision.models import detection, get_model, get_model_weights, list_models
 
-    name, _, weights = options.model.partition("=")
+    name, given, weights = name.partition("=")
     known = list_models(detection)
     if name not in known:
         raise _unknown(f"torchvision:{name}", known)
     trained = get_model_weights(name).DEFAULT
-    if "=" in options.model:
+    if given:
         model = get_model(name, weights=None, weights_backbone=None)
         if weights:
             model.load_state_dict(torch.load(weights, map_location="cpu", weights_only=True))
     else:
         model = get_model(name, weights=trained)
-    model = model.to(options.device).eval()
+    model = model.to(device).eval()
 
     def run(images: list[Image]) -> Iterator[dict[str, Any]]:
-        rgb = torch.from_numpy(np.stack(images)[..., ::-1].copy()).to(options.device)
+        rgb = torch.from_numpy(np.stack(images)[..., ::-1].copy()).to(device)
         with torch.inference_mode():
             answers = model(list(rgb.permute(0, 3, 1, 2).float() / 255))
         for found in answers:
-            keep = (found["scores"] >= options.min_score) & (found["labels"] > 0)  # 0: background
+            keep = (found["scores"] >= min_score) & (found["labels"] > 0)  # 0: background
             yield {key: value[keep].cpu() for key, value in found.items()}
 
     return LibraryDetector(run, tuple(trained.meta["categories"]))
 
 
-def _transformers(options: LibraryOptions) -> LibraryDetector:
+def _transformers(name: str, words: list[str], min_score: float, device: str) -> LibraryDetector:
     import torch
     import transformers
 
-    words = list(options.words)
     kind = "ZeroShotObjectDetection" if words else "ObjectDetection"
     try:
-        model = getattr(transformers, f"AutoModelFor{kind}").from_pretrained(options.model)
+        model = getattr(transformers, f"AutoModelFor{kind}").from_pretrained(name)
         loader = transformers.AutoProcessor if words else transformers.AutoImageProcessor
-        processor = loader.from_pretrained(options.model)
+        processor = loader.from_pretrained(name)
     except (OSError, ValueError) as error:
         advice = "" if words else "; a detector of free text needs --words"
-        raise ReobjError(f"hf:{options.model}: {str(error).splitlines()[0]}{advice}") from error
-    model = model.to(options.device).eval()
+        raise ReobjError(f"hf:{name}: {str(error).splitlines()[0]}{advice}") from error
+    model = model.to(device).eval()
 
     def run(images: list[Image]) -> Any:
-        count = len(images)
         rgb = [image[..., ::-1].copy() for image in images]
-        text = {"text": [words] * count, "padding": True, "truncation": True} if words else {}
-        inputs = processor(images=rgb, return_tensors="pt", **text).to(options.device)
+        text = {"text": [words] * len(rgb), "padding": True, "truncation": True} if words else {}
+        inputs = processor(images=rgb, return_tensors="pt", **text).to(device)
         with torch.inference_mode():
             outputs = model(**inputs)
-        sizes = [image.shape[:2] for image in rgb]
-        asked: dict[str, Any] = {"threshold": options.min_score, "target_sizes": sizes}
+        asked: dict[str, Any] = {"threshold": min_score}
+        asked["target_sizes"] = [image.shape[:2] for image in rgb]
         if not words:
             return processor.post_process_object_detection(outputs, **asked)
         if "input_ids" in inputs and type(processor).__name__.startswith("GroundingDino"):
-            asked |= {"input_ids": inputs["input_ids"], "text_threshold": options.min_score}
+            asked |= {"input_ids": inputs["input_ids"], "text_threshold": min_score}
         else:
-            asked["text_labels"] = [words] * count
+            asked["text_labels"] = [words] * len(rgb)
         answers = processor.post_process_grounded_object_detection(outputs, **asked)
         return (_with_words(found, words) for found in answers)
 
-    return LibraryDetector(run, options.words or names_by_number(model.config.id2label))
+    return LibraryDetector(run, tuple(words) or names_by_number(model.config.id2label))
 
 
 def _with_words(image: Any, words: list[str]) -> dict[str, Any]:
@@ -203,22 +187,16 @@ def _with_words(image: Any, words: list[str]) -> dict[str, Any]:
     shared = np.array([[len(p & t) / len(t) for t in tokens] for p in phrases])
     shared = shared.reshape(len(phrases), len(words))
     rows = np.flatnonzero(shared.max(1, initial=0) > 0)
-    return {
-        "boxes": image["boxes"][rows],
-        "scores": image["scores"][rows],
-        "labels": shared[rows].argmax(1),
-    }
+    kept = {key: image[key][rows] for key in ("boxes", "scores")}
+    return kept | {"labels": shared[rows].argmax(1)}
 
 
 LIBRARIES = {
-    "ultralytics": Library(_ultralytics, "ultralytics", "yolo11n.pt", "yolov8s-worldv2.pt"),
-    "rfdetr": Library(_rfdetr, "rfdetr", "nano, seg-nano, nano=WEIGHTS.pth"),
-    "torchvision": Library(_torchvision, "torchvision", "fasterrcnn_resnet50_fpn_v2"),
-    "hf": Library(
-        _transformers, "transformers torchvision", "PekingU/rtdetr_v2_r18vd or a folder",
-        "IDEA-Research/grounding-dino-tiny",
-    ),
-}  # fmt: skip
+    "ultralytics": Library(_ultralytics, "ultralytics", "yolov8s-worldv2.pt"),
+    "rfdetr": Library(_rfdetr, "rfdetr"),
+    "torchvision": Library(_torchvision, "torchvision"),
+    "hf": Library(_transformers, "transformers torchvision", "IDEA-Research/grounding-dino-tiny"),
+}
 
 
 def library_of(detector: str) -> tuple[str, str] | None:
@@ -252,7 +230,7 @@ def library_detector(
         raise ReobjError(f"--device {device}: detectors of {name} run on cpu, cuda or mps")
     with failing(f"--detector {detector}"):
         try:
-            found = library.open(LibraryOptions(model, words, min_score, device))
+            found = library.open(model, list(words), min_score, device)
         except ImportError as error:
             remedy = f"it needs: pip install {library.install}"
             missing = (error.name or "").partition(".")[0]

@@ -20,9 +20,16 @@ NO_RUNS: Counts = np.empty(0, np.uint32)
 
 def rle_encode(mask: BoolArray) -> Counts:
     """Encode an (H, W) mask as run lengths."""
-    flat = cv2.transpose(mask.view(np.uint8)).ravel()  # (W * H,)
-    edges = np.flatnonzero(np.diff(flat, prepend=np.uint8(0)))
-    counts = np.diff(edges, prepend=0, append=flat.size).astype(np.uint32)
+    return _runs_of_columns(mask, 0, mask.shape[1])
+
+
+def _runs_of_columns(columns: BoolArray, first: int, width: int) -> Counts:
+    """Encode columns (H, w) of the mask of an image, from `first` of `width`; others are zero."""
+    flat = cv2.transpose(columns.view(np.uint8)).ravel()  # (w * H,)
+    none = np.uint8(0)
+    edges = np.flatnonzero(np.diff(flat, prepend=none, append=none)) + first * len(columns)
+    end = width * len(columns)
+    counts = np.diff(edges[edges < end], prepend=0, append=end).astype(np.uint32)
     return counts if len(counts) > 1 else NO_RUNS
 
 
@@ -66,21 +73,9 @@ def crop_runs(mask: BoolArray, corner: tuple[int, int], size: tuple[int, int]) -
     mask = mask[max(-y, 0) : max(height - y, 0), max(-x, 0) : max(width - x, 0)]
     if not mask.size:
         return NO_RUNS
-    x = max(x, 0)
-    y = max(y, 0)
     strip = np.zeros((height, mask.shape[1]), bool)  # whole columns: runs follow them
-    strip[y : y + len(mask)] = mask
-    counts = rle_encode(strip)
-    if not len(counts):
-        return NO_RUNS
-    counts[0] += x * height
-    rest = (width - x - mask.shape[1]) * height
-    if not rest:
-        return counts
-    if len(counts) % 2:  # ends with zeros
-        counts[-1] += rest
-        return counts
-    return np.append(counts, np.uint32(rest))
+    strip[max(y, 0) :][: len(mask)] = mask
+    return _runs_of_columns(strip, max(x, 0), width)
 
 
 def polygon_runs(rings: Sequence[Sequence[float]], size: tuple[int, int]) -> Counts:
@@ -88,9 +83,7 @@ def polygon_runs(rings: Sequence[Sequence[float]], size: tuple[int, int]) -> Cou
     corners = [np.reshape(np.asarray(ring, np.float64), (-1, 2)) for ring in rings]
     flat = np.concatenate([np.empty((0, 2)), *corners])
     if not (np.abs(flat) <= COORDINATE_MAX).all():
-        raise ValueError(
-            f"a polygon with corners that are not finite, or beyond {COORDINATE_MAX:g}"
-        )
+        raise ValueError("a polygon with corners that are not finite, or beyond 1e7 px")
     if not len(flat):
         return NO_RUNS
     low = np.clip(np.floor(flat.min(0)) - 1, 0, size).astype(int)  # only the part with the polygon

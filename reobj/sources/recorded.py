@@ -63,8 +63,7 @@ class RecordedDetections:
     def select(self, rows: IntArray) -> None:
         """Select rows (n,), in this order."""
         count = len(self)
-        columns = ("frame", "xyxy", "score", "class_id", "line", "identity", "boxes_3d", "ignored")
-        for name in columns:
+        for name in "frame xyxy score class_id line identity boxes_3d ignored".split():
             values = getattr(self, name)
             setattr(self, name, values[rows] if len(values) == count else values)
         self.runs = [self.runs[row] for row in rows]
@@ -72,9 +71,9 @@ class RecordedDetections:
     def fingerprint(self) -> str:
         """Hash the detections, independently of the format of the file."""
         digest = hashlib.sha256(repr((self.class_names, self.size)).encode())
-        arrays: list[npt.NDArray[Any]] = [self.frame, self.xyxy, self.score, self.class_id]
-        arrays += [self.boxes_3d] if len(self.boxes_3d) else []
-        for values in arrays + list(self.runs):
+        given: list[npt.NDArray[Any]] = [self.boxes_3d] if len(self.boxes_3d) else []
+        given = [self.frame, self.xyxy, self.score, self.class_id, *given, *self.runs]
+        for values in given:
             digest.update(repr(values.shape).encode() + np.ascontiguousarray(values).tobytes())
         return digest.hexdigest()[:16]
 
@@ -99,14 +98,15 @@ class Source:
         path: of the file. video: whose frames the boxes belong to (attributes of `Video`).
         names: class names by number, (): not given. first: number of the first frame, "": as the
             format says, or "order": listed images are the frames in this order.
-        poses: cameras that project boxes in 3D. messages: about assumptions, for the user.
+        poses: cameras that project boxes in 3D; None: unknown.
+        messages: about assumptions, for the user.
     """
 
     path: Path
     video: Any
     names: Sequence[str] = ()
     first: str = ""
-    poses: Sequence[Poses] = ()
+    poses: Poses | None = None
     messages: list[str] = field(default_factory=list)
 
     def say(self, *texts: str) -> None:
@@ -178,18 +178,16 @@ def pack_detections(
         mask_counts[mask_offsets[i] : mask_offsets[i + 1]].
     """
     parts = [Detections.empty(), *(detections for _, detections in frames)]
+    index = np.array([i for i, _ in frames], np.int64)  # (F,)
     runs = [NO_RUNS]
     for detections in parts:
         masks = detections.masks
         expected = (len(detections), size[1], size[0])
-        if masks is None:
-            runs += [NO_RUNS] * len(detections)
-        elif masks.shape != expected:
+        if masks is not None and masks.shape != expected:
             raise ReobjError(f"masks are {masks.shape}, expected (D, H, W) = {expected}")
-        else:
-            runs += map(rle_encode, masks)
+        runs += [NO_RUNS] * len(detections) if masks is None else map(rle_encode, masks)
     return {
-        "frame": np.repeat([i for i, _ in frames], [len(d) for _, d in frames]).astype(np.int64),
+        "frame": np.repeat(index, list(map(len, parts[1:]))),
         "xyxy": np.concatenate([d.xyxy for d in parts]).astype(np.float64),
         "score": np.concatenate([d.score for d in parts]).astype(np.float64),
         "class_id": np.concatenate([d.class_id for d in parts]).astype(np.int64),
@@ -197,7 +195,7 @@ def pack_detections(
         "image_size": np.array(size, np.int64),
         "mask_counts": np.concatenate(runs),
         "mask_offsets": np.cumsum([len(run) for run in runs]),
-        "done": np.unique(np.array([i for i, _ in frames], np.int64)),
+        "done": np.unique(index),
     }
 
 

@@ -31,6 +31,7 @@ from reobj.types import (
     BoolArray,
     IntArray,
     ReobjError,
+    nearest_of,
     printable,
     xyxy_from_cxcywh,
 )
@@ -99,11 +100,7 @@ class Table:
     def numbers(self, role: str) -> Array:
         """Convert a column to finite numbers (N,); an error names the line."""
         values = np.array([_number(cell, self.comma) for cell in self.cells[role]], np.float64)
-        if (bad := ~np.isfinite(values)).any():
-            row = int(bad.argmax())
-            cell = self.cells[role][row]
-            why = f"is no finite number{DECIMAL_COMMAS * (',' in cell)}"
-            raise ReobjError(f"{self.where(row)}: {cell!r} {why}")
+        self._check(role, ~np.isfinite(values), "{!r} is no finite number")
         return values
 
     def whole(self, role: str) -> IntArray:
@@ -111,11 +108,15 @@ class Table:
         values = self.numbers(role)
         # Above 2^53 not every integer is a float64
         bad = (np.abs(values) > 2.0**53) | (values % 1 != 0)
-        if bad.any():
-            row = int(bad.argmax())
-            text = f"{role} {self.cells[role][row]}, expected a whole number"
-            raise ReobjError(f"{self.where(row)}: {text}")
+        self._check(role, bad, f"{role} {{}}, expected a whole number")
         return values.astype(np.int64)
+
+    def _check(self, role: str, bad: BoolArray, why: str) -> None:
+        """Refuse the first cell of a column that is `bad` (N,); why: its text in braces."""
+        for row in np.flatnonzero(bad)[:1].tolist():
+            cell = self.cells[role][row]
+            advice = DECIMAL_COMMAS * ("," in cell and not self.comma)
+            raise ReobjError(f"{self.where(row)}: {why.format(cell)}{advice}")
 
     def boxes(self) -> Array:
         """Return the boxes (N, 4), corners."""
@@ -537,11 +538,8 @@ def nearest_times(times_s: Array, time_s: Array, alone_s: float) -> IntArray:
     if not len(times_s):
         return np.full(len(time_s), -1)
     half = 0.5 * float(np.median(np.diff(times_s))) if len(times_s) > 1 else alone_s
-    after = np.searchsorted(times_s, time_s).clip(max=len(times_s) - 1)  # (N,)
-    pair = np.stack([(after - 1).clip(0), after], 1)  # (N, 2)
-    offset = np.abs(times_s[pair] - time_s[:, None])
-    nearest = np.take_along_axis(pair, offset.argmin(1)[:, None], 1)[:, 0]
-    return np.asarray(np.where(offset.min(1) <= half, nearest, -1), np.int64)
+    nearest = nearest_of(time_s, times_s)
+    return np.where(np.abs(times_s[nearest] - time_s) <= half, nearest, -1)
 
 
 # ---- Classes -------------------------------------------------------------------------------------

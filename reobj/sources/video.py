@@ -18,6 +18,7 @@ import math
 import os
 import queue
 import re
+import sys
 import threading
 import time
 from collections import Counter
@@ -79,6 +80,11 @@ class InputConfig:
     reconnect: int = option(
         0, "reconnection attempts after a live source ends, after 1, 2, 4, ... 30 s"
     )
+
+    def selects(self, frame: Any) -> Any:
+        """Test whether frame numbers of the source, one or (N,), are to be read."""
+        within = (frame >= self.start) & (frame < (self.stop or sys.maxsize))
+        return within & ((frame - self.start) % self.every == 0)
 
 
 MAX_UNREADABLE = 64  # consecutive frames, 2 s at 30 Hz; lower: a damaged passage ends a video
@@ -299,14 +305,12 @@ class Video:
 
     def _from_file(self) -> Iterator[tuple[int, float, Image | None]]:
         """Decode a file: yield number, time in s and image (None: undecodable) of its frames."""
-        start = self.config.start
-        every = self.config.every
         raw_s = list[float]()
         for index, (seconds, image, _) in enumerate(self._decoded()):
             if not seconds > max(raw_s[-1:], default=-math.inf):
                 self._measured()  # correcting this time needs all later ones
             raw_s.append(seconds)
-            if index >= start and (index - start) % every == 0:
+            if self.config.selects(index):
                 time_s = seconds if self._clock is None else float(self._clock.times_s[index])
                 yield index, time_s, None if image is None else image()
         if self._clock is None:
@@ -439,7 +443,7 @@ class Video:
                 self._last_frame_s = time.monotonic()
                 at = self._seen
                 self._seen += 1
-                if at < self.config.start or (at - self.config.start) % self.config.every:
+                if not self.config.selects(at):
                     continue
                 self.read += 1
                 if frames.full():
@@ -456,24 +460,18 @@ class Video:
             ReobjError: it is missing, unreadable, no video, or has too large frames.
         """
         path = Path(self.source)
-        if self.is_live and self._address.isdecimal():
-            if (camera := open_camera(int(self._address))) is None:
-                raise ReobjError(f"{self.source}: cannot be opened as a camera (is it connected?)")
-            return camera
-        if not self._is_url and not path.is_file():
+        is_camera = self.is_live and self._address.isdecimal()
+        if not (is_camera or self._is_url or path.is_file()):
             raise ReobjError(f"{self.source}: no such file or folder")
-        if not self._is_url and not os.access(path, os.R_OK):
-            raise ReobjError(f"{self.source}: you may not read it; allow it (chmod u+r)")
         try:
+            if is_camera:
+                return open_camera(int(self._address))
             opened = (
                 open_animation(path) if self._is_animation
                 else open_file(self._path, self._live.open_s if self._is_url else None)
             )  # fmt: skip
         except ReobjError as error:
             raise ReobjError(f"{self.source}: {error}") from None
-        if opened is None:
-            kind = "stream (is it there?)" if self._is_url else "video (damaged, or no video)"
-            raise ReobjError(f"{self.source}: cannot be opened as a {kind}")
         if opened.pixels > PIXELS_MAX:
             raise ReobjError(f"{self.source}: frames of {opened.pixels} pixels, at most "
                              f"{PIXELS_MAX} are allowed")  # fmt: skip

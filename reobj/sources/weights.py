@@ -196,34 +196,28 @@ def _fetch(weights: Weights, offline: bool) -> Path:
         raise ReobjError(f"{missing} and --offline forbids the download: fetch {weights.url} "
                          f"elsewhere and {by_hand}{weights.fallback}")  # fmt: skip
     target = _writable_folder() / weights.file
-    with locked(target.with_name(".lock"), wait_s=600.0):  # 100 MB at 1.3 Mbit/s
-        if not (target.is_file() and weights.digest_of(target) == weights.digest):
-            _fetch_alone(weights, target, missing, by_hand)
-    return target
-
-
-def _fetch_alone(weights: Weights, target: Path, missing: str, by_hand: str) -> None:
-    """Download weights to `target`."""
     expected = f"{weights.digest_kind} {weights.digest}"
     size = f"{weights.size / 1e6:.1f} MB" if weights.size else "size unknown"
-    log.log(
-        NOTE, "fetching %s: %s, licence %s, from %s, %s",
-        weights.name, size, weights.licence, weights.url, expected,
-    )  # fmt: skip
-    try:
-        with atomic(target) as part:
-            _download(weights, part)
-            if (digest := weights.digest_of(part)) != weights.digest:
-                raise ReobjError(
-                    f"{weights.url}: {weights.digest_kind} is {digest}, expected {weights.digest}: "
-                    "not kept; run again; if it happens again the source has changed: do not use "
-                    f"it{weights.fallback}"
-                )
-    except (OSError, http.client.HTTPException) as error:  # the server, the network or the disk
-        raise ReobjError(
-            f"{missing} and {weights.url}: download failed ({error}): run again, or get a file "
-            f"with {expected} on another machine and {by_hand}{weights.fallback}"
-        ) from error
+    with locked(target.with_name(".lock"), wait_s=600.0):  # 100 MB at 1.3 Mbit/s
+        if target.is_file() and weights.digest_of(target) == weights.digest:
+            return target
+        log.log(NOTE, "fetching %s: %s, licence %s, from %s, %s", weights.name, size,
+                weights.licence, weights.url, expected)  # fmt: skip
+        try:
+            with atomic(target) as part:
+                _download(weights, part)
+                if (digest := weights.digest_of(part)) != weights.digest:
+                    raise ReobjError(
+                        f"{weights.url}: {weights.digest_kind} is {digest}, expected "
+                        f"{weights.digest}: not kept; run again; if it happens again the source "
+                        f"has changed: do not use it{weights.fallback}"
+                    )
+        except (OSError, http.client.HTTPException) as error:  # the server, the network or the disk
+            raise ReobjError(
+                f"{missing} and {weights.url}: download failed ({error}): run again, or get a file "
+                f"with {expected} on another machine and {by_hand}{weights.fallback}"
+            ) from error
+    return target
 
 
 def _writable_folder() -> Path:

@@ -48,7 +48,7 @@ def test_a_video_that_may_not_be_read(tmp_path: Path, capsys: pytest.CaptureFixt
     video = Path(shutil.copy(CLIP, tmp_path / "room.mp4"))
     video.chmod(0)
     text = refusal(capsys, "run", video, "-o", tmp_path / "out")
-    assert text == f"error: {video}: you may not read it; allow it (chmod u+r)\n"
+    assert text == f"error: {video}: cannot be opened as a video (Permission denied)\n"
 
 
 def test_labels_in_the_working_folder_have_a_name(

@@ -1211,7 +1211,7 @@ HEAD = b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary=fr
 def test_an_unresponsive_camera_times_out(silent: str) -> None:
     """OpenCV itself waits for half a minute."""
     began = time.monotonic()
-    with pytest.raises(rt.ReobjError, match=r"cannot be opened as a stream \(is it there"):
+    with pytest.raises(rt.ReobjError, match="cannot be opened"):
         rt.Video(silent, live=sources.LiveTimes(open_s=0.5))
     assert 0.4 < time.monotonic() - began < 5
 
@@ -1252,7 +1252,7 @@ def test_a_file_behind_a_url_is_read_like_a_file(tmp_path: Path) -> None:
         assert not video.is_live and video.frame_count == 12
         for _ in range(2):
             assert [f.index for f in video] == [0, 3, 6, 9]
-        with pytest.raises(rt.ReobjError, match=r"none\.mp4: cannot be opened as a stream"):
+        with pytest.raises(rt.ReobjError, match=r"none\.mp4: cannot be opened"):
             rt.Video(url + "none.mp4")
         server.shutdown()
 

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from reobj.cameras import Camera, Poses, invert_rigid
 from reobj.files import load_json
 from reobj.poses.intrinsics import camera_of_keys, read_camera
-from reobj.poses.supplied.frame_assignment import STAMP_TOLERANCE_S
+from reobj.poses.supplied.frame_assignment import rows_by_time
 from reobj.sources.image_files import read_image
 from reobj.types import Array, BoolArray, Floats, IntArray, ReobjError, log
 from reobj.visible_points import VisiblePoints
@@ -55,22 +55,16 @@ class DepthMaps:
                 f"{size[0]}x{size[1]} as the other maps"
             )
         step = -(-max(size) // 320)
-        K = self.camera.K
-        x, y = np.meshgrid(np.arange(0, size[0], step), np.arange(0, size[1], step))
-        xy = np.stack([x, y], -1)  # (h, w, 2)
-        if self.camera.model not in ("PINHOLE", "SIMPLE_PINHOLE"):
-            # pixels of an ideal pinhole camera lie elsewhere in the distorted image
-            distorted = np.nan_to_num(self.camera.distort((xy + 0.5).astype(np.float64)), nan=-1)
-            xy = np.floor(distorted.clip(-1, max(size))).astype(int)
-        inside: BoolArray = np.all((xy >= 0) & (xy < size), axis=-1)
-        xy = np.where(inside[..., None], xy, 0)
-        depth = np.where(inside, image[xy[..., 1], xy[..., 0]], 0).astype(np.float32)
+        sides = (np.arange(0.5, side, step) for side in size)
+        # pixels of an ideal pinhole camera lie elsewhere in the distorted image; NaN: outside
+        at = self.camera.distort(np.stack(np.meshgrid(*sides), -1)) - 0.5  # (h, w, 2)
+        x, y = np.moveaxis(np.nan_to_num(at, nan=-9).astype(np.float32), -1, 0)
+        depth = cv2.remap(image, x, y, cv2.INTER_NEAREST).astype(np.float32)  # outside: 0
         depth[depth == 65535] = 0  # 7-Scenes: none
         # a pixel x of the subsampled map has its centre at step x + .5 of the whole one
-        small_from_full = np.array(
-            [[1 / step, 0, 0.5 - 0.5 / step], [0, 1 / step, 0.5 - 0.5 / step], [0, 0, 1]]
-        )
-        return depth / np.float32(self.units_per_m), small_from_full @ K
+        small_from_full = np.diag([1 / step, 1 / step, 1])
+        small_from_full[:2, 2] = 0.5 - 0.5 / step
+        return depth / np.float32(self.units_per_m), small_from_full @ self.camera.K
 
 
 def _read_map(path: Path) -> Any:
@@ -84,21 +78,20 @@ def _read_map(path: Path) -> Any:
 # ---- The maps and their camera -------------------------------------------------------------------
 
 
-def find_depth_maps(text: str, poses: Poses, names: Sequence[str]) -> DepthMaps:
-    """Find the depth maps of the frames.
+def find_depth_maps(text: str, poses: Poses, video: Any) -> DepthMaps:
+    """Find the depth maps of the frames of a video.
 
     Args:
         text: folder, or FOLDER:UNITS with units per metre (TUM: 5000; default: mm).
-        names: (F,) of the frames' images, or () for those of a video.
     Raises:
         ReobjError: no folder, no maps in it, none of a frame, or intrinsics that do not fit.
     """
+    names = [video.name(int(frame)) for frame in poses.frame] if video.names else []
     folder, units = _folder_and_units(text)
     paths = sorted(folder.glob("*.png"))
     if not paths:
         raise ReobjError(f"{folder}: no .png in it; --depth needs a folder of 16-bit depth maps")
-    rows = _rows_of_maps([path.stem for path in paths], poses.frame, names)
-    files = {row: path for path, row in zip(paths, rows, strict=True) if row >= 0}
+    files = _files_of_rows(paths, poses.frame, names)
     if not files:
         first = names[0] if names else f"frame {poses.frame[0]}"
         raise ReobjError(
@@ -125,32 +118,22 @@ def _folder_and_units(text: str) -> tuple[Path, float]:
     return folder, units
 
 
-def _rows_of_maps(stems: Sequence[str], frame: IntArray, names: Sequence[str]) -> list[int]:
-    """Match depth maps to frames: by name, else by time stamps, else by the last number.
-
-    Returns:
-        the row of each map's frame, -1: none.
-    """
+def _files_of_rows(paths: Sequence[Path], frame: IntArray, names: Sequence[str]) -> dict[int, Path]:
+    """Match depth maps to frames: by name, else by time stamps, else by the last number."""
     images = [_core(Path(name).stem) for name in names]
-    row_of = {name: row for row, name in enumerate(images)}
-    rows = [row_of.get(_core(stem), -1) for stem in stems]
-    if max(rows) >= 0:
-        return rows
-    if images and all(re.fullmatch(r"\d+\.\d+", name) for name in (*images, *stems)):  # s (TUM)
-        image_s = np.array(images, np.float64)
-        distance = np.abs(image_s - np.array(stems, np.float64)[:, None])  # (N, F)
-        found = np.where(distance.min(1) <= STAMP_TOLERANCE_S, distance.argmin(1), -1)
-        return [int(row) for row in found]
-    row_of = {str(int(n)): row for row, n in enumerate(frame)}
-    if images:
-        row_of = {_last_number(name): row for row, name in enumerate(images)}
-    return [row_of.get(_last_number(stem), -1) for stem in stems]
+    maps = {_core(path.stem): path for path in paths}
+    if maps.keys().isdisjoint(images):
+        if images and all(re.fullmatch(r"\d+\.\d+", name) for name in (*images, *maps)):  # s (TUM)
+            near = rows_by_time(np.array([*maps], float), frame, np.array(images, float))
+            return {row: paths[k] for row, k in enumerate(near.tolist()) if k >= 0}
+        images = list(map(_last_number, images or map(str, frame)))
+        maps = {_last_number(name): path for name, path in maps.items()}
+    return {row: maps[name] for row, name in enumerate(images) if name and name in maps}
 
 
 def _last_number(text: str) -> str:
-    """Return the last number in a text without leading zeros, or the text."""
-    digits = re.findall(r"\d+", text)
-    return str(int(digits[-1])) if digits else text
+    """Return the last number in a text without leading zeros, "" if there is none."""
+    return "".join(str(int(digits)) for digits in re.findall(r"\d+", text)[-1:])
 
 
 def _core(stem: str) -> str:
@@ -199,12 +182,6 @@ def _depth_camera(folder: Path, size: tuple[int, int], color: Camera) -> tuple[C
 # ---- Scale and points ----------------------------------------------------------------------------
 
 
-def depth_maps_of(video: Any, poses: Poses, text: str) -> DepthMaps:
-    """Find the depth maps of the frames of a video; for arguments and errors `find_depth_maps`."""
-    names = [video.name(int(frame)) for frame in poses.frame] if video.names else ()
-    return find_depth_maps(text, poses, names)
-
-
 def add_depth(poses: Poses, text: str, video: Any) -> Poses:
     """Add points from depth maps to poses, and make these metric if they were not.
 
@@ -213,7 +190,7 @@ def add_depth(poses: Poses, text: str, video: Any) -> Poses:
     Returns:
         the poses with more points; unchanged, with a message, where the scale is not observable.
     """
-    maps = depth_maps_of(video, poses, text)
+    maps = find_depth_maps(text, poses, video)
     if not poses.metric:
         scale = depth_scale(poses, maps)
         if isinstance(scale, str):
@@ -284,18 +261,22 @@ def _log_ratio(poses: Poses, maps: DepthMaps, visible: VisiblePoints, row: int) 
     if len(points) < least:
         return None
     depth, K = maps.read(row)
-    in_color = points @ poses.cam_from_world[row, :, :3].T + poses.cam_from_world[row, :, 3]
-    rotation = maps.depth_from_color[:, :3]
-    shift = maps.depth_from_color[:, 3]
+    in_color = moved(points, poses.cam_from_world[row])
+    rotation, shift = np.split(maps.depth_from_color, [3], 1)
     log_scale = 0.0
     for offset in (0 * shift, shift, shift):  # the shift between the cameras needs the scale
-        in_depth = np.exp(log_scale) * in_color @ rotation.T + offset
+        in_depth = moved(np.exp(log_scale) * in_color, np.hstack([rotation, offset]))
         measured = look_up_depth(depth, K, in_depth)
         good = (measured > 0) & (in_depth[:, 2] > 0)
         if good.sum() < least:
             return None
         log_scale += float(np.median(np.log(measured[good] / in_depth[good, 2])))
     return log_scale
+
+
+def moved(points: Array, b_from_a: Array) -> Array:
+    """Move points (N, 3) by a rigid transform (3, 4)."""
+    return np.asarray(points @ b_from_a[:, :3].T + b_from_a[:, 3])
 
 
 def look_up_depth(depth: Floats, K: Array, in_depth: Array) -> Array:
@@ -351,32 +332,23 @@ def _with_points(poses: Poses, maps: DepthMaps, video: Any) -> Poses:
     rows = _spread_rows(poses, maps)
     if not rows:
         return _with_message(poses, "no frame with a depth map has a pose")
-    depth_maps = {row: maps.read(row) for row in rows}
+    depths = {row: maps.read(row) for row in rows}
     depth_from_world = {
         row: composed(maps.depth_from_color, poses.cam_from_world[row]) for row in rows
     }
-    map_points = []
-    map_depths = []
-    map_rows = []
-    for row in rows:
-        in_depth = _grid_points(*depth_maps[row])
-        world_from_depth = invert_rigid(depth_from_world[row])
-        map_points.append(in_depth @ world_from_depth[:, :3].T + world_from_depth[:, 3])
-        map_depths.append(in_depth[:, 2])
-        map_rows.append(np.full(len(in_depth), row))
-    points = np.concatenate(map_points)
-    origin = np.concatenate(map_rows)
-    kept = _thin(points, np.concatenate(map_depths), poses.part[origin])
+    grids = [_grid_points(*depths[row]) for row in rows]
+    worlds = [moved(g, invert_rigid(depth_from_world[r])) for r, g in zip(rows, grids, strict=True)]
+    points = np.concatenate(worlds)
+    origin = np.repeat(rows, list(map(len, grids)))
+    kept = _thin(points, np.concatenate(grids)[:, 2], poses.part[origin])
     points = points[kept]
     origin = origin[kept]
     observations = []
     seen_through = np.zeros(len(points), np.int64)
     for row in rows:
         same = np.flatnonzero(poses.part[origin] == poses.part[row])
-        pose = depth_from_world[row]
-        in_depth = points[same] @ pose[:, :3].T + pose[:, 3]
-        measured = look_up_depth(*depth_maps[row], in_depth)
-        agrees, through = compared(measured, in_depth[:, 2])
+        in_depth = moved(points[same], depth_from_world[row])
+        agrees, through = compared(look_up_depth(*depths[row], in_depth), in_depth[:, 2])
         observations.append(np.column_stack([np.full(agrees.sum(), row), same[agrees]]))
         seen_through[same[through]] += 1
     visibility = np.concatenate(observations)
@@ -410,9 +382,7 @@ def _with_message(poses: Poses, reason: str) -> Poses:
 
 def composed(c_from_b: Array, b_from_a: Array) -> Array:
     """Chain rigid transforms (3, 4)."""
-    return np.column_stack(
-        [c_from_b[:, :3] @ b_from_a[:, :3], c_from_b[:, :3] @ b_from_a[:, 3] + c_from_b[:, 3]]
-    )
+    return np.asarray(c_from_b @ np.vstack([b_from_a, [0, 0, 0, 1]]))
 
 
 def smooth_pixels(depth: Floats) -> BoolArray:
@@ -427,7 +397,12 @@ def _grid_points(depth: Floats, K: Array) -> Array:
     step = max(1, max(depth.shape) // 80)
     chosen = np.zeros(depth.shape, bool)
     chosen[step // 2 :: step, step // 2 :: step] = True
-    y, x = np.nonzero(chosen & smooth_pixels(depth))
+    return points_of(depth, K, chosen & smooth_pixels(depth))
+
+
+def points_of(depth: Floats, K: Array, chosen: BoolArray) -> Array:
+    """Return the points (N, 3), in its camera, of the chosen pixels (h, w) of a map."""
+    y, x = np.nonzero(chosen)
     rays = np.column_stack([x + 0.5, y + 0.5, np.ones(len(x))]) @ np.linalg.inv(K).T  # (N, 3)
     return np.asarray(rays * depth[y, x][:, None], np.float64)
 
@@ -460,11 +435,10 @@ def _colors(points: Array, origin: IntArray, poses: Poses, video: Any) -> npt.ND
         if row is None or frame.image is None:
             continue
         chosen = np.flatnonzero(origin == row)
-        pose = poses.cam_from_world[row]
         height, width = frame.image.shape[:2]
-        scale = np.array([width / poses.camera.width, height / poses.camera.height])
-        xyw = (points[chosen] @ pose[:, :3].T + pose[:, 3]) @ poses.camera.K.T
-        xy = xyw[:, :2] / np.maximum(xyw[:, 2:], 1e-9) * scale  # distortion hardly matters here
+        K = poses.camera.resized((width, height)).K  # distortion hardly matters here
+        xyw = moved(points[chosen], poses.cam_from_world[row]) @ K.T
+        xy = xyw[:, :2] / np.maximum(xyw[:, 2:], 1e-9)
         x, y = xy.astype(int).clip(0, (width - 1, height - 1)).T
         colors[chosen] = frame.image[y, x, ::-1]
     return colors

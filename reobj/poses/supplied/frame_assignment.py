@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from reobj.cameras import invert_rigid
 from reobj.frame_lookup import frames_by_name
 from reobj.sources.image_files import LEAST_STAMP, TimeUnit, is_date
-from reobj.types import Array, BoolArray, IntArray, ReobjError
+from reobj.types import Array, BoolArray, IntArray, ReobjError, nearest_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,13 +191,13 @@ def numbers_of_names(names: Sequence[str], where: str) -> IntArray:
             return np.array(number, np.int64)
     if not numbered:
         return np.full(len(names), -1)
-    number = [int(found[-1][-18:]) if found else -1 for found in digits]
-    first: dict[int, str] = {}
-    for name, n in zip(names, number, strict=True):
-        if n >= 0 and first.setdefault(n, name) != name:
+    first: dict[str, str] = {}
+    for name, found in zip(names, digits, strict=True):
+        if found and first.setdefault(found[-1].lstrip("0"), name) != name:
             raise ReobjError(
-                f"{where}: {first[n]!r} and {name!r} have the same number, and neither is the name "
-                "of a frame; give the poses of one camera, or a folder of images with these names"
+                f"{where}: {first[found[-1].lstrip('0')]!r} and {name!r} have the same number, and "
+                "neither is the name of a frame; give the poses of one camera, or a folder of "
+                "images with these names"
             )
     raise ReobjError(f"{where}: {names[0]!r} appears twice; expected each image once")
 
@@ -280,22 +280,18 @@ def _by_stamps(stamps_s: Array, source: SourceFrames, is_ours: bool) -> list[Fra
         found.append(FrameAssignment("time", "time stamps", row, int(outside.sum())))
     if found and (is_ours or (found[0].row < 0).all()):  # the same clock, none within the tolerance
         return found
-    clock = (
-        ""
-        if found or not source.timed
-        else ", the time stamps are of another clock than the frames"
-    )
+    other_clock = not found and source.timed
+    clock = ", the time stamps are of another clock than the frames" * other_clock
     if is_whole(stamps_s) and 0 <= stamps_s[0] and stamps_s[-1] < LEAST_STAMP:
         noun = "whole numbers in place of time stamps"
         found += by_numbers(stamps_s.astype(np.int64), source, noun)
     elif not source.timed and count != source.count:
-        number = _even_numbers(stamps_s)
-        if number is not None:
+        if (number := _even_numbers(stamps_s)) is not None:
             noun = f"time stamps as multiples of {float(np.median(np.diff(stamps_s))):.4g} s"
-            found.append(_assignment("number0", f"{noun}, from 0", number, source))
-            found.append(
-                _assignment("first0", f"{noun}, from the first", number - number[0], source)
-            )
+            found += [
+                _assignment("number0", f"{noun}, from 0", number, source),
+                _assignment("first0", f"{noun}, from the first", number - number[0], source),
+            ]
     if count == source.count:
         rule = f"order, one row for each frame of the source{clock}"
         found.append(_assignment("order", rule, np.arange(count), source))
@@ -315,12 +311,9 @@ def rows_by_time(stamps_s: Array, frame: IntArray, time_s: Array) -> IntArray:
     """
     steps = np.diff(time_s) / np.maximum(np.diff(frame), 1)
     half = 0.5 * float(np.median(steps)) if len(steps) else 1 / 60  # 30 Hz
-    after = np.searchsorted(stamps_s, time_s).clip(1, max(len(stamps_s) - 1, 1))  # (F,)
-    pair = np.stack([after - 1, after], 1).clip(max=len(stamps_s) - 1)  # (F, 2)
-    offset = np.abs(stamps_s[pair] - time_s[:, None])
-    nearest = np.take_along_axis(pair, offset.argmin(1)[:, None], 1)[:, 0]
+    nearest = nearest_of(time_s, stamps_s)  # (F,)
     tolerance = min(half, STAMP_TOLERANCE_S) * (1 + 1e-6)
-    return np.where(offset.min(1) <= tolerance, nearest, -1)
+    return np.where(np.abs(stamps_s[nearest] - time_s) <= tolerance, nearest, -1)
 
 
 def interpolated(
@@ -402,9 +395,8 @@ def _by_picked_images(count: int, source: SourceFrames) -> list[FrameAssignment]
             frame_of = {n - first: frame for frame, n in enumerate(number.tolist())}
             frame = np.array([frame_of.get(n, -1) for n in range(count)], np.int64)
             rule = f"numbers in the image names, rows counted from {first}"
-            found.append(
-                FrameAssignment(f"number{first}", rule, _assignment("", "", frame, source).row, 0)
-            )
+            one = _assignment(f"number{first}", rule, frame, source)
+            found.append(replace(one, outside=0))
     return found
 
 

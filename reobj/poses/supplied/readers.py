@@ -84,17 +84,13 @@ def read_supplied(video: Any, config: PosesConfig) -> Supplied:
     stamps_s, messages = _in_seconds(pose_file, path, source)
     assignment = _assignment(pose_file, stamps_s, source, path, config.frames_by)
     row = assignment.row
-    turns, turn_messages = (
-        turns_of(source, size, pose_file.cameras, row) if pose_file.stored_pixels else ({}, ())
-    )
     cameras = pose_file.cameras
+    turns, turn_messages = (
+        turns_of(source, size, cameras, row) if pose_file.stored_pixels else ({}, ())
+    )
     if len(cameras) == len(pose_file.cam_from_world) > 1:
         cameras = tuple(turned(cameras[r], turns.get(f)) for f, r in enumerate(row) if r >= 0)
-    intrinsics = stated or one_camera(cameras, path)
-    if intrinsics is None:
-        raise ReobjError(f"{path}: no intrinsics; add --camera {CAMERA_FORMS}")
-    if stated is None:
-        intrinsics = fitted_camera(intrinsics, size, str(path))
+    intrinsics = stated or one_camera(cameras, path, size)
     if not usable(intrinsics):
         raise ReobjError(f"{path}: {intrinsics}: expected finite numbers, focal lengths above 0")
     cam_from_world, lost = _of_frames(pose_file.cam_from_world, stamps_s, assignment, source, path)
@@ -172,16 +168,18 @@ def _assignment(
 MAX_FOCAL_SPREAD = 0.02  # relative, over the images of one camera: autofocus (chosen)
 
 
-def one_camera(cameras: Sequence[Camera | None], path: Path) -> Camera | None:
+def one_camera(cameras: Sequence[Camera | None], path: Path, size: tuple[int, int]) -> Camera:
     """Return the single camera of images: the median of slightly different focal lengths.
 
+    Args:
+        size: (w, h) of the frames, to which it is resized.
     Raises:
-        ReobjError: they differ by more than MAX_FOCAL_SPREAD in focal length or (in longer sides)
-            in the principal point, or in model or size.
+        ReobjError: none, or they differ by more than MAX_FOCAL_SPREAD in focal length or (in longer
+            sides) in the principal point, or in model or size.
     """
     found = sorted((c for c in cameras if c is not None), key=lambda c: c.params[0])
     if not found:
-        return None
+        raise ReobjError(f"{path}: no intrinsics; add --camera {CAMERA_FORMS}")
     kinds = sorted({f"{c.model} {c.width}x{c.height}" for c in found})
     K = np.array([camera.K for camera in found])  # (n, 3, 3)
     spread = np.ptp(K[:, :2], axis=0) / max(found[0].width, found[0].height)
@@ -194,7 +192,7 @@ def one_camera(cameras: Sequence[Camera | None], path: Path) -> Camera | None:
             f"{path}: several different cameras took the frames ({cameras_text}); expected one: "
             "give its intrinsics with --camera, or reconstruct with a single camera"
         )
-    return found[len(found) // 2]
+    return fitted_camera(found[len(found) // 2], size, str(path))
 
 
 def _in_seconds(
