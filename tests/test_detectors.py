@@ -982,5 +982,5 @@ def test_real_weights_agree_with_yolov8s(
 @pytest.mark.parametrize("name", ["mobilenetv2_feat", "squeezenet1.1", "osnet_x0_25_msmt17"])
 def test_real_networks_that_are_not_detectors(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("REOBJ_MODELS", str(SHARED / "models"))
-    with pytest.raises(rt.ReobjError, match="no known (object|format of) detector"):
+    with pytest.raises(rt.ReobjError, match=r"no known (object|format of) detector"):
         rt.OnnxDetector(name)
