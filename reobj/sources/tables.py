@@ -340,8 +340,7 @@ def is_boxmot(probe: Probe) -> bool:
     """Test for nine columns: 1, a class, a score; no names of classes beside it, as CVAT's."""
     rows = _values(probe, 9)
     fits = (rows[:, 6] == 1) & (rows[:, 7] >= 0) & (rows[:, 7] % 1 == 0) & (rows[:, 8] <= 1)
-    beside = probe.path.with_name("labels.txt").exists()
-    return bool(len(rows) and fits.all() and not beside)
+    return bool(len(rows) and fits.all()) and not probe.path.with_name("labels.txt").exists()
 
 
 def is_mot(probe: Probe) -> bool:
