@@ -326,7 +326,7 @@ IMAGENET_BGR = Pixels("BGR, ImageNet", False, IMAGENET_MEAN[::-1], IMAGENET_STD[
 BYTES_BGR = Pixels("BGR, 0..255", False, std=(1.0, 1.0, 1.0))
 YOLO = "YOLOv8, YOLO11"
 
-LAYOUTS: Registry[Decode] = Registry("detector outputs", "--detector-layout", [
+LAYOUTS: Registry[Decode] = Registry("object detectors", "--detector-layout", [
     _layout("detr", "DEIM, D-FINE, RT-DETR", "labels, boxes, scores",
             lambda m: None if "orig_target_sizes" in m.inputs
             and {"labels", "boxes", "scores"} <= m.outputs.keys() else 0,
@@ -378,11 +378,13 @@ def find_layout(model: ModelProbe, declared: str, names_of: str) -> Layout:
             raise ReobjError(f"{model.path}: {shapes}: not the outputs of layout {declared}, "
                              f"{entry.shape}")  # fmt: skip
         near += [f"{entry.name} with {count} classes"] if count and count > 0 else []
-    small = near and near[0].startswith("yolo ") and model.in_fractions
-    fractions = ", but its boxes are fractions: export them in px of the input" * bool(small)
-    task = f" and task {task}" if (task := model.metadata.get("task")) else ""
-    model.found = (f": {shapes} with {model.count} class names ({names_of}){task}; by its shape "
-                   f"{' or '.join(near) or 'none'}{fractions}")  # fmt: skip
+    model.found = f": {shapes}"
+    if near:
+        task = f" and task {task}" if (task := model.metadata.get("task")) else ""
+        small = near[0].startswith("yolo ") and model.in_fractions
+        fractions = ", but its boxes are fractions: export them in px of the input" * bool(small)
+        model.found += (f" with {model.count} class names ({names_of}){task}; by its shape "
+                        f"{' or '.join(near)}{fractions}")  # fmt: skip
     layout = LAYOUTS.choose(model, declared)
     assert isinstance(layout, Layout)
     return layout
