@@ -75,6 +75,8 @@ def read_supplied(video: Any, config: PosesConfig) -> Supplied:
     stated = parse_camera(config.camera, size, config.camera_format)
     if stated is None and not any(pose_file.cameras):
         raise ReobjError(f"{path}: no intrinsics; add --camera {CAMERA_FORMS}")
+    if pose_file.lost == len(pose_file.cam_from_world):
+        raise ReobjError(f"{path}: no poses in it, or only those of lost frames")
     times = [(frame.index, frame.time_s) for frame in video]
     if not times:
         raise ReobjError("no readable frame in the video, so no pose can be matched")
@@ -272,7 +274,7 @@ def read_pose_file(path: Path, fmt: str, size: tuple[int, int]) -> PoseFile:
     """
     read = POSES.reader(path, fmt)
     try:
-        return _without_lost(read(path, size), path)
+        return _without_lost(read(path, size))
     except ReobjError:
         raise
     except Exception as error:  # files of other tools lack any key, or hold any type
@@ -280,7 +282,7 @@ def read_pose_file(path: Path, fmt: str, size: tuple[int, int]) -> PoseFile:
         raise ReobjError(f"{path}: damaged, or no file of format {name} ({error!r:.100})") from None
 
 
-def _without_lost(pose_file: PoseFile, path: Path) -> PoseFile:
+def _without_lost(pose_file: PoseFile) -> PoseFile:
     """Remove poses that are the identity in the axes of the file, as of lost frames.
 
     It is a pose where it begins the path, and where it is the only one of poses with names.
@@ -294,8 +296,6 @@ def _without_lost(pose_file: PoseFile, path: Path) -> PoseFile:
         same[same.argmax()] = False
     cam_from_world = np.where(same[:, None, None], np.nan, cam_from_world)
     lost: BoolArray = ~np.all(np.isfinite(cam_from_world), axis=(1, 2))
-    if lost.all():
-        raise ReobjError(f"{path}: no poses in it, or only those of lost frames")
     return dataclasses.replace(pose_file, cam_from_world=cam_from_world, lost=int(lost.sum()))
 
 
