@@ -217,18 +217,19 @@ def check_boxes(given: Supplied, tracks: Tracks, refuse: bool = True) -> bool:
     if not refuse:
         return as_given < GOOD_DEG
     measured = f"{len(views)} tracks triangulate within {as_given:.1f} deg"
-    residuals = {name: _residual_deg(poses, views) for name, poses in _orders(given)}
-    best = min(residuals.values())
+    if as_given >= GOOD_DEG:
+        residuals = {name: _residual_deg(poses, views) for name, poses in conventions(given)}
+        best = min(residuals.values())
+        if best <= min(MAX_RATIO * as_given, 2 * GOOD_DEG):
+            likely = [n for n in sorted(residuals, key=residuals.__getitem__)
+                      if residuals[n] <= 1.5 * best]  # fmt: skip
+            _refuse(given, likely, f"{measured}, then {best:.1f} deg")
+    orders = {name: _residual_deg(poses, views) for name, poses in _orders(given)}
+    best = min(orders.values())
     if as_given > ORDER_DEG and best < MAX_ORDER_RATIO * as_given and best < GOOD_DEG:
-        _refuse(given, [min(residuals, key=residuals.__getitem__)],
-                f"{measured}, then {best:.1f} deg")  # fmt: skip
+        _refuse(given, [min(orders, key=orders.__getitem__)], f"{measured}, then {best:.1f} deg")
     if as_given < GOOD_DEG:
         return True
-    residuals = {name: _residual_deg(poses, views) for name, poses in conventions(given)}
-    best = min(residuals.values())
-    if best <= min(MAX_RATIO * as_given, 2 * GOOD_DEG):
-        likely = [name for name, value in residuals.items() if value <= 1.5 * best]
-        _refuse(given, likely, f"{measured}, then {best:.1f} deg")
     if as_given > WRONG_DEG:
         _refuse(given, [], measured)
     return False
