@@ -386,7 +386,11 @@ def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> npt.NDArray[Any] | 
         image = cv2.imdecode(data, flags) if len(data) else None
     except (OSError, cv2.error):
         return None
-    return None if image is None else np.asarray(image)
+    if image is None:  # OpenCV 4 reads no animated WebP
+        with contextlib.suppress(Exception), PillowImage.open(path) as opened:
+            if getattr(opened, "is_animated", False):
+                image = np.asarray(opened.convert("RGB"))[..., ::-1]
+    return None if image is None else np.ascontiguousarray(image)
 
 
 def why_unreadable(path: Path) -> str:
