@@ -116,7 +116,7 @@ def _refuse(given: Supplied, likely: Sequence[str], measured: str) -> None:
     if likely:
         remedy = "convert them, or name their format with --pose-format"
         if likely[0].startswith("the order"):
-            remedy = "give each frame its pose"
+            remedy = "give each frame its pose in --poses"
         raise ReobjError(
             f"the poses look like ones with {' or '.join(likely[:3])}; they were read with "
             f"{_axes_text(given.axes)} ({measured}): {remedy}"

@@ -275,8 +275,9 @@ def read_pose_file(path: Path, fmt: str, size: tuple[int, int]) -> PoseFile:
     read = POSES.reader(path, fmt)
     try:
         return _without_lost(read(path, size))
-    except ReobjError:
-        raise
+    except ReobjError as error:
+        text = str(error)  # of a file beside it, or without a name
+        raise ReobjError(text if str(path) in text else f"{path}: {text}") from None
     except Exception as error:  # files of other tools lack any key, or hold any type
         name = POSES.find(path, fmt).name
         raise ReobjError(f"{path}: damaged, or no file of format {name} ({error!r:.100})") from None
