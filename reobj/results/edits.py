@@ -34,7 +34,7 @@ from reobj.types import (
 )
 
 HEADER = {"format": "reobj-edits", "version": 1}
-KEYS = {  # of an edit besides `do` and `object`: one of these
+KEYS = {  # besides `do` and `object`, one each
     "merge": ("with",), "split": ("frames", "visits"), "rename": ("class",), "delete": ("",),
 }  # fmt: skip
 Coordinate = Annotated[float, msgspec.Meta(ge=-COORDINATE_MAX, le=COORDINATE_MAX)]  # px

@@ -80,7 +80,9 @@ def read_source_3d(source: Source) -> RecordedDetections:
     Raises:
         ReobjError: no cameras, an invalid value, or no box that is visible in its frame.
     """
-    path, video, poses = source.path, source.video, source.poses
+    path = source.path
+    video = source.video
+    poses = source.poses
     if poses is None:
         fault = "these are 3D boxes in the world, which need its cameras"
         raise ReobjError(f"{path}, line 1: {fault}: `run` with --detections and --poses FILE")

@@ -307,7 +307,8 @@ def _usable(
 ) -> BoolArray:
     """Test which boxes (N,) have an area, overlap the image and belong to a frame of the video."""
     count = len(recorded)
-    xyxy, size = recorded.xyxy, recorded.size
+    xyxy = recorded.xyxy
+    size = recorded.size
     low, high = xyxy[:, :2], xyxy[:, 2:]
     empty: BoolArray = np.any(high <= low, axis=1)  # (N,)
     outside = ~empty & ((high <= 0) | (low >= np.array(size))).any(1)

@@ -56,7 +56,8 @@ def read_label_folder(source: Source, pose: int = 0) -> RecordedDetections:
     ultralytics, if NAME is that of the video). Class names are the user's, or those of a file
     beside the labels, else COCO's. pose: numbers of each keypoint between box and confidence.
     """
-    path, video = source.path, source.video
+    path = source.path
+    video = source.video
     files = label_files(path)
     source.say(f"a folder of YOLO labels: {len(files)} files")
     of_video = re.compile(re.escape(Path(video.source).stem) + r"_\d+")
