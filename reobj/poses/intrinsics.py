@@ -199,7 +199,7 @@ def brown_camera(
 
 
 def _focal_and_centre(matrix: Any) -> tuple[float, ...]:
-    """Return fx, fy, cx, cy of four numbers, or of K: 3x3 or 4x4, row by row or column by column."""
+    """Return fx, fy, cx, cy of four numbers, or of K (3x3 or 4x4, either order)."""
     flat = np.array(matrix, np.float64).ravel()
     if flat.size == 4:  # Kalibr, EuRoC
         return tuple(flat.tolist())
