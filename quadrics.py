@@ -1638,7 +1638,7 @@ def _hypotheses(
     log_odds = np.where(rows >= 0, np.log1p(-given.wrong_class), 0.0)
     if doubts:
         log_odds[turned] += np.log1p(-NOT_ROUND)
-        log_odds[flat] += np.log(NOT_ROUND / len(SUPPORTS))
+        log_odds[flat] += np.log(NOT_ROUND)
         log_odds[n_obj : n_obj + len(wrong)] = np.log(given.wrong_class / len(SUPPORTS))
     return obj, rows, flat, log_odds
 
@@ -1671,7 +1671,6 @@ def _prior_spec(given: _Given, world: _World) -> _Spec:
         upright[known] = priors.upright[pick]
     cov = cov + world.scale_sigma**2
     code = np.where(codes == Shape.BY_EVIDENCE, -1, np.where(codes >= 0, codes, natural))  # (O,)
-    code = np.where(flat & (codes < 0), -1, code)
     allowed = (code[:, None] == np.arange(3)) | (code < 0)[:, None]
     size_mean = mean - np.log(2.0) - world.log_scale
     plane = np.zeros(4)
@@ -1835,7 +1834,7 @@ def _refine_start(
 # ---- fit_objects: starts, inliers, evidence -------------------------------------------------
 
 ROUND_LOG = 0.05  # log, sigma of width / depth of yaw-symmetric categories
-NOT_ROUND = 0.1  # probability that an object of a yaw-symmetric category is not (chosen)
+NOT_ROUND = 0.03  # probability that an object of a yaw-symmetric category is not (chosen)
 FREE_CORR = 0.3  # correlation of its log sizes, as of the other categories
 SIZE_WALL_LOG = 0.25  # log, least sigma of which SIZE_WALL is a multiple: a category may be wrong
 NOISE_PRIOR_DOF = 12.0  # residuals, weight of the nominal noise level

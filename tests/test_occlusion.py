@@ -54,6 +54,19 @@ def test_farther_objects_occlude_nothing() -> None:
     assert occluded_edges(views, solids, ELSEWHERE)[:, 0, LOWER].all()
 
 
+def test_a_table_hides_what_is_behind_it_and_not_what_stands_on_it() -> None:
+    table = np.array([1.0, 0.6, 0.15])
+    solids, views = scene(table)
+    for y, hidden in ((-1.0, False), (1.0, True)):
+        height = 2 * table[2] if not hidden else 0.0
+        solids.center_in_world[0] = 0, y, height + 0.2
+        solids.half_axes[0] = 0.06, 0.06, 0.2
+        views.boxes[:] = quadrics.solid_boxes(solids, "box", views.img_from_world)
+        if hidden:
+            cut_below(views)
+        assert (occluded_edges(views, solids, ELSEWHERE)[:, 0, LOWER] == hidden).all()
+
+
 def test_an_object_covering_the_whole_box_occludes_no_edge() -> None:
     """The chair is detected although an object covers it: that object is not opaque."""
     solids, views = scene(np.array([1.5, 0.1, 0.9]))

@@ -390,7 +390,8 @@ def test_a_flat_bottle_is_not_made_round(shape: str) -> None:
     cams = syn.arc_cameras(20, 120, rng, distance=0.8)
     boxes = q.solid_boxes(truth, shape, cams)
     fits = q.fit_objects(boxes, cams, syn.IMAGE, ["bottle"], q.load_priors(), up=UP)
-    assert fits.support[0] == shape and fits.reason[0] == ""
+    assert fits.support[0] == shape
+    assert ("overruled" in fits.reason[0]) == (shape == "box")  # a flat cylinder may be a bottle
     assert syn.box_overlap(fits.ellipsoids, truth)[0] > 0.95
 
 

@@ -1,9 +1,10 @@
 """Occluded edges of boxes, and background points seen through objects.
 
 A box edge caused by an occluder does not bound the object. An edge counts as occluded if a nearer
-object covers the image just outside it but not just inside it, or if the box of a floor-standing
-object ends above the floor. Sparse points seen behind an object, on rays through its middle, are
-evidence that the object does not exist.
+object covers the image just outside it but not just inside it, unless that object continues behind
+this one, which stands on it; or if the box of a floor-standing object ends above the floor. Sparse
+points seen behind an object, on rays through its middle, are evidence that the object does not
+exist.
 """
 
 from __future__ import annotations
@@ -57,7 +58,8 @@ def edges_above_floor(boxes: Array, projected: Array) -> BoolArray:
 def _occluded_by_nearer(views: Views, ellipsoids: quadrics.Ellipsoids) -> BoolArray:
     """Mark box edges (V, G, 4) with a nearer object just outside and none just inside.
 
-    A nearer object is there if it covers half of the points beside the edge or more.
+    A nearer object is there if it covers half of the points beside the edge or more. One that is
+    behind the object at the points inside is what it stands on, and hides nothing.
     """
     occluded = np.zeros(views.boxes.shape, bool)
     known = np.isfinite(ellipsoids.half_axes.sum(1) + ellipsoids.center_in_world.sum(1))
@@ -77,8 +79,9 @@ def _occluded_by_nearer(views: Views, ellipsoids: quadrics.Ellipsoids) -> BoolAr
         entry = entry.reshape(*points.shape[:4], -1)  # (2, D, 4, P, N)
         itself = candidates == column[groups, None]  # (D, N)
         entry = np.where(itself[:, None, None], np.inf, entry)
-        nearest = entry.min(4, initial=np.inf)
-        covered = (nearest < depth[column[groups], None, None]).mean(3) >= 0.5  # (2, D, 4)
+        outside, inside = entry < depth[column[groups], None, None, None]  # (D, 4, P, N)
+        outside &= ~np.isfinite(entry[1]) | inside  # one that continues behind it supports it
+        covered = [hit.any(3).mean(2) >= 0.5 for hit in (outside, inside)]  # (D, 4)
         occluded[v, groups] = covered[0] & ~covered[1]
     return occluded
 
