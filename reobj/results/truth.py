@@ -25,7 +25,7 @@ from reobj.formats import AUTO, Format, Registry
 from reobj.results.result import Result
 from reobj.sources.detection_files import check_rows, read_source
 from reobj.sources.detection_formats import DETECTIONS, FROM_1, Reader
-from reobj.sources.recorded import Source
+from reobj.sources.recorded import SIZES, Source, corners, other_form
 from reobj.sources.tables import is_boxmot, is_mot, read_mot_rows
 from reobj.types import CLASS_MAX, Array, BoolArray, IntArray, ReobjError, counted
 from reobj.words import among, canonical
@@ -70,8 +70,7 @@ class LabelledBoxes:
 def labelled(rows: Array, name: Any = "", role: Any = Role.SCORED) -> LabelledBoxes:
     """Convert MOTChallenge rows (N, 6+) to labelled boxes; name, role: for all rows, or (N,)."""
     n = len(rows)
-    box = rows[:, 2:6]
-    xyxy = np.concatenate([box[:, :2], box[:, :2] + box[:, 2:]], 1)  # (N, 4)
+    xyxy = corners(rows[:, 2:6], SIZES)  # (N, 4)
     whole = rows[:, :2].astype(np.int64)
     names = np.broadcast_to(np.asarray(name, str), n)
     roles = np.broadcast_to(role, n)
@@ -118,6 +117,8 @@ def _with_roles(entry: Format[Reader]) -> Format[TruthReader]:
         assert entry.read is not None
         recorded = read_source(source, entry.read)
         check_rows(recorded, path)
+        if 0 not in size and (fault := other_form(recorded.xyxy, recorded.form, size)):
+            raise ReobjError(f"{path}: {fault}")
         if not len(recorded.identity):
             raise ReobjError(f"{path}: boxes without identities; expected tracks")
         names = np.array([*recorded.class_names, ""], str)[recorded.class_id]
@@ -153,7 +154,7 @@ def read_result(out: Path, notes: list[str] | None = None) -> LabelledBoxes:
         frame = tracks.frame + 1
         predicted = LabelledBoxes(frame, ids, tracks.xyxy, names[tracks.class_id], role)
     else:
-        predicted = labelled(_from_one(read_mot_rows(out), out, notes))
+        predicted = labelled(_checked(read_mot_rows(out), out, notes))
     _check_identities(predicted, out)
     return predicted
 
@@ -177,7 +178,7 @@ def _read_mot(
     class_names: Sequence[str],
     min_visibility: float,
     notes: list[str],
-    _: tuple[int, int],
+    size: tuple[int, int],
     first: str,
 ) -> LabelledBoxes:
     """Read MOTChallenge rows.
@@ -185,9 +186,9 @@ def _read_mot(
     Column 7 is a flag (0: the row does not count). In files of nine columns, column 8 is the class
     and column 9 the visibility; MOT15 has ten columns, with world coordinates instead.
     """
-    rows = _from_one(read_mot_rows(path), path, notes, first)
-    flagged = rows[:, 6] == 0 if rows.shape[1] > 6 else np.zeros(len(rows), bool)
     sequence = _sequence(path)
+    rows = _checked(read_mot_rows(path), path, notes, first, size)
+    flagged = rows[:, 6] == 0 if rows.shape[1] > 6 else np.zeros(len(rows), bool)
     _check_length(rows, path, sequence)
     if rows.shape[1] != 9:
         return labelled(rows, "", np.where(flagged, Role.ABSENT, Role.SCORED))
@@ -237,8 +238,16 @@ TRUTH: Registry[TruthReader] = Registry("ground truth", "--gt-format", [
 ])  # fmt: skip
 
 
-def _from_one(rows: Array, path: Path, notes: list[str], begin: str = "") -> Array:
-    """Return rows whose frames count from 1; convert those that count from 0."""
+def _checked(
+    rows: Array, path: Path, notes: list[str], begin: str = "", size: tuple[int, int] = (0, 0)
+) -> Array:
+    """Refuse rows of another form; return them with frames that count from 1."""
+    fault = other_form(corners(rows[:, 2:6], SIZES), SIZES, size) if 0 not in size else ""
+    if not fault and _move_as_corners(rows):
+        fault = ("columns 3 to 6 are x1, y1, x2, y2: column 5 is above 3 and 6 above 4 in all rows, "
+                 "and changes as much")  # fmt: skip
+    if fault:
+        raise ReobjError(f"{path}: {fault}; expected left, top, width, height")
     first = rows[:, 0].min(initial=1)
     if first < int(begin or 0):
         expected = f"from {begin}" if begin else "from 1, or from 0"
@@ -254,6 +263,17 @@ def _from_one(rows: Array, path: Path, notes: list[str], begin: str = "") -> Arr
         notes.append(f"{why} frames are taken as 0-based")
         rows = rows + np.eye(1, rows.shape[1])
     return rows
+
+
+def _move_as_corners(rows: Array) -> bool:
+    """Test whether boxes of an unknown image are corners: columns 5 and 6 move with 3 and 4.
+
+    Sizes change little from one frame of an identity to its next, independently of the place.
+    """
+    rows = rows[np.lexsort((rows[:, 0], rows[:, 1]))]
+    step = np.diff(rows[:, 2:6], axis=0)[np.diff(rows[:, 1]) == 0]  # (M, 4)
+    apart = np.abs(step[:, 2:] - step[:, :2]).sum()
+    return bool((rows[:, 4:6] > rows[:, 2:4]).all() and 2 * apart < np.abs(step[:, 2:]).sum())
 
 
 def _sequence(path: Path) -> dict[str, str]:

@@ -114,7 +114,7 @@ def read_source_3d(source: Source) -> RecordedDetections:
 
 def _boxes(table: Table) -> Array:
     """Return centre, half extents and rotation (N, 15) of the rows."""
-    center, quat, size = (np.stack([table.numbers(role) for role in roles], 1)
+    center, quat, size = (table.columns(roles)
                           for roles in (BOXES_3D[:3], BOXES_3D[3:7], BOXES_3D[7:]))  # fmt: skip
     bad = (size <= 0).any(1) | (np.abs(np.linalg.norm(quat, axis=1) - 1) > 0.01)
     if bad.any():

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -19,7 +19,7 @@ from reobj.frame_lookup import frames_by_name
 from reobj.sources.class_names import check_length
 from reobj.sources.image_frames import frames_of_names, frames_of_numbers, original_name
 from reobj.sources.masks import NO_RUNS, Counts, coco_runs, polygon_runs
-from reobj.sources.recorded import RecordedDetections, Source
+from reobj.sources.recorded import CORNERS, SIZES, RecordedDetections, Source
 from reobj.types import COCO_NAMES, Array, IntArray, ReobjError
 
 T = TypeVar("T")
@@ -60,11 +60,12 @@ class Named(msgspec.Struct):
 
 
 class Annotation(msgspec.Struct):
-    """A box of an image: x, y, w, h in px."""
+    """A box of an image."""
 
     image_id: Id
     category_id: Id
     bbox: Box
+    bbox_mode: Literal[0, 1] = 1  # detectron2: 0 corners, 1 x, y, w, h; in px
     score: float = 1.0
     file_name: str | None = None
     track_id: float | None = None
@@ -185,7 +186,6 @@ def _read(source: Source, entries: list[Annotation], dataset: Dataset | None) ->
     classes = _categories(source, entries, dataset)
     frame, size, looked = _images(source, entries, dataset)
     scale = source.scale(size, frame >= 0)
-    box = np.array([entry.bbox for entry in entries], np.float64).reshape(-1, 4)
     masks = []
     identity = np.full(len(entries), -1)
     for at, (entry, ratio) in enumerate(zip(entries, scale[:, :2], strict=True)):
@@ -194,10 +194,13 @@ def _read(source: Source, entries: list[Annotation], dataset: Dataset | None) ->
             identity[at] = entry.identity
         except ReobjError as error:
             raise ReobjError(f"{source.path}, entry {at}: {error}") from error
+    modes = {entry.bbox_mode for entry in entries}
+    if len(modes) > 1:
+        raise ReobjError(f"{source.path}: entries of several bbox_mode; expected one")
     return source.recorded(
-        frame, np.hstack([box[:, :2], box[:, :2] + box[:, 2:]]) * scale, classes,
+        frame, np.array([entry.bbox for entry in entries]), classes,
         np.array([entry.score for entry in entries], np.float64), masks,
-        identity=identity, looked=looked,
+        form=CORNERS if 0 in modes else SIZES, scale=scale, identity=identity, looked=looked,
         ignored=np.array([bool(entry.iscrowd or entry.ignore) for entry in entries], bool),
     )  # fmt: skip
 

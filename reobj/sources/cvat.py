@@ -62,7 +62,8 @@ def read_cvat(source: Source) -> RecordedDetections:
     ]
     ids = np.array(identity, np.int64)
     return source.recorded(
-        frame, boxes * scale, (class_id.astype(np.int64), names.tolist()), runs=runs, unit="box",
+        frame, boxes, (class_id.astype(np.int64), names.tolist()), runs=runs, unit="box",
+        scale=scale,
         identity=ids if (ids > 0).any() else np.empty(0, np.int64), looked=looked,
     )  # fmt: skip
 

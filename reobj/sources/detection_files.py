@@ -25,7 +25,13 @@ from reobj.sources.class_names import check_length, load_class_names
 from reobj.sources.detection_formats import DETECTIONS, Reader
 from reobj.sources.label_folders import label_files
 from reobj.sources.looked import frames_looked_at, looked_message
-from reobj.sources.recorded import NORMALISED_MAX, RecordedDetections, Source, npz_image_size
+from reobj.sources.recorded import (
+    NORMALISED_MAX,
+    RecordedDetections,
+    Source,
+    npz_image_size,
+    other_form,
+)
 from reobj.sources.tables import are_numbers, read_cells, read_cells_3d, seconds
 from reobj.sources.video import Video
 from reobj.types import (
@@ -320,15 +326,15 @@ def _usable(
     if count and xyxy.max() <= NORMALISED_MAX:
         fault = f"no coordinate above {NORMALISED_MAX}: normalised to 0..1? "
         fault += "Multiply them by the image size"
-    elif checks_size and (other := _other_size(xyxy[~empty], size)):
+    elif count and (other := other_form(xyxy, recorded.form, size)):
         fault = other
-    elif other := _other_reading(xyxy, size):
+    elif checks_size and (other := _other_size(xyxy[~empty], size)):
         fault = other
     elif 2 * (empty | outside).sum() > count or larger:
         fault = (
             f"{empty.sum()} of {count} boxes have no area and {outside.sum()} lie outside "
-            f"the image of {size}: x, y, w, h where x1, y1, x2, y2 is expected, "
-            "frames of another size (--set detect.image_size=WIDTHxHEIGHT), or another video?"
+            f"the image of {size}: frames of another size (--set detect.image_size=WIDTHxHEIGHT), "
+            "or another video?"
         )
     elif count and missing.all():
         fault = f"all detections are {text}: detections of another video?"
@@ -368,33 +374,6 @@ def _other_size(xyxy: Array, size: tuple[int, int]) -> str:
     where = f"x = {most[0]:.0f}, y = {most[1]:.0f}, and the image is {size[0]}x{size[1]}"
     return (f"boxes are cut off at {where}: boxes of frames of another size? Name it with --set "
             "detect.image_size=WIDTHxHEIGHT")  # fmt: skip
-
-
-def _other_reading(xyxy: Array, size: tuple[int, int]) -> str:
-    """Describe the box format that boxes (N, 4) probably have; "" if corners are valid.
-
-    Corners are invalid if the second is before the first or the centre lies outside the image.
-    Then common mistakes are tried; one is the cause if all boxes fit the image with it.
-    """
-    low, high = xyxy[:, :2], xyxy[:, 2:]
-    centre = (low + high) / 2
-    inverted = (high < low).any(1)
-    beyond = ((centre < 0) | (centre > size)).any(1)
-    if not (inverted | beyond).any():
-        return ""
-    why = f"{inverted.sum()} of {len(xyxy)} boxes have x2 < x1 or y2 < y1 and {beyond.sum()} have "
-    why += f"their centre outside the image of {size}"
-    for end, limit, cause in (
-        (high, size[::-1], f"all fit the frame turned by 90 deg, {size[::-1]}: made on frames that "
-                           "were not turned upright? Detect on upright frames"),
-        (low + high, size, "all fit it as x, y, w, h: name the columns so, or give corners"),
-        (high - low, size, "all fit it if w and h are the corner x2, y2: name them so, or give "
-                           "sizes"),
-    ):  # fmt: skip
-        # Tolerance of 1 px: detectors round boxes to whole pixels
-        if (low >= -1).all() and (low <= end).all() and (end <= np.add(limit, 1)).all():
-            return f"{why}; {cause}"
-    return ""
 
 
 def read_tracks(

@@ -15,8 +15,8 @@ from reobj.files import LINES_MAX, read_lines
 from reobj.sources.class_names import is_yaml, load_class_names
 from reobj.sources.image_frames import frames_of_names
 from reobj.sources.masks import NO_RUNS, polygon_runs
-from reobj.sources.recorded import NORMALISED_MAX, RecordedDetections, Source
-from reobj.types import COCO_NAMES, Array, IntArray, ReobjError, xyxy_from_cxcywh
+from reobj.sources.recorded import CENTRES, NORMALISED_MAX, RecordedDetections, Source
+from reobj.types import COCO_NAMES, Array, IntArray, ReobjError
 
 NO_LABELS = ("classes.txt train.txt val.txt valid.txt test.txt readme.txt readme.dataset.txt "
              "readme.roboflow.txt requirements.txt labels.txt").split()  # fmt: skip
@@ -95,9 +95,8 @@ def read_label_folder(source: Source, pose: int = 0) -> RecordedDetections:
         runs[row] = polygon_runs([(corners * video.size).ravel().tolist()], video.size)
     class_id = np.array([row[0] for row in rows], np.float64).astype(np.int64)
     return source.recorded(
-        frame[np.array(of_file, np.int64)], xyxy_from_cxcywh(box) * np.tile(video.size, 2),
-        (class_id, names or COCO_NAMES), score, runs, np.array(lines, object), "line",
-        identity=identity,
+        frame[np.array(of_file, np.int64)], box, (class_id, names or COCO_NAMES), score, runs,
+        np.array(lines, object), "line", CENTRES, np.tile(video.size, 2), identity=identity,
     )  # fmt: skip
 
 

@@ -18,7 +18,68 @@ import numpy.typing as npt
 from reobj.cameras import Poses
 from reobj.files import LINES_MAX, MEMORY_MAX, load_npz, save_npz
 from reobj.sources.masks import NO_RUNS, Counts, rle_decode, rle_encode
-from reobj.types import CLASS_MAX, Array, BoolArray, Detections, IntArray, ReobjError, visible_name
+from reobj.types import (
+    CLASS_MAX,
+    Array,
+    BoolArray,
+    Detections,
+    IntArray,
+    ReobjError,
+    visible_name,
+    xyxy_from_cxcywh,
+)
+
+CORNERS, SIZES, CENTRES = "x1, y1, x2, y2", "x, y, w, h", "cx, cy, w, h"  # forms of a box
+
+
+def corners(box: Array, form: str) -> Array:
+    """Convert boxes (N, 4) of a form to corners (N, 4)."""
+    if form == CENTRES:
+        return xyxy_from_cxcywh(box)
+    return np.hstack([box[:, :2], box[:, :2] + box[:, 2:]]) if form == SIZES else box
+
+
+def other_form(xyxy: Array, form: str, size: Sequence[float]) -> str:
+    """Describe the form that boxes of an image of (w, h) `size` have instead of `form`.
+
+    Args:
+        xyxy: (N, 4) boxes as read. form: in which the file has them.
+    Returns:
+        the fault and the remedy; "" if the boxes fit, or fit in no other form either. A box that is
+        inverted, or whose centre is outside the image, is a fault; so are more than a tenth of
+        boxes, and more than two, that leave the image (of boxes in another form 41 % or more do).
+    """
+    low, high = xyxy[:, :2], xyxy[:, 2:]
+    inverted = (high < low).any(1)
+    centre = (low + high) / 2
+    beyond = ((centre < 0) | (centre > size)).any(1)
+    leave = ~_inside(xyxy, size)
+    if not (inverted | beyond).any() and leave.sum() <= max(2, 0.1 * len(xyxy)):
+        return ""
+    given = xyxy  # the numbers in the file
+    if form != CORNERS:
+        given = np.hstack([low if form == SIZES else centre, high - low])
+    why = (f"as {form}, {inverted.sum()} of {len(xyxy)} boxes have x2 < x1 or y2 < y1 and "
+           f"{leave.sum()} leave the image of {size[0]:g}x{size[1]:g}")  # fmt: skip
+    others = [other for other in (CORNERS, SIZES, CENTRES) if other != form]
+    fits = [other for other in others if _inside(corners(given, other), size).mean() > 0.98]
+    if fits:
+        names = " or ".join(fits)
+        return (f"{why}; all fit it as {names}: convert them, or write a CSV whose header names "
+                "these columns")  # fmt: skip
+    if (inverted | beyond).any() and _inside(xyxy, size[::-1]).all():
+        return (f"{why}; all fit the frame turned by 90 deg: made on frames that were not turned "
+                "upright? Detect on upright frames")  # fmt: skip
+    return ""
+
+
+def _inside(xyxy: Array, size: Sequence[float]) -> BoolArray:
+    """Test which boxes (N,) are not inverted and lie in the image.
+
+    Tolerance of 1 px: detectors round boxes to whole pixels.
+    """
+    low, high = xyxy[:, :2], xyxy[:, 2:]
+    return np.asarray(((low >= -1) & (low <= high) & (high <= np.add(size, 1))).all(1))
 
 
 @dataclass(slots=True)
@@ -36,6 +97,7 @@ class RecordedDetections:
         looked: frames on which the detector was run, ascending; None: all.
         boxes_3d: (N, 15) of `boxes_3d.Boxes3D`, or empty.
         ignored: (N,) regions that do not count, as the file marks them, or empty.
+        form: of the boxes in the file.
     """
 
     frame: IntArray
@@ -53,6 +115,7 @@ class RecordedDetections:
     looked: IntArray | None = None
     boxes_3d: Array = field(default_factory=lambda: np.empty((0, 15)))
     ignored: BoolArray = field(default_factory=lambda: np.empty(0, bool))
+    form: str = CORNERS
 
     def __post_init__(self) -> None:
         self.class_names = tuple(map(visible_name, self.class_names))
@@ -116,21 +179,27 @@ class Source:
     def recorded(
         self,
         frame: IntArray,
-        xyxy: Array,
+        box: Array,
         classes: tuple[IntArray, Sequence[str]],
         score: Array | None = None,
         runs: list[Counts] | None = None,
         line: npt.NDArray[Any] | None = None,
         unit: str = "entry",
+        form: str = CORNERS,
+        scale: Array | float = 1.0,
         **columns: Any,
     ) -> RecordedDetections:
-        """Return the detections of N rows; columns: further attributes of RecordedDetections."""
+        """Return the detections of N rows; columns: further attributes of RecordedDetections.
+
+        scale: px of the video for each unit of the boxes (N, 4).
+        """
         count = len(frame)
+        xyxy = corners(np.reshape(box, (-1, 4)).astype(np.float64), form) * scale  # (N, 4)
         return RecordedDetections(
-            frame, xyxy.reshape(-1, 4), np.ones(count) if score is None else score, classes[0],
+            frame, xyxy, np.ones(count) if score is None else score, classes[0],
             [NO_RUNS] * count if runs is None else runs, tuple(classes[1]), self.video.size,
             self.video.working_size, np.arange(count) if line is None else line, unit,
-            self.messages, **columns,
+            self.messages, form=form, **columns,
         )  # fmt: skip
 
     def scale(self, made_for: Array, used: BoolArray | None = None) -> Array:

@@ -22,7 +22,7 @@ from reobj.formats import HEAD_BYTES, Probe
 from reobj.sources.class_names import load_class_names
 from reobj.sources.image_files import TimeUnit, is_date
 from reobj.sources.image_frames import frames_of_names, frames_of_numbers
-from reobj.sources.recorded import RecordedDetections, Source
+from reobj.sources.recorded import CENTRES, CORNERS, SIZES, RecordedDetections, Source
 from reobj.types import (
     CLASS_MAX,
     COCO_NAMES,
@@ -33,7 +33,6 @@ from reobj.types import (
     ReobjError,
     nearest_of,
     printable,
-    xyxy_from_cxcywh,
 )
 
 BOXES_3D = (
@@ -71,7 +70,11 @@ ALIASES: dict[str, str] = {  # names of columns; the first one with values is us
              "category_id label_id coco80_class",
 }  # fmt: skip
 NONE = np.empty(0, bool)
-BOX_FORMS = (("x1", "y1", "x2", "y2"), ("x1", "y1", "w", "h"), ("cx", "cy", "w", "h"))
+BOX_FORMS = {
+    ("x1", "y1", "x2", "y2"): CORNERS,
+    ("x1", "y1", "w", "h"): SIZES,
+    ("cx", "cy", "w", "h"): CENTRES,
+}
 
 
 @dataclass(slots=True)
@@ -103,6 +106,10 @@ class Table:
         self._check(role, ~np.isfinite(values), "{!r} is no finite number")
         return values
 
+    def columns(self, roles: Sequence[str]) -> Array:
+        """Convert columns to finite numbers (N, count)."""
+        return np.stack([self.numbers(role) for role in roles], 1)
+
     def whole(self, role: str) -> IntArray:
         """Convert a column to whole numbers (N,)."""
         values = self.numbers(role)
@@ -118,13 +125,6 @@ class Table:
             advice = DECIMAL_COMMAS * ("," in cell and not self.comma)
             raise ReobjError(f"{self.where(row)}: {why.format(cell)}{advice}")
 
-    def boxes(self) -> Array:
-        """Return the boxes (N, 4), corners."""
-        roles = _box_roles(self.cells)
-        box = np.stack([self.numbers(role) for role in roles], 1)
-        if roles[0] == "cx":
-            return xyxy_from_cxcywh(box)
-        return np.hstack([box[:, :2], box[:, :2] + box[:, 2:]]) if roles[2] == "w" else box
 
 
 DECIMAL_COMMAS = ": decimal commas? Separate the columns with semicolons, or write points"
@@ -235,7 +235,7 @@ def _named(table: Table) -> Table:
     found = {"frame", "image", "time"} & name_of.keys()
     if not found or not _box_roles(name_of):
         missing = ["frame"] * (not found)
-        missing += [role for role in BOX_FORMS[0] if role not in name_of]
+        missing += [role for role in ("x1", "y1", "x2", "y2") if role not in name_of]
         text = f"no column {', '.join(missing)} in the header {','.join(by_name)}"
         example = "expected one such as frame,x1,y1,x2,y2,score,class"
         raise ReobjError(f"{table.path}, line 1: {text}: {example}")
@@ -374,7 +374,7 @@ def read_mot_rows(path: Path) -> Array:
         ReobjError: a line with another number of columns, or with a cell that is no number.
     """
     table = _columns(path, MOT, 6)
-    rows = np.stack([table.numbers(role) for role in table.cells], 1)  # (N, 6 to 10)
+    rows = table.columns(list(table.cells))  # (N, 6 to 10)
     table.whole("frame"), table.whole("id")
     if (too_large := (np.abs(rows[:, 2:6]) > COORDINATE_MAX).any(1)).any():
         row = int(too_large.argmax())
@@ -478,15 +478,17 @@ def _recorded(
     ignored: BoolArray = NONE,
 ) -> RecordedDetections:
     """Convert a table to detections; usual: number of the first frame."""
-    xyxy = table.boxes()
+    roles = _box_roles(table.cells)
+    box = table.columns(roles)  # (N, 4)
     frame = _frames(table, source, usual)
+    scale = np.ones(box.shape)
     if "image w" in table.cells and "image h" in table.cells:
-        size = np.stack([table.numbers("image w"), table.numbers("image h")], 1)  # (N, 2)
-        if np.abs(size - (xyxy[:, 2:] - xyxy[:, :2])).max(initial=0) > 1.01:  # else the boxes'
-            xyxy = xyxy * source.scale(size, frame >= 0)
+        size = table.columns(("image w", "image h"))  # (N, 2)
+        if np.abs(size - (box[:, 2:] - box[:, :2])).max(initial=0) > 1.01:  # else the boxes'
+            scale = source.scale(size, frame >= 0)
     return source.recorded(
-        frame, xyxy, classes, table.numbers("score") if "score" in table.cells else None,
-        line=table.line, unit=table.unit, ignored=ignored,
+        frame, box, classes, table.numbers("score") if "score" in table.cells else None,
+        line=table.line, unit=table.unit, form=BOX_FORMS[roles], scale=scale, ignored=ignored,
         identity=table.whole("id") if "id" in table.cells else np.empty(0, np.int64),
     )  # fmt: skip
 
