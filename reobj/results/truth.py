@@ -135,7 +135,7 @@ def _with_roles(entry: Format[Reader]) -> Format[TruthReader]:
         return LabelledBoxes(recorded.frame + 1, ids, recorded.xyxy, names, role, listed)
 
     return Format(entry.name, entry.title, entry.recognise, entry.read and read, entry.frames,
-                  entry.units, entry.unread, entry.advice)  # fmt: skip
+                  entry.units, entry.unread, WITH_TRACKS, entry.kind)  # fmt: skip
 
 
 def read_result(out: Path, notes: list[str] | None = None) -> LabelledBoxes:
@@ -228,11 +228,12 @@ def _read_mot(
     return labelled(rows, names, (flagged | hidden | unnamed) * Role.IGNORED)
 
 
+WITH_TRACKS = "export it as COCO JSON with track_id, or as MOTChallenge rows"
 WITH_IDENTITIES = "visdrone kitti csv records coco cvat".split()
 TRUTH: Registry[TruthReader] = Registry("ground truth", "--gt-format", [
     Format("mot", "MOTChallenge, CVAT's MOT 1.1, DanceTrack: rows of 6 to 10 numbers",
            lambda probe: is_mot(probe) or is_boxmot(probe), _read_mot, FROM_1, "px",
-           "x, y, z in ten columns"),
+           "x, y, z in ten columns", kind="text"),
     *(_with_roles(entry) for entry in DETECTIONS.formats
       if entry.name in WITH_IDENTITIES or entry.read is None),
 ])  # fmt: skip
@@ -244,8 +245,8 @@ def _checked(
     """Refuse rows of another form; return them with frames that count from 1."""
     fault = other_form(corners(rows[:, 2:6], SIZES), SIZES, size) if 0 not in size else ""
     if not fault and _move_as_corners(rows):
-        fault = ("columns 3 to 6 are x1, y1, x2, y2: column 5 is above 3 and 6 above 4 in all rows, "
-                 "and changes as much")  # fmt: skip
+        fault = ("columns 3 to 6 are x1, y1, x2, y2: 5 is above 3 and 6 above 4 in all rows, and "
+                 "they change together")  # fmt: skip
     if fault:
         raise ReobjError(f"{path}: {fault}; expected left, top, width, height")
     first = rows[:, 0].min(initial=1)

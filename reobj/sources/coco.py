@@ -150,7 +150,7 @@ def _beside(path: Path, entries: Sequence[Annotation]) -> tuple[str, Dataset | N
         names = {category.id: category.name for category in dataset.categories}
         missing = [*ids.difference(images), *(kinds.difference(names) if names else ())]
         if missing:
-            fault = f"id {missing[0]} is not in the dataset JSON {other.name} beside this file"
+            fault = f"id {missing[0]!r} is not in the dataset JSON {other.name} beside this file"
             continue
         matches.append((other.name, dataset))
         used.append([{i: images[i] for i in ids}, {k: names.get(k) for k in kinds}])
@@ -227,9 +227,11 @@ def _categories(
         source.say("no categories in it or beside it: category_id is taken as COCO's (1 to 90)")
     for at, entry in enumerate(entries):
         if entry.category_id not in name_of:
-            raise ReobjError(f"{source.path}, entry {at}: category_id {entry.category_id} is "
-                             "unknown: put the dataset JSON beside this file, or give a file of "
-                             "names (ids from 0) with --set detect.class_names=FILE")  # fmt: skip
+            known = shortened([repr(i) for i in name_of])
+            raise ReobjError(f"{source.path}, entry {at}: category_id {entry.category_id!r} is "
+                             f"unknown, expected one of {known}: put the dataset JSON beside this "
+                             "file, or give a file of names (ids from 0) with --set "
+                             "detect.class_names=FILE")  # fmt: skip
     names = list(dict.fromkeys(name_of.values()))
     return np.array([names.index(name_of[e.category_id]) for e in entries], np.int64), names
 
@@ -250,7 +252,10 @@ def _images(
         image_of = {image.id: image for image in dataset.images}
         for at, i in enumerate(ids):
             if i not in image_of:
-                raise ReobjError(f"{source.path}, entry {at}: image_id {i} is not in the dataset")
+                raise ReobjError(
+                    f"{source.path}, entry {at}: image_id {i!r} is not in the "
+                    f"dataset, which has {shortened([*map(repr, image_of)])}"
+                )
             size[at] = image_of[i].width or 0, image_of[i].height or 0
         listed = np.unique(np.array(list(frame_of.values()), np.int64))
         return np.array([frame_of[i] for i in ids], np.int64), size, listed[listed >= 0]

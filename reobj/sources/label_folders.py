@@ -21,7 +21,8 @@ from reobj.types import COCO_NAMES, Array, IntArray, ReobjError
 NO_LABELS = ("classes.txt train.txt val.txt valid.txt test.txt readme.txt readme.dataset.txt "
              "readme.roboflow.txt requirements.txt labels.txt").split()  # fmt: skip
 NAMES_FILES = (
-    "classes.txt obj.names data.yaml dataset.yaml data.yml dataset.yml labels.txt _darknet.labels"
+    "classes.txt obj.names data.yaml dataset.yaml data.yml dataset.yml labels.txt _darknet.labels "
+    "notes.json"
 ).split()
 
 

@@ -126,7 +126,6 @@ class Table:
             raise ReobjError(f"{self.where(row)}: {why.format(cell)}{advice}")
 
 
-
 DECIMAL_COMMAS = ": decimal commas? Separate the columns with semicolons, or write points"
 
 
