@@ -26,7 +26,7 @@ from reobj.results.result import Result
 from reobj.sources.detection_files import check_rows, read_source
 from reobj.sources.detection_formats import DETECTIONS, FROM_1, Reader
 from reobj.sources.recorded import SIZES, Source, corners, other_form
-from reobj.sources.tables import is_boxmot, is_mot, read_mot_rows
+from reobj.sources.tables import forms, read_mot_rows
 from reobj.types import CLASS_MAX, Array, BoolArray, IntArray, ReobjError, counted
 from reobj.words import among, canonical
 
@@ -232,7 +232,7 @@ WITH_TRACKS = "export it as COCO JSON with track_id, or as MOTChallenge rows"
 WITH_IDENTITIES = "visdrone kitti csv records coco cvat".split()
 TRUTH: Registry[TruthReader] = Registry("ground truth", "--gt-format", [
     Format("mot", "MOTChallenge, CVAT's MOT 1.1, DanceTrack: rows of 6 to 10 numbers",
-           lambda probe: is_mot(probe) or is_boxmot(probe), _read_mot, FROM_1, "px",
+           lambda probe: bool(forms(probe) & {"mot", "boxmot"}), _read_mot, FROM_1, "px",
            "x, y, z in ten columns", kind="text"),
     *(_with_roles(entry) for entry in DETECTIONS.formats
       if entry.name in WITH_IDENTITIES or entry.read is None),

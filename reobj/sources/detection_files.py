@@ -20,7 +20,7 @@ import numpy as np
 from reobj.cameras import Poses
 from reobj.files import did_you_mean, last_name, shortened
 from reobj.formats import AUTO
-from reobj.sources import coco
+from reobj.sources import boxes_3d, coco
 from reobj.sources.class_names import check_length, load_class_names
 from reobj.sources.detection_formats import DETECTIONS, Reader
 from reobj.sources.label_folders import label_files
@@ -32,7 +32,7 @@ from reobj.sources.recorded import (
     npz_image_size,
     other_form,
 )
-from reobj.sources.tables import are_numbers, read_cells, read_cells_3d, seconds
+from reobj.sources.tables import are_numbers, read_cells, seconds
 from reobj.sources.video import Video
 from reobj.types import (
     CLASS_NAME_MAX,
@@ -201,7 +201,7 @@ def described_images(
         case "yolo":
             return None, [str(file.relative_to(path)) for file in label_files(path)], None
         case "boxer-3d":
-            return None, [], np.unique(seconds(read_cells_3d(path)))
+            return None, [], np.unique(seconds(boxes_3d.read_cells(path)))
         case "csv" if "frame" not in (table := read_cells(path)).cells:
             if "image" not in table.cells:
                 return None, [], np.unique(seconds(table))

@@ -23,6 +23,10 @@ def _has(*keys: str, listed: bool | None = None) -> Callable[[Probe], bool]:
     return lambda probe: probe.keys() >= {*keys} and listed in (None, isinstance(probe.json, list))
 
 
+def _table(name: str) -> Callable[[Probe], bool]:
+    return lambda probe: name in tables.forms(probe)
+
+
 def _is_records(probe: Probe) -> bool:
     return _has(listed=True)(probe) and bool(probe.keys() & {*tables.ALIASES["x1"].split()})
 
@@ -80,20 +84,19 @@ COCO, YOLO = "as COCO JSON", "as a folder of YOLO labels"
 
 DETECTIONS: Registry[Reader] = Registry("detections", "--detections-format", [
     Format("mot", "MOTChallenge, CVAT's MOT 1.1, trackers: rows of 6 to 10 numbers",
-           tables.is_mot, tables.read_mot, FROM_1, "px", "column 9; x, y, z in ten columns",
+           _table("mot"), tables.read_mot, FROM_1, "px", "column 9; x, y, z in ten columns",
            kind="text"),
-    Format("boxmot", "boxmot: nine columns that end in 1, class from 0, score", tables.is_boxmot,
+    Format("boxmot", "boxmot: nine columns that end in 1, class from 0, score", _table("boxmot"),
            tables.read_boxmot, FROM_1, "px", kind="text"),
     Format("visdrone", "VisDrone: ten columns that end in class, truncation, occlusion",
-           tables.is_visdrone, tables.read_visdrone, FROM_1, "px", "truncation, occlusion",
+           _table("visdrone"), tables.read_visdrone, FROM_1, "px", "truncation, occlusion",
            kind="text"),
-    Format("kitti", "KITTI tracking: 17 or 18 columns", tables.is_kitti, tables.read_kitti,
+    Format("kitti", "KITTI tracking: 17 or 18 columns", _table("kitti"), tables.read_kitti,
            "from 0", "px", "everything in 3D", kind="text"),
     Format("csv", "tables with a header: supervision's CSVSink, pandas, Boxer's 2D boxes, "
-           "Roboflow's CSV", lambda probe: tables.has_header(probe)
-           and not boxes_3d.is_boxes_3d(probe), tables.read_csv,
+           "Roboflow's CSV", _table("csv"), tables.read_csv,
            "from 0 (bb_left: from 1), image names, or times", "px", "other columns", kind="text"),
-    Format("boxer-3d", "Boxer, WildDet3D: boxes in the world of --poses", boxes_3d.is_boxes_3d,
+    Format("boxer-3d", "Boxer, WildDet3D: boxes in the world of --poses", _table("boxer-3d"),
            boxes_3d.read_source_3d, "by time", "world", "instance, sem_id", kind="text"),
     Format("records", "supervision's JSONSink: a JSON list of flat objects", _is_records,
            tables.read_records, "from 0", "px", "other keys", kind="JSON"),
