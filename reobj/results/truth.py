@@ -14,7 +14,6 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -25,7 +24,7 @@ from reobj.formats import AUTO, Format, Registry
 from reobj.results.result import Result
 from reobj.sources.detection_files import check_rows, read_source
 from reobj.sources.detection_formats import DETECTIONS, FROM_1, Reader
-from reobj.sources.recorded import SIZES, Source, corners, other_form
+from reobj.sources.recorded import SIZES, NoVideo, Source, corners, other_form
 from reobj.sources.tables import forms, read_mot_rows
 from reobj.types import CLASS_MAX, Array, BoolArray, IntArray, ReobjError, counted
 from reobj.words import among, canonical
@@ -111,8 +110,7 @@ def _with_roles(entry: Format[Reader]) -> Format[TruthReader]:
     def read(
         path: Path, _: Sequence[str], __: float, notes: list[str], size: tuple[int, int], first: str
     ) -> LabelledBoxes:
-        video = SimpleNamespace(size=size, working_size=size, names=[], files=[], frame_count=0,
-                                times_s=None, source=path.stem)  # fmt: skip
+        video = NoVideo(path.stem, size, size)
         source = Source(path, video, first=first, messages=notes)
         assert entry.read is not None
         recorded = read_source(source, entry.read)

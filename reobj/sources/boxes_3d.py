@@ -94,6 +94,9 @@ def read_source_3d(source: Source) -> RecordedDetections:
     path = source.path
     video = source.video
     poses = source.poses
+    if source.describes:
+        source.times_s = seconds(read_cells(path))
+        return source.recorded(np.empty(0, np.int64), np.empty((0, 4)), (np.empty(0, np.int64), ()))
     if poses is None:
         fault = "these are 3D boxes in the world, which need its cameras"
         raise ReobjError(f"{path}, line 1: {fault}: `run` with --detections and --poses FILE")

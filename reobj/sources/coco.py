@@ -283,7 +283,9 @@ def _dataset_frames(dataset: Dataset, source: Source) -> dict[Id, int]:
     rule = named and frames_by_name(list(dict.fromkeys(names)), video.files or video.names)[1]
     if source.first == "order":
         frame = np.arange(len(images))
-    elif not rule and all(number is not None for number in numbers):
+    elif not (rule or (named and source.describes)) and all(
+        number is not None for number in numbers
+    ):
         frame = frames_of_numbers(np.array(numbers, np.int64), source, 0)
     elif named or not images:
         frame = frames_of_names(names, source)
@@ -345,25 +347,3 @@ def read_oa_slam(source: Source) -> RecordedDetections:
         (np.array([row.category_id for row in rows], np.int64), source.names or COCO_NAMES),
         np.array([row.detection_score for row in rows], np.float64), unit="detection",
     )  # fmt: skip
-
-
-def described_images(path: Path, name: str) -> tuple[tuple[int, int] | None, list[str]]:
-    """Return the common (w, h) and the names of the images of a format; as in the dataset beside.
-
-    The size is None where images differ or lack it.
-    """
-    data = load_json(path)
-    if name == "oa-slam":
-        return None, [image.file_name for image in converted(data, list[_OaImage], path)]
-    if name == "coco":
-        dataset: Dataset | None = read_dataset(path, data, Dataset)
-    else:
-        entries = converted(data, list[Annotation], path)
-        dataset = _beside(path, entries)[1] if entries else None
-        if dataset is None:
-            return None, [entry.file_name for entry in entries if entry.file_name]
-    images = dataset.images if dataset else []
-    sizes = {(image.width, image.height) for image in images}
-    width, height = sizes.pop() if len(sizes) == 1 else (None, None)
-    size = (int(width), int(height)) if width and height else None
-    return size, [image.file_name for image in images if image.file_name]

@@ -20,19 +20,16 @@ import numpy as np
 from reobj.cameras import Poses
 from reobj.files import did_you_mean, last_name, shortened
 from reobj.formats import AUTO
-from reobj.sources import boxes_3d, coco
 from reobj.sources.class_names import check_length, load_class_names
 from reobj.sources.detection_formats import DETECTIONS, Reader
-from reobj.sources.label_folders import label_files
 from reobj.sources.looked import frames_looked_at, looked_message
 from reobj.sources.recorded import (
     NORMALISED_MAX,
+    NoVideo,
     RecordedDetections,
     Source,
-    npz_image_size,
     other_form,
 )
-from reobj.sources.tables import are_numbers, read_cells, seconds
 from reobj.sources.video import Video
 from reobj.types import (
     CLASS_NAME_MAX,
@@ -169,9 +166,13 @@ def _read(
     """Read a file of any format without validation."""
     if config.first_frame not in ("", "0", "1", "order"):
         raise ReobjError(f"detect.first_frame {config.first_frame}: expected 0, 1 or order")
-    names = load_class_names(config.class_names) if config.class_names else ()
-    source = Source(path, video, names, config.first_frame, poses)
+    source = Source(path, video, class_names(config), config.first_frame, poses)
     return read_source(source, DETECTIONS.reader(path, config.format))
+
+
+def class_names(config: DetectConfig) -> Sequence[str]:
+    """Read the class names that the user gives; (): none."""
+    return load_class_names(config.class_names) if config.class_names else ()
 
 
 def read_source(source: Source, read: Reader) -> RecordedDetections:
@@ -193,21 +194,13 @@ def described_images(
         their common (w, h), None: not stated or they differ; their names; their times in s,
         ascending, None: frames are not found by times.
     """
-    match DETECTIONS.find(path, config.format).name:
-        case "npz":
-            return npz_image_size(path), [], None
-        case "coco" | "coco-results" | "oa-slam" as name:
-            return *coco.described_images(path, name), None
-        case "yolo":
-            return None, [str(file.relative_to(path)) for file in label_files(path)], None
-        case "boxer-3d":
-            return None, [], np.unique(seconds(boxes_3d.read_cells(path)))
-        case "csv" if "frame" not in (table := read_cells(path)).cells:
-            if "image" not in table.cells:
-                return None, [], np.unique(seconds(table))
-            names = list(dict.fromkeys(table.cells["image"]))
-            return None, [] if are_numbers(names) else names, None
-    return None, [], None
+    source = Source(path, NoVideo(path.stem), class_names(config), config.first_frame)
+    source.describes = True
+    size = read_source(source, DETECTIONS.reader(path, config.format)).size
+    sizes = source.image_sizes if size == (0, 0) else {size}
+    stated = sizes.pop() if len(sizes) == 1 else (0, 0)
+    times_s = None if source.times_s is None else np.unique(source.times_s)
+    return None if 0 in stated else stated, list(dict.fromkeys(source.image_names)), times_s
 
 
 def _check(

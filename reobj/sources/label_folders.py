@@ -92,7 +92,7 @@ def read_label_folder(source: Source, pose: int = 0) -> RecordedDetections:
     stems = [str(file.relative_to(path)) for file in files]
     frame = frames_of_names(stems, source, 1 if video_files else None)
     runs = [NO_RUNS] * len(rows)
-    for row, corners in polygons.items():
+    for row, corners in polygons.items() if not source.describes else ():
         runs[row] = polygon_runs([(corners * video.size).ravel().tolist()], video.size)
     class_id = np.array([row[0] for row in rows], np.float64).astype(np.int64)
     return source.recorded(

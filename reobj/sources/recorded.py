@@ -154,6 +154,19 @@ class RecordedDetections:
 
 
 @dataclass(slots=True)
+class NoVideo:
+    """The video of a file that is read alone: frames of unknown number, size and names."""
+
+    source: str
+    size: tuple[int, int] = (0, 0)
+    working_size: tuple[int, int] = (0, 0)
+    names: Sequence[str] = ()
+    files: Sequence[Path] = ()
+    frame_count: int = 0
+    times_s: Array | None = None
+
+
+@dataclass(slots=True)
 class Source:
     """A file or folder of detections, and what its reader needs besides.
 
@@ -163,6 +176,8 @@ class Source:
             format says, or "order": listed images are the frames in this order.
         poses: cameras that project boxes in 3D; None: unknown.
         messages: about assumptions, for the user.
+        describes: only what the file says about its images is needed: names, sizes and times_s of
+            the frames, which the reader adds.
     """
 
     path: Path
@@ -171,6 +186,10 @@ class Source:
     first: str = ""
     poses: Poses | None = None
     messages: list[str] = field(default_factory=list)
+    describes: bool = False
+    image_names: list[str] = field(default_factory=list)
+    image_sizes: set[tuple[int, int]] = field(default_factory=set)
+    times_s: Array | None = None
 
     def say(self, *texts: str) -> None:
         """Add messages, without empty ones."""
@@ -212,6 +231,7 @@ class Source:
             ReobjError: images of another aspect ratio.
         """
         size = self.video.size
+        self.image_sizes |= {(int(w), int(h)) for w, h in np.unique(made_for, axis=0)}
         scale = np.ones((len(made_for), 4))
         known = (made_for > 0).all(1) & (True if used is None else used)
         for w, h in np.unique(made_for[known], axis=0).tolist() if size != (0, 0) else ():
@@ -288,18 +308,10 @@ def write_detections_npz(
 NORMALISED_MAX = 1.5
 
 
-def npz_image_size(path: Path) -> tuple[int, int]:
-    """Return the (w, h) of the images of an npz file of detections."""
-    data, _ = load_npz(path)
-    _check_arrays(data, path)
-    width, height = data["image_size"].tolist()
-    return width, height
-
-
 def read_npz(
     path: Path, size: tuple[int, int], working_size: tuple[int, int], sealed: bool = False
 ) -> tuple[RecordedDetections, IntArray]:
-    """Read the format of `pack_detections` for a video of (w, h) `size`.
+    """Read the format of `pack_detections` for a video of (w, h) `size`, (0, 0): any.
 
     Args:
         sealed: as in `load_npz`.
@@ -309,7 +321,7 @@ def read_npz(
     """
     data, _ = load_npz(path, sealed)
     _check_arrays(data, path)
-    if (made_for := tuple(data["image_size"].tolist())) != size:
+    if (made_for := tuple(data["image_size"].tolist())) != size and size != (0, 0):
         turned = ": made on frames that were not turned upright?" if made_for == size[::-1] else ""
         text = f"made for images of {made_for} px, but the video is {size} px"
         raise ReobjError(f"{path}: {text}{turned}")
@@ -318,7 +330,7 @@ def read_npz(
         data["frame"].astype(np.int64), data["xyxy"].astype(np.float64),
         data["score"].astype(np.float64), data["class_id"].astype(np.int64),
         np.split(data["mask_counts"].astype(np.uint32), data["mask_offsets"][1:])[:count],
-        tuple(data["class_names"].tolist()), size, working_size, np.arange(count), "row",
+        tuple(data["class_names"].tolist()), made_for, working_size, np.arange(count), "row",
     )  # fmt: skip
     if "done" not in data:
         return recorded, recorded.frame

@@ -457,10 +457,13 @@ def _frames(table: Table, source: Source, usual: int) -> IntArray:
         return frames_of_numbers(table.whole("frame"), source, usual)
     if names is not None:
         return frames_of_names(names, source, 0)
+    source.times_s = seconds(table)
+    if source.describes:
+        return np.zeros(len(source.times_s), np.int64)
     if source.video.times_s is None:
         raise ReobjError(f"{source.path}, line 1: no column frame; time stamps can be used only if "
                          "the names of the images are time stamps too")  # fmt: skip
-    return nearest_times(source.video.times_s, seconds(table), 0.0)
+    return nearest_times(source.video.times_s, source.times_s, 0.0)
 
 
 def seconds(table: Table) -> Array:
