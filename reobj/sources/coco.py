@@ -9,23 +9,22 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
 
 from reobj.files import load_json, shortened
 from reobj.frame_lookup import frames_by_name
-from reobj.sources.class_names import check_length
 from reobj.sources.image_frames import frames_of_names, frames_of_numbers, original_name
 from reobj.sources.masks import NO_RUNS, Counts, coco_runs, polygon_runs
 from reobj.sources.recorded import CORNERS, SIZES, RecordedDetections, Source
 from reobj.types import COCO_NAMES, Array, IntArray, ReobjError
 
 T = TypeVar("T")
-D = TypeVar("D", bound="Dataset")
 Id = int | str
 Box = tuple[float, float, float, float]
+Identity = Annotated[int, msgspec.Meta(gt=-(1 << 53), lt=1 << 53)] | None
 
 
 class Image(msgspec.Struct):
@@ -59,7 +58,21 @@ class Named(msgspec.Struct):
     name: str
 
 
-class Annotation(msgspec.Struct):
+class Identities(msgspec.Struct, kw_only=True):
+    """Attributes that hold the identity of a box, as CVAT writes them, or the box itself."""
+
+    track_id: Identity = None
+    instance_id: Identity = None
+
+
+class Rle(msgspec.Struct):
+    """A mask as run lengths, compressed or not; size: (h, w)."""
+
+    size: tuple[int, int]
+    counts: str | list[int]
+
+
+class Annotation(Identities, kw_only=True):
     """A box of an image."""
 
     image_id: Id
@@ -68,35 +81,26 @@ class Annotation(msgspec.Struct):
     bbox_mode: Literal[0, 1] = 1  # detectron2: 0 corners, 1 x, y, w, h; in px
     score: float = 1.0
     file_name: str | None = None
-    track_id: float | None = None
-    instance_id: float | None = None
-    attributes: Any = None  # CVAT's hold the identity
-    segmentation: Any = None
+    attributes: Identities | list[Any] | None = None
+    segmentation: Rle | list[list[float]] | None = None
     iscrowd: Any = False
     ignore: Any = False
 
     @property
     def identity(self) -> int:
         """Identity, -1: none."""
-        inner = self.attributes if isinstance(self.attributes, dict) else {}
-        holders = (self.track_id, self.instance_id, inner.get("track_id"), inner.get("instance_id"))
-        value = next((value for value in holders if value is not None), -1)
-        if type(value) not in (int, float) or value % 1 or abs(value) >= 1 << 53:
-            raise ReobjError(f"track_id {value!r:.40}, expected a whole number")
-        return int(value)
+        values = [self.track_id, self.instance_id]
+        if isinstance(self.attributes, Identities):
+            values += [self.attributes.track_id, self.attributes.instance_id]
+        return next((value for value in values if value is not None), -1)
 
 
 class Dataset(msgspec.Struct):
-    """Images and classes of a COCO dataset."""
+    """Images and classes of a COCO dataset, perhaps with boxes."""
 
     images: list[Image]
     categories: list[Named] = []
     videos: list[Named] | None = None
-
-
-class Annotated(Dataset):
-    """A dataset with boxes."""
-
     annotations: list[Annotation] | None = None
 
 
@@ -119,54 +123,46 @@ def converted(data: Any, kind: type[T], where: object) -> T:
         raise ReobjError(f"{where}: {error}") from error
 
 
-def read_dataset(path: Path, data: Any, kind: type[D]) -> D:
-    """Validate a COCO dataset."""
-    dataset = converted(data, kind, path)
-    for category in dataset.categories:
-        check_length(category.name, f"{path}, categories")
-    return dataset
-
-
-def _beside(path: Path, entries: Sequence[Annotation]) -> tuple[str, Dataset | None]:
-    """Find the dataset beside a file of results that has all ids of the results, and its name.
+def _beside(source: Source, entries: Sequence[Annotation]) -> Dataset | None:
+    """Read the dataset beside a file of results that has all ids of the results.
 
     Raises:
-        ReobjError: several datasets match and disagree; or none does, and the results do not name
-            their images.
+        ReobjError: several datasets have them; or none does, and the results do not name their
+            images.
     """
+    path = source.path
     ids = {entry.image_id for entry in entries}
     kinds = {entry.category_id for entry in entries}
     fault = ""
-    matches: list[tuple[str, Dataset]] = []
-    used: list[list[Any]] = []
+    matches: dict[str, Dataset] = {}
     for other in sorted(path.parent.glob("*.json")):
         data = None
-        with contextlib.suppress(ValueError, OSError):  # an invalid JSON file is no dataset
+        with contextlib.suppress(ReobjError, OSError):  # an invalid JSON file is no dataset
             data = load_json(other) if other != path else None
         if not isinstance(data, dict) or not data.get("images"):
             continue
-        dataset = read_dataset(other, data, Dataset)
-        images = {image.id: image.name for image in dataset.images}
-        names = {category.id: category.name for category in dataset.categories}
-        missing = [*ids.difference(images), *(kinds.difference(names) if names else ())]
+        dataset = converted(data | {"annotations": None}, Dataset, other)
+        missing = [*ids.difference(image.id for image in dataset.images)]
+        missing += kinds.difference(named.id for named in dataset.categories or ())
         if missing:
             fault = f"id {missing[0]!r} is not in the dataset JSON {other.name} beside this file"
-            continue
-        matches.append((other.name, dataset))
-        used.append([{i: images[i] for i in ids}, {k: names.get(k) for k in kinds}])
-    if any(one != used[0] for one in used):
-        both = " and ".join(name for name, _ in matches[:2])
-        raise ReobjError(f"{path}: {both} beside it both have the ids of its images, for other "
-                         "images or classes; keep only the dataset of this file")  # fmt: skip
+        else:
+            matches[other.name] = dataset
+    if len(matches) > 1:
+        raise ReobjError(f"{path}: {' and '.join(matches)} beside it all have the ids of its "
+                         "images; keep only the dataset of this file")  # fmt: skip
     by_name = all(entry.file_name or isinstance(entry.image_id, str) for entry in entries)
     if fault and not matches and not by_name:
         raise ReobjError(f"{path}: {fault}; put its own dataset there, or remove the other")
-    return matches[0] if matches else ("", None)
+    for name, dataset in matches.items():
+        source.say(f"images and classes of {name} beside it")
+        return dataset
+    return None
 
 
 def read_coco(source: Source) -> RecordedDetections:
     """Read a COCO, COCO-VID or TAO dataset with its own annotations."""
-    dataset = read_dataset(source.path, load_json(source.path), Annotated)
+    dataset = converted(load_json(source.path), Dataset, source.path)
     if dataset.annotations is None:
         raise ReobjError(f"{source.path}: a dataset without annotations; give the file of COCO "
                          "results [{image_id, category_id, bbox, score}] beside it")  # fmt: skip
@@ -176,9 +172,7 @@ def read_coco(source: Source) -> RecordedDetections:
 def read_coco_results(source: Source) -> RecordedDetections:
     """Read COCO results with ids of a dataset beside them, or with names or numbers of images."""
     entries = converted(load_json(source.path), list[Annotation], source.path)
-    name, dataset = _beside(source.path, entries) if entries else ("", None)
-    source.say(f"images and classes of {name} beside it" * bool(name))
-    return _read(source, entries, dataset)
+    return _read(source, entries, _beside(source, entries) if entries else None)
 
 
 def _read(source: Source, entries: list[Annotation], dataset: Dataset | None) -> RecordedDetections:
@@ -187,20 +181,19 @@ def _read(source: Source, entries: list[Annotation], dataset: Dataset | None) ->
     frame, size, looked = _images(source, entries, dataset)
     scale = source.scale(size, frame >= 0)
     masks = []
-    identity = np.full(len(entries), -1)
     for at, (entry, ratio) in enumerate(zip(entries, scale[:, :2], strict=True)):
         try:
             masks.append(_mask(entry.segmentation, source.video.size, ratio))
-            identity[at] = entry.identity
-        except ReobjError as error:
-            raise ReobjError(f"{source.path}, entry {at}: {error}") from error
+        except (OverflowError, ValueError) as error:
+            raise ReobjError(f"{source.path}, entry {at}: segmentation: {error}") from error
     modes = {entry.bbox_mode for entry in entries}
     if len(modes) > 1:
         raise ReobjError(f"{source.path}: entries of several bbox_mode; expected one")
     return source.recorded(
         frame, np.array([entry.bbox for entry in entries]), classes,
         np.array([entry.score for entry in entries], np.float64), masks,
-        form=CORNERS if 0 in modes else SIZES, scale=scale, identity=identity, looked=looked,
+        form=CORNERS if 0 in modes else SIZES, scale=scale, looked=looked,
+        identity=np.array([entry.identity for entry in entries], np.int64),
         ignored=np.array([bool(entry.iscrowd or entry.ignore) for entry in entries], bool),
     )  # fmt: skip
 
@@ -211,13 +204,14 @@ def _categories(
     """Return the class (N,) of every entry and the class names.
 
     Category ids are those of the dataset; else positions in the names that the user gives, from 0,
-    or from 1 if only that is possible; else COCO's.
+    or from 1 if none is 0 and one is their number; else COCO's.
     """
     used = list(dict.fromkeys(entry.category_id for entry in entries))
     gaps = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)  # unused among COCO's category ids 1 to 90
-    name_of: dict[Id, str] = dict(zip(sorted({*range(1, 91)} - {*gaps}), COCO_NAMES, strict=True))
+    numbers = [number for number in range(1, 91) if number not in gaps]
+    name_of: dict[Id, str] = dict(zip(numbers, COCO_NAMES, strict=True))
     if source.names:
-        from_1 = not {*used} <= {*range(len(source.names))} and 0 not in used
+        from_1 = 0 not in used and len(source.names) in used
         name_of = dict(enumerate(source.names, int(from_1)))
         text = f"category ids are taken as positions in the class names, from {int(from_1)}"
         source.say(text * bool(used and 0 not in used))
@@ -317,23 +311,17 @@ def _of_one_video(dataset: Dataset, source: Source) -> list[Image]:
                      f"{stem}; keep one, or rename it")  # fmt: skip
 
 
-def _mask(mask: Any, size: tuple[int, int], scale: Array) -> Counts:
-    """Read a COCO segmentation as run lengths: RLE (compressed or not), polygons or none."""
+def _mask(mask: Rle | list[list[float]] | None, size: tuple[int, int], scale: Array) -> Counts:
+    """Return a segmentation as run lengths."""
     if not mask or size == (0, 0):
         return NO_RUNS
-    try:
-        if not isinstance(mask, dict):
-            rings = [np.reshape(np.asarray(ring, np.float64), (-1, 2)) * scale for ring in mask]
-            return polygon_runs([ring.ravel().tolist() for ring in rings], size)
-        counts = mask["counts"]
-        if tuple(mask["size"]) != size[::-1]:
-            raise ReobjError(f"mask of (h, w) {mask['size']} in a video of {size[::-1]}")
-        return coco_runs(counts) if isinstance(counts, str) else np.array(counts, np.uint32).ravel()
-    except ReobjError:
-        raise
-    except (KeyError, OverflowError, TypeError, ValueError) as error:
-        text = f"segmentation cannot be read ({error!r:.80})"
-        raise ReobjError(f"{text}; expected polygons or RLE") from error
+    if not isinstance(mask, Rle):
+        rings = [np.reshape(ring, (-1, 2)) * scale for ring in mask]
+        return polygon_runs([ring.ravel().tolist() for ring in rings], size)
+    if mask.size != size[::-1]:
+        raise ValueError(f"mask of (h, w) {mask.size} in a video of {size[::-1]}")
+    counts = mask.counts
+    return coco_runs(counts) if isinstance(counts, str) else np.array(counts, np.uint32)
 
 
 def read_oa_slam(source: Source) -> RecordedDetections:

@@ -66,7 +66,7 @@ ALIASES: dict[str, str] = {  # names of columns; the first one with values is us
              "category_id label_id coco80_class",
 }  # fmt: skip
 NONE = np.empty(0, bool)
-BOX_FORMS = {
+BOX_FORMS: dict[tuple[str, ...], str] = {
     ("x1", "y1", "x2", "y2"): CORNERS,
     ("x1", "y1", "w", "h"): SIZES,
     ("cx", "cy", "w", "h"): CENTRES,
