@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import zipfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -13,7 +12,6 @@ import cv2
 import numpy as np
 
 from reobj.files import MEMORY_MAX, check_unpacked
-from reobj.sources.class_names import check_length
 from reobj.sources.image_frames import frames_of_names
 from reobj.sources.masks import NO_RUNS, Counts, crop_runs, polygon_runs
 from reobj.sources.recorded import RecordedDetections, Source
@@ -30,7 +28,8 @@ def read_cvat(source: Source) -> RecordedDetections:
     try:
         root = _root(path)
         bounded = Counter[str]()  # number of shapes of each kind that became bounding boxes
-        shapes = list(_of_tracks(root)) or list(_of_images(root))
+        left = Counter(child.tag for parent in _parents(root) for child in parent)
+        shapes = list(_shapes(root))
         boxes = np.array([_bounds(shape, bounded) for *_, shape in shapes], np.float64)
         size = [float(root.findtext(f".//meta//original_size/{side}", "0"))
                 for side in ("width", "height")]  # fmt: skip
@@ -43,8 +42,8 @@ def read_cvat(source: Source) -> RecordedDetections:
     frames, identity, labels, _ = zip(*shapes, strict=True)
     for kind, count in sorted(bounded.items()):
         source.say(f"{count} {kind} taken as their bounding boxes")
-    skeletons = sum(1 for _ in root.iter("skeleton"))
-    source.say(f"{skeletons} skeletons left out" * bool(skeletons))
+    for kind in sorted(left.keys() - {*KINDS, "tag"}):
+        source.say(f"{left[kind]} shapes {kind} left out")
     looked = None
     if isinstance(frames[0], str):
         frame = frames_of_names(frames, source)
@@ -53,8 +52,6 @@ def read_cvat(source: Source) -> RecordedDetections:
         frame = np.array(frames, np.int64) - begin
         looked = _listed_frames(root, frames, begin)
     names, class_id = np.unique(labels, return_inverse=True)
-    for name in names.tolist():
-        check_length(name, f"{path}, label")
     scale = source.scale(np.tile(size, (len(shapes), 1)))
     runs = [
         _runs(shape, ratio, source.video.size, f"{path}, box {at}")
@@ -99,26 +96,25 @@ def _listed_frames(root: ET.Element, frames: Sequence[int | str], begin: int) ->
 Shape = tuple[int | str, int, str, ET.Element]  # frame or image, identity, label, element
 
 
-def _of_tracks(root: ET.Element) -> Iterator[Shape]:
-    """Yield the shapes of tracks."""
-    for track in root.iter("track"):
-        for shape in _shapes(track):
-            if shape.attrib.get("outside") != "1":
-                identity = int(track.attrib["id"]) + 1
-                yield int(shape.attrib["frame"]), identity, track.attrib["label"], shape
+KINDS = ("box", "polygon", "polyline", "points", "ellipse", "mask")
 
 
-def _of_images(root: ET.Element) -> Iterator[Shape]:
-    """Yield the shapes of CVAT for images, which have no identities (0)."""
-    for image in root.iter("image"):
-        for shape in _shapes(image):
-            yield image.attrib["name"], 0, shape.attrib["label"], shape
+def _parents(root: ET.Element) -> list[ET.Element]:
+    """List the tracks, or the images of CVAT for images."""
+    return list(root.iter("track")) or list(root.iter("image"))
 
 
-def _shapes(parent: ET.Element) -> list[ET.Element]:
-    """List the shapes of a track or an image that have a bounding box."""
-    kinds = ("box", "polygon", "polyline", "points", "ellipse", "mask", "cuboid")
-    return [child for child in parent if child.tag in kinds]
+def _shapes(root: ET.Element) -> Iterator[Shape]:
+    """Yield the shapes that are in view; those of images have no identities (0)."""
+    for parent in _parents(root):
+        for shape in parent:
+            if shape.tag not in KINDS or shape.get("outside") == "1":
+                continue
+            if parent.tag == "track":
+                identity = int(parent.attrib["id"]) + 1
+                yield int(shape.attrib["frame"]), identity, parent.attrib["label"], shape
+            else:
+                yield parent.attrib["name"], 0, shape.attrib["label"], shape
 
 
 def _floats(shape: ET.Element, names: str) -> Array:
@@ -143,12 +139,7 @@ def _bounds(shape: ET.Element, bounded: Counter[str]) -> Array:
     if shape.tag == "mask":
         low = _floats(shape, "left top")
         return np.hstack([low, low + _floats(shape, "width height")])
-    if shape.tag == "cuboid":
-        names = [" ".join(k for k in shape.attrib if re.fullmatch(axis + "[tb][lr][12]", k))
-                 for axis in "xy"]  # fmt: skip
-        corners = np.stack([_floats(shape, of_axis) for of_axis in names], 1)
-    else:
-        corners = _corners(shape)
+    corners = _corners(shape)
     return np.hstack([corners.min(0), corners.max(0)])
 
 

@@ -145,16 +145,6 @@ def _points_in_boxes(rows: Array) -> bool:
     return bool((inside | (points == 0)).all())
 
 
-def read_pose_folder(source: Source) -> RecordedDetections:
-    """Read a folder of YOLO labels with keypoints x y visibility, which are not read."""
-    return read_label_folder(source, 3)
-
-
-def read_pose_2d_folder(source: Source) -> RecordedDetections:
-    """Read a folder of YOLO labels with keypoints x y, which are not read."""
-    return read_label_folder(source, 2)
-
-
 def _columns(
     rows: Sequence[Sequence[float]], where: Sequence[str]
 ) -> tuple[Array, Array, IntArray, dict[int, Array]]:

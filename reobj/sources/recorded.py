@@ -340,27 +340,26 @@ def read_npz(
 
 def _check_arrays(data: dict[str, Any], path: Path) -> None:
     """Validate number, shape and kind of the arrays; add empty masks where there are none."""
-    limits = {"frame": LINES_MAX, "done": LINES_MAX, "class_names": CLASS_MAX,
-              "mask_counts": MEMORY_MAX // 8}  # fmt: skip  # uint32, held twice
-    for key, most in limits.items():
-        if key in data and data[key].size > most:
-            raise ReobjError(f"{path}: {data[key].size} {key}, at most {most} are allowed")
     count = len(np.atleast_1d(data.get("frame", ())))
     data.setdefault("mask_counts", NO_RUNS)
     data.setdefault("mask_offsets", np.zeros(count + 1, np.int64))
-    expected: dict[str, tuple[tuple[int, ...], str]] = {
+    limits = {"frame": LINES_MAX, "done": LINES_MAX, "class_names": CLASS_MAX,
+              "mask_counts": MEMORY_MAX // 8}  # fmt: skip  # uint32, held twice
+    expected: dict[str, tuple[int | tuple[int, ...], str]] = {  # shape, or number of dimensions
         "frame": ((count,), "iu"), "xyxy": ((count, 4), "fiu"), "score": ((count,), "fiu"),
-        "class_id": ((count,), "iu"), "class_names": ((-1,), "U"), "image_size": ((2,), "iu"),
-        "mask_counts": ((-1,), "iu"), "mask_offsets": ((count + 1,), "iu"), "done": ((-1,), "iu"),
+        "class_id": ((count,), "iu"), "class_names": (1, "U"), "image_size": ((2,), "iu"),
+        "mask_counts": (1, "iu"), "mask_offsets": ((count + 1,), "iu"), "done": (1, "iu"),
     }  # fmt: skip
     for key, (shape, kinds) in expected.items():
-        if key not in data and key == "done":
-            continue
-        found = data[key].shape if key in data else "missing"
-        if found != shape and (shape != (-1,) or len(found) != 1):
-            raise ReobjError(f"{path}: array {key} is {found}, expected shape {shape}")
-        if data[key].dtype.kind not in kinds and data[key].size:
-            raise ReobjError(f"{path}: array {key} is of {data[key].dtype}, expected {kinds}")
+        if key not in data and key != "done":
+            raise ReobjError(f"{path}: array {key} is missing")
+        array = data.get(key, NO_RUNS)
+        if array.size > limits.get(key, array.size):
+            raise ReobjError(f"{path}: {array.size} {key}, at most {limits[key]} are allowed")
+        if shape not in (array.ndim, array.shape):
+            raise ReobjError(f"{path}: array {key} is {array.shape}, expected shape {shape}")
+        if array.dtype.kind not in kinds and array.size:
+            raise ReobjError(f"{path}: array {key} is of {array.dtype}, expected {kinds}")
     data["mask_offsets"] = data["mask_offsets"].astype(np.int64)
     ordered = (np.diff(data["mask_offsets"], prepend=0) >= 0).all()
     runs = data["mask_counts"]
