@@ -370,7 +370,7 @@ def test_yolo_labels_of_a_video(
     [
         ("56 100 80 40 40\n", "is no fraction of the image size"),
         ("56 .5 .5 .2\n", "expected class cx cy w h"),
-        ("chair .5 .5 .2 .2\n", "expected numbers"),
+        ("chair .5 .5 .2 .2\n", "all numbers"),
         ("56 .5 .5 .2 nan\n", "expected class cx cy w h"),
         ("99 .5 .5 .2 .2\n", "class 99, but there are only 80 class names"),
     ],
