@@ -115,7 +115,9 @@ def _with_roles(entry: Format[Reader]) -> Format[TruthReader]:
         assert entry.read is not None
         recorded = read_source(source, entry.read)
         check_rows(recorded, path)
-        if 0 not in size and (fault := other_form(recorded.xyxy, recorded.form, size)):
+        sizes = {size, *source.image_sizes} - {(0, 0)}
+        image = min(sizes) if len(sizes) == 1 else (0, 0)
+        if 0 not in image and (fault := other_form(recorded.xyxy, recorded.form, image)):
             raise ReobjError(f"{path}: {fault}")
         if not len(recorded.identity):
             raise ReobjError(f"{path}: boxes without identities; expected tracks")
@@ -185,6 +187,9 @@ def _read_mot(
     and column 9 the visibility; MOT15 has ten columns, with world coordinates instead.
     """
     sequence = _sequence(path)
+    sides = [sequence.get(key, "") for key in ("imwidth", "imheight")]
+    if 0 in size and all(map(str.isdecimal, sides)):
+        size = (int(sides[0]), int(sides[1]))
     rows = _checked(read_mot_rows(path), path, notes, first, size)
     flagged = rows[:, 6] == 0 if rows.shape[1] > 6 else np.zeros(len(rows), bool)
     _check_length(rows, path, sequence)

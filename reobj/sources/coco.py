@@ -22,9 +22,9 @@ from reobj.sources.recorded import CORNERS, SIZES, RecordedDetections, Source
 from reobj.types import COCO_NAMES, Array, IntArray, ReobjError
 
 T = TypeVar("T")
-Id = int | str
 Box = tuple[float, float, float, float]
-Identity = Annotated[int, msgspec.Meta(gt=-(1 << 53), lt=1 << 53)] | None
+Whole = Annotated[int, msgspec.Meta(gt=-(1 << 53), lt=1 << 53)]
+Id = Whole | str
 
 
 class Image(msgspec.Struct):
@@ -34,8 +34,8 @@ class Image(msgspec.Struct):
     file_name: str | None = None
     width: float | None = None
     height: float | None = None
-    frame_id: int | None = None  # COCO-VID
-    frame_index: int | None = None  # TAO
+    frame_id: Whole | None = None  # COCO-VID
+    frame_index: Whole | None = None  # TAO
     video_id: Id | None = None
     extra: Any = None
 
@@ -61,8 +61,8 @@ class Named(msgspec.Struct):
 class Identities(msgspec.Struct, kw_only=True):
     """Attributes that hold the identity of a box, as CVAT writes them, or the box itself."""
 
-    track_id: Identity = None
-    instance_id: Identity = None
+    track_id: Whole | float | None = None
+    instance_id: Whole | float | None = None
 
 
 class Rle(msgspec.Struct):
@@ -92,7 +92,10 @@ class Annotation(Identities, kw_only=True):
         values = [self.track_id, self.instance_id]
         if isinstance(self.attributes, Identities):
             values += [self.attributes.track_id, self.attributes.instance_id]
-        return next((value for value in values if value is not None), -1)
+        value = next((value for value in values if value is not None), -1)
+        if value % 1:
+            raise ValueError(f"track_id {value}, expected a whole number")
+        return int(value)
 
 
 class Dataset(msgspec.Struct):
@@ -181,11 +184,13 @@ def _read(source: Source, entries: list[Annotation], dataset: Dataset | None) ->
     frame, size, looked = _images(source, entries, dataset)
     scale = source.scale(size, frame >= 0)
     masks = []
+    identity = []
     for at, (entry, ratio) in enumerate(zip(entries, scale[:, :2], strict=True)):
         try:
             masks.append(_mask(entry.segmentation, source.video.size, ratio))
+            identity.append(entry.identity)
         except (OverflowError, ValueError) as error:
-            raise ReobjError(f"{source.path}, entry {at}: segmentation: {error}") from error
+            raise ReobjError(f"{source.path}, entry {at}: {error}") from error
     modes = {entry.bbox_mode for entry in entries}
     if len(modes) > 1:
         raise ReobjError(f"{source.path}: entries of several bbox_mode; expected one")
@@ -193,7 +198,7 @@ def _read(source: Source, entries: list[Annotation], dataset: Dataset | None) ->
         frame, np.array([entry.bbox for entry in entries]), classes,
         np.array([entry.score for entry in entries], np.float64), masks,
         form=CORNERS if 0 in modes else SIZES, scale=scale, looked=looked,
-        identity=np.array([entry.identity for entry in entries], np.int64),
+        identity=np.array(identity, np.int64),
         ignored=np.array([bool(entry.iscrowd or entry.ignore) for entry in entries], bool),
     )  # fmt: skip
 
@@ -239,28 +244,24 @@ def _images(
         frame (N,) of every entry, -1: none; size (N, 2) of its image, 0: unknown; and the frames
         listed in the dataset, ascending, None without a dataset.
     """
-    size = np.zeros((len(entries), 2))
     ids = [entry.image_id for entry in entries]
     if dataset is not None:
         frame_of = _dataset_frames(dataset, source)
-        image_of = {image.id: image for image in dataset.images}
-        for at, i in enumerate(ids):
-            if i not in image_of:
-                raise ReobjError(
-                    f"{source.path}, entry {at}: image_id {i!r} is not in the "
-                    f"dataset, which has {shortened([*map(repr, image_of)])}"
-                )
-            size[at] = image_of[i].width or 0, image_of[i].height or 0
+        size_of = {image.id: (image.width or 0, image.height or 0) for image in dataset.images}
+        for at in [at for at, i in enumerate(ids) if i not in size_of][:1]:
+            known = shortened([*map(repr, size_of)])
+            raise ReobjError(f"{source.path}, entry {at}: image_id {ids[at]!r} is not in the "
+                             f"dataset, which has {known}")  # fmt: skip
         listed = np.unique(np.array(list(frame_of.values()), np.int64))
+        size = np.array([size_of[i] for i in ids], np.float64).reshape(-1, 2)
         return np.array([frame_of[i] for i in ids], np.int64), size, listed[listed >= 0]
-    if source.video.names or not all(isinstance(i, int) for i in ids):
+    size = np.zeros((len(entries), 2))
+    numbers = [i for i in ids if isinstance(i, int)]
+    if source.video.names or len(numbers) < len(ids):
         names = [entry.file_name or str(entry.image_id) for entry in entries]
         return frames_of_names(names, source, 0), size, None
-    numbers = np.array(ids, np.float64)
-    if (np.abs(numbers) >= 1 << 53).any():
-        raise ReobjError(f"{source.path}: image_id {numbers.max():.0f}, expected a frame number")
     source.say("no dataset JSON beside it: image_id is taken as the frame number" * bool(ids))
-    return frames_of_numbers(numbers.astype(np.int64), source, 0), size, None
+    return frames_of_numbers(np.array(numbers, np.int64), source, 0), size, None
 
 
 def _dataset_frames(dataset: Dataset, source: Source) -> dict[Id, int]:
@@ -294,21 +295,18 @@ def _dataset_frames(dataset: Dataset, source: Source) -> dict[Id, int]:
 def _of_one_video(dataset: Dataset, source: Source) -> list[Image]:
     """Return the images of the video, of a dataset of several; all if images are found by name."""
     images = dataset.images
-    ids = {image.video_id for image in images}
-    if len(ids) < 2:
-        return images
-    name_of = {video.id: video.name for video in dataset.videos or ()}
     stem = Path(source.video.source).stem
-    same = [i for i in ids if i is not None and Path(name_of.get(i, str(i))).stem == stem]
-    if len(same) == 1:
-        kept = [image for image in images if image.video_id == same[0]]
-        source.say(f"{len(images) - len(kept)} images of other videos left out")
-        return kept
-    if source.video.names and any(image.file_name for image in images):
+    of_video = {video.id for video in dataset.videos or () if Path(video.name).stem == stem}
+    kept = [image for image in images if image.video_id in of_video and len(of_video) == 1]
+    ids = {image.video_id for image in images}
+    if len(ids) < 2 or (not kept and source.video.names and any(i.file_name for i in images)):
         return images
-    some = shortened(sorted(map(str, name_of.values())))
-    raise ReobjError(f"{source.path}: images of {len(ids)} videos ({some}), none of them called "
-                     f"{stem}; keep one, or rename it")  # fmt: skip
+    if not kept:
+        some = shortened([video.name for video in dataset.videos or ()])
+        raise ReobjError(f"{source.path}: images of {len(ids)} videos ({some}), none of them "
+                         f"called {stem}; keep one, or rename it")  # fmt: skip
+    source.say(f"{len(images) - len(kept)} images of other videos left out")
+    return kept
 
 
 def _mask(mask: Rle | list[list[float]] | None, size: tuple[int, int], scale: Array) -> Counts:

@@ -156,12 +156,12 @@ def _runs(shape: ET.Element, scale: Array, size: tuple[int, int], where: str) ->
         scale: (2,) pixels of the video for each of the annotation. size: (w, h) of the video,
             (0, 0): unknown, no mask.
     """
-    if size == (0, 0):
+    if size == (0, 0) or shape.tag not in ("polygon", "mask"):
         return NO_RUNS
     try:
         if shape.tag == "polygon":
             return polygon_runs([(_corners(shape) * scale).ravel().tolist()], size)
-        return _mask_runs(shape, scale, size) if shape.tag == "mask" else NO_RUNS
+        return _mask_runs(shape, scale, size)
     except (KeyError, OverflowError, ValueError) as error:
         raise ReobjError(f"{where}: {shape.tag} cannot be read ({error!r:.120})") from error
 
@@ -169,20 +169,17 @@ def _runs(shape: ET.Element, scale: Array, size: tuple[int, int], where: str) ->
 def _mask_runs(shape: ET.Element, scale: Array, size: tuple[int, int]) -> Counts:
     """Return a mask as run lengths down the columns of the image; the file's follow its rows."""
     left, top, width, height = _floats(shape, "left top width height").astype(int).tolist()
-    low = np.array([left, top], np.float64) * scale
-    high = np.array([left + width, top + height], np.float64) * scale
-    if width < 1 or height < 1 or (low < -scale).any() or (high > size + scale).any():
+    box = np.array([[left, top], [left + width, top + height]]) * scale  # (2, 2) corners
+    if width < 1 or height < 1 or (box[0] < -scale).any() or (box[1] > size + scale).any():
         raise ValueError(f"{width}x{height} pixels from {left}, {top} on, beyond the image")
     counts = np.array(shape.attrib["rle"].split(","), np.int64)
     if counts.min() < 0 or counts.max() > width * height or counts.sum() != width * height:
         raise ValueError(f"run lengths of {counts.sum()} pixels for {width}x{height}")
-    crop = np.repeat(np.arange(len(counts)) % 2 > 0, counts).reshape(height, width)
-    corner = low.round().astype(int)
-    if (scale != 1).any():
-        scaled = np.maximum(high.round().astype(int) - corner, 1).tolist()
-        small = crop.astype(np.uint8)
-        crop = cv2.resize(small, scaled, interpolation=cv2.INTER_NEAREST) > 0
-    return crop_runs(crop, (int(corner[0]), int(corner[1])), size)
+    mask = np.repeat(np.arange(len(counts)) % 2, counts).reshape(height, width)  # (H, W) 0, 1
+    (x1, y1), (x2, y2) = box.round().astype(int).tolist()
+    scaled = (max(x2 - x1, 1), max(y2 - y1, 1))
+    crop = cv2.resize(mask.astype(np.uint8), scaled, interpolation=cv2.INTER_NEAREST)
+    return crop_runs(crop > 0, (x1, y1), size)
 
 
 def _rotated_bounds(centre: Array, half: Array, angle_deg: float, box: bool) -> Array:

@@ -32,7 +32,6 @@ from reobj.sources.recorded import (
 )
 from reobj.sources.video import Video
 from reobj.types import (
-    CLASS_NAME_MAX,
     COORDINATE_MAX,
     DETECTIONS_MAX,
     Array,
@@ -248,25 +247,22 @@ def _stated_scale(text: str, size: tuple[int, int]) -> Array:
 def check_rows(recorded: RecordedDetections, path: Path) -> None:
     """Refuse invalid values and masks; the error names the first such row."""
     names = recorded.class_names
+    for name in names:
+        check_length(name, str(path))
     with np.errstate(invalid="ignore", over="ignore"):  # inf - inf
         finite = np.isfinite(recorded.xyxy.sum(1) + recorded.score)  # (N,)
     finite &= (np.abs(recorded.xyxy) <= COORDINATE_MAX).all(1)
     named = (recorded.class_id >= 0) & (recorded.class_id < len(names))
-    is_long = np.array([len(name) > CLASS_NAME_MAX for name in (*names, "")], bool)
-    long = is_long[np.where(named, recorded.class_id, -1)]
     whole = math.prod(recorded.size)
     unfit = np.array([len(runs) > 0 and runs.sum() != whole for runs in recorded.runs], bool)
-    for row in np.flatnonzero(~finite | ~named | long | unfit)[:1]:
-        where = f"{path}, {recorded.unit} {recorded.line[row]}"
+    for row in np.flatnonzero(~finite | ~named | unfit)[:1]:
         text = f"mask of {recorded.runs[row].sum()} pixels in a video of {recorded.size}"
         if not finite[row]:
             values = f"{recorded.xyxy[row]}, {recorded.score[row]}"
             text = f"{values}: NaN, infinite or beyond 1e7 pixels"
         elif not named[row]:
             text = unnamed_class(int(recorded.class_id[row]), len(names))
-        elif long[row]:
-            check_length(names[recorded.class_id[row]], where)
-        raise ReobjError(f"{where}: {text}")
+        raise ReobjError(f"{path}, {recorded.unit} {recorded.line[row]}: {text}")
 
 
 def _check_scores(recorded: RecordedDetections, most: float, path: Path) -> None:

@@ -505,7 +505,7 @@ def test_an_ambiguous_csv_counts_from_0(tmp_path: Path, tracked: Callable[..., T
         (csv("frame,x1,y1,x2,y2", "{f},200,100,40,40"), "all fit it as x, y, w, h"),
         (csv("frame,x,y,w,h", "{f},200,100,310,220"), "all fit it as x1, y1, x2, y2"),
         (csv("frame,x1,y1,x2,y2,class", "{f},1,2,30,40," + "b" * 131000),
-         "det.csv, line 2: a class name of 131000 characters, at most 200"),
+         "det.csv: a class name of 131000 characters, at most 200"),
         (csv("frame,x1,y1,x2,y2,score", "{f},{x1},{y1},nan,{y2},.9"), "'nan' is no finite"),
         (csv("filename,x1,y1,x2,y2", "a/img.jpg,1,2,30,40"), "match no frame of the video"),
     ],
@@ -1076,3 +1076,117 @@ def test_boxes_of_resized_frames_that_are_not_cut_off(tmp_path: Path) -> None:
     (tmp_path / "det.csv").write_text(crowd(1.5, clipped=False))
     with pytest.raises(rt.ReobjError, match="frames of another size"):
         rt.read_detections(tmp_path / "det.csv", video)
+
+
+# ---- Boxes in another form than declared, class names, unclear files -----------------------------
+
+
+def forms_of_boxes() -> dict[str, list[list[float]]]:
+    """The boxes of `crowd` as frame and four numbers, in each form."""
+    rows = np.loadtxt(crowd(1).splitlines()[1:], delimiter=",", usecols=range(5))  # (N, 5)
+    frame, low, high = rows[:, :1], rows[:, 1:3], rows[:, 3:5]
+    return {
+        "x1, y1, x2, y2": rows.tolist(),
+        "x, y, w, h": np.hstack([frame, low, high - low]).tolist(),
+        "cx, cy, w, h": np.hstack([frame, (low + high) / 2, high - low]).tolist(),
+    }
+
+
+def write_boxes(folder: Path, kind: str, form: str) -> Path:
+    """A file of a kind whose numbers have a form, right or wrong."""
+    rows = forms_of_boxes()[form]
+    path = folder / f"det.{kind}"
+    if kind == "yolo":
+        path.mkdir()
+        for f, a, b, c, d in rows:
+            with (path / f"v_{f + 1:.0f}.txt").open("a") as file:
+                file.write(f"0 {a / 320:.6f} {b / 240:.6f} {c / 320:.6f} {d / 240:.6f} .9\n")
+    elif kind == "json":
+        entries = [{"image_id": int(f), "category_id": 1, "bbox": box, "score": 0.9}
+                   for f, *box in rows]  # fmt: skip
+        path.write_text(json.dumps(entries))
+    elif kind == "txt":
+        path.write_text("".join(f"{f + 1:.0f},-1,{a},{b},{c},{d},.9\n" for f, a, b, c, d in rows))
+    else:
+        lines = [f"{f:.0f},{a},{b},{c},{d}\n" for f, a, b, c, d in rows]
+        path.write_text("frame,x,y,width,height\n" + "".join(lines))
+    return path
+
+
+DECLARED = {"txt": "x, y, w, h", "csv": "x, y, w, h", "json": "x, y, w, h", "yolo": "cx, cy, w, h"}
+
+
+@pytest.mark.parametrize("form", ["x1, y1, x2, y2", "x, y, w, h", "cx, cy, w, h"])
+@pytest.mark.parametrize("kind", DECLARED)
+def test_boxes_in_another_form(
+    tmp_path: Path, tracked: Callable[..., Tracked], kind: str, form: str
+) -> None:
+    """Boxes that leave the image and all fit in another form: one line that names it."""
+    path = write_boxes(tmp_path, kind, form)
+    made = tracked(write_clip(tmp_path / "v.avi"), "--detections", path)
+    if form == DECLARED[kind]:
+        assert made.code == 0, made.said
+        return
+    assert made.code == 2 and made.said.count("\n") == 1, made.said
+    if (kind, form) != ("yolo", "x, y, w, h"):  # these fit as centres or not at all
+        assert f"all fit it as {form}" in made.said, made.said
+
+
+def test_the_box_mode_of_detectron2(tmp_path: Path) -> None:
+    """0: corners; 1: x, y, w, h; others are refused."""
+    video = rt.Video(write_clip(tmp_path / "v.avi"))
+    for mode, values in ((0, [10, 20, 50, 60]), (1, [10, 20, 40, 40]), (4, [10, 20, 40, 40])):
+        entry = {"image_id": 0, "category_id": 1, "bbox": values, "score": 0.9, "bbox_mode": mode}
+        (tmp_path / "r.json").write_text(json.dumps([entry]))
+        if mode == 4:
+            with pytest.raises(rt.ReobjError, match="bbox_mode"):
+                rt.read_detections(tmp_path / "r.json", video)
+        else:
+            found = rt.read_detections(tmp_path / "r.json", video)
+            assert found.xyxy.tolist() == [[10, 20, 50, 60]]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "expected"),
+    [
+        ("notes.json", '{"categories": [{"id": 1, "name": "mug"}, {"id": 0, "name": "pot"}]}', ""),
+        ("classes.txt", "0 pot\n1 mug\n", ""),
+        ("classes.txt", "1: mug\n0: pot\n", ""),
+        ("obj.names", "0, pot\n1, mug\n", ""),
+        ("classes.txt", "0 pot\nmug\n", "'0 pot'); expected different numbers in all"),
+        ("data.yaml", "nc: 3\nnames: [pot, mug]\n", "nc is 3, but there are 2 names"),
+        ("data.yaml", "nc: 2\nnames: [pot, mug]\n", ""),
+    ],
+)
+def test_class_names_with_numbers(
+    tmp_path: Path, tracked: Callable[..., Tracked], name: str, text: str, expected: str
+) -> None:
+    """A number before a name is its number; the count of data.yaml must be right."""
+    labels = yolo_folder(tmp_path / "set/labels", lambda f: yolo(f, 1), "v_{}.txt", 1)
+    (tmp_path / "set" / name).write_text(text)
+    made = tracked(write_clip(tmp_path / "v.avi"), "--detections", labels)
+    if expected:
+        assert made.code == 2 and expected in made.said and name in made.said
+    else:
+        assert is_truth(made, "mug") and name in made.said, made
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "expected"),
+    [
+        ("d.jsonl", '{"frame": 0, "x1": 1}\n{"frame": 1, "x1": 2}\n', "JSON Lines"),
+        ("d.json", '{"frame": 0, "x1": 1}\n{"frame": 1, "x1": 2}\n', "JSON Lines"),
+        ("d.json", '[{"file_name": "a.png", "annotations": [], "image_id": 0}]', "detectron2"),
+        ("d.json", '{"a": 1}', "(JSON with a); expected one of records, coco-results, "),
+        ("d.xml", "<other/>", "XML <other>); expected one of cvat ("),
+        ("d.json", json.dumps(dataset(categories=[{"id": "1", "name": "chair"}])),
+         "category_id 1 is unknown, expected one of '1'"),
+    ],
+)  # fmt: skip
+def test_unclear_files_are_named(
+    tmp_path: Path, tracked: Callable[..., Tracked], name: str, text: str, expected: str
+) -> None:
+    (tmp_path / name).write_text(text)
+    source = images(tmp_path / "im", [f"{f}.png" for f in range(FRAMES)])
+    made = tracked(source, "--detections", tmp_path / name)
+    assert made.code == 2 and expected in made.said and made.said.count("\n") == 1, made.said
