@@ -120,7 +120,7 @@ DETECTIONS: Registry[Reader] = Registry("detections", "--detections-format", [
         ("yolo-pose-2d", "with keypoints without visibility", 2),
       )),
     Format("cvat", "CVAT for video 1.1 and for images 1.1, XML or zip", _is_cvat, cvat.read_cvat,
-           f"from 0; images {NAMED}", "px", "skeletons", kind="XML"),
+           f"from 0; images {NAMED}", "px", "skeletons, cuboids", kind="XML"),
     Format("npz", "`rt.write_detections_npz`", lambda probe: probe.suffix == ".npz", _read_npz,
            "from 0", "px", kind="binary"),
     *(Format(name, title, lambda probe, test=recognise: test(_sample(probe)), None,  # type: ignore[misc]
