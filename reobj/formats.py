@@ -61,9 +61,9 @@ class Probe:
 
     @functools.cached_property
     def kind(self) -> str:
-        """Kind of file: "folder", "XML", "JSON", "text" or "binary"."""
+        """Kind of file: "folder", "XML", "JSON" or "text"; "" of a binary one."""
         begin = self.lines[0][0] if self.lines else ""
-        text = {"<": "XML", "[": "JSON", "{": "JSON", "": "binary"}.get(begin, "text")
+        text = {"<": "XML", "[": "JSON", "{": "JSON", "": ""}.get(begin, "text")
         return "folder" if self.is_dir else text
 
     @functools.cached_property

@@ -117,7 +117,7 @@ def _with_roles(entry: Format[Reader]) -> Format[TruthReader]:
         check_rows(recorded, path)
         sizes = {size, *source.image_sizes} - {(0, 0)}
         image = min(sizes) if len(sizes) == 1 else (0, 0)
-        if 0 not in image and (fault := other_form(recorded.xyxy, recorded.form, image)):
+        if fault := recorded.other_form(image):
             raise ReobjError(f"{path}: {fault}")
         if not len(recorded.identity):
             raise ReobjError(f"{path}: boxes without identities; expected tracks")
@@ -246,12 +246,11 @@ def _checked(
     rows: Array, path: Path, notes: list[str], begin: str = "", size: tuple[int, int] = (0, 0)
 ) -> Array:
     """Refuse rows of another form; return them with frames that count from 1."""
-    fault = other_form(corners(rows[:, 2:6], SIZES), SIZES, size) if 0 not in size else ""
-    if not fault and _move_as_corners(rows):
-        fault = ("columns 3 to 6 are x1, y1, x2, y2: 5 is above 3 and 6 above 4 in all rows, and "
-                 "they change together")  # fmt: skip
+    whole = rows[:, :2].astype(np.int64)
+    xyxy = corners(rows[:, 2:6], SIZES)
+    fault = other_form(xyxy, SIZES, size, whole[:, 0], whole[:, 1])
     if fault:
-        raise ReobjError(f"{path}: {fault}; expected left, top, width, height")
+        raise ReobjError(f"{path}: {fault}")
     first = rows[:, 0].min(initial=1)
     if first < int(begin or 0):
         expected = f"from {begin}" if begin else "from 1, or from 0"
@@ -267,17 +266,6 @@ def _checked(
         notes.append(f"{why} frames are taken as 0-based")
         rows = rows + np.eye(1, rows.shape[1])
     return rows
-
-
-def _move_as_corners(rows: Array) -> bool:
-    """Test whether boxes of an unknown image are corners: columns 5 and 6 move with 3 and 4.
-
-    Sizes change little from one frame of an identity to its next, independently of the place.
-    """
-    rows = rows[np.lexsort((rows[:, 0], rows[:, 1]))]
-    step = np.diff(rows[:, 2:6], axis=0)[np.diff(rows[:, 1]) == 0]  # (M, 4)
-    apart = np.abs(step[:, 2:] - step[:, :2]).sum()
-    return bool((rows[:, 4:6] > rows[:, 2:4]).all() and 2 * apart < np.abs(step[:, 2:]).sum())
 
 
 def _sequence(path: Path) -> dict[str, str]:

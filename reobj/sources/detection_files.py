@@ -28,7 +28,6 @@ from reobj.sources.recorded import (
     NoVideo,
     RecordedDetections,
     Source,
-    other_form,
 )
 from reobj.sources.video import Video
 from reobj.types import (
@@ -315,7 +314,7 @@ def _usable(
     if count and xyxy.max() <= NORMALISED_MAX:
         fault = f"no coordinate above {NORMALISED_MAX}: normalised to 0..1? "
         fault += "Multiply them by the image size"
-    elif count and (other := other_form(xyxy, recorded.form, size)):
+    elif count and (other := recorded.other_form(size)):
         fault = other
     elif checks_size and (other := _other_size(xyxy[~empty], size)):
         fault = other

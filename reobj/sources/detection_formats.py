@@ -122,7 +122,7 @@ DETECTIONS: Registry[Reader] = Registry("detections", "--detections-format", [
     Format("cvat", "CVAT for video 1.1 and for images 1.1, XML or zip", _is_cvat, cvat.read_cvat,
            f"from 0; images {NAMED}", "px", "skeletons, cuboids", kind="XML"),
     Format("npz", "`rt.write_detections_npz`", lambda probe: probe.suffix == ".npz", _read_npz,
-           "from 0", "px", kind="binary"),
+           "from 0", "px"),
     *(Format(name, title, lambda probe, test=recognise: test(_sample(probe)), None,  # type: ignore[misc]
              advice=f"export it {advice}")
       for name, title, recognise, advice in (

@@ -39,38 +39,60 @@ def corners(box: Array, form: str) -> Array:
     return np.hstack([box[:, :2], box[:, :2] + box[:, 2:]]) if form == SIZES else box
 
 
-def other_form(xyxy: Array, form: str, size: Sequence[float]) -> str:
+def other_form(
+    xyxy: Array, form: str, size: Sequence[float], frame: IntArray, identity: IntArray
+) -> str:
     """Describe the form that boxes of an image of (w, h) `size` have instead of `form`.
 
     Args:
-        xyxy: (N, 4) boxes as read. form: in which the file has them.
+        xyxy: (N, 4) boxes as read. form: in which the file has them. size: (0, 0): unknown.
+        frame, identity: (N,); no identities: empty, or below 0.
     Returns:
         the fault and the remedy; "" if the boxes fit, or fit in no other form either. A box that is
         inverted, or whose centre is outside the image, is a fault; so are more than a tenth of
-        boxes, and more than two, that leave the image (of boxes in another form 41 % or more do).
+        boxes, and more than two, that leave the image (of boxes in another form 41 % or more do);
+        and sizes of an identity that change as its place does.
     """
     low, high = xyxy[:, :2], xyxy[:, 2:]
-    inverted = (high < low).any(1)
     centre = (low + high) / 2
+    given = xyxy  # the numbers in the file
+    if form != CORNERS:
+        given = np.hstack([low if form == SIZES else centre, high - low])
+        if len(identity) and _move_as_corners(given, frame, identity):
+            return (f"all boxes are {CORNERS}, expected {form}: the third and fourth number "
+                    f"are above the first and second, and change with them; {REMEDY}")  # fmt: skip
+    if 0 in size:
+        return ""
+    inverted = (high < low).any(1)
     beyond = ((centre < 0) | (centre > size)).any(1)
     leave = ~_inside(xyxy, size)
     if not (inverted | beyond).any() and leave.sum() <= max(2, 0.1 * len(xyxy)):
         return ""
-    given = xyxy  # the numbers in the file
-    if form != CORNERS:
-        given = np.hstack([low if form == SIZES else centre, high - low])
     why = (f"as {form}, {inverted.sum()} of {len(xyxy)} boxes have x2 < x1 or y2 < y1 and "
            f"{leave.sum()} leave the image of {size[0]:g}x{size[1]:g}")  # fmt: skip
     others = [other for other in (CORNERS, SIZES, CENTRES) if other != form]
     fits = [other for other in others if _inside(corners(given, other), size).mean() > 0.98]
     if fits:
-        names = " or ".join(fits)
-        return (f"{why}; all fit it as {names}: convert them, or write a CSV whose header names "
-                "these columns")  # fmt: skip
+        return f"{why}; all fit it as {' or '.join(fits)}: {REMEDY}"
     if (inverted | beyond).any() and _inside(xyxy, size[::-1]).all():
         return (f"{why}; all fit the frame turned by 90 deg: made on frames that were not turned "
                 "upright? Detect on upright frames")  # fmt: skip
     return ""
+
+
+REMEDY = "convert them, or write a CSV whose header names these columns"
+
+
+def _move_as_corners(box: Array, frame: IntArray, identity: IntArray) -> bool:
+    """Test whether numbers (N, 4) are corners: the last two change as the first two do.
+
+    Sizes change little from one frame of an identity to its next, independently of the place.
+    """
+    order = np.lexsort((frame, identity))
+    same = (np.diff(identity[order]) == 0) & (identity[order[1:]] >= 0)
+    step = np.diff(box[order], axis=0)[same]  # (M, 4)
+    apart = np.abs(step[:, 2:] - step[:, :2]).sum()
+    return bool((box[:, 2:] > box[:, :2]).all() and 2 * apart < np.abs(step[:, 2:]).sum())
 
 
 def _inside(xyxy: Array, size: Sequence[float]) -> BoolArray:
@@ -122,6 +144,10 @@ class RecordedDetections:
 
     def __len__(self) -> int:
         return len(self.frame)
+
+    def other_form(self, size: Sequence[float]) -> str:
+        """Describe another form of the boxes, as the function of this name."""
+        return other_form(self.xyxy, self.form, size, self.frame, self.identity)
 
     def select(self, rows: IntArray) -> None:
         """Select rows (n,), in this order."""

@@ -1132,6 +1132,17 @@ def test_boxes_in_another_form(
         assert f"all fit it as {form}" in made.said, made.said
 
 
+@pytest.mark.parametrize("option", ["--detections", "--tracks"])
+def test_corners_that_stay_in_the_image(
+    tmp_path: Path, tracked: Callable[..., Tracked], option: str
+) -> None:
+    """Of an identity, the third and fourth number move with the first and second."""
+    rows = [f"{f + 1},1,{box(f)[0]},20,{box(f)[2]},60,.9\n" for f in range(FRAMES)]
+    (tmp_path / "det.txt").write_text("".join(rows))
+    made = tracked(write_clip(tmp_path / "v.avi"), option, tmp_path / "det.txt")
+    assert made.code == 2 and "all boxes are x1, y1, x2, y2" in made.said, made
+
+
 def test_the_box_mode_of_detectron2(tmp_path: Path) -> None:
     """0: corners; 1: x, y, w, h; others are refused."""
     video = rt.Video(write_clip(tmp_path / "v.avi"))

@@ -498,7 +498,7 @@ def test_rows_that_hold_corners_are_refused(
     good = {name: write(tmp_path / f"{name}.txt", ROWS, "1") for name in ("truth", "result")}
     files = good | {wrong: write(tmp_path / "corners.txt", rows, "1")}
     text = refused(capsys, files["result"], files["truth"])
-    assert "corners.txt: columns 3 to 6 are x1, y1, x2, y2" in text
+    assert "corners.txt: all boxes are x1, y1, x2, y2" in text
     large = ROWS.copy()
     large[:, 4:6] = 1300, 700
     files = good | {wrong: write(tmp_path / "large.txt", large, "1")}
