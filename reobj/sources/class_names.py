@@ -31,14 +31,14 @@ def load_class_names(path: str | Path) -> tuple[str, ...]:
     if not is_yaml(path) and path.suffix.lower() != ".json":
         return names_by_number(_of_lines(path), where)
     data = parse_yaml(read_text(path, YAML_MAX), where) if is_yaml(path) else load_json(path)
+    if is_yaml(path) and not (isinstance(data, dict) and "names" in data):
+        raise ReobjError(f"{path}: no `names:` in it; expected YOLO's data.yaml, or a text file "
+                         "with one class name a line")  # fmt: skip
     if not isinstance(data, dict):
         return names_by_number(data, where)
     if isinstance(entries := data.get("categories"), list):
         named = [entry for entry in entries if isinstance(entry, dict)]
         data = {"names": {entry.get("id"): entry.get("name") for entry in named}}
-    if "names" not in data and is_yaml(path):
-        raise ReobjError(f"{path}: no `names:` in it; expected YOLO's data.yaml, or a text file "
-                         "with one class name a line")  # fmt: skip
     names = names_by_number(given := data.get("names", data), where)
     if "nc" in data and str(data["nc"]) not in (str(len(names)), str(len(given))):
         raise ReobjError(f"{path}: nc is {data['nc']}, but there are {len(names)} names")

@@ -12,7 +12,7 @@ import functools
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -80,8 +80,6 @@ class Table:
     Attributes:
         path: of the file. cells: N texts by role: a key of ALIASES, or a column of MOT or KITTI.
         line: (N,) position of each row, in `unit`s. header: names of the columns, () without.
-        unread: names of columns that are not read although they name a class, an identity or a
-            size.
     """
 
     path: Path
@@ -89,7 +87,6 @@ class Table:
     line: IntArray
     unit: str = "line"
     header: tuple[str, ...] = ()
-    unread: list[str] = field(default_factory=list)
 
     def where(self, row: int) -> str:
         """Return the position of a row, for messages."""
@@ -199,31 +196,6 @@ def _header(cells: Sequence[str]) -> tuple[str, ...]:
     if "detection_id" in names:  # Roboflow's inference: x, y is the centre
         names = [{"x": "cx", "y": "cy"}.get(name, name) for name in names]
     return tuple(name if name not in names[:i] else f"column {i}" for i, name in enumerate(names))
-
-
-def read_cells(path: Path) -> Table:
-    """Read a table with a header.
-
-    Raises:
-        ReobjError: a row has another length than the header, or the header has no box columns.
-    """
-    return _named(read_columns(path))
-
-
-def _named(table: Table) -> Table:
-    """Find the roles of the columns of a table by their names."""
-    by_name = table.cells
-    name_of = _roles(by_name)
-    found = {"frame", "image", "time"} & name_of.keys()
-    if not found or not _box_roles(name_of):
-        missing = ["frame"] * (not found)
-        missing += [role for role in ("x1", "y1", "x2", "y2") if role not in name_of]
-        text = f"no column {', '.join(missing)} in the header {','.join(by_name)}"
-        example = "expected one such as frame,x1,y1,x2,y2,score,class"
-        raise ReobjError(f"{table.path}, line 1: {text}: {example}")
-    table.cells = {role: by_name[name] for role, name in name_of.items()}
-    table.unread = _unread(by_name, set(name_of.values()))
-    return table
 
 
 def _roles(by_name: Mapping[str, list[str]]) -> dict[str, str]:
@@ -372,31 +344,43 @@ def read_kitti(source: Source) -> RecordedDetections:
 
 def read_csv(source: Source) -> RecordedDetections:
     """Read a table with a header."""
-    return _read_named(read_cells(source.path), source)
+    return _read_named(read_columns(source.path), source)
 
 
 def read_records(source: Source) -> RecordedDetections:
     """Read a JSON list of flat objects (supervision's JSONSink)."""
-    return _read_named(records_table(source.path), source)
-
-
-def records_table(path: Path) -> Table:
-    """Read a JSON list of flat objects as a table."""
-    records = load_json(path)
+    records = load_json(source.path)
     if not all(isinstance(record, dict) for record in records):
-        raise ReobjError(f"{path}: an entry is no object; expected objects with the same keys")
+        raise ReobjError(f"{source.path}: an entry is no object; expected objects with the same "
+                         "keys")  # fmt: skip
     names = list(dict.fromkeys(name for record in records for name in record))
     header = _header([name.replace(",", " ") for name in names])
     texts = [["" if r.get(name) is None else str(r[name]).strip() for r in records]
              for name in names]  # fmt: skip
     by_name = dict(zip(header, texts, strict=True))
-    return _named(Table(path, by_name, np.arange(len(records)), "entry", header))
+    return _read_named(
+        Table(source.path, by_name, np.arange(len(records)), "entry", header), source
+    )
 
 
 def _read_named(table: Table, source: Source) -> RecordedDetections:
-    """Convert a table with named columns to detections."""
-    if table.unread:
-        source.say(f"columns that are not read: {', '.join(table.unread)}")
+    """Convert a table with named columns to detections.
+
+    Raises:
+        ReobjError: there are no columns of frames or boxes, or a cell is invalid.
+    """
+    by_name = table.cells
+    name_of = _roles(by_name)
+    found = {"frame", "image", "time"} & name_of.keys()
+    if not found or not _box_roles(name_of):
+        missing = ["frame"] * (not found)
+        missing += [role for role in ("x1", "y1", "x2", "y2") if role not in name_of]
+        text = f"no column {', '.join(missing)} in the header {','.join(by_name)}"
+        example = "expected one such as frame,x1,y1,x2,y2,score,class"
+        raise ReobjError(f"{table.path}, line 1: {text}: {example}")
+    table.cells = {role: by_name[name] for role, name in name_of.items()}
+    unread = _unread(by_name, {*name_of.values()})
+    source.say(f"columns that are not read: {', '.join(unread)}" * bool(unread))
     if "detection_id" in table.header and _box_roles(table.cells)[0] == "cx":
         source.say("x, y are the centres of boxes, as in all files with detection_id (Roboflow)")
     _drop_empty(table, source)
