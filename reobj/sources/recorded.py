@@ -5,6 +5,7 @@ A reader (`detection_formats`) makes them from a `Source`; `detection_files` val
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -346,50 +347,51 @@ def read_npz(
         those without detections (default: the frame of every detection).
     """
     data, _ = load_npz(path, sealed)
-    _check_arrays(data, path)
-    if (made_for := tuple(data["image_size"].tolist())) != size and size != (0, 0):
-        turned = ": made on frames that were not turned upright?" if made_for == size[::-1] else ""
-        text = f"made for images of {made_for} px, but the video is {size} px"
-        raise ReobjError(f"{path}: {text}{turned}")
-    count = len(data["frame"])
+    take = functools.partial(_array, data, path)
+    frame = take("frame", "iu", (-1,), LINES_MAX).astype(np.int64)
+    count = len(frame)
+    data.setdefault("mask_counts", NO_RUNS)
+    data.setdefault("mask_offsets", np.zeros(count + 1, np.int64))
+    runs = take("mask_counts", "iu", (-1,), MEMORY_MAX // 8)  # uint32, held twice
+    offsets = take("mask_offsets", "iu", (count + 1,)).astype(np.int64)
+    if (np.diff(offsets, prepend=0) < 0).any() or offsets[-1] > runs.size or (runs < 0).any():
+        raise ReobjError(f"{path}: mask_counts and mask_offsets are inconsistent")
+    width, height = take("image_size", "iu", (2,)).tolist()
+    if min(width, height) < 1:
+        raise ReobjError(f"{path}: image_size {width}, {height}, expected (w, h) in px")
+    if (width, height) != size and size != (0, 0):
+        turned = (height, width) == size
+        why = ": made on frames that were not turned upright?" if turned else ""
+        text = f"made for images of {(width, height)} px, but the video is {size} px"
+        raise ReobjError(f"{path}: {text}{why}")
     recorded = RecordedDetections(
-        data["frame"].astype(np.int64), data["xyxy"].astype(np.float64),
-        data["score"].astype(np.float64), data["class_id"].astype(np.int64),
-        np.split(data["mask_counts"].astype(np.uint32), data["mask_offsets"][1:])[:count],
-        tuple(data["class_names"].tolist()), made_for, working_size, np.arange(count), "row",
+        frame, take("xyxy", "fiu", (count, 4)).astype(np.float64),
+        take("score", "fiu", (count,)).astype(np.float64),
+        take("class_id", "iu", (count,)).astype(np.int64),
+        np.split(runs.astype(np.uint32), offsets[1:])[:count],
+        tuple(take("class_names", "U", (-1,), CLASS_MAX).tolist()), (width, height), working_size,
+        np.arange(count), "row",
     )  # fmt: skip
     if "done" not in data:
         return recorded, recorded.frame
-    recorded.looked = np.unique(data["done"]).astype(np.int64)
+    recorded.looked = np.unique(take("done", "iu", (-1,), LINES_MAX)).astype(np.int64)
     return recorded, recorded.looked
 
 
-def _check_arrays(data: dict[str, Any], path: Path) -> None:
-    """Validate number, shape and kind of the arrays; add empty masks where there are none."""
-    count = len(np.atleast_1d(data.get("frame", ())))
-    data.setdefault("mask_counts", NO_RUNS)
-    data.setdefault("mask_offsets", np.zeros(count + 1, np.int64))
-    limits = {"frame": LINES_MAX, "done": LINES_MAX, "class_names": CLASS_MAX,
-              "mask_counts": MEMORY_MAX // 8}  # fmt: skip  # uint32, held twice
-    expected: dict[str, tuple[int | tuple[int, ...], str]] = {  # shape, or number of dimensions
-        "frame": ((count,), "iu"), "xyxy": ((count, 4), "fiu"), "score": ((count,), "fiu"),
-        "class_id": ((count,), "iu"), "class_names": (1, "U"), "image_size": ((2,), "iu"),
-        "mask_counts": (1, "iu"), "mask_offsets": ((count + 1,), "iu"), "done": (1, "iu"),
-    }  # fmt: skip
-    for key, (shape, kinds) in expected.items():
-        if key not in data and key != "done":
-            raise ReobjError(f"{path}: array {key} is missing")
-        array = data.get(key, NO_RUNS)
-        if array.size > limits.get(key, array.size):
-            raise ReobjError(f"{path}: {array.size} {key}, at most {limits[key]} are allowed")
-        if shape not in (array.ndim, array.shape):
-            raise ReobjError(f"{path}: array {key} is {array.shape}, expected shape {shape}")
-        if array.dtype.kind not in kinds and array.size:
-            raise ReobjError(f"{path}: array {key} is of {array.dtype}, expected {kinds}")
-    data["mask_offsets"] = data["mask_offsets"].astype(np.int64)
-    ordered = (np.diff(data["mask_offsets"], prepend=0) >= 0).all()
-    runs = data["mask_counts"]
-    if (data["image_size"] < 1).any():
-        raise ReobjError(f"{path}: image_size {data['image_size']}, expected (w, h) in px")
-    if not ordered or data["mask_offsets"][-1] > runs.size or (runs < 0).any():
-        raise ReobjError(f"{path}: mask_counts and mask_offsets are inconsistent")
+def _array(
+    data: dict[str, npt.NDArray[Any]], path: Path, key: str, kinds: str, shape: tuple[int, ...],
+    most: int = MEMORY_MAX,
+) -> npt.NDArray[Any]:  # fmt: skip
+    """Return an array of an npz file; refuse another kind, shape (-1: any) or more numbers."""
+    if key not in data:
+        raise ReobjError(f"{path}: array {key} is missing")
+    array = data[key]
+    if array.ndim != len(shape) or any(
+        n not in (-1, m) for n, m in zip(shape, array.shape, strict=True)
+    ):
+        raise ReobjError(f"{path}: array {key} is {array.shape}, expected shape {shape}")
+    if array.dtype.kind not in kinds and array.size:
+        raise ReobjError(f"{path}: array {key} is of {array.dtype}, expected {kinds}")
+    if len(array) > most:
+        raise ReobjError(f"{path}: {len(array)} {key}, at most {most} are allowed")
+    return array
