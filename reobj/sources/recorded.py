@@ -81,19 +81,21 @@ def other_form(
     return ""
 
 
-REMEDY = "convert them, or write a CSV whose header names these columns"
+REMEDY = "convert them, or name these columns in the header of a CSV"
 
 
 def _move_as_corners(box: Array, frame: IntArray, identity: IntArray) -> bool:
     """Test whether numbers (N, 4) are corners: the last two change as the first two do.
 
-    Sizes change little from one frame of an identity to its next, independently of the place.
+    From one frame of an identity to its next, sizes change little: the difference of both changes
+    is at least 1.58 times the change of a size (1.57 in 24 files of tracks), but at most 1.41 times
+    that of a corner; both are reached where the corners move independently.
     """
     order = np.lexsort((frame, identity))
     same = (np.diff(identity[order]) == 0) & (identity[order[1:]] >= 0)
     step = np.diff(box[order], axis=0)[same]  # (M, 4)
     apart = np.abs(step[:, 2:] - step[:, :2]).sum()
-    return bool((box[:, 2:] > box[:, :2]).all() and 2 * apart < np.abs(step[:, 2:]).sum())
+    return bool((box[:, 2:] > box[:, :2]).all() and apart < 1.25 * np.abs(step[:, 2:]).sum())
 
 
 def _inside(xyxy: Array, size: Sequence[float]) -> BoolArray:
