@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from reobj.files import LINES_MAX, read_lines
+from reobj.files import LINES_MAX, read_lines, read_text
 from reobj.sources.class_names import is_yaml, load_class_names
 from reobj.sources.image_frames import frames_of_names
 from reobj.sources.masks import NO_RUNS, polygon_runs
@@ -22,8 +22,7 @@ from reobj.types import COCO_NAMES, Array, IntArray, ReobjError, cxcywh_from_xyx
 NO_LABELS = ("classes.txt train.txt val.txt valid.txt test.txt readme.txt readme.dataset.txt "
              "readme.roboflow.txt requirements.txt labels.txt").split()  # fmt: skip
 NAMES_FILES = (
-    "classes.txt obj.names data.yaml dataset.yaml data.yml dataset.yml labels.txt _darknet.labels "
-    "notes.json"
+    "classes.txt obj.names data.yaml dataset.yaml data.yml dataset.yml labels.txt _darknet.labels"
 ).split()
 
 
@@ -45,8 +44,9 @@ def names_file(path: Path) -> Path | None:
     labels = path.resolve()
     for folder in (labels, *labels.parents[:2]):
         known = [*(folder / name for name in NAMES_FILES), *sorted(folder.glob("*.names"))]
-        for file in (*filter(Path.is_file, known), *sorted(filter(is_yaml, folder.glob("*")))):
-            if file in known or any(line.startswith("names") for line in read_lines(file)):
+        other = [*sorted(filter(is_yaml, folder.glob("*"))), *folder.glob("notes.json")]
+        for file in (*filter(Path.is_file, known), *other):
+            if file in known or re.search(r'^names|"categories"', read_text(file), re.MULTILINE):
                 return file
     return None
 
