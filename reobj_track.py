@@ -705,7 +705,7 @@ class Tracker:
         pose = checked_pose(cam_from_world, camera, points, part)
         state.frame_number += 1
         if len(detections):
-            state.intervals.add(state.frame_number, len(detections))
+            state.intervals.add(state.frame_number)
         elif run and looked is None:
             run = state.intervals.looked_at(state.frame_number)
         state.detector_runs += run

@@ -53,6 +53,19 @@ class Probe:
         lines = head.decode(coding, "replace").splitlines()
         return [line.strip() for line in lines if line.strip()]
 
+    @property
+    def json_lines(self) -> bool:
+        """Whether the file is JSON Lines: an object or list a line."""
+        pairs = [line[0] + line[-1] for line in self.lines[:2]]
+        return self.suffix in (".jsonl", ".ndjson") or (len(pairs) > 1 and {*pairs} <= {"{}", "[]"})
+
+    @functools.cached_property
+    def kind(self) -> str:
+        """Kind of file: "folder", "XML", "JSON" or "text"; "" of a binary one."""
+        begin = self.lines[0][0] if self.lines else ""
+        text = {"<": "XML", "[": "JSON", "{": "JSON", "": ""}.get(begin, "text")
+        return "folder" if self.is_dir else text
+
     @functools.cached_property
     def json(self) -> Any:
         """Content of a JSON file; None of another file. Reads it once.
@@ -60,14 +73,14 @@ class Probe:
         Raises:
             ReobjError: the name ends with .json, and the content is damaged.
         """
-        if self.suffix != ".json" and not (self.lines and self.lines[0][0] in "[{"):
+        if (self.suffix != ".json" and self.kind != "JSON") or self.json_lines:
             return None
         return load_json(self.path)
 
     @functools.cached_property
     def root(self) -> ElementTree.Element | None:
         """Root element of an XML file, without its children; None of another file."""
-        if not (self.lines and self.lines[0].startswith("<")):
+        if self.kind != "XML":
             return None
         try:
             element: ElementTree.Element = next(ElementTree.iterparse(self.path, ("start",)))[1]
@@ -84,6 +97,8 @@ class Probe:
     @functools.cached_property
     def found(self) -> str:
         """What the file holds, for the error of one that fits no format."""
+        if self.json_lines:
+            return " (JSON Lines, one object a line); write one JSON list of these objects"
         if self.root is not None:
             return f" (XML <{self.root.tag}>)"
         return f" (JSON with {shortened(sorted(self.keys()))})" if self.keys() else ""
@@ -98,6 +113,7 @@ class Format(Generic[R]):
         recognise: tests structure alone (names, suffix, header, keys).
         read: the reader; None: a format that is only named, with `advice` on the export to use.
         frames, units, unread: numbering of frames, units, and what is not read (for the table).
+        kind: of file, as of a Probe; "": any.
     """
 
     name: str
@@ -108,6 +124,7 @@ class Format(Generic[R]):
     units: str = ""
     unread: str = ""
     advice: str = ""
+    kind: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,8 +173,9 @@ class Registry(Generic[R]):
         if fits:
             raise ReobjError(f"{probe.path}: fits {len(fits)} formats of {self.what}: "
                              f"{', '.join(names)}; name one with {self.flag}")  # fmt: skip
+        near = [name for name, entry in known.items() if entry.kind == probe.kind] or known
         raise ReobjError(f"{probe.path}: no known format of {self.what}{probe.found}; expected one "
-                         f"of {', '.join(known)} ({self.flag}; docs/input_formats.md)")  # fmt: skip
+                         f"of {', '.join(near)} ({self.flag}; docs/input_formats.md)")  # fmt: skip
 
     def table(self) -> str:
         """Return the Markdown table of docs/input_formats.md."""

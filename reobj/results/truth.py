@@ -14,7 +14,6 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -25,8 +24,8 @@ from reobj.formats import AUTO, Format, Registry
 from reobj.results.result import Result
 from reobj.sources.detection_files import check_rows, read_source
 from reobj.sources.detection_formats import DETECTIONS, FROM_1, Reader
-from reobj.sources.recorded import Source
-from reobj.sources.tables import is_boxmot, is_mot, read_mot_rows
+from reobj.sources.recorded import SIZES, NoVideo, Source, corners, other_form
+from reobj.sources.tables import forms, read_mot_rows
 from reobj.types import CLASS_MAX, Array, BoolArray, IntArray, ReobjError, counted
 from reobj.words import among, canonical
 
@@ -70,8 +69,7 @@ class LabelledBoxes:
 def labelled(rows: Array, name: Any = "", role: Any = Role.SCORED) -> LabelledBoxes:
     """Convert MOTChallenge rows (N, 6+) to labelled boxes; name, role: for all rows, or (N,)."""
     n = len(rows)
-    box = rows[:, 2:6]
-    xyxy = np.concatenate([box[:, :2], box[:, :2] + box[:, 2:]], 1)  # (N, 4)
+    xyxy = corners(rows[:, 2:6], SIZES)  # (N, 4)
     whole = rows[:, :2].astype(np.int64)
     names = np.broadcast_to(np.asarray(name, str), n)
     roles = np.broadcast_to(role, n)
@@ -112,12 +110,15 @@ def _with_roles(entry: Format[Reader]) -> Format[TruthReader]:
     def read(
         path: Path, _: Sequence[str], __: float, notes: list[str], size: tuple[int, int], first: str
     ) -> LabelledBoxes:
-        video = SimpleNamespace(size=size, working_size=size, names=[], files=[], frame_count=0,
-                                times_s=None, source=path.stem)  # fmt: skip
+        video = NoVideo(path.stem, size, size)
         source = Source(path, video, first=first, messages=notes)
         assert entry.read is not None
         recorded = read_source(source, entry.read)
         check_rows(recorded, path)
+        sizes = {size, *source.image_sizes} - {(0, 0)}
+        image = min(sizes) if len(sizes) == 1 else (0, 0)
+        if fault := recorded.other_form(image):
+            raise ReobjError(f"{path}: {fault}")
         if not len(recorded.identity):
             raise ReobjError(f"{path}: boxes without identities; expected tracks")
         names = np.array([*recorded.class_names, ""], str)[recorded.class_id]
@@ -134,7 +135,7 @@ def _with_roles(entry: Format[Reader]) -> Format[TruthReader]:
         return LabelledBoxes(recorded.frame + 1, ids, recorded.xyxy, names, role, listed)
 
     return Format(entry.name, entry.title, entry.recognise, entry.read and read, entry.frames,
-                  entry.units, entry.unread, entry.advice)  # fmt: skip
+                  entry.units, entry.unread, WITH_TRACKS, entry.kind)  # fmt: skip
 
 
 def read_result(out: Path, notes: list[str] | None = None) -> LabelledBoxes:
@@ -153,7 +154,7 @@ def read_result(out: Path, notes: list[str] | None = None) -> LabelledBoxes:
         frame = tracks.frame + 1
         predicted = LabelledBoxes(frame, ids, tracks.xyxy, names[tracks.class_id], role)
     else:
-        predicted = labelled(_from_one(read_mot_rows(out), out, notes))
+        predicted = labelled(_checked(read_mot_rows(out), out, notes))
     _check_identities(predicted, out)
     return predicted
 
@@ -177,7 +178,7 @@ def _read_mot(
     class_names: Sequence[str],
     min_visibility: float,
     notes: list[str],
-    _: tuple[int, int],
+    size: tuple[int, int],
     first: str,
 ) -> LabelledBoxes:
     """Read MOTChallenge rows.
@@ -185,9 +186,12 @@ def _read_mot(
     Column 7 is a flag (0: the row does not count). In files of nine columns, column 8 is the class
     and column 9 the visibility; MOT15 has ten columns, with world coordinates instead.
     """
-    rows = _from_one(read_mot_rows(path), path, notes, first)
-    flagged = rows[:, 6] == 0 if rows.shape[1] > 6 else np.zeros(len(rows), bool)
     sequence = _sequence(path)
+    sides = [sequence.get(key, "") for key in ("imwidth", "imheight")]
+    if 0 in size and all(map(str.isdecimal, sides)):
+        size = (int(sides[0]), int(sides[1]))
+    rows = _checked(read_mot_rows(path), path, notes, first, size)
+    flagged = rows[:, 6] == 0 if rows.shape[1] > 6 else np.zeros(len(rows), bool)
     _check_length(rows, path, sequence)
     if rows.shape[1] != 9:
         return labelled(rows, "", np.where(flagged, Role.ABSENT, Role.SCORED))
@@ -227,18 +231,26 @@ def _read_mot(
     return labelled(rows, names, (flagged | hidden | unnamed) * Role.IGNORED)
 
 
+WITH_TRACKS = "export it as COCO JSON with track_id, or as MOTChallenge rows"
 WITH_IDENTITIES = "visdrone kitti csv records coco cvat".split()
 TRUTH: Registry[TruthReader] = Registry("ground truth", "--gt-format", [
     Format("mot", "MOTChallenge, CVAT's MOT 1.1, DanceTrack: rows of 6 to 10 numbers",
-           lambda probe: is_mot(probe) or is_boxmot(probe), _read_mot, FROM_1, "px",
-           "x, y, z in ten columns"),
+           lambda probe: bool(forms(probe) & {"mot", "boxmot"}), _read_mot, FROM_1, "px",
+           "x, y, z in ten columns", kind="text"),
     *(_with_roles(entry) for entry in DETECTIONS.formats
       if entry.name in WITH_IDENTITIES or entry.read is None),
 ])  # fmt: skip
 
 
-def _from_one(rows: Array, path: Path, notes: list[str], begin: str = "") -> Array:
-    """Return rows whose frames count from 1; convert those that count from 0."""
+def _checked(
+    rows: Array, path: Path, notes: list[str], begin: str = "", size: tuple[int, int] = (0, 0)
+) -> Array:
+    """Refuse rows of another form; return them with frames that count from 1."""
+    whole = rows[:, :2].astype(np.int64)
+    xyxy = corners(rows[:, 2:6], SIZES)
+    fault = other_form(xyxy, SIZES, size, whole[:, 0], whole[:, 1])
+    if fault:
+        raise ReobjError(f"{path}: {fault}")
     first = rows[:, 0].min(initial=1)
     if first < int(begin or 0):
         expected = f"from {begin}" if begin else "from 1, or from 0"

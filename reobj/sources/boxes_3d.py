@@ -21,16 +21,20 @@ from reobj.cameras import Poses, distort_boxes
 from reobj.formats import Probe
 from reobj.sources.recorded import RecordedDetections, Source
 from reobj.sources.tables import (
-    BOXES_3D,
     Table,
-    head,
+    forms,
     nearest_times,
-    read_cells_3d,
+    read_columns,
     seconds,
     text_classes,
 )
 from reobj.sources.video import Video
 from reobj.types import COCO_NAMES, Array, IntArray, ReobjError, Tracks
+
+BOXES_3D = (
+    "tx_world_object ty_world_object tz_world_object qw_world_object qx_world_object "
+    "qy_world_object qz_world_object scale_x scale_y scale_z"
+).split()
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,12 +70,19 @@ def boxes_3d_of(recorded: RecordedDetections | None) -> Boxes3D | None:
 
 def has_boxes_3d(path: Path) -> bool:
     """Test whether a file is a table of boxes in 3D."""
-    return path.is_file() and is_boxes_3d(Probe(path))
+    return path.is_file() and "boxer-3d" in forms(Probe(path))
 
 
-def is_boxes_3d(probe: Probe) -> bool:
-    """Test for a column of positions in the world in the header."""
-    return any("tx_world_object" in cells for cells in head(probe)[:1])
+def read_cells(path: Path) -> Table:
+    """Read a table of boxes in the world."""
+    table = read_columns(path)
+    role_of = {name: name for name in BOXES_3D}
+    role_of |= {"time_ns": "time", "prob": "score", "name": "class"}
+    if missing := [name for name in role_of if name not in table.cells]:
+        text = f"3D boxes without the columns {', '.join(missing)}"
+        raise ReobjError(f"{path}, line 1: {text}; expected those of Boxer's 3D boxes")
+    table.cells = {role: table.cells[name] for name, role in role_of.items()}
+    return table
 
 
 def read_source_3d(source: Source) -> RecordedDetections:
@@ -83,10 +94,13 @@ def read_source_3d(source: Source) -> RecordedDetections:
     path = source.path
     video = source.video
     poses = source.poses
+    if source.describes:
+        source.times_s = seconds(read_cells(path))
+        return source.recorded(np.empty(0, np.int64), np.empty((0, 4)), (np.empty(0, np.int64), ()))
     if poses is None:
         fault = "these are 3D boxes in the world, which need its cameras"
         raise ReobjError(f"{path}, line 1: {fault}: `run` with --detections and --poses FILE")
-    table = read_cells_3d(path)
+    table = read_cells(path)
     box = _boxes(table)
     time_s = seconds(table)
     frame, xyxy = _projected(box, time_s, poses, video)
@@ -114,7 +128,7 @@ def read_source_3d(source: Source) -> RecordedDetections:
 
 def _boxes(table: Table) -> Array:
     """Return centre, half extents and rotation (N, 15) of the rows."""
-    center, quat, size = (np.stack([table.numbers(role) for role in roles], 1)
+    center, quat, size = (table.columns(roles)
                           for roles in (BOXES_3D[:3], BOXES_3D[3:7], BOXES_3D[7:]))  # fmt: skip
     bad = (size <= 0).any(1) | (np.abs(np.linalg.norm(quat, axis=1) - 1) > 0.01)
     if bad.any():

@@ -20,28 +20,43 @@ def load_class_names(path: str | Path) -> tuple[str, ...]:
     """Read class names in the order of their numbers.
 
     Args:
-        path: text file with one name, or `NUMBER: NAME`, a line (empty lines are skipped); or
-            data.yaml, whose `names` are a list or a map from numbers; or JSON with the same
-            content.
+        path: text file with one name, or `NUMBER: NAME` or `NUMBER NAME`, a line (empty lines are
+            skipped); or data.yaml, whose `names` are a list or a map from numbers; or JSON with
+            the same content, or with `categories` (Label Studio's notes.json).
     Raises:
         ReobjError: as `names_by_number`, or a damaged file.
     """
     path = Path(path)
     where = str(path)
-    if is_yaml(path):
-        data = parse_yaml(read_text(path, YAML_MAX), where)
-        if not isinstance(data, dict) or "names" not in data:
-            raise ReobjError(f"{path}: no `names:` in it; expected YOLO's data.yaml, or a text "
-                             "file with one class name a line")  # fmt: skip
-        return names_by_number(data["names"], where)
-    if path.suffix.lower() == ".json":
-        data = load_json(path)
-        return names_by_number(data.get("names", data) if isinstance(data, dict) else data, where)
+    if not is_yaml(path) and path.suffix.lower() != ".json":
+        return names_by_number(_of_lines(path), where)
+    data = parse_yaml(read_text(path, YAML_MAX), where) if is_yaml(path) else load_json(path)
+    if is_yaml(path) and not (isinstance(data, dict) and "names" in data):
+        raise ReobjError(f"{path}: no `names:` in it; expected YOLO's data.yaml, or a text file "
+                         "with one class name a line")  # fmt: skip
+    if not isinstance(data, dict):
+        return names_by_number(data, where)
+    if isinstance(entries := data.get("categories"), list):
+        named = [entry for entry in entries if isinstance(entry, dict)]
+        data = {"names": {entry.get("id"): entry.get("name") for entry in named}}
+    names = names_by_number(given := data.get("names", data), where)
+    if "nc" in data and str(data["nc"]) not in (str(len(names)), str(len(given))):
+        raise ReobjError(f"{path}: nc is {data['nc']}, but there are {len(names)} names")
+    return names
+
+
+def _of_lines(path: Path) -> list[str] | dict[str, str]:
+    """Read a name a line, or a number and a name: all lines have one, or none has."""
     lines = [line.strip() for line in read_lines(path) if line.strip()]
-    numbered = [re.fullmatch(r"(\d+)\s*:\s*(\S.*)", line) for line in lines]
-    if lines and all(numbered):
-        return names_by_number({match[1]: match[2] for match in numbered if match}, where)
-    return names_by_number(lines, where)
+    numbered = [match for line in lines if (match := re.fullmatch(r"(\d+)[\s:,]+(\S.*)", line))]
+    if not numbered:
+        return lines
+    named = {match[1]: match[2] for match in numbered}
+    if len(named) < len(lines):
+        raise ReobjError(f"{path}: {len(numbered)} of {len(lines)} lines are a number and a name "
+                         f"({numbered[0][0]!r:.40}); expected different numbers in all, or in none"
+                         )  # fmt: skip
+    return named
 
 
 def is_yaml(path: Path) -> bool:

@@ -9,23 +9,22 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
 
 from reobj.files import load_json, shortened
 from reobj.frame_lookup import frames_by_name
-from reobj.sources.class_names import check_length
 from reobj.sources.image_frames import frames_of_names, frames_of_numbers, original_name
 from reobj.sources.masks import NO_RUNS, Counts, coco_runs, polygon_runs
-from reobj.sources.recorded import RecordedDetections, Source
+from reobj.sources.recorded import CORNERS, SIZES, RecordedDetections, Source
 from reobj.types import COCO_NAMES, Array, IntArray, ReobjError
 
 T = TypeVar("T")
-D = TypeVar("D", bound="Dataset")
-Id = int | str
 Box = tuple[float, float, float, float]
+Whole = Annotated[int, msgspec.Meta(gt=-(1 << 53), lt=1 << 53)]
+Id = Whole | str
 
 
 class Image(msgspec.Struct):
@@ -35,8 +34,8 @@ class Image(msgspec.Struct):
     file_name: str | None = None
     width: float | None = None
     height: float | None = None
-    frame_id: int | None = None  # COCO-VID
-    frame_index: int | None = None  # TAO
+    frame_id: Whole | None = None  # COCO-VID
+    frame_index: Whole | None = None  # TAO
     video_id: Id | None = None
     extra: Any = None
 
@@ -59,43 +58,52 @@ class Named(msgspec.Struct):
     name: str
 
 
-class Annotation(msgspec.Struct):
-    """A box of an image: x, y, w, h in px."""
+class Identities(msgspec.Struct, kw_only=True):
+    """Attributes that hold the identity of a box, as CVAT writes them, or the box itself."""
+
+    track_id: Whole | float | None = None
+    instance_id: Whole | float | None = None
+
+
+class Rle(msgspec.Struct):
+    """A mask as run lengths, compressed or not; size: (h, w)."""
+
+    size: tuple[int, int]
+    counts: str | list[int]
+
+
+class Annotation(Identities, kw_only=True):
+    """A box of an image."""
 
     image_id: Id
     category_id: Id
     bbox: Box
+    bbox_mode: Literal[0, 1] = 1  # detectron2: 0 corners, 1 x, y, w, h; in px
     score: float = 1.0
     file_name: str | None = None
-    track_id: float | None = None
-    instance_id: float | None = None
-    attributes: Any = None  # CVAT's hold the identity
-    segmentation: Any = None
+    attributes: Identities | list[Any] | None = None
+    segmentation: Rle | list[list[float]] | None = None
     iscrowd: Any = False
     ignore: Any = False
 
     @property
     def identity(self) -> int:
         """Identity, -1: none."""
-        inner = self.attributes if isinstance(self.attributes, dict) else {}
-        holders = (self.track_id, self.instance_id, inner.get("track_id"), inner.get("instance_id"))
-        value = next((value for value in holders if value is not None), -1)
-        if type(value) not in (int, float) or value % 1 or abs(value) >= 1 << 53:
-            raise ReobjError(f"track_id {value!r:.40}, expected a whole number")
+        values = [self.track_id, self.instance_id]
+        if isinstance(self.attributes, Identities):
+            values += [self.attributes.track_id, self.attributes.instance_id]
+        value = next((value for value in values if value is not None), -1)
+        if value % 1:
+            raise ValueError(f"track_id {value}, expected a whole number")
         return int(value)
 
 
 class Dataset(msgspec.Struct):
-    """Images and classes of a COCO dataset."""
+    """Images and classes of a COCO dataset, perhaps with boxes."""
 
     images: list[Image]
     categories: list[Named] = []
     videos: list[Named] | None = None
-
-
-class Annotated(Dataset):
-    """A dataset with boxes."""
-
     annotations: list[Annotation] | None = None
 
 
@@ -118,54 +126,46 @@ def converted(data: Any, kind: type[T], where: object) -> T:
         raise ReobjError(f"{where}: {error}") from error
 
 
-def read_dataset(path: Path, data: Any, kind: type[D]) -> D:
-    """Validate a COCO dataset."""
-    dataset = converted(data, kind, path)
-    for category in dataset.categories:
-        check_length(category.name, f"{path}, categories")
-    return dataset
-
-
-def _beside(path: Path, entries: Sequence[Annotation]) -> tuple[str, Dataset | None]:
-    """Find the dataset beside a file of results that has all ids of the results, and its name.
+def _beside(source: Source, entries: Sequence[Annotation]) -> Dataset | None:
+    """Read the dataset beside a file of results that has all ids of the results.
 
     Raises:
-        ReobjError: several datasets match and disagree; or none does, and the results do not name
-            their images.
+        ReobjError: several datasets have them; or none does, and the results do not name their
+            images.
     """
+    path = source.path
     ids = {entry.image_id for entry in entries}
     kinds = {entry.category_id for entry in entries}
     fault = ""
-    matches: list[tuple[str, Dataset]] = []
-    used: list[list[Any]] = []
+    matches: dict[str, Dataset] = {}
     for other in sorted(path.parent.glob("*.json")):
         data = None
-        with contextlib.suppress(ValueError, OSError):  # an invalid JSON file is no dataset
+        with contextlib.suppress(ReobjError, OSError):  # an invalid JSON file is no dataset
             data = load_json(other) if other != path else None
         if not isinstance(data, dict) or not data.get("images"):
             continue
-        dataset = read_dataset(other, data, Dataset)
-        images = {image.id: image.name for image in dataset.images}
-        names = {category.id: category.name for category in dataset.categories}
-        missing = [*ids.difference(images), *(kinds.difference(names) if names else ())]
+        dataset = converted(data | {"annotations": None}, Dataset, other)
+        missing = [*ids.difference(image.id for image in dataset.images)]
+        missing += kinds.difference(named.id for named in dataset.categories or ())
         if missing:
-            fault = f"id {missing[0]} is not in the dataset JSON {other.name} beside this file"
-            continue
-        matches.append((other.name, dataset))
-        used.append([{i: images[i] for i in ids}, {k: names.get(k) for k in kinds}])
-    if any(one != used[0] for one in used):
-        both = " and ".join(name for name, _ in matches[:2])
-        raise ReobjError(f"{path}: {both} beside it both have the ids of its images, for other "
-                         "images or classes; keep only the dataset of this file")  # fmt: skip
+            fault = f"id {missing[0]!r} is not in the dataset JSON {other.name} beside this file"
+        else:
+            matches[other.name] = dataset
+    if len(matches) > 1:
+        raise ReobjError(f"{path}: {' and '.join(matches)} beside it all have the ids of its "
+                         "images; keep only the dataset of this file")  # fmt: skip
     by_name = all(entry.file_name or isinstance(entry.image_id, str) for entry in entries)
     if fault and not matches and not by_name:
         raise ReobjError(f"{path}: {fault}; put its own dataset there, or remove the other")
-    return matches[0] if matches else ("", None)
+    for name, dataset in matches.items():
+        source.say(f"images and classes of {name} beside it")
+        return dataset
+    return None
 
 
 def read_coco(source: Source) -> RecordedDetections:
     """Read a COCO, COCO-VID or TAO dataset with its own annotations."""
-    dataset = read_dataset(source.path, load_json(source.path), Annotated)
+    dataset = converted(load_json(source.path), Dataset, source.path)
     if dataset.annotations is None:
         raise ReobjError(f"{source.path}: a dataset without annotations; give the file of COCO "
                          "results [{image_id, category_id, bbox, score}] beside it")  # fmt: skip
@@ -175,9 +175,7 @@ def read_coco(source: Source) -> RecordedDetections:
 def read_coco_results(source: Source) -> RecordedDetections:
     """Read COCO results with ids of a dataset beside them, or with names or numbers of images."""
     entries = converted(load_json(source.path), list[Annotation], source.path)
-    name, dataset = _beside(source.path, entries) if entries else ("", None)
-    source.say(f"images and classes of {name} beside it" * bool(name))
-    return _read(source, entries, dataset)
+    return _read(source, entries, _beside(source, entries) if entries else None)
 
 
 def _read(source: Source, entries: list[Annotation], dataset: Dataset | None) -> RecordedDetections:
@@ -185,19 +183,22 @@ def _read(source: Source, entries: list[Annotation], dataset: Dataset | None) ->
     classes = _categories(source, entries, dataset)
     frame, size, looked = _images(source, entries, dataset)
     scale = source.scale(size, frame >= 0)
-    box = np.array([entry.bbox for entry in entries], np.float64).reshape(-1, 4)
     masks = []
-    identity = np.full(len(entries), -1)
+    identity = []
     for at, (entry, ratio) in enumerate(zip(entries, scale[:, :2], strict=True)):
         try:
             masks.append(_mask(entry.segmentation, source.video.size, ratio))
-            identity[at] = entry.identity
-        except ReobjError as error:
+            identity.append(entry.identity)
+        except (OverflowError, ValueError) as error:
             raise ReobjError(f"{source.path}, entry {at}: {error}") from error
+    modes = {entry.bbox_mode for entry in entries}
+    if len(modes) > 1:
+        raise ReobjError(f"{source.path}: entries of several bbox_mode; expected one")
     return source.recorded(
-        frame, np.hstack([box[:, :2], box[:, :2] + box[:, 2:]]) * scale, classes,
+        frame, np.array([entry.bbox for entry in entries]), classes,
         np.array([entry.score for entry in entries], np.float64), masks,
-        identity=identity, looked=looked,
+        form=CORNERS if 0 in modes else SIZES, scale=scale, looked=looked,
+        identity=np.array(identity, np.int64),
         ignored=np.array([bool(entry.iscrowd or entry.ignore) for entry in entries], bool),
     )  # fmt: skip
 
@@ -208,13 +209,14 @@ def _categories(
     """Return the class (N,) of every entry and the class names.
 
     Category ids are those of the dataset; else positions in the names that the user gives, from 0,
-    or from 1 if only that is possible; else COCO's.
+    or from 1 if none is 0 and one is their number; else COCO's.
     """
     used = list(dict.fromkeys(entry.category_id for entry in entries))
     gaps = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)  # unused among COCO's category ids 1 to 90
-    name_of: dict[Id, str] = dict(zip(sorted({*range(1, 91)} - {*gaps}), COCO_NAMES, strict=True))
+    numbers = [number for number in range(1, 91) if number not in gaps]
+    name_of: dict[Id, str] = dict(zip(numbers, COCO_NAMES, strict=True))
     if source.names:
-        from_1 = not {*used} <= {*range(len(source.names))} and 0 not in used
+        from_1 = 0 not in used and len(source.names) in used
         name_of = dict(enumerate(source.names, int(from_1)))
         text = f"category ids are taken as positions in the class names, from {int(from_1)}"
         source.say(text * bool(used and 0 not in used))
@@ -224,9 +226,11 @@ def _categories(
         source.say("no categories in it or beside it: category_id is taken as COCO's (1 to 90)")
     for at, entry in enumerate(entries):
         if entry.category_id not in name_of:
-            raise ReobjError(f"{source.path}, entry {at}: category_id {entry.category_id} is "
-                             "unknown: put the dataset JSON beside this file, or give a file of "
-                             "names (ids from 0) with --set detect.class_names=FILE")  # fmt: skip
+            known = shortened([repr(i) for i in name_of])
+            raise ReobjError(f"{source.path}, entry {at}: category_id {entry.category_id!r} is "
+                             f"unknown, expected one of {known}: put the dataset JSON beside this "
+                             "file, or give a file of names (ids from 0) with --set "
+                             "detect.class_names=FILE")  # fmt: skip
     names = list(dict.fromkeys(name_of.values()))
     return np.array([names.index(name_of[e.category_id]) for e in entries], np.int64), names
 
@@ -240,25 +244,24 @@ def _images(
         frame (N,) of every entry, -1: none; size (N, 2) of its image, 0: unknown; and the frames
         listed in the dataset, ascending, None without a dataset.
     """
-    size = np.zeros((len(entries), 2))
     ids = [entry.image_id for entry in entries]
     if dataset is not None:
         frame_of = _dataset_frames(dataset, source)
-        image_of = {image.id: image for image in dataset.images}
-        for at, i in enumerate(ids):
-            if i not in image_of:
-                raise ReobjError(f"{source.path}, entry {at}: image_id {i} is not in the dataset")
-            size[at] = image_of[i].width or 0, image_of[i].height or 0
+        size_of = {image.id: (image.width or 0, image.height or 0) for image in dataset.images}
+        for at in [at for at, i in enumerate(ids) if i not in size_of][:1]:
+            known = shortened([*map(repr, size_of)])
+            raise ReobjError(f"{source.path}, entry {at}: image_id {ids[at]!r} is not in the "
+                             f"dataset, which has {known}")  # fmt: skip
         listed = np.unique(np.array(list(frame_of.values()), np.int64))
+        size = np.array([size_of[i] for i in ids], np.float64).reshape(-1, 2)
         return np.array([frame_of[i] for i in ids], np.int64), size, listed[listed >= 0]
-    if source.video.names or not all(isinstance(i, int) for i in ids):
+    size = np.zeros((len(entries), 2))
+    numbers = [i for i in ids if isinstance(i, int)]
+    if source.video.names or len(numbers) < len(ids):
         names = [entry.file_name or str(entry.image_id) for entry in entries]
         return frames_of_names(names, source, 0), size, None
-    numbers = np.array(ids, np.float64)
-    if (np.abs(numbers) >= 1 << 53).any():
-        raise ReobjError(f"{source.path}: image_id {numbers.max():.0f}, expected a frame number")
     source.say("no dataset JSON beside it: image_id is taken as the frame number" * bool(ids))
-    return frames_of_numbers(numbers.astype(np.int64), source, 0), size, None
+    return frames_of_numbers(np.array(numbers, np.int64), source, 0), size, None
 
 
 def _dataset_frames(dataset: Dataset, source: Source) -> dict[Id, int]:
@@ -275,7 +278,9 @@ def _dataset_frames(dataset: Dataset, source: Source) -> dict[Id, int]:
     rule = named and frames_by_name(list(dict.fromkeys(names)), video.files or video.names)[1]
     if source.first == "order":
         frame = np.arange(len(images))
-    elif not rule and all(number is not None for number in numbers):
+    elif not (rule or (named and source.describes)) and all(
+        number is not None for number in numbers
+    ):
         frame = frames_of_numbers(np.array(numbers, np.int64), source, 0)
     elif named or not images:
         frame = frames_of_names(names, source)
@@ -290,40 +295,31 @@ def _dataset_frames(dataset: Dataset, source: Source) -> dict[Id, int]:
 def _of_one_video(dataset: Dataset, source: Source) -> list[Image]:
     """Return the images of the video, of a dataset of several; all if images are found by name."""
     images = dataset.images
-    ids = {image.video_id for image in images}
-    if len(ids) < 2:
-        return images
-    name_of = {video.id: video.name for video in dataset.videos or ()}
     stem = Path(source.video.source).stem
-    same = [i for i in ids if i is not None and Path(name_of.get(i, str(i))).stem == stem]
-    if len(same) == 1:
-        kept = [image for image in images if image.video_id == same[0]]
-        source.say(f"{len(images) - len(kept)} images of other videos left out")
-        return kept
-    if source.video.names and any(image.file_name for image in images):
+    of_video = {video.id for video in dataset.videos or () if Path(video.name).stem == stem}
+    kept = [image for image in images if image.video_id in of_video and len(of_video) == 1]
+    ids = {image.video_id for image in images}
+    if len(ids) < 2 or (not kept and source.video.names and any(i.file_name for i in images)):
         return images
-    some = shortened(sorted(map(str, name_of.values())))
-    raise ReobjError(f"{source.path}: images of {len(ids)} videos ({some}), none of them called "
-                     f"{stem}; keep one, or rename it")  # fmt: skip
+    if not kept:
+        some = shortened([video.name for video in dataset.videos or ()])
+        raise ReobjError(f"{source.path}: images of {len(ids)} videos ({some}), none of them "
+                         f"called {stem}; keep one, or rename it")  # fmt: skip
+    source.say(f"{len(images) - len(kept)} images of other videos left out")
+    return kept
 
 
-def _mask(mask: Any, size: tuple[int, int], scale: Array) -> Counts:
-    """Read a COCO segmentation as run lengths: RLE (compressed or not), polygons or none."""
+def _mask(mask: Rle | list[list[float]] | None, size: tuple[int, int], scale: Array) -> Counts:
+    """Return a segmentation as run lengths."""
     if not mask or size == (0, 0):
         return NO_RUNS
-    try:
-        if not isinstance(mask, dict):
-            rings = [np.reshape(np.asarray(ring, np.float64), (-1, 2)) * scale for ring in mask]
-            return polygon_runs([ring.ravel().tolist() for ring in rings], size)
-        counts = mask["counts"]
-        if tuple(mask["size"]) != size[::-1]:
-            raise ReobjError(f"mask of (h, w) {mask['size']} in a video of {size[::-1]}")
-        return coco_runs(counts) if isinstance(counts, str) else np.array(counts, np.uint32).ravel()
-    except ReobjError:
-        raise
-    except (KeyError, OverflowError, TypeError, ValueError) as error:
-        text = f"segmentation cannot be read ({error!r:.80})"
-        raise ReobjError(f"{text}; expected polygons or RLE") from error
+    if not isinstance(mask, Rle):
+        rings = [np.reshape(ring, (-1, 2)) * scale for ring in mask]
+        return polygon_runs([ring.ravel().tolist() for ring in rings], size)
+    if mask.size != size[::-1]:
+        raise ValueError(f"mask of (h, w) {mask.size} in a video of {size[::-1]}")
+    counts = mask.counts
+    return coco_runs(counts) if isinstance(counts, str) else np.array(counts, np.uint32)
 
 
 def read_oa_slam(source: Source) -> RecordedDetections:
@@ -337,25 +333,3 @@ def read_oa_slam(source: Source) -> RecordedDetections:
         (np.array([row.category_id for row in rows], np.int64), source.names or COCO_NAMES),
         np.array([row.detection_score for row in rows], np.float64), unit="detection",
     )  # fmt: skip
-
-
-def described_images(path: Path, name: str) -> tuple[tuple[int, int] | None, list[str]]:
-    """Return the common (w, h) and the names of the images of a format; as in the dataset beside.
-
-    The size is None where images differ or lack it.
-    """
-    data = load_json(path)
-    if name == "oa-slam":
-        return None, [image.file_name for image in converted(data, list[_OaImage], path)]
-    if name == "coco":
-        dataset: Dataset | None = read_dataset(path, data, Dataset)
-    else:
-        entries = converted(data, list[Annotation], path)
-        dataset = _beside(path, entries)[1] if entries else None
-        if dataset is None:
-            return None, [entry.file_name for entry in entries if entry.file_name]
-    images = dataset.images if dataset else []
-    sizes = {(image.width, image.height) for image in images}
-    width, height = sizes.pop() if len(sizes) == 1 else (None, None)
-    size = (int(width), int(height)) if width and height else None
-    return size, [image.file_name for image in images if image.file_name]

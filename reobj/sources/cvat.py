@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import zipfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -13,7 +12,6 @@ import cv2
 import numpy as np
 
 from reobj.files import MEMORY_MAX, check_unpacked
-from reobj.sources.class_names import check_length
 from reobj.sources.image_frames import frames_of_names
 from reobj.sources.masks import NO_RUNS, Counts, crop_runs, polygon_runs
 from reobj.sources.recorded import RecordedDetections, Source
@@ -30,7 +28,8 @@ def read_cvat(source: Source) -> RecordedDetections:
     try:
         root = _root(path)
         bounded = Counter[str]()  # number of shapes of each kind that became bounding boxes
-        shapes = list(_of_tracks(root)) or list(_of_images(root))
+        left = Counter(child.tag for parent in _parents(root) for child in parent)
+        shapes = list(_shapes(root))
         boxes = np.array([_bounds(shape, bounded) for *_, shape in shapes], np.float64)
         size = [float(root.findtext(f".//meta//original_size/{side}", "0"))
                 for side in ("width", "height")]  # fmt: skip
@@ -43,8 +42,8 @@ def read_cvat(source: Source) -> RecordedDetections:
     frames, identity, labels, _ = zip(*shapes, strict=True)
     for kind, count in sorted(bounded.items()):
         source.say(f"{count} {kind} taken as their bounding boxes")
-    skeletons = sum(1 for _ in root.iter("skeleton"))
-    source.say(f"{skeletons} skeletons left out" * bool(skeletons))
+    for kind in sorted(left.keys() - {*KINDS, "tag"}):
+        source.say(f"{left[kind]} shapes {kind} left out")
     looked = None
     if isinstance(frames[0], str):
         frame = frames_of_names(frames, source)
@@ -53,8 +52,6 @@ def read_cvat(source: Source) -> RecordedDetections:
         frame = np.array(frames, np.int64) - begin
         looked = _listed_frames(root, frames, begin)
     names, class_id = np.unique(labels, return_inverse=True)
-    for name in names.tolist():
-        check_length(name, f"{path}, label")
     scale = source.scale(np.tile(size, (len(shapes), 1)))
     runs = [
         _runs(shape, ratio, source.video.size, f"{path}, box {at}")
@@ -62,7 +59,8 @@ def read_cvat(source: Source) -> RecordedDetections:
     ]
     ids = np.array(identity, np.int64)
     return source.recorded(
-        frame, boxes * scale, (class_id.astype(np.int64), names.tolist()), runs=runs, unit="box",
+        frame, boxes, (class_id.astype(np.int64), names.tolist()), runs=runs, unit="box",
+        scale=scale,
         identity=ids if (ids > 0).any() else np.empty(0, np.int64), looked=looked,
     )  # fmt: skip
 
@@ -98,26 +96,25 @@ def _listed_frames(root: ET.Element, frames: Sequence[int | str], begin: int) ->
 Shape = tuple[int | str, int, str, ET.Element]  # frame or image, identity, label, element
 
 
-def _of_tracks(root: ET.Element) -> Iterator[Shape]:
-    """Yield the shapes of tracks."""
-    for track in root.iter("track"):
-        for shape in _shapes(track):
-            if shape.attrib.get("outside") != "1":
-                identity = int(track.attrib["id"]) + 1
-                yield int(shape.attrib["frame"]), identity, track.attrib["label"], shape
+KINDS = ("box", "polygon", "polyline", "points", "ellipse", "mask")
 
 
-def _of_images(root: ET.Element) -> Iterator[Shape]:
-    """Yield the shapes of CVAT for images, which have no identities (0)."""
-    for image in root.iter("image"):
-        for shape in _shapes(image):
-            yield image.attrib["name"], 0, shape.attrib["label"], shape
+def _parents(root: ET.Element) -> list[ET.Element]:
+    """List the tracks, or the images of CVAT for images."""
+    return list(root.iter("track")) or list(root.iter("image"))
 
 
-def _shapes(parent: ET.Element) -> list[ET.Element]:
-    """List the shapes of a track or an image that have a bounding box."""
-    kinds = ("box", "polygon", "polyline", "points", "ellipse", "mask", "cuboid")
-    return [child for child in parent if child.tag in kinds]
+def _shapes(root: ET.Element) -> Iterator[Shape]:
+    """Yield the shapes that are in view; those of images have no identities (0)."""
+    for parent in _parents(root):
+        for shape in parent:
+            if shape.tag not in KINDS or shape.get("outside") == "1":
+                continue
+            if parent.tag == "track":
+                identity = int(parent.attrib["id"]) + 1
+                yield int(shape.attrib["frame"]), identity, parent.attrib["label"], shape
+            else:
+                yield parent.attrib["name"], 0, shape.attrib["label"], shape
 
 
 def _floats(shape: ET.Element, names: str) -> Array:
@@ -142,12 +139,7 @@ def _bounds(shape: ET.Element, bounded: Counter[str]) -> Array:
     if shape.tag == "mask":
         low = _floats(shape, "left top")
         return np.hstack([low, low + _floats(shape, "width height")])
-    if shape.tag == "cuboid":
-        names = [" ".join(k for k in shape.attrib if re.fullmatch(axis + "[tb][lr][12]", k))
-                 for axis in "xy"]  # fmt: skip
-        corners = np.stack([_floats(shape, of_axis) for of_axis in names], 1)
-    else:
-        corners = _corners(shape)
+    corners = _corners(shape)
     return np.hstack([corners.min(0), corners.max(0)])
 
 
@@ -164,12 +156,12 @@ def _runs(shape: ET.Element, scale: Array, size: tuple[int, int], where: str) ->
         scale: (2,) pixels of the video for each of the annotation. size: (w, h) of the video,
             (0, 0): unknown, no mask.
     """
-    if size == (0, 0):
+    if size == (0, 0) or shape.tag not in ("polygon", "mask"):
         return NO_RUNS
     try:
         if shape.tag == "polygon":
             return polygon_runs([(_corners(shape) * scale).ravel().tolist()], size)
-        return _mask_runs(shape, scale, size) if shape.tag == "mask" else NO_RUNS
+        return _mask_runs(shape, scale, size)
     except (KeyError, OverflowError, ValueError) as error:
         raise ReobjError(f"{where}: {shape.tag} cannot be read ({error!r:.120})") from error
 
@@ -177,20 +169,17 @@ def _runs(shape: ET.Element, scale: Array, size: tuple[int, int], where: str) ->
 def _mask_runs(shape: ET.Element, scale: Array, size: tuple[int, int]) -> Counts:
     """Return a mask as run lengths down the columns of the image; the file's follow its rows."""
     left, top, width, height = _floats(shape, "left top width height").astype(int).tolist()
-    low = np.array([left, top], np.float64) * scale
-    high = np.array([left + width, top + height], np.float64) * scale
-    if width < 1 or height < 1 or (low < -scale).any() or (high > size + scale).any():
+    box = np.array([[left, top], [left + width, top + height]]) * scale  # (2, 2) corners
+    if width < 1 or height < 1 or (box[0] < -scale).any() or (box[1] > size + scale).any():
         raise ValueError(f"{width}x{height} pixels from {left}, {top} on, beyond the image")
     counts = np.array(shape.attrib["rle"].split(","), np.int64)
     if counts.min() < 0 or counts.max() > width * height or counts.sum() != width * height:
         raise ValueError(f"run lengths of {counts.sum()} pixels for {width}x{height}")
-    crop = np.repeat(np.arange(len(counts)) % 2 > 0, counts).reshape(height, width)
-    corner = low.round().astype(int)
-    if (scale != 1).any():
-        scaled = np.maximum(high.round().astype(int) - corner, 1).tolist()
-        small = crop.astype(np.uint8)
-        crop = cv2.resize(small, scaled, interpolation=cv2.INTER_NEAREST) > 0
-    return crop_runs(crop, (int(corner[0]), int(corner[1])), size)
+    mask = np.repeat(np.arange(len(counts)) % 2, counts).reshape(height, width)  # (H, W) 0, 1
+    (x1, y1), (x2, y2) = box.round().astype(int).tolist()
+    scaled = (max(x2 - x1, 1), max(y2 - y1, 1))
+    crop = cv2.resize(mask.astype(np.uint8), scaled, interpolation=cv2.INTER_NEAREST)
+    return crop_runs(crop > 0, (x1, y1), size)
 
 
 def _rotated_bounds(centre: Array, half: Array, angle_deg: float, box: bool) -> Array:

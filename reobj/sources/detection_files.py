@@ -20,16 +20,17 @@ import numpy as np
 from reobj.cameras import Poses
 from reobj.files import did_you_mean, last_name, shortened
 from reobj.formats import AUTO
-from reobj.sources import coco
 from reobj.sources.class_names import check_length, load_class_names
 from reobj.sources.detection_formats import DETECTIONS, Reader
-from reobj.sources.label_folders import label_files
 from reobj.sources.looked import frames_looked_at, looked_message
-from reobj.sources.recorded import NORMALISED_MAX, RecordedDetections, Source, npz_image_size
-from reobj.sources.tables import are_numbers, read_cells, read_cells_3d, seconds
+from reobj.sources.recorded import (
+    NORMALISED_MAX,
+    NoVideo,
+    RecordedDetections,
+    Source,
+)
 from reobj.sources.video import Video
 from reobj.types import (
-    CLASS_NAME_MAX,
     COORDINATE_MAX,
     DETECTIONS_MAX,
     Array,
@@ -163,9 +164,13 @@ def _read(
     """Read a file of any format without validation."""
     if config.first_frame not in ("", "0", "1", "order"):
         raise ReobjError(f"detect.first_frame {config.first_frame}: expected 0, 1 or order")
-    names = load_class_names(config.class_names) if config.class_names else ()
-    source = Source(path, video, names, config.first_frame, poses)
+    source = Source(path, video, class_names(config), config.first_frame, poses)
     return read_source(source, DETECTIONS.reader(path, config.format))
+
+
+def class_names(config: DetectConfig) -> Sequence[str]:
+    """Read the class names that the user gives; (): none."""
+    return load_class_names(config.class_names) if config.class_names else ()
 
 
 def read_source(source: Source, read: Reader) -> RecordedDetections:
@@ -187,21 +192,13 @@ def described_images(
         their common (w, h), None: not stated or they differ; their names; their times in s,
         ascending, None: frames are not found by times.
     """
-    match DETECTIONS.find(path, config.format).name:
-        case "npz":
-            return npz_image_size(path), [], None
-        case "coco" | "coco-results" | "oa-slam" as name:
-            return *coco.described_images(path, name), None
-        case "yolo":
-            return None, [str(file.relative_to(path)) for file in label_files(path)], None
-        case "boxer-3d":
-            return None, [], np.unique(seconds(read_cells_3d(path)))
-        case "csv" if "frame" not in (table := read_cells(path)).cells:
-            if "image" not in table.cells:
-                return None, [], np.unique(seconds(table))
-            names = list(dict.fromkeys(table.cells["image"]))
-            return None, [] if are_numbers(names) else names, None
-    return None, [], None
+    source = Source(path, NoVideo(path.stem), class_names(config), config.first_frame)
+    source.describes = True
+    size = read_source(source, DETECTIONS.reader(path, config.format)).size
+    sizes = source.image_sizes if size == (0, 0) else {size}
+    stated = sizes.pop() if len(sizes) == 1 else (0, 0)
+    times_s = None if source.times_s is None else np.unique(source.times_s)
+    return None if 0 in stated else stated, list(dict.fromkeys(source.image_names)), times_s
 
 
 def _check(
@@ -249,25 +246,22 @@ def _stated_scale(text: str, size: tuple[int, int]) -> Array:
 def check_rows(recorded: RecordedDetections, path: Path) -> None:
     """Refuse invalid values and masks; the error names the first such row."""
     names = recorded.class_names
+    for name in names:
+        check_length(name, str(path))
     with np.errstate(invalid="ignore", over="ignore"):  # inf - inf
         finite = np.isfinite(recorded.xyxy.sum(1) + recorded.score)  # (N,)
     finite &= (np.abs(recorded.xyxy) <= COORDINATE_MAX).all(1)
     named = (recorded.class_id >= 0) & (recorded.class_id < len(names))
-    is_long = np.array([len(name) > CLASS_NAME_MAX for name in (*names, "")], bool)
-    long = is_long[np.where(named, recorded.class_id, -1)]
     whole = math.prod(recorded.size)
     unfit = np.array([len(runs) > 0 and runs.sum() != whole for runs in recorded.runs], bool)
-    for row in np.flatnonzero(~finite | ~named | long | unfit)[:1]:
-        where = f"{path}, {recorded.unit} {recorded.line[row]}"
+    for row in np.flatnonzero(~finite | ~named | unfit)[:1]:
         text = f"mask of {recorded.runs[row].sum()} pixels in a video of {recorded.size}"
         if not finite[row]:
             values = f"{recorded.xyxy[row]}, {recorded.score[row]}"
             text = f"{values}: NaN, infinite or beyond 1e7 pixels"
         elif not named[row]:
             text = unnamed_class(int(recorded.class_id[row]), len(names))
-        elif long[row]:
-            check_length(names[recorded.class_id[row]], where)
-        raise ReobjError(f"{where}: {text}")
+        raise ReobjError(f"{path}, {recorded.unit} {recorded.line[row]}: {text}")
 
 
 def _check_scores(recorded: RecordedDetections, most: float, path: Path) -> None:
@@ -320,15 +314,15 @@ def _usable(
     if count and xyxy.max() <= NORMALISED_MAX:
         fault = f"no coordinate above {NORMALISED_MAX}: normalised to 0..1? "
         fault += "Multiply them by the image size"
-    elif checks_size and (other := _other_size(xyxy[~empty], size)):
+    elif count and (other := recorded.other_form(size)):
         fault = other
-    elif other := _other_reading(xyxy, size):
+    elif checks_size and (other := _other_size(xyxy[~empty], size)):
         fault = other
     elif 2 * (empty | outside).sum() > count or larger:
         fault = (
             f"{empty.sum()} of {count} boxes have no area and {outside.sum()} lie outside "
-            f"the image of {size}: x, y, w, h where x1, y1, x2, y2 is expected, "
-            "frames of another size (--set detect.image_size=WIDTHxHEIGHT), or another video?"
+            f"the image of {size}: frames of another size (--set detect.image_size=WIDTHxHEIGHT), "
+            "or another video?"
         )
     elif count and missing.all():
         fault = f"all detections are {text}: detections of another video?"
@@ -368,33 +362,6 @@ def _other_size(xyxy: Array, size: tuple[int, int]) -> str:
     where = f"x = {most[0]:.0f}, y = {most[1]:.0f}, and the image is {size[0]}x{size[1]}"
     return (f"boxes are cut off at {where}: boxes of frames of another size? Name it with --set "
             "detect.image_size=WIDTHxHEIGHT")  # fmt: skip
-
-
-def _other_reading(xyxy: Array, size: tuple[int, int]) -> str:
-    """Describe the box format that boxes (N, 4) probably have; "" if corners are valid.
-
-    Corners are invalid if the second is before the first or the centre lies outside the image.
-    Then common mistakes are tried; one is the cause if all boxes fit the image with it.
-    """
-    low, high = xyxy[:, :2], xyxy[:, 2:]
-    centre = (low + high) / 2
-    inverted = (high < low).any(1)
-    beyond = ((centre < 0) | (centre > size)).any(1)
-    if not (inverted | beyond).any():
-        return ""
-    why = f"{inverted.sum()} of {len(xyxy)} boxes have x2 < x1 or y2 < y1 and {beyond.sum()} have "
-    why += f"their centre outside the image of {size}"
-    for end, limit, cause in (
-        (high, size[::-1], f"all fit the frame turned by 90 deg, {size[::-1]}: made on frames that "
-                           "were not turned upright? Detect on upright frames"),
-        (low + high, size, "all fit it as x, y, w, h: name the columns so, or give corners"),
-        (high - low, size, "all fit it if w and h are the corner x2, y2: name them so, or give "
-                           "sizes"),
-    ):  # fmt: skip
-        # Tolerance of 1 px: detectors round boxes to whole pixels
-        if (low >= -1).all() and (low <= end).all() and (end <= np.add(limit, 1)).all():
-            return f"{why}; {cause}"
-    return ""
 
 
 def read_tracks(

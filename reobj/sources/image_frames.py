@@ -88,8 +88,10 @@ def frames_of_names(names: Sequence[str], source: Source, usual: int | None = No
     video = source.video
     distinct, row = np.unique(np.array(names, object), return_inverse=True)
     given = [original_name(name) for name in distinct.tolist()]
-    if not given:
-        return np.empty(0, np.int64)
+    if source.describes and not all(name.isdecimal() for name in given):
+        source.image_names += given
+    if source.describes or not given:
+        return np.zeros(len(names), np.int64)
     frame, rule = frames_by_name(given, video.files or video.names, str(source.path))
     if rule:
         unmatched = [name for name, f in zip(given, frame.tolist(), strict=True) if f < 0]

@@ -5,18 +5,19 @@ Coordinates are fractions of the image size. Keypoints after `class cx cy w h` a
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from reobj.files import LINES_MAX, read_lines
+from reobj.files import LINES_MAX, read_lines, read_text
 from reobj.sources.class_names import is_yaml, load_class_names
 from reobj.sources.image_frames import frames_of_names
 from reobj.sources.masks import NO_RUNS, polygon_runs
-from reobj.sources.recorded import NORMALISED_MAX, RecordedDetections, Source
-from reobj.types import COCO_NAMES, Array, IntArray, ReobjError, xyxy_from_cxcywh
+from reobj.sources.recorded import CENTRES, NORMALISED_MAX, RecordedDetections, Source
+from reobj.types import COCO_NAMES, Array, IntArray, ReobjError, cxcywh_from_xyxy
 
 NO_LABELS = ("classes.txt train.txt val.txt valid.txt test.txt readme.txt readme.dataset.txt "
              "readme.roboflow.txt requirements.txt labels.txt").split()  # fmt: skip
@@ -43,8 +44,9 @@ def names_file(path: Path) -> Path | None:
     labels = path.resolve()
     for folder in (labels, *labels.parents[:2]):
         known = [*(folder / name for name in NAMES_FILES), *sorted(folder.glob("*.names"))]
-        for file in (*filter(Path.is_file, known), *sorted(filter(is_yaml, folder.glob("*")))):
-            if file in known or any(line.startswith("names") for line in read_lines(file)):
+        other = [*sorted(filter(is_yaml, folder.glob("*"))), *folder.glob("notes.json")]
+        for file in (*filter(Path.is_file, known), *other):
+            if file in known or re.search(r'^names|"categories"', read_text(file), re.MULTILINE):
                 return file
     return None
 
@@ -66,52 +68,67 @@ def read_label_folder(source: Source, pose: int = 0) -> RecordedDetections:
         count = len(files) - len(video_files)
         source.say(f"{count} files of other names than the video's left out")
         files = video_files
-    names = source.names
-    beside = None if names else names_file(path)
-    if beside is not None:
-        names = load_class_names(beside)
+    rows, lines, of_file = _read_rows(files, path)
+    if pose:
+        rows = [row[:5] + row[len(row) - (len(row) - 5) % pose :] for row in rows]
+        source.say("keypoints after class cx cy w h are not read")
+    triangles = any(row[6] % 1 for row in rows if len(row) == 7)  # else of box, conf and id
+    begin = [len(row) - _tail(row) if len(row) > 7 - triangles else 5 for row in rows]
+    polygons = {i: np.reshape(rows[i][1:at], (-1, 2)) for i, at in enumerate(begin) if at > 5}
+    box = np.array([row[1:5] for row in rows]).reshape(-1, 4)
+    runs = [NO_RUNS] * len(rows)
+    for i, points in polygons.items():
+        if np.abs(points).max() > NORMALISED_MAX:
+            raise ReobjError(f"{path}, line {lines[i]}: {len(rows[i])} columns that are no polygon:"
+                             " a corner is no fraction of the image size")  # fmt: skip
+        box[i] = cxcywh_from_xyxy(np.hstack([points.min(0), points.max(0)])[None])[0]
+        if not source.describes:
+            runs[i] = polygon_runs([(points * video.size).ravel().tolist()], video.size)
+    score, identity = _tails([row[at:] for row, at in zip(rows, begin, strict=True)], path)
+    stems = [str(file.relative_to(path)) for file in files]
+    frame = frames_of_names(stems, source, 1 if video_files else None)
+    class_id = np.array([row[0] for row in rows], np.float64).astype(np.int64)
+    return source.recorded(
+        frame[np.array(of_file, np.int64)], box, (class_id, _names(source)), score, runs,
+        np.array(lines, object), "line", CENTRES, np.tile(video.size, 2), identity=identity,
+    )  # fmt: skip
+
+
+def _names(source: Source) -> Sequence[str]:
+    """Return the class names: the user's, those of a file beside the labels, else COCO's."""
+    if source.names:
+        return source.names
+    if beside := names_file(source.path):
         source.say(f"class names of {beside}")
-    elif not names:
-        source.say("no class names beside it: class numbers are taken as COCO's 80")
+        return load_class_names(beside)
+    source.say("no class names beside it: class numbers are taken as COCO's 80")
+    return COCO_NAMES
+
+
+def _read_rows(files: Sequence[Path], path: Path) -> tuple[list[list[float]], list[str], list[int]]:
+    """Read the rows of all files: numbers, line for messages, number of the file."""
     rows = list[list[float]]()
     lines = list[str]()
     of_file = list[int]()
     for at, file in enumerate(files):
         for number, line in enumerate(read_lines(file), 1):
-            if cells := line.split():
-                rows.append(_row(cells, f"{file}, line {number}"))
+            if line.strip():
+                rows.append(_row(line, f"{file}, line {number}"))
                 lines.append(f"{number} of {file.name}")
                 of_file.append(at)
         if len(rows) > LINES_MAX:
             raise ReobjError(f"{path}: more than {LINES_MAX} boxes; take fewer frames")
-    if pose:
-        rows = [row[:5] + row[len(row) - (len(row) - 5) % pose :] for row in rows]
-        source.say("keypoints after class cx cy w h are not read")
-    box, score, identity, polygons = _columns(rows, [f"{path}, line {line}" for line in lines])
-    stems = [str(file.relative_to(path)) for file in files]
-    frame = frames_of_names(stems, source, 1 if video_files else None)
-    runs = [NO_RUNS] * len(rows)
-    for row, corners in polygons.items():
-        runs[row] = polygon_runs([(corners * video.size).ravel().tolist()], video.size)
-    class_id = np.array([row[0] for row in rows], np.float64).astype(np.int64)
-    return source.recorded(
-        frame[np.array(of_file, np.int64)], xyxy_from_cxcywh(box) * np.tile(video.size, 2),
-        (class_id, names or COCO_NAMES), score, runs, np.array(lines, object), "line",
-        identity=identity,
-    )  # fmt: skip
+    return rows, lines, of_file
 
 
-def _row(cells: Sequence[str], where: str) -> list[float]:
+def _row(line: str, where: str) -> list[float]:
     """Read the numbers of a line, the class first."""
-    shown = repr(" ".join(cells)[:60])
-    try:
-        row = [float(cell) for cell in cells]
-    except ValueError:
-        text = f"{shown}, expected numbers: class cx cy w h [conf] [id]"
-        raise ReobjError(f"{where}: {text}") from None
+    row = list[float]()
+    with contextlib.suppress(ValueError):
+        row = [float(cell) for cell in line.split()]
     if len(row) < 5 or not np.isfinite(row).all() or row[0] % 1 or not 0 <= row[0] < 1 << 31:
-        expected = "expected class cx cy w h [conf] [id] or class x1 y1 x2 y2 ..."
-        raise ReobjError(f"{where}: {shown}, {expected}")
+        expected = "expected class cx cy w h [conf] [id] or class x1 y1 x2 y2 ..., all numbers"
+        raise ReobjError(f"{where}: {line.strip()[:60]!r}, {expected}")
     if max(map(abs, row[1:5])) > NORMALISED_MAX:
         text = f"{max(row[1:5], key=abs):g} is no fraction of the image size"
         raise ReobjError(f"{where}: {text}; expected numbers of 0..1, not pixels")
@@ -145,55 +162,21 @@ def _points_in_boxes(rows: Array) -> bool:
     return bool((inside | (points == 0)).all())
 
 
-def read_pose_folder(source: Source) -> RecordedDetections:
-    """Read a folder of YOLO labels with keypoints x y visibility, which are not read."""
-    return read_label_folder(source, 3)
+def _tails(tails: Sequence[Sequence[float]], path: Path) -> tuple[Array, IntArray]:
+    """Return scores and identities (N,), -1: none, of the numbers after boxes and polygons.
 
-
-def read_pose_2d_folder(source: Source) -> RecordedDetections:
-    """Read a folder of YOLO labels with keypoints x y, which are not read."""
-    return read_label_folder(source, 2)
-
-
-def _columns(
-    rows: Sequence[Sequence[float]], where: Sequence[str]
-) -> tuple[Array, Array, IntArray, dict[int, Array]]:
-    """Split rows into boxes (N, 4) cx, cy, w, h, scores (N,) and identities (N,), -1: none.
-
-    The corners (K, 2) of polygons are returned by the number of their row.
-
-    Rows of up to seven numbers are boxes with optional confidence and identity (whole); if a
-    seventh number is not whole, rows of seven are triangles. Longer rows are polygons, also with
-    optional confidence and identity. A single number at the end is the identity if all such are
-    whole and one is above 1.
+    Two are confidence and identity. One is the confidence; or the identity, if all such are whole
+    and one is above 1.
     """
-    box = np.zeros((len(rows), 4))
-    score = np.ones(len(rows))
-    identity = np.full(len(rows), -1, np.int64)
-    polygons: dict[int, Array] = {}
-    triangles = any(row[6] % 1 for row in rows if len(row) == 7)
-    begin = [len(row) - _tail(row) if len(row) > 7 - triangles else 5 for row in rows]
-    alone = [row[-1] for row, at in zip(rows, begin, strict=True) if len(row) == at + 1]
+    alone = [tail[0] for tail in tails if len(tail) == 1]
     whole = max(alone, default=0) > 1
-    for i, (row, at) in enumerate(zip(rows, begin, strict=True)):
-        rest = list(row[at:])
-        if at > 5:
-            corners = np.reshape(row[1:at], (-1, 2))  # (K, 2)
-            if np.abs(corners).max() > NORMALISED_MAX:
-                raise ReobjError(f"{where[i]}: {len(row)} columns that are no polygon: a corner is "
-                                 "no fraction of the image size")  # fmt: skip
-            low, high = corners.min(0), corners.max(0)
-            box[i] = *(low + high) / 2, *(high - low)
-            polygons[i] = corners
-        else:
-            box[i] = row[1:5]
-        if len(rest) == 2 or (rest and whole):
-            identity[i] = int(rest.pop())
-        score[i] = rest[0] if rest else 1.0
     if whole and any(value % 1 for value in alone):
-        raise ReobjError(f"{where[0]}: the last column of the labels holds numbers above 1 and "
+        raise ReobjError(f"{path}: the last column of the labels holds numbers above 1 and "
                          "fractions: neither confidences nor identities")  # fmt: skip
-    return box, score, identity, polygons
+    least = 1 if whole else 2  # numbers of a row with identity
+    score = [tail[0] if len(tail) == 2 or (tail and not whole) else 1.0 for tail in tails]
+    identity = [tail[-1] if len(tail) >= least else -1 for tail in tails]
+    return np.array(score, np.float64), np.array(identity, np.float64).astype(np.int64)
 
 
 def _tail(row: Sequence[float]) -> int:

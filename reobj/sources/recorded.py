@@ -5,6 +5,7 @@ A reader (`detection_formats`) makes them from a `Source`; `detection_files` val
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -18,7 +19,92 @@ import numpy.typing as npt
 from reobj.cameras import Poses
 from reobj.files import LINES_MAX, MEMORY_MAX, load_npz, save_npz
 from reobj.sources.masks import NO_RUNS, Counts, rle_decode, rle_encode
-from reobj.types import CLASS_MAX, Array, BoolArray, Detections, IntArray, ReobjError, visible_name
+from reobj.types import (
+    CLASS_MAX,
+    Array,
+    BoolArray,
+    Detections,
+    IntArray,
+    ReobjError,
+    visible_name,
+    xyxy_from_cxcywh,
+)
+
+CORNERS, SIZES, CENTRES = "x1, y1, x2, y2", "x, y, w, h", "cx, cy, w, h"  # forms of a box
+
+
+def corners(box: Array, form: str) -> Array:
+    """Convert boxes (N, 4) of a form to corners (N, 4)."""
+    if form == CENTRES:
+        return xyxy_from_cxcywh(box)
+    return np.hstack([box[:, :2], box[:, :2] + box[:, 2:]]) if form == SIZES else box
+
+
+def other_form(
+    xyxy: Array, form: str, size: Sequence[float], frame: IntArray, identity: IntArray
+) -> str:
+    """Describe the form that boxes of an image of (w, h) `size` have instead of `form`.
+
+    Args:
+        xyxy: (N, 4) boxes as read. form: in which the file has them. size: (0, 0): unknown.
+        frame, identity: (N,); no identities: empty, or below 0.
+    Returns:
+        the fault and the remedy; "" if the boxes fit, or fit in no other form either. A box that is
+        inverted, or whose centre is outside the image, is a fault; so are more than a tenth of
+        boxes, and more than two, that leave the image (of boxes in another form 41 % or more do);
+        and sizes of an identity that change as its place does.
+    """
+    low, high = xyxy[:, :2], xyxy[:, 2:]
+    centre = (low + high) / 2
+    given = xyxy  # the numbers in the file
+    if form != CORNERS:
+        given = np.hstack([low if form == SIZES else centre, high - low])
+        if len(identity) and _move_as_corners(given, frame, identity):
+            return (f"all boxes are {CORNERS}, expected {form}: the third and fourth number "
+                    f"are above the first and second, and change with them; {REMEDY}")  # fmt: skip
+    if 0 in size:
+        return ""
+    inverted = (high < low).any(1)
+    beyond = ((centre < 0) | (centre > size)).any(1)
+    leave = ~_inside(xyxy, size)
+    if not (inverted | beyond).any() and leave.sum() <= max(2, 0.1 * len(xyxy)):
+        return ""
+    why = (f"as {form}, {inverted.sum()} of {len(xyxy)} boxes have x2 < x1 or y2 < y1 and "
+           f"{leave.sum()} leave the image of {size[0]:g}x{size[1]:g}")  # fmt: skip
+    others = [other for other in (CORNERS, SIZES, CENTRES) if other != form]
+    fits = [other for other in others if _inside(corners(given, other), size).mean() > 0.98]
+    if fits:
+        return f"{why}; all fit it as {' or '.join(fits)}: {REMEDY}"
+    if (inverted | beyond).any() and _inside(xyxy, size[::-1]).all():
+        return (f"{why}; all fit the frame turned by 90 deg: made on frames that were not turned "
+                "upright? Detect on upright frames")  # fmt: skip
+    return ""
+
+
+REMEDY = "convert them, or name these columns in the header of a CSV"
+
+
+def _move_as_corners(box: Array, frame: IntArray, identity: IntArray) -> bool:
+    """Test whether numbers (N, 4) are corners: the last two change as the first two do.
+
+    From one frame of an identity to its next, sizes change little: the difference of both changes
+    is at least 1.58 times the change of a size (1.57 in 24 files of tracks), but at most 1.41 times
+    that of a corner; both are reached where the corners move independently.
+    """
+    order = np.lexsort((frame, identity))
+    same = (np.diff(identity[order]) == 0) & (identity[order[1:]] >= 0)
+    step = np.diff(box[order], axis=0)[same]  # (M, 4)
+    apart = np.abs(step[:, 2:] - step[:, :2]).sum()
+    return bool((box[:, 2:] > box[:, :2]).all() and apart < 1.25 * np.abs(step[:, 2:]).sum())
+
+
+def _inside(xyxy: Array, size: Sequence[float]) -> BoolArray:
+    """Test which boxes (N,) are not inverted and lie in the image.
+
+    Tolerance of 1 px: detectors round boxes to whole pixels.
+    """
+    low, high = xyxy[:, :2], xyxy[:, 2:]
+    return np.asarray(((low >= -1) & (low <= high) & (high <= np.add(size, 1))).all(1))
 
 
 @dataclass(slots=True)
@@ -36,6 +122,7 @@ class RecordedDetections:
         looked: frames on which the detector was run, ascending; None: all.
         boxes_3d: (N, 15) of `boxes_3d.Boxes3D`, or empty.
         ignored: (N,) regions that do not count, as the file marks them, or empty.
+        form: of the boxes in the file.
     """
 
     frame: IntArray
@@ -53,12 +140,17 @@ class RecordedDetections:
     looked: IntArray | None = None
     boxes_3d: Array = field(default_factory=lambda: np.empty((0, 15)))
     ignored: BoolArray = field(default_factory=lambda: np.empty(0, bool))
+    form: str = CORNERS
 
     def __post_init__(self) -> None:
         self.class_names = tuple(map(visible_name, self.class_names))
 
     def __len__(self) -> int:
         return len(self.frame)
+
+    def other_form(self, size: Sequence[float]) -> str:
+        """Describe another form of the boxes, as the function of this name."""
+        return other_form(self.xyxy, self.form, size, self.frame, self.identity)
 
     def select(self, rows: IntArray) -> None:
         """Select rows (n,), in this order."""
@@ -91,6 +183,19 @@ class RecordedDetections:
 
 
 @dataclass(slots=True)
+class NoVideo:
+    """The video of a file that is read alone: frames of unknown number, size and names."""
+
+    source: str
+    size: tuple[int, int] = (0, 0)
+    working_size: tuple[int, int] = (0, 0)
+    names: Sequence[str] = ()
+    files: Sequence[Path] = ()
+    frame_count: int = 0
+    times_s: Array | None = None
+
+
+@dataclass(slots=True)
 class Source:
     """A file or folder of detections, and what its reader needs besides.
 
@@ -100,6 +205,8 @@ class Source:
             format says, or "order": listed images are the frames in this order.
         poses: cameras that project boxes in 3D; None: unknown.
         messages: about assumptions, for the user.
+        describes: only what the file says about its images is needed: names, sizes and times_s of
+            the frames, which the reader adds.
     """
 
     path: Path
@@ -108,6 +215,10 @@ class Source:
     first: str = ""
     poses: Poses | None = None
     messages: list[str] = field(default_factory=list)
+    describes: bool = False
+    image_names: list[str] = field(default_factory=list)
+    image_sizes: set[tuple[int, int]] = field(default_factory=set)
+    times_s: Array | None = None
 
     def say(self, *texts: str) -> None:
         """Add messages, without empty ones."""
@@ -116,21 +227,27 @@ class Source:
     def recorded(
         self,
         frame: IntArray,
-        xyxy: Array,
+        box: Array,
         classes: tuple[IntArray, Sequence[str]],
         score: Array | None = None,
         runs: list[Counts] | None = None,
         line: npt.NDArray[Any] | None = None,
         unit: str = "entry",
+        form: str = CORNERS,
+        scale: Array | float = 1.0,
         **columns: Any,
     ) -> RecordedDetections:
-        """Return the detections of N rows; columns: further attributes of RecordedDetections."""
+        """Return the detections of N rows; columns: further attributes of RecordedDetections.
+
+        scale: px of the video for each unit of the boxes (N, 4).
+        """
         count = len(frame)
+        xyxy = corners(np.reshape(box, (-1, 4)).astype(np.float64), form) * scale  # (N, 4)
         return RecordedDetections(
-            frame, xyxy.reshape(-1, 4), np.ones(count) if score is None else score, classes[0],
+            frame, xyxy, np.ones(count) if score is None else score, classes[0],
             [NO_RUNS] * count if runs is None else runs, tuple(classes[1]), self.video.size,
             self.video.working_size, np.arange(count) if line is None else line, unit,
-            self.messages, **columns,
+            self.messages, form=form, **columns,
         )  # fmt: skip
 
     def scale(self, made_for: Array, used: BoolArray | None = None) -> Array:
@@ -143,6 +260,7 @@ class Source:
             ReobjError: images of another aspect ratio.
         """
         size = self.video.size
+        self.image_sizes |= {(int(w), int(h)) for w, h in np.unique(made_for, axis=0)}
         scale = np.ones((len(made_for), 4))
         known = (made_for > 0).all(1) & (True if used is None else used)
         for w, h in np.unique(made_for[known], axis=0).tolist() if size != (0, 0) else ():
@@ -219,18 +337,10 @@ def write_detections_npz(
 NORMALISED_MAX = 1.5
 
 
-def npz_image_size(path: Path) -> tuple[int, int]:
-    """Return the (w, h) of the images of an npz file of detections."""
-    data, _ = load_npz(path)
-    _check_arrays(data, path)
-    width, height = data["image_size"].tolist()
-    return width, height
-
-
 def read_npz(
     path: Path, size: tuple[int, int], working_size: tuple[int, int], sealed: bool = False
 ) -> tuple[RecordedDetections, IntArray]:
-    """Read the format of `pack_detections` for a video of (w, h) `size`.
+    """Read the format of `pack_detections` for a video of (w, h) `size`, (0, 0): any.
 
     Args:
         sealed: as in `load_npz`.
@@ -239,51 +349,51 @@ def read_npz(
         those without detections (default: the frame of every detection).
     """
     data, _ = load_npz(path, sealed)
-    _check_arrays(data, path)
-    if (made_for := tuple(data["image_size"].tolist())) != size:
-        turned = ": made on frames that were not turned upright?" if made_for == size[::-1] else ""
-        text = f"made for images of {made_for} px, but the video is {size} px"
-        raise ReobjError(f"{path}: {text}{turned}")
-    count = len(data["frame"])
+    take = functools.partial(_array, data, path)
+    frame = take("frame", "iu", (-1,), LINES_MAX).astype(np.int64)
+    count = len(frame)
+    data.setdefault("mask_counts", NO_RUNS)
+    data.setdefault("mask_offsets", np.zeros(count + 1, np.int64))
+    runs = take("mask_counts", "iu", (-1,), MEMORY_MAX // 8)  # uint32, held twice
+    offsets = take("mask_offsets", "iu", (count + 1,)).astype(np.int64)
+    if (np.diff(offsets, prepend=0) < 0).any() or offsets[-1] > runs.size or (runs < 0).any():
+        raise ReobjError(f"{path}: mask_counts and mask_offsets are inconsistent")
+    width, height = take("image_size", "iu", (2,)).tolist()
+    if min(width, height) < 1:
+        raise ReobjError(f"{path}: image_size {width}, {height}, expected (w, h) in px")
+    if (width, height) != size and size != (0, 0):
+        turned = (height, width) == size
+        why = ": made on frames that were not turned upright?" if turned else ""
+        text = f"made for images of {(width, height)} px, but the video is {size} px"
+        raise ReobjError(f"{path}: {text}{why}")
     recorded = RecordedDetections(
-        data["frame"].astype(np.int64), data["xyxy"].astype(np.float64),
-        data["score"].astype(np.float64), data["class_id"].astype(np.int64),
-        np.split(data["mask_counts"].astype(np.uint32), data["mask_offsets"][1:])[:count],
-        tuple(data["class_names"].tolist()), size, working_size, np.arange(count), "row",
+        frame, take("xyxy", "fiu", (count, 4)).astype(np.float64),
+        take("score", "fiu", (count,)).astype(np.float64),
+        take("class_id", "iu", (count,)).astype(np.int64),
+        np.split(runs.astype(np.uint32), offsets[1:])[:count],
+        tuple(take("class_names", "U", (-1,), CLASS_MAX).tolist()), (width, height), working_size,
+        np.arange(count), "row",
     )  # fmt: skip
     if "done" not in data:
         return recorded, recorded.frame
-    recorded.looked = np.unique(data["done"]).astype(np.int64)
+    recorded.looked = np.unique(take("done", "iu", (-1,), LINES_MAX)).astype(np.int64)
     return recorded, recorded.looked
 
 
-def _check_arrays(data: dict[str, Any], path: Path) -> None:
-    """Validate number, shape and kind of the arrays; add empty masks where there are none."""
-    limits = {"frame": LINES_MAX, "done": LINES_MAX, "class_names": CLASS_MAX,
-              "mask_counts": MEMORY_MAX // 8}  # fmt: skip  # uint32, held twice
-    for key, most in limits.items():
-        if key in data and data[key].size > most:
-            raise ReobjError(f"{path}: {data[key].size} {key}, at most {most} are allowed")
-    count = len(np.atleast_1d(data.get("frame", ())))
-    data.setdefault("mask_counts", NO_RUNS)
-    data.setdefault("mask_offsets", np.zeros(count + 1, np.int64))
-    expected: dict[str, tuple[tuple[int, ...], str]] = {
-        "frame": ((count,), "iu"), "xyxy": ((count, 4), "fiu"), "score": ((count,), "fiu"),
-        "class_id": ((count,), "iu"), "class_names": ((-1,), "U"), "image_size": ((2,), "iu"),
-        "mask_counts": ((-1,), "iu"), "mask_offsets": ((count + 1,), "iu"), "done": ((-1,), "iu"),
-    }  # fmt: skip
-    for key, (shape, kinds) in expected.items():
-        if key not in data and key == "done":
-            continue
-        found = data[key].shape if key in data else "missing"
-        if found != shape and (shape != (-1,) or len(found) != 1):
-            raise ReobjError(f"{path}: array {key} is {found}, expected shape {shape}")
-        if data[key].dtype.kind not in kinds and data[key].size:
-            raise ReobjError(f"{path}: array {key} is of {data[key].dtype}, expected {kinds}")
-    data["mask_offsets"] = data["mask_offsets"].astype(np.int64)
-    ordered = (np.diff(data["mask_offsets"], prepend=0) >= 0).all()
-    runs = data["mask_counts"]
-    if (data["image_size"] < 1).any():
-        raise ReobjError(f"{path}: image_size {data['image_size']}, expected (w, h) in px")
-    if not ordered or data["mask_offsets"][-1] > runs.size or (runs < 0).any():
-        raise ReobjError(f"{path}: mask_counts and mask_offsets are inconsistent")
+def _array(
+    data: dict[str, npt.NDArray[Any]], path: Path, key: str, kinds: str, shape: tuple[int, ...],
+    most: int = MEMORY_MAX,
+) -> npt.NDArray[Any]:  # fmt: skip
+    """Return an array of an npz file; refuse another kind, shape (-1: any) or more numbers."""
+    if key not in data:
+        raise ReobjError(f"{path}: array {key} is missing")
+    array = data[key]
+    if array.ndim != len(shape) or any(
+        n not in (-1, m) for n, m in zip(shape, array.shape, strict=True)
+    ):
+        raise ReobjError(f"{path}: array {key} is {array.shape}, expected shape {shape}")
+    if array.dtype.kind not in kinds and array.size:
+        raise ReobjError(f"{path}: array {key} is of {array.dtype}, expected {kinds}")
+    if len(array) > most:
+        raise ReobjError(f"{path}: {len(array)} {key}, at most {most} are allowed")
+    return array

@@ -8,21 +8,22 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import functools
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from reobj.files import load_json, read_lines, shortened
+from reobj.files import load_json, read_lines
 from reobj.formats import HEAD_BYTES, Probe
 from reobj.sources.class_names import load_class_names
-from reobj.sources.image_files import TimeUnit, is_date
+from reobj.sources.image_files import TimeUnit
 from reobj.sources.image_frames import frames_of_names, frames_of_numbers
-from reobj.sources.recorded import RecordedDetections, Source
+from reobj.sources.recorded import CENTRES, CORNERS, SIZES, RecordedDetections, Source
 from reobj.types import (
     CLASS_MAX,
     COCO_NAMES,
@@ -32,14 +33,8 @@ from reobj.types import (
     IntArray,
     ReobjError,
     nearest_of,
-    printable,
-    xyxy_from_cxcywh,
 )
 
-BOXES_3D = (
-    "tx_world_object ty_world_object tz_world_object qw_world_object qx_world_object "
-    "qy_world_object qz_world_object scale_x scale_y scale_z"
-).split()
 MOT = "frame id x1 y1 w h score class extra z".split()
 KITTI = ("frame id class truncated occluded alpha x1 y1 x2 y2 "
          "height width length x y z yaw score").split()  # fmt: skip
@@ -71,7 +66,11 @@ ALIASES: dict[str, str] = {  # names of columns; the first one with values is us
              "category_id label_id coco80_class",
 }  # fmt: skip
 NONE = np.empty(0, bool)
-BOX_FORMS = (("x1", "y1", "x2", "y2"), ("x1", "y1", "w", "h"), ("cx", "cy", "w", "h"))
+BOX_FORMS: dict[tuple[str, ...], str] = {
+    ("x1", "y1", "x2", "y2"): CORNERS,
+    ("x1", "y1", "w", "h"): SIZES,
+    ("cx", "cy", "w", "h"): CENTRES,
+}
 
 
 @dataclass(slots=True)
@@ -81,8 +80,6 @@ class Table:
     Attributes:
         path: of the file. cells: N texts by role: a key of ALIASES, or a column of MOT or KITTI.
         line: (N,) position of each row, in `unit`s. header: names of the columns, () without.
-        comma: may be the decimal point. unread: names of columns that are not read although they
-            name a class, an identity or a size.
     """
 
     path: Path
@@ -90,8 +87,6 @@ class Table:
     line: IntArray
     unit: str = "line"
     header: tuple[str, ...] = ()
-    comma: bool = False
-    unread: list[str] = field(default_factory=list)
 
     def where(self, row: int) -> str:
         """Return the position of a row, for messages."""
@@ -99,9 +94,13 @@ class Table:
 
     def numbers(self, role: str) -> Array:
         """Convert a column to finite numbers (N,); an error names the line."""
-        values = np.array([_number(cell, self.comma) for cell in self.cells[role]], np.float64)
+        values = np.array([_number(cell) for cell in self.cells[role]], np.float64)
         self._check(role, ~np.isfinite(values), "{!r} is no finite number")
         return values
+
+    def columns(self, roles: Sequence[str]) -> Array:
+        """Convert columns to finite numbers (N, count)."""
+        return np.stack([self.numbers(role) for role in roles], 1)
 
     def whole(self, role: str) -> IntArray:
         """Convert a column to whole numbers (N,)."""
@@ -114,29 +113,16 @@ class Table:
     def _check(self, role: str, bad: BoolArray, why: str) -> None:
         """Refuse the first cell of a column that is `bad` (N,); why: its text in braces."""
         for row in np.flatnonzero(bad)[:1].tolist():
-            cell = self.cells[role][row]
-            advice = DECIMAL_COMMAS * ("," in cell and not self.comma)
-            raise ReobjError(f"{self.where(row)}: {why.format(cell)}{advice}")
-
-    def boxes(self) -> Array:
-        """Return the boxes (N, 4), corners."""
-        roles = _box_roles(self.cells)
-        box = np.stack([self.numbers(role) for role in roles], 1)
-        if roles[0] == "cx":
-            return xyxy_from_cxcywh(box)
-        return np.hstack([box[:, :2], box[:, :2] + box[:, 2:]]) if roles[2] == "w" else box
-
-
-DECIMAL_COMMAS = ": decimal commas? Separate the columns with semicolons, or write points"
+            raise ReobjError(f"{self.where(row)}: {why.format(self.cells[role][row])}")
 
 
 # ---- Cells ---------------------------------------------------------------------------------------
 
 
-def _number(cell: str, comma: bool = True) -> float:
-    """Convert a cell to a number, NaN: none; comma: may be the decimal point."""
+def _number(cell: str) -> float:
+    """Convert a cell to a number, NaN: none; a comma is the decimal point."""
     try:
-        return float(cell.replace(",", ".") if comma else cell)
+        return float(cell.replace(",", "."))
     except ValueError:
         return math.nan
 
@@ -161,14 +147,13 @@ def _is_comment(line: str) -> bool:
     return line[:1] == "#" and not header
 
 
-def split(lines: Sequence[str]) -> tuple[list[list[str]], IntArray, bool]:
+def split(lines: Sequence[str]) -> tuple[list[list[str]], IntArray]:
     """Split lines into rows of cells, without comments and the empty cells at all their ends.
 
     Returns:
-        rows, the lines on which they end, and whether commas are no separators.
+        rows, and the lines on which they end.
     """
     lines = ["\n" if _is_comment(line) else line for line in lines]
-    lines[:1] = ["\n" if re.match(r'"?sep=.', line) else line for line in lines[:1]]  # Excel's
     separator = _separator(next((line for line in lines if line.strip()), ""))
     reader: Any = csv.reader(lines, delimiter=separator, strict=True)
     split = [([cell.strip() for cell in cells], reader.line_num) for cells in reader]
@@ -180,30 +165,27 @@ def split(lines: Sequence[str]) -> tuple[list[list[str]], IntArray, bool]:
     rows = [cells for cells, _ in kept]
     if rows and len(rows[0]) > 1 and not any(cells[-1] for cells in rows):
         rows = [cells[:-1] for cells in rows]
-    return rows, np.array([i for _, i in kept], np.int64), separator != ","
+    return rows, np.array([i for _, i in kept], np.int64)
 
 
-def _columns(path: Path, roles: Sequence[str] = (), least: int = 0) -> Table:
+def read_columns(path: Path, roles: Sequence[str] = (), least: int = 0) -> Table:
     """Read a table: by the names in its header, or columns `roles`, of which the last may lack."""
     try:
-        rows, line, comma = split(read_lines(path))
+        rows, line = split(read_lines(path))
     except csv.Error as error:
         raise ReobjError(f"{path}: no table ({error})") from error
-    header = () if roles or not rows else _header(rows[0])
-    rows, line = (rows[1:], line[1:]) if header else (rows, line)
+    header = () if roles or not rows else _header(rows.pop(0))
+    line = line[len(line) - len(rows) :]
     names = header or roles
     count = len(rows[0]) if rows and not header else len(names)
     fits = least <= count <= len(names)
     for cells, at in zip(rows, line.tolist(), strict=True):
         if len(cells) != count or not fits:
             expected = str(count) if fits else f"{least} to {len(names)}"
-            commas = not comma and len(cells) > least and not any("." in cell for cell in cells)
-            why = DECIMAL_COMMAS * commas
-            text = f"{len(cells)} columns, expected {expected}{why}"
-            raise ReobjError(f"{path}, line {at}: {text}")
+            raise ReobjError(f"{path}, line {at}: {len(cells)} columns, expected {expected}")
     columns = zip(*rows, strict=True) if rows else [()] * len(names)
     by_name = {name: list(column) for name, column in zip(names, columns, strict=False)}
-    return Table(path, by_name, line, header=header, comma=comma)
+    return Table(path, by_name, line, header=header)
 
 
 def _header(cells: Sequence[str]) -> tuple[str, ...]:
@@ -211,49 +193,9 @@ def _header(cells: Sequence[str]) -> tuple[str, ...]:
     text = re.sub(r"\s*[\[(](s|ms|us|ns)[\])]", r"_\1", ",".join(cells).lower())  # unit of a time
     text = re.sub(r"\(.*?\)|\[.*?\]", "", text).split(";")[0]
     names = [re.sub(r"[\s.-]+", "_", name.strip()) for name in text.lstrip("# ").split(",")]
-    if "x0" in names and "y0" in names:  # corners counted from 0
-        other = {"x0": "x1", "y0": "y1", "x1": "x2", "y1": "y2"}
-        names = [other.get(name, name) for name in names]
     if "detection_id" in names:  # Roboflow's inference: x, y is the centre
         names = [{"x": "cx", "y": "cy"}.get(name, name) for name in names]
     return tuple(name if name not in names[:i] else f"column {i}" for i, name in enumerate(names))
-
-
-def read_cells(path: Path) -> Table:
-    """Read a table with a header.
-
-    Raises:
-        ReobjError: a row has another length than the header, or the header has no box columns.
-    """
-    return _named(_columns(path))
-
-
-def _named(table: Table) -> Table:
-    """Find the roles of the columns of a table by their names."""
-    by_name = table.cells
-    name_of = _roles(by_name)
-    found = {"frame", "image", "time"} & name_of.keys()
-    if not found or not _box_roles(name_of):
-        missing = ["frame"] * (not found)
-        missing += [role for role in BOX_FORMS[0] if role not in name_of]
-        text = f"no column {', '.join(missing)} in the header {','.join(by_name)}"
-        example = "expected one such as frame,x1,y1,x2,y2,score,class"
-        raise ReobjError(f"{table.path}, line 1: {text}: {example}")
-    table.cells = {role: by_name[name] for role, name in name_of.items()}
-    table.unread = _unread(by_name, set(name_of.values()), table.cells)
-    return table
-
-
-def read_cells_3d(path: Path) -> Table:
-    """Read a table of boxes in the world."""
-    table = _columns(path)
-    role_of = {name: name for name in BOXES_3D}
-    role_of |= {"time_ns": "time", "prob": "score", "name": "class"}
-    if missing := [name for name in role_of if name not in table.cells]:
-        text = f"3D boxes without the columns {', '.join(missing)}"
-        raise ReobjError(f"{path}, line 1: {text}; expected those of Boxer's 3D boxes")
-    table.cells = {role: table.cells[name] for name, role in role_of.items()}
-    return table
 
 
 def _roles(by_name: Mapping[str, list[str]]) -> dict[str, str]:
@@ -275,24 +217,12 @@ def _roles(by_name: Mapping[str, list[str]]) -> dict[str, str]:
     return name_of
 
 
-def _unread(
-    by_name: Mapping[str, list[str]], used: set[str], cells: Mapping[str, list[str]]
-) -> list[str]:
-    """List the columns that name a class, an identity or a size and are not read.
-
-    Left out are empty ones, and other names of the same classes and identities.
-    """
-    sizes = r"width|height|size|resolution|(^|_)[wh]($|_)"
-    kinds = rf"class|label|categor|type|track|inst|obj|ident|(^|_)id($|_)|{sizes}"
-    read = [cells[role] for role in ("class", "id") if role in cells]
+def _unread(by_name: Mapping[str, list[str]], used: set[str]) -> list[str]:
+    """List the columns with values that name a class, an identity or a size and are not read."""
+    kinds = r"class|label|categor|type|track|inst|obj|ident|width|height|size|resolution|"
+    kinds += r"(^|_)(id|w|h)($|_)"
     names = [name for name in by_name if name not in used and re.search(kinds, name)]
-    names = [name for name in names if len(set(by_name[name]) - {"-1", ""}) > 0]
-    return [
-        name for name in names
-        if re.search(sizes, name)
-        or not any(len(set(zip(by_name[name], other, strict=True))) == len(set(by_name[name]))
-                   == len(set(other)) for other in read)
-    ]  # fmt: skip
+    return [name for name in names if not {"-1", ""} >= {*by_name[name]}]
 
 
 def _is_empty(cell: str) -> bool:
@@ -308,8 +238,8 @@ def _box_roles(roles: Mapping[str, object]) -> tuple[str, ...]:
 
 
 def head(probe: Probe) -> list[list[str]]:
-    """Return the cells of the first rows of a text table; [] of JSON, XML, folders and others."""
-    if not probe.lines or probe.lines[0][0] in "<[{" or probe.suffix == ".npz":
+    """Return the cells of the first rows of a text table; [] of other files and folders."""
+    if probe.kind != "text" or probe.suffix == ".npz":
         return []
     cut = len(probe.lines) > 1 and probe.path.stat().st_size > HEAD_BYTES  # within the last line
     with contextlib.suppress(csv.Error):
@@ -317,48 +247,35 @@ def head(probe: Probe) -> list[list[str]]:
     return [probe.lines[0].split(",")]
 
 
-def has_header(probe: Probe) -> bool:
-    """Test whether the first cell of a table is no number."""
-    rows = head(probe)
-    return bool(rows) and not are_numbers(rows[0][:1])
+@functools.lru_cache(maxsize=1)
+def forms(probe: Probe) -> frozenset[str]:
+    """Return the formats of tables that the first rows fit.
 
-
-def is_kitti(probe: Probe) -> bool:
-    """Test for 17 or 18 columns of which the third is text."""
-    rows = head(probe)
-    return bool(rows) and len(rows[0]) in (17, 18) and not are_numbers(rows[0][2:3])
-
-
-def _values(probe: Probe, count: int) -> Array:
-    """Return the first rows of a table of `count` numbers (N, count); else (0, count)."""
-    rows = [[_number(cell) for cell in cells] for cells in head(probe)]
-    same = all(len(row) == count for row in rows)
-    return np.array(rows if same else [], np.float64).reshape(-1, count)
-
-
-def is_visdrone(probe: Probe) -> bool:
-    """Test for ten columns: a category of VisDrone, then truncation and occlusion, 0 to 2."""
-    rows = _values(probe, 10)
-    kind = rows[:, 7]
-    flags = np.isin(kind, range(12)) & np.isin(rows[:, 8:], range(3)).all(1)
-    return bool(flags.all() and (kind > 0).any() and (rows[kind == 0, 6] == 0).all())
-
-
-def is_boxmot(probe: Probe) -> bool:
-    """Test for nine columns: 1, a class, a score; no names of classes beside it, as CVAT's."""
-    rows = _values(probe, 9)
-    fits = (rows[:, 6] == 1) & (rows[:, 7] >= 0) & (rows[:, 7] % 1 == 0) & (rows[:, 8] <= 1)
-    beside = (probe.path.parent / "labels.txt").exists()
-    return bool(len(rows) and fits.all() and not beside)
-
-
-def is_mot(probe: Probe) -> bool:
-    """Test for a table of numbers; without identities nine columns are boxmot's detections."""
+    VisDrone: the eighth of ten columns is one of its categories, the last two are 0 to 2. Boxmot:
+    nine columns end in 1, a class and a score, without the names of classes that CVAT writes beside
+    them; if all identities are below 0, they are detections, which ground truth is not.
+    """
     rows = head(probe)
     if not rows:
-        return not probe.is_dir and not probe.path.read_bytes()[:4096].strip()
-    other = has_header(probe) or is_kitti(probe) or is_visdrone(probe)
-    return not other and not (is_boxmot(probe) and (_values(probe, 9)[:, 1] < 0).all())
+        empty = not probe.is_dir and not probe.path.read_bytes()[:4096].strip()
+        return frozenset({"mot"} if empty else ())
+    if not are_numbers(rows[0][:1]):
+        return frozenset({"boxer-3d" if "tx_world_object" in rows[0] else "csv"})
+    if len(rows[0]) in (17, 18) and not are_numbers(rows[0][2:3]):
+        return frozenset({"kitti"})
+    count = len(rows[0])
+    if count not in (9, 10) or any(len(cells) != count for cells in rows):
+        return frozenset({"mot"})
+    values = np.array([[_number(cell) for cell in cells] for cells in rows])  # (N, 9 or 10)
+    flag, kind, last = values[:, 6], values[:, 7], values[:, 8:]
+    whole = (kind >= 0) & (kind % 1 == 0)
+    if count == 10:
+        fits = whole & (kind <= 11) & np.isin(last, range(3)).all(1) & ((kind > 0) | (flag == 0))
+        return frozenset({"visdrone" if fits.all() and kind.any() else "mot"})
+    named = (probe.path.parent / "labels.txt").exists()
+    if named or not (whole & (flag == 1) & (last[:, 0] <= 1)).all():
+        return frozenset({"mot"})
+    return frozenset({"boxmot"} if (values[:, 1] < 0).all() else {"boxmot", "mot"})
 
 
 # ---- Readers -------------------------------------------------------------------------------------
@@ -373,8 +290,8 @@ def read_mot_rows(path: Path) -> Array:
     Raises:
         ReobjError: a line with another number of columns, or with a cell that is no number.
     """
-    table = _columns(path, MOT, 6)
-    rows = np.stack([table.numbers(role) for role in table.cells], 1)  # (N, 6 to 10)
+    table = read_columns(path, MOT, 6)
+    rows = table.columns(list(table.cells))  # (N, 6 to 10)
     table.whole("frame"), table.whole("id")
     if (too_large := (np.abs(rows[:, 2:6]) > COORDINATE_MAX).any(1)).any():
         row = int(too_large.argmax())
@@ -420,38 +337,50 @@ def read_visdrone(source: Source) -> RecordedDetections:
 
 def read_kitti(source: Source) -> RecordedDetections:
     """Read KITTI's tracking labels or results; DontCare is an ignored region."""
-    table = _columns(source.path, KITTI, 17)
+    table = read_columns(source.path, KITTI, 17)
     care = np.array(table.cells["class"]) == "DontCare"
     return _recorded(table, source, 0, text_classes(table, source, ()), care)
 
 
 def read_csv(source: Source) -> RecordedDetections:
     """Read a table with a header."""
-    return _read_named(read_cells(source.path), source)
+    return _read_named(read_columns(source.path), source)
 
 
 def read_records(source: Source) -> RecordedDetections:
     """Read a JSON list of flat objects (supervision's JSONSink)."""
-    return _read_named(records_table(source.path), source)
-
-
-def records_table(path: Path) -> Table:
-    """Read a JSON list of flat objects as a table."""
-    records = load_json(path)
+    records = load_json(source.path)
     if not all(isinstance(record, dict) for record in records):
-        raise ReobjError(f"{path}: an entry is no object; expected objects with the same keys")
+        raise ReobjError(f"{source.path}: an entry is no object; expected objects with the same "
+                         "keys")  # fmt: skip
     names = list(dict.fromkeys(name for record in records for name in record))
     header = _header([name.replace(",", " ") for name in names])
     texts = [["" if r.get(name) is None else str(r[name]).strip() for r in records]
              for name in names]  # fmt: skip
     by_name = dict(zip(header, texts, strict=True))
-    return _named(Table(path, by_name, np.arange(len(records)), "entry", header))
+    return _read_named(
+        Table(source.path, by_name, np.arange(len(records)), "entry", header), source
+    )
 
 
 def _read_named(table: Table, source: Source) -> RecordedDetections:
-    """Convert a table with named columns to detections."""
-    if table.unread:
-        source.say(f"columns that are not read: {', '.join(table.unread)}")
+    """Convert a table with named columns to detections.
+
+    Raises:
+        ReobjError: there are no columns of frames or boxes, or a cell is invalid.
+    """
+    by_name = table.cells
+    name_of = _roles(by_name)
+    found = {"frame", "image", "time"} & name_of.keys()
+    if not found or not _box_roles(name_of):
+        missing = ["frame"] * (not found)
+        missing += [role for role in ("x1", "y1", "x2", "y2") if role not in name_of]
+        text = f"no column {', '.join(missing)} in the header {','.join(by_name)}"
+        example = "expected one such as frame,x1,y1,x2,y2,score,class"
+        raise ReobjError(f"{table.path}, line 1: {text}: {example}")
+    table.cells = {role: by_name[name] for role, name in name_of.items()}
+    unread = _unread(by_name, {*name_of.values()})
+    source.say(f"columns that are not read: {', '.join(unread)}" * bool(unread))
     if "detection_id" in table.header and _box_roles(table.cells)[0] == "cx":
         source.say("x, y are the centres of boxes, as in all files with detection_id (Roboflow)")
     _drop_empty(table, source)
@@ -463,7 +392,7 @@ def _read_named(table: Table, source: Source) -> RecordedDetections:
 
 
 def _mot_table(source: Source) -> Table:
-    table = _columns(source.path, MOT, 6)
+    table = read_columns(source.path, MOT, 6)
     if (table.numbers("id") % 1 != 0).any():
         raise ReobjError(f"{table.path}: the second column is no identity. If this is no MOT file: "
                          "CSV needs a header such as frame,x1,y1,x2,y2,score,class")  # fmt: skip
@@ -478,15 +407,17 @@ def _recorded(
     ignored: BoolArray = NONE,
 ) -> RecordedDetections:
     """Convert a table to detections; usual: number of the first frame."""
-    xyxy = table.boxes()
+    roles = _box_roles(table.cells)
+    box = table.columns(roles)  # (N, 4)
     frame = _frames(table, source, usual)
+    scale = np.ones(box.shape)
     if "image w" in table.cells and "image h" in table.cells:
-        size = np.stack([table.numbers("image w"), table.numbers("image h")], 1)  # (N, 2)
-        if np.abs(size - (xyxy[:, 2:] - xyxy[:, :2])).max(initial=0) > 1.01:  # else the boxes'
-            xyxy = xyxy * source.scale(size, frame >= 0)
+        size = table.columns(("image w", "image h"))  # (N, 2)
+        if np.abs(size - (box[:, 2:] - box[:, :2])).max(initial=0) > 1.01:  # else the boxes'
+            scale = source.scale(size, frame >= 0)
     return source.recorded(
-        frame, xyxy, classes, table.numbers("score") if "score" in table.cells else None,
-        line=table.line, unit=table.unit, ignored=ignored,
+        frame, box, classes, table.numbers("score") if "score" in table.cells else None,
+        line=table.line, unit=table.unit, form=BOX_FORMS[roles], scale=scale, ignored=ignored,
         identity=table.whole("id") if "id" in table.cells else np.empty(0, np.int64),
     )  # fmt: skip
 
@@ -510,24 +441,24 @@ def _frames(table: Table, source: Source, usual: int) -> IntArray:
         return frames_of_numbers(table.whole("frame"), source, usual)
     if names is not None:
         return frames_of_names(names, source, 0)
+    source.times_s = seconds(table)
+    if source.describes:
+        return np.zeros(len(source.times_s), np.int64)
     if source.video.times_s is None:
         raise ReobjError(f"{source.path}, line 1: no column frame; time stamps can be used only if "
                          "the names of the images are time stamps too")  # fmt: skip
-    return nearest_times(source.video.times_s, seconds(table), 0.0)
+    return nearest_times(source.video.times_s, source.times_s, 0.0)
 
 
 def seconds(table: Table) -> Array:
-    """Return the times (N,) of a table in s.
-
-    The unit is that in the name of the column; else the one of s, ms, us and ns in which the times
-    are dates since 1970; else s.
-    """
+    """Return the times (N,) of a table in s: of the unit that ends the column's name, else in s."""
     values = table.numbers("time")
-    named = [name for name in ALIASES["time"].split() if name in table.header][:1]
-    units = [unit for unit in TimeUnit if named[:1] and named[0].endswith(f"_{unit.name}")]
-    if not units and len(values):
-        units = [unit for unit in TimeUnit if is_date(float(values.min()) / unit.value)]
-    return values / (units[0].value if units else 1.0)
+    name = next(name for name in ALIASES["time"].split() if name in table.header)
+    per_s = next((unit.value for unit in TimeUnit if name.endswith(f"_{unit.name}")), 1.0)
+    if (latest := values.max(initial=0)) > 1e11 * per_s:
+        raise ReobjError(f"{table.path}: column {name}: {latest:g} is no time in s; name its unit: "
+                         "timestamp_ms, timestamp_us or timestamp_ns")  # fmt: skip
+    return values / per_s
 
 
 def nearest_times(times_s: Array, time_s: Array, alone_s: float) -> IntArray:
@@ -556,11 +487,7 @@ def text_classes(table: Table, source: Source, base: Sequence[str]) -> tuple[Int
     if all(re.fullmatch(r"[0-9]{1,18}(\.0*)?", cell) for cell in texts):
         index = {cell: int(cell.partition(".")[0]) for cell in texts}
     else:
-        new = sorted(texts - set(names))
-        if new and source.names:
-            text = f"{len(new)} class names that detect.class_names does not have"
-            source.say(f"{text}: {printable(shortened(new))}")
-        names += new
+        names += sorted(texts - set(names))
         index = {name: i for i, name in reversed(list(enumerate(names)))}
     return _with_unnamed(np.array([index.get(cell, -1) for cell in cells], np.int64), names, source)
 

@@ -486,3 +486,54 @@ def test_a_result_of_frames_of_another_size(tmp_path: Path, scale: float) -> Non
     _, said = score(write(tmp_path / "res.txt", rows, "0.9,-1,-1,-1"), gt)
     (note,) = [text for text in said if "frames of another size" in text]
     assert f"150 do if the boxes of the result are scaled by {1 / scale:g}" in note
+
+
+@pytest.mark.parametrize("wrong", ["truth", "result"])
+def test_rows_that_hold_corners_are_refused(
+    tmp_path: Path, wrong: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without a size of the images too; rows whose sizes exceed their places are no corners."""
+    rows = ROWS.copy()
+    rows[:, 4:6] += rows[:, 2:4]
+    good = {name: write(tmp_path / f"{name}.txt", ROWS, "1") for name in ("truth", "result")}
+    files = good | {wrong: write(tmp_path / "corners.txt", rows, "1")}
+    text = refused(capsys, files["result"], files["truth"])
+    assert "corners.txt: all boxes are x1, y1, x2, y2" in text
+    large = ROWS.copy()
+    large[:, 4:6] = 1300, 700
+    files = good | {wrong: write(tmp_path / "large.txt", large, "1")}
+    score(files["result"], files["truth"])
+
+
+def test_corners_in_a_sequence_of_known_size(
+    tmp_path: Path, result: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of seqinfo.ini, or of the images of a dataset."""
+    rows = ROWS[ROWS[:, 0] == 1]
+    rows[:, 4:6] += rows[:, 2:4]
+    gt = write(tmp_path / "room/gt/gt.txt", rows, "1")
+    assert score(result, gt)  # of one frame: nothing shows it
+    size = "[Sequence]\nname=room\nimWidth=200\nimHeight=800\n"
+    (tmp_path / "room/seqinfo.ini").write_text(size)
+    assert "all fit it as x1, y1, x2, y2" in refused(capsys, result, gt)
+    data = {
+        "images": [{"id": 1, "frame_id": 0, "width": 200, "height": 800}],
+        "categories": [{"id": 1, "name": "chair"}],
+        "annotations": [{"image_id": 1, "category_id": 1, "bbox": row[2:6], "track_id": int(row[1])}
+                        for row in rows.tolist()],
+    }  # fmt: skip
+    (tmp_path / "gt.json").write_text(json.dumps(data))
+    assert "all fit it as x1, y1, x2, y2" in refused(capsys, result, tmp_path / "gt.json")
+    for entry in data["annotations"]:
+        entry["bbox_mode"] = 0
+    (tmp_path / "gt.json").write_text(json.dumps(data))
+    assert score(result, tmp_path / "gt.json")[0]["gt_objects"] == 5
+
+
+def test_a_folder_of_another_tool_as_truth(
+    tmp_path: Path, result: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "VOC/Annotations").mkdir(parents=True)
+    (tmp_path / "VOC/Annotations/0.xml").write_text("<annotation><object/></annotation>")
+    text = refused(capsys, result, tmp_path / "VOC")
+    assert "Pascal VOC" in text and "COCO JSON with track_id" in text
