@@ -406,9 +406,9 @@ def test_shapes_of_merged_objects_occlude_nothing(
     tracks = tracks_of(poses)
     asked: list[quadrics.Ellipsoids] = []
 
-    def noted(views: Any, ellipsoids: quadrics.Ellipsoids, on_floor: Any) -> Any:
+    def noted(views: Any, ellipsoids: quadrics.Ellipsoids, *standing: Any) -> Any:
         asked.append(ellipsoids)
-        return occluded_edges(views, ellipsoids, on_floor)
+        return occluded_edges(views, ellipsoids, *standing)
 
     monkeypatch.setattr(fitting, "occluded_edges", noted)
     plain = link_and_fit(unlinked(poses, tracks), rt.ObjectsConfig())

@@ -521,7 +521,7 @@ def _fit_component(
         standing = on_floor(priors, [name_of(class_names, c) for c in categories])
         views = dataclasses.replace(
             views,
-            occluded=occluded_edges(views, ellipsoids, standing & (floor is not None)),
+            occluded=occluded_edges(views, ellipsoids, standing, floor is not None),
             points=points_on(views, poses, ellipsoids),
         )
         reach("occlusion", 1.0)

@@ -25,18 +25,21 @@ BESIDE_EDGE = (0.1, -0.2)
 ABOVE_FLOOR = 0.1
 
 
-def occluded_edges(views: Views, ellipsoids: quadrics.Ellipsoids, on_floor: BoolArray) -> BoolArray:
+def occluded_edges(
+    views: Views, ellipsoids: quadrics.Ellipsoids, standing: BoolArray, floor_known: bool = True
+) -> BoolArray:
     """Mark box edges where the object is occluded rather than ends.
 
     Args:
         ellipsoids: of the G groups of the views, NaN where unknown: they occlude nothing.
-        on_floor: (G,) these stand on a known floor.
+        standing: (G,) of a category that stands on the floor. floor_known: where it is.
     Returns:
         (V, G, 4) left, upper, right and lower edge.
     """
     projected = quadrics.solid_boxes(ellipsoids, "box", views.img_from_world)
     above = edges_above_floor(views.boxes, quadrics.clip_boxes(projected, views.image_size))
-    return _occluded_by_nearer(views, ellipsoids) | above & on_floor[:, None]
+    above &= (standing & floor_known)[:, None]
+    return _occluded_by_nearer(views, ellipsoids, standing) | above
 
 
 def edges_above_floor(boxes: Array, projected: Array) -> BoolArray:
@@ -55,11 +58,14 @@ def edges_above_floor(boxes: Array, projected: Array) -> BoolArray:
     return np.asarray(above[..., None] & np.array([True, False, True, True]), bool)
 
 
-def _occluded_by_nearer(views: Views, ellipsoids: quadrics.Ellipsoids) -> BoolArray:
+def _occluded_by_nearer(
+    views: Views, ellipsoids: quadrics.Ellipsoids, standing: BoolArray
+) -> BoolArray:
     """Mark box edges (V, G, 4) with a nearer object just outside and none just inside.
 
     A nearer object is there if it covers half of the points beside the edge or more. One that is
-    behind the object at the points inside is what it stands on, and hides nothing.
+    behind the object at the points inside supports it, and hides nothing, unless the object stands
+    on the floor.
     """
     occluded = np.zeros(views.boxes.shape, bool)
     known = np.isfinite(ellipsoids.half_axes.sum(1) + ellipsoids.center_in_world.sum(1))
@@ -80,7 +86,8 @@ def _occluded_by_nearer(views: Views, ellipsoids: quadrics.Ellipsoids) -> BoolAr
         itself = candidates == column[groups, None]  # (D, N)
         entry = np.where(itself[:, None, None], np.inf, entry)
         outside, inside = entry < depth[column[groups], None, None, None]  # (D, 4, P, N)
-        outside &= ~np.isfinite(entry[1]) | inside  # one that continues behind it supports it
+        supports = np.isfinite(entry[1]) & ~inside & ~standing[groups, None, None, None]
+        outside &= ~supports
         covered = [hit.any(3).mean(2) >= 0.5 for hit in (outside, inside)]  # (D, 4)
         occluded[v, groups] = covered[0] & ~covered[1]
     return occluded

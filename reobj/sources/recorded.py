@@ -50,9 +50,9 @@ def other_form(
         frame, identity: (N,); no identities: empty, or below 0.
     Returns:
         the fault and the remedy; "" if the boxes fit, or fit in no other form either. A box that is
-        inverted, or whose centre is outside the image, is a fault; so are more than a tenth of
-        boxes, and more than two, that leave the image (of boxes in another form 41 % or more do);
-        and sizes of an identity that change as its place does.
+        inverted is a fault; so are more than a tenth of boxes, and more than two, that leave the
+        image (of boxes in another form 41 % or more do); and sizes of an identity that change as
+        its place does.
     """
     low, high = xyxy[:, :2], xyxy[:, 2:]
     centre = (low + high) / 2
@@ -65,9 +65,8 @@ def other_form(
     if 0 in size:
         return ""
     inverted = (high < low).any(1)
-    beyond = ((centre < 0) | (centre > size)).any(1)
     leave = ~_inside(xyxy, size)
-    if not (inverted | beyond).any() and leave.sum() <= max(2, 0.1 * len(xyxy)):
+    if not inverted.any() and leave.sum() <= max(2, 0.1 * len(xyxy)):
         return ""
     why = (f"as {form}, {inverted.sum()} of {len(xyxy)} boxes have x2 < x1 or y2 < y1 and "
            f"{leave.sum()} leave the image of {size[0]:g}x{size[1]:g}")  # fmt: skip
@@ -75,7 +74,7 @@ def other_form(
     fits = [other for other in others if _inside(corners(given, other), size).mean() > 0.98]
     if fits:
         return f"{why}; all fit it as {' or '.join(fits)}: {REMEDY}"
-    if (inverted | beyond).any() and _inside(xyxy, size[::-1]).all():
+    if _inside(xyxy, size[::-1]).all():
         return (f"{why}; all fit the frame turned by 90 deg: made on frames that were not turned "
                 "upright? Detect on upright frames")  # fmt: skip
     return ""
