@@ -96,10 +96,15 @@ def _orders(given: Supplied) -> Iterator[tuple[str, Array]]:
     for first in (0, 1) if not given.orders else ():
         order = np.argsort(np.argsort([str(n + first) for n in at]))
         yield f"the order of numbers from {first} as text (1, 10, 2)", poses[filled[order]]
-    for shift in (*range(-10, 0), *range(1, 11)):
-        frames = f"{abs(shift)} frames {'earlier' if shift > 0 else 'later'}"
-        text = f"the order shifted (each pose is that of {frames})"
-        yield text, poses[filled[(at + shift).clip(0, len(at) - 1)]]
+    rows = dict[str, IntArray]()
+    for k in (*range(-10, 0), *range(1, 11)):
+        frames = f"{abs(k)} frames {'earlier' if k > 0 else 'later'}"
+        rows[f"the order shifted (each pose is that of {frames})"] = at + k
+    for k in (2, 3, 4, 5):
+        rows[f"the order of {k} poses for each frame (frame n has pose {k}n)"] = k * at
+        rows[f"the order of one pose for {k} frames (frame n has pose n/{k})"] = at // k
+    for text, row in rows.items():
+        yield text, poses[filled[row.clip(0, len(at) - 1)]]
 
 
 def _rolled(cam_from_world: Array, count: int) -> Array:
@@ -192,8 +197,10 @@ def _explained(cam_from_world: Array, views: IntArray, rays: Array) -> float:
 
 GOOD_DEG = 1.0  # residual of poses that are certainly right (chosen: 9 px at 500 px focal length)
 MAX_RATIO = 0.3  # of residuals of a clearly better convention (chosen; higher: refuses right poses)
-ORDER_DEG = 0.4  # least residual of a wrong order (chosen: above the noise of boxes)
-MAX_ORDER_RATIO = 0.6  # of residuals of a better order; measured, right poses: .92 and more
+ORDER_DEG = 0.2  # least residual of a wrong order (chosen: 2 px at 500 px focal length)
+# Of residuals of a better order: below and above GOOD_DEG. Measured, right poses: recordings .95
+# and more; noise of the boxes up to 8 px .82, of 20 px (residuals above 1.2 deg) .70 and more
+MAX_ORDER_RATIO = (0.75, 0.6)
 WRONG_DEG = 6.0  # of poses that are certainly wrong; measured, right ones: up to 2.0
 MIN_TRACKS = 4  # chosen: three triangulate by chance in a trajectory read backwards
 
@@ -226,7 +233,8 @@ def check_boxes(given: Supplied, tracks: Tracks, refuse: bool = True) -> bool:
             _refuse(given, likely, f"{measured}, then {best:.1f} deg")
     orders = {name: _residual_deg(poses, views) for name, poses in _orders(given)}
     best = min(orders.values())
-    if as_given > ORDER_DEG and best < MAX_ORDER_RATIO * as_given and best < GOOD_DEG:
+    ratio = MAX_ORDER_RATIO[as_given >= GOOD_DEG]
+    if as_given > ORDER_DEG and best < min(ratio * as_given, GOOD_DEG):
         _refuse(given, [min(orders, key=orders.__getitem__)], f"{measured}, then {best:.1f} deg")
     if as_given < GOOD_DEG:
         return True
