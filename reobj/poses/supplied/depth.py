@@ -20,8 +20,9 @@ import numpy.typing as npt
 
 from reobj.cameras import Camera, Poses, invert_rigid
 from reobj.files import load_json
-from reobj.poses.intrinsics import camera_of_keys, read_camera
+from reobj.poses.intrinsics import camera_of_keys
 from reobj.poses.supplied.frame_assignment import rows_by_time
+from reobj.poses.supplied.pose_formats import scannet_camera
 from reobj.sources.image_files import read_image
 from reobj.types import Array, BoolArray, Floats, IntArray, ReobjError, log
 from reobj.visible_points import VisiblePoints
@@ -150,8 +151,7 @@ def _depth_camera(folder: Path, size: tuple[int, int], color: Camera) -> tuple[C
     same = np.eye(3, 4)
     for path in (folder, folder.parent, folder.parent / "intrinsic"):
         if (file := path / "intrinsic_depth.txt").exists():  # ScanNet: first pixel's centre at 0, 0
-            fx, fy, cx, cy = read_camera(file, size, "matrix").params
-            return Camera("PINHOLE", *size, (fx, fy, cx + 0.5, cy + 0.5)), same
+            return scannet_camera(file, size), same
     for path in (folder / "intrinsics.json", folder.parent / "intrinsics.json"):
         content = load_json(path) if path.exists() else {}
         depth = content.get("depth") if isinstance(content, dict) else None

@@ -19,23 +19,28 @@ from reobj.cameras import WORLD_MAX, Camera, Poses, invert_rigid, usable
 from reobj.files import spans
 from reobj.formats import AUTO, Format, Probe, Registry
 from reobj.poses.estimate import PosesConfig
-from reobj.poses.intrinsics import CAMERA_FORMS, fitted_camera, parse_camera
+from reobj.poses.intrinsics import (
+    CAMERA_FORMS,
+    fitted_camera,
+    is_dso_camera,
+    is_kitti_calibration,
+    parse_camera,
+)
 from reobj.poses.supplied import pose_formats as formats
 from reobj.poses.supplied.check import Supplied
 from reobj.poses.supplied.colmap_model import find_models, read_colmap
 from reobj.poses.supplied.frame_assignment import (
     FrameAssignment,
     SourceFrames,
-    assignments,
+    assign,
     by_order,
     interpolated,
+    seconds_of,
     source_of,
-    unit_of_stamps,
 )
 from reobj.poses.supplied.orientation import turned, turns_of
 from reobj.poses.supplied.pose_formats import PoseFile
-from reobj.sources.image_files import TimeUnit
-from reobj.types import Array, BoolArray, IntArray, ReobjError
+from reobj.types import NOTE_START, Array, BoolArray, IntArray, ReobjError
 
 
 def read_poses(
@@ -75,52 +80,75 @@ def read_supplied(video: Any, config: PosesConfig) -> Supplied:
     stated = parse_camera(config.camera, size, config.camera_format)
     if stated is None and not any(pose_file.cameras):
         raise ReobjError(f"{path}: no intrinsics; add --camera {CAMERA_FORMS}")
-    if pose_file.lost == len(pose_file.cam_from_world):
-        raise ReobjError(f"{path}: no poses in it, or only those of lost frames")
-    times = [(frame.index, frame.time_s) for frame in video]
-    if not times:
-        raise ReobjError("no readable frame in the video, so no pose can be matched")
-    frame = np.array([n for n, _ in times], np.int64)
-    time_s = np.array([t for _, t in times])
-    source = source_of(video, frame, time_s)
-    stamps_s, messages = _in_seconds(pose_file, path, source)
-    assignment = _assignment(pose_file, stamps_s, source, path, config.frames_by)
+    source = source_of(video)
+    stamps_s = None
+    if pose_file.stamps is not None:
+        stamps_s = seconds_of(pose_file.stamps, pose_file.unit)
+    count = len(pose_file.cam_from_world)
+    assignment = assign(
+        count, pose_file.names, stamps_s, source, str(path),
+        config.frames_by, pose_file.is_ours, pose_file.by_text,
+    )  # fmt: skip
     row = assignment.row
-    cameras = pose_file.cameras
-    turns, turn_messages = (
-        turns_of(source, size, cameras, row) if pose_file.stored_pixels else ({}, ())
-    )
-    if len(cameras) == len(pose_file.cam_from_world) > 1:
-        cameras = tuple(turned(cameras[r], turns.get(f)) for f, r in enumerate(row) if r >= 0)
-    intrinsics = stated or one_camera(cameras, path, size)
-    if not usable(intrinsics):
-        raise ReobjError(f"{path}: {intrinsics}: expected finite numbers, focal lengths above 0")
-    cam_from_world, lost = _of_frames(pose_file.cam_from_world, stamps_s, assignment, source, path)
-    if pose_file.lost:
-        lost = lost or f"{path}: a pose for each frame"
-        lost += f"; {pose_file.lost} poses of lost frames (the identity, zeros, not finite)"
+    turns = turns_of(source, size, pose_file.cameras, row) if pose_file.stored_pixels else {}
+    camera = stated or one_camera(_cameras_of(pose_file, row, turns), path, size)
+    if not usable(camera):
+        raise ReobjError(f"{path}: {camera}: expected finite numbers, focal lengths above 0")
+    cam_from_world = _of_frames(pose_file.cam_from_world, assignment, source, stamps_s)
+    if (np.abs(cam_from_world) >= WORLD_MAX).any():
+        raise ReobjError(f"{path}: a camera is more than {WORLD_MAX:g} units away from the origin")
     for f, turn in turns.items():
         cam_from_world[f, :2] = turn @ cam_from_world[f, :2]
+    known = np.asarray(np.isfinite(cam_from_world).all((1, 2)), bool)
+    metric = config.metric or pose_file.metric is not False
+    if metric:
+        _check_units(cam_from_world, path)
     poses = Poses(
-        intrinsics, frame, time_s, cam_from_world,
-        np.where(np.isfinite(cam_from_world).all((1, 2)), "supplied", "none"), "user",
-        metric=pose_file.metric or config.metric, up_in_world=pose_file.up_in_world,
-        points=pose_file.points, colors=pose_file.colors,
+        camera, source.frame, source.time_s, cam_from_world,
+        np.where(known, "supplied", "none"), "user", metric=metric,
+        up_in_world=pose_file.up_in_world, points=pose_file.points, colors=pose_file.colors,
         visibility=_in_frames(pose_file.visibility, row),
-        messages=(*pose_file.messages, *messages, *turn_messages, *[lost] * bool(lost)),
+        messages=(*pose_file.messages, *_messages(pose_file, source, known, len(turns), config)),
         reading=f"{pose_file.kind}, frames by {assignment.rule}",
     )  # fmt: skip
-    if poses.metric:
-        _check_units(cam_from_world, path)
-    others = by_order(len(pose_file.cam_from_world), source, assignment.key == "order")
     orders = {
         f"the {one.rule} (--set poses.frames_by={one.key})": _of_frames(
-            pose_file.cam_from_world, None, one, source, path
-        )[0]
-        for one in others
+            pose_file.cam_from_world, one, source
+        )
+        for one in by_order(count, source, assignment.key == "order")
         if assignment.key in ("order", "text") and one.key != assignment.key
     }
     return Supplied(poses, pose_file.axes, orders)
+
+
+def _cameras_of(
+    pose_file: PoseFile, row: IntArray, turns: dict[int, Array]
+) -> Sequence[Camera | None]:
+    """Return the cameras of the frames with a pose, turned with their photos, or that of all."""
+    cameras = pose_file.cameras
+    if not len(cameras) == len(pose_file.cam_from_world) > 1:
+        return cameras
+    return [turned(cameras[r], turns.get(f)) for f, r in enumerate(row.tolist()) if r >= 0]
+
+
+def _messages(
+    pose_file: PoseFile, source: SourceFrames, known: BoolArray, turned: int, config: PosesConfig
+) -> list[str]:
+    """List what was assumed about poses, and the frames (F,) without one."""
+    path = config.mode
+    messages = []
+    if pose_file.metric is None and not config.metric:
+        messages.append(f"{NOTE_START}{path}: {METRES_ASSUMED}")
+    if turned:
+        messages.append(f"{turned} photos have an EXIF orientation, which COLMAP ignores: its "
+                        "cameras are turned with them")  # fmt: skip
+    lost = f"{pose_file.lost} poses of lost frames (the identity, zeros, not finite)"
+    facts = [lost] * bool(pose_file.lost)
+    if not known.all():
+        step = int(np.median(np.diff(source.frame))) if len(known) > 1 else 1
+        without = spans(source.frame[~known].tolist(), step)
+        facts.insert(0, f"poses for {known.sum()} of {len(known)} frames, none for {without}")
+    return messages + [f"{path}: {'; '.join(facts)}"] * bool(facts)
 
 
 LARGE_M, FAST_M = 100.0, 0.5  # radius of an indoor path, and of a step in it (chosen)
@@ -137,34 +165,6 @@ def _check_units(cam_from_world: Array, path: Path) -> None:
             f"{path}: the cameras move by {step:.3g} between frames, within a radius of "
             f"{radius:.3g}; expected metres (mm, cm? divide the translations by 1000, 100)"
         )
-
-
-def _assignment(
-    pose_file: PoseFile, stamps_s: Array | None, source: SourceFrames, path: Path, frames_by: str
-) -> FrameAssignment:
-    """Return the only assignment to frames that the file allows, or the one that is named."""
-    count = len(pose_file.cam_from_world)
-    found = assignments(
-        count, pose_file.names, stamps_s, source, str(path), pose_file.is_ours, pose_file.by_text
-    )
-    if not found:
-        compared = _compared(pose_file, stamps_s, source)
-        raise ReobjError(f"{path}: none of its {count} poses belongs to a frame ({compared})")
-    if frames_by:
-        if not pose_file.names and stamps_s is None:
-            found += by_order(count, source, not pose_file.by_text)
-        chosen = [one for one in found if one.key == frames_by]
-        if not chosen:
-            keys = ", ".join(one.key for one in found)
-            raise ReobjError(f"--set poses.frames_by={frames_by}: {path} can be read by {keys}")
-        return chosen[0]
-    if len(found) > 1:
-        choices = "; or ".join(f"{one.key} ({one.rule})" for one in found)
-        raise ReobjError(
-            f"{path}: its poses can be assigned to frames in {len(found)} ways: {choices}; choose "
-            f"with --set poses.frames_by={found[0].key}"
-        )
-    return found[0]
 
 
 MAX_FOCAL_SPREAD = 0.02  # relative, over the images of one camera: autofocus (chosen)
@@ -197,62 +197,19 @@ def one_camera(cameras: Sequence[Camera | None], path: Path, size: tuple[int, in
     return fitted_camera(found[len(found) // 2], size, str(path))
 
 
-def _in_seconds(
-    pose_file: PoseFile, path: Path, source: SourceFrames
-) -> tuple[Array | None, tuple[str, ...]]:
-    """Convert the stamps (N,) of a file to seconds; report the unit if it was inferred."""
-    if pose_file.stamps is None:
-        return None, ()
-    if pose_file.unit:
-        return pose_file.stamps / TimeUnit[pose_file.unit].value, ()
-    end_s = float(source.time_s[-1]) if source.timed else 0.0
-    unit = unit_of_stamps(pose_file.stamps, end_s)
-    messages = () if unit is TimeUnit.s else (f"{path}: time stamps taken for {unit.name}",)
-    return pose_file.stamps / unit.value, messages
-
-
 def _of_frames(
     cam_from_world: Array,
-    stamps_s: Array | None,
     assignment: FrameAssignment,
     source: SourceFrames,
-    path: Path,
-) -> tuple[Array, str]:
-    """Return the poses (F, 3, 4) of the frames by one assignment; report frames without, if any.
-
-    Returns:
-        the poses, and which frames have none: "" or a text.
-    """
+    stamps_s: Array | None = None,
+) -> Array:
+    """Return the poses (F, 3, 4) of the frames by one assignment, NaN where there is none."""
     row = assignment.row
-    known = row >= 0
-    poses = np.full((len(row), 3, 4), np.nan)
-    poses[known] = cam_from_world[row[known]]
-    if assignment.key == "time" and stamps_s is not None and len(stamps_s) > 1:
+    poses = np.where((row >= 0)[:, None, None], cam_from_world[row], np.nan)
+    if assignment.key == "time" and stamps_s is not None:
         exact, use = interpolated(cam_from_world, stamps_s, source.time_s)
-        poses[use & known] = exact[row[use] >= 0]
-    known = np.isfinite(poses).all((1, 2))
-    if (np.abs(poses[known]) >= WORLD_MAX).any():
-        raise ReobjError(f"{path}: a camera is more than {WORLD_MAX:g} units away from the origin")
-    if known.all():
-        return poses, ""
-    step = int(np.median(np.diff(source.frame))) if len(row) > 1 else 1
-    lost = spans(source.frame[~known].tolist(), step)
-    return poses, f"{path}: poses for {known.sum()} of {len(row)} frames, none for {lost}"
-
-
-def _compared(pose_file: PoseFile, stamps_s: Array | None, source: SourceFrames) -> str:
-    """Describe what was compared without a match, for a message."""
-    if pose_file.names:
-        first = source.images[int(source.frame[0])] if source.images else int(source.frame[0])
-        return f"images {pose_file.names[0]!r} ..., frames {first!r} ..."
-    if stamps_s is None:
-        return "in order"
-    start, end = source.time_s[[0, -1]]
-    frames = f"frames {start:.3f}-{end:.3f} s" if source.timed else "the images have no times"
-    return (
-        f"{stamps_s[0]:.3f}-{stamps_s[-1]:.3f} s, {frames}; stamps of another clock need one row "
-        "for each frame"
-    )
+        poses[use & (row >= 0)] = exact[row[use] >= 0]
+    return poses
 
 
 def _in_frames(visibility: IntArray, row: IntArray) -> IntArray:
@@ -273,17 +230,39 @@ def read_pose_file(path: Path, fmt: str, size: tuple[int, int]) -> PoseFile:
         size: (w, h) of the images, for formats that do not state it.
     """
     read = POSES.reader(path, fmt)
+    entry = POSES.find(path, fmt)
     try:
-        return _without_lost(read(path, size))
+        found = read(path, size)
     except ReobjError as error:
         text = str(error)  # of a file beside it, or without a name
         raise ReobjError(text if str(path) in text else f"{path}: {text}") from None
     except Exception as error:  # files of other tools lack any key, or hold any type
-        name = POSES.find(path, fmt).name
-        raise ReobjError(f"{path}: damaged, or no file of format {name} ({error!r:.100})") from None
+        text = f"damaged, or no file of format {entry.name} ({error!r:.100})"
+        raise ReobjError(f"{path}: {text}") from None
+    metric = {METRES: True, UNKNOWN: False}.get(entry.units, found.metric)
+    kind = " ".join(filter(None, (entry.name, found.kind)))
+    found = dataclasses.replace(found, metric=metric, kind=kind)
+    return _without_lost(_by_time(found, path), path)
 
 
-def _without_lost(pose_file: PoseFile) -> PoseFile:
+def _by_time(pose_file: PoseFile, path: Path) -> PoseFile:
+    """Sort poses by their time stamps, without repeated ones."""
+    stamps = pose_file.stamps
+    if stamps is None:
+        return pose_file
+    if not np.isfinite(stamps).all():
+        raise ReobjError(f"{path}: a time stamp is not finite")
+    stamps, kept = np.unique(stamps, return_index=True)
+    poses = pose_file.cam_from_world
+    messages = pose_file.messages
+    if repeated := len(poses) - len(kept):
+        messages += (f"{path}: {repeated} rows repeat a time stamp and are left out",)
+    return dataclasses.replace(
+        pose_file, cam_from_world=poses[kept], stamps=stamps, messages=messages
+    )
+
+
+def _without_lost(pose_file: PoseFile, path: Path) -> PoseFile:
     """Remove poses that are the identity in the axes of the file, as of lost frames.
 
     It is a pose where it begins the path, and where it is the only one of poses with names.
@@ -296,8 +275,10 @@ def _without_lost(pose_file: PoseFile) -> PoseFile:
     if begins or (pose_file.names and same.sum() == 1):
         same[same.argmax()] = False
     cam_from_world = np.where(same[:, None, None], np.nan, cam_from_world)
-    lost: BoolArray = ~np.all(np.isfinite(cam_from_world), axis=(1, 2))
-    return dataclasses.replace(pose_file, cam_from_world=cam_from_world, lost=int(lost.sum()))
+    lost = int((~np.isfinite(cam_from_world).all((1, 2))).sum())
+    if lost == len(cam_from_world):
+        raise ReobjError(f"{path}: no poses in it, or only those of lost frames")
+    return dataclasses.replace(pose_file, cam_from_world=cam_from_world, lost=lost)
 
 
 def _head(probe: Probe) -> tuple[str, list[str], str]:
@@ -310,6 +291,11 @@ def _head(probe: Probe) -> tuple[str, list[str], str]:
         if words and all(map(formats.is_number, words)):
             return "\n".join(probe.lines[:k]), words, line
     return "", [], ""
+
+
+def _is_ours(probe: Probe) -> bool:
+    """Test for an output folder of this tool."""
+    return {"poses.txt", "sparse"} <= probe.names and formats.OUR_HEADER in _head(probe)[0]
 
 
 def _is_euroc(probe: Probe) -> bool:
@@ -327,14 +313,17 @@ def _is_tum(probe: Probe) -> bool:
     """Test for 8 columns; without a header ns with commas may be EuRoC's as well."""
     header, words, _ = _head(probe)
     is_euroc = formats.named_columns(header, 8) is not None and _is_euroc(probe)
-    return len(words) == 8 and not is_euroc and "_RS_" not in header
+    return len(words) == 8 and not is_euroc and "_RS_" not in header and not _is_ours(probe)
 
 
 def _is_colmap(probe: Probe) -> bool:
     """Test for a model; not that from which nerfstudio's transforms.json beside it was made."""
     if probe.is_dir:
-        return not {"transforms.json", "colmap"} <= probe.names and bool(find_models(probe.path))
-    return probe.suffix == ".bin" or probe.path.name == "images.txt"
+        has_copy = {"transforms.json", "colmap"} <= probe.names or _is_ours(probe)
+        return not has_copy and bool(find_models(probe.path))
+    return probe.path.stem in ("cameras", "images", "points3D", "frames", "rigs") and (
+        probe.suffix in (".bin", ".txt")
+    )
 
 
 def _is_reality_capture(probe: Probe) -> bool:
@@ -350,17 +339,24 @@ def _has(probe: Probe, name: str, *keys: str) -> bool:
 ReadPoses = Callable[[Path, tuple[int, int]], PoseFile]
 NAME, TIME, ORDER = "name, number", "time", "order"
 METRES, UNKNOWN = "metres", "unknown"
+UNSTATED = "not stated: metres with a note, or as `# units: arbitrary` in the file says"
+METRES_ASSUMED = (
+    "the file does not state the unit of its poses: metres are assumed (--metric confirms them; a "
+    "line `# units: arbitrary` at the start of the file denies them, as of monocular SLAM)"
+)
 GIVE = "no intrinsics (`--camera`)"
 POSES: Registry[ReadPoses] = Registry("poses", "--pose-format", [
     Format("colmap", "COLMAP: model, binary (preferred) or text, with its points", _is_colmap,
            read_colmap, NAME, UNKNOWN, "cameras of images that are no frames"),
     Format("tum", "TUM, ORB-SLAM3: rows `t tx ty tz qx qy qz qw`, or as a header names them",
-           _is_tum, formats.read_tum, TIME, f"{METRES}; ours, as its header says", GIVE),
+           _is_tum, formats.read_tum, TIME, UNSTATED, GIVE),
+    Format("reobj", "this tool: output folder, `poses.txt` with the camera of `sparse/`", _is_ours,
+           formats.read_ours, TIME, "as the header says", "points"),
     Format("euroc", "EuRoC: CSV of 8 or 17 columns, ns, body, quaternion w first; `T_BS` of "
            "`sensor.yaml` beside it or in `cam0`", _is_euroc, formats.read_euroc, TIME, METRES,
            "velocities, biases"),
     Format("matrices", "KITTI (12), Replica, NICE-SLAM (16): rows of matrices, row-major",
-           lambda p: len(_head(p)[1]) in (12, 16), formats.read_matrices, ORDER, METRES, GIVE),
+           lambda p: len(_head(p)[1]) in (12, 16), formats.read_matrices, ORDER, UNSTATED, GIVE),
     Format("transforms", "nerfstudio, instant-ngp, NeRF synthetic: `transforms.json`, OpenGL axes; "
            "`applied_transform` is undone", lambda p: _has(p, "transforms.json", "frames"),
            formats.read_transforms, NAME, UNKNOWN, "`applied_scale`"),
@@ -401,6 +397,9 @@ POSES: Registry[ReadPoses] = Registry("poses", "--pose-format", [
            advice="reconstruct the images with COLMAP"),
     Format("", "RealityCapture's CSV or XMP", _is_reality_capture, None,
            advice="export the registration as COLMAP"),
+    Format("", "KITTI's calib.txt", is_kitti_calibration, None,
+           advice="it holds cameras: give it as --camera, and the rows of poses/NN.txt as --poses"),
+    Format("", "DSO's camera.txt", is_dso_camera, None, advice="give its result.txt as --poses"),
     Format("", "a folder of NeRF splits", lambda p: "transforms_train.json" in p.names
            and "transforms.json" not in p.names, None,
            advice="give the file transforms_....json of the images"),
