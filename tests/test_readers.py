@@ -309,6 +309,21 @@ def test_any_format_can_be_declared_metric(tmp_path, write, metric, up):
     assert read(path, camera=camera).metric == metric
 
 
+@pytest.mark.parametrize("write", [as_tum, as_kitti, as_orbslam3, as_replica])
+def test_a_unit_that_the_format_does_not_state_is_declared_or_assumed_once(tmp_path, write):
+    path = write(tmp_path, some_cameras())
+    path = path / "traj.txt" if path.is_dir() else path
+    assumed = [t for t in read(path, camera=CAMERA).messages if "metres are assumed" in t]
+    assert len(assumed) == 1 and assumed[0].startswith("note: ")
+    assert read(path, camera=CAMERA, metric=True).messages == ()
+    path.write_text("# units: arbitrary\n" + path.read_text())
+    poses = read(path, camera=CAMERA)
+    assert not poses.metric and poses.messages == ()
+    path.write_text(path.read_text().replace("arbitrary", "metres"))
+    poses = read(path, camera=CAMERA)
+    assert poses.metric and poses.messages == ()
+
+
 @pytest.mark.parametrize("write, metric, up", FORMATS, ids=lambda v: getattr(v, "__name__", None))
 @pytest.mark.parametrize("named", [True, False])
 def test_frames_without_a_pose_are_known(tmp_path, write, metric, up, named):
