@@ -359,7 +359,7 @@ def test_a_camera_of_another_size_is_resized_and_of_another_shape_refused(tmp_pa
         ("a.json", '{"fx": 500, "model": "MAGIC"}', "no camera model MAGIC"),
         ("cameras.txt", "1 PINHOLE 640 480 500 510 320 240\n" * 2, "2 cameras; expected one"),
         ("K.txt", "1 2\n3 4\n", "no known format"),
-        ("K.txt", "1 2 3\n3 4\n5 6 7", "not a camera file"),
+        ("K.txt", "1 2 3\n3 4\n5 6 7", "no known format of cameras"),
         ("empty.txt", "", "no known format"),
         ("picture.txt", bytes(range(256)), "no known format"),
     ],
