@@ -201,13 +201,10 @@ def numbers_of_names(names: Sequence[str], where: str) -> IntArray:
     digits = [re.findall(r"\d+", PurePosixPath(name.replace("\\", "/")).stem) for name in names]
     numbered = [found for found in digits if found]
     counts = {len(found) for found in numbered}
-    groups = 1 if len(counts) > 1 else max(counts, default=0)
-    for group in range(1, groups + 1):
+    for group in range(1, max(counts, default=1) + 1 if len(counts) < 2 else 2):
         number = [int(found[-group][-18:]) if found else -1 for found in digits]  # int64 holds 18
-        if len({n for n in number if n >= 0}) == len(numbered):
+        if len({*number} - {-1}) == len(numbered):
             return np.array(number, np.int64)
-    if not numbered:
-        return np.full(len(names), -1)
     keys = [found[-1].lstrip("0") if found else "-" for found in digits]
     twice = next(key for key in keys if key != "-" and keys.count(key) > 1)
     same = [name for name, key in zip(names, keys, strict=True) if key == twice]
@@ -273,14 +270,7 @@ def _by_stamps(stamps_s: Array, source: SourceFrames, is_ours: bool) -> list[Fra
     if is_number and 0 <= stamps_s[0] and stamps_s[-1] <= source.count:
         noun = "whole numbers in place of time stamps"
         found += by_numbers(stamps_s.astype(np.int64), source, noun)
-    clock = ", the time stamps are of another clock" * (source.timed and not found)
-    if count == source.count:
-        rule = f"order, one row for each frame of the source{clock}"
-        found.append(_assignment("order", rule, np.arange(count), source))
-    elif count == len(source.frame) and not found:
-        rule = f"order, one row for each frame that is read{clock}"
-        found.append(FrameAssignment("order", rule, np.arange(count), 0))
-    return found
+    return found + by_order(count, source) or _by_frames_read(count, source)
 
 
 def rows_by_time(stamps_s: Array, frame: IntArray, time_s: Array) -> IntArray:
@@ -351,9 +341,8 @@ def _by_rows(
     """Assign rows without names or times by their order, or by the numbers of selected images."""
     if found := by_order(count, source, by_text):
         return found + (by_order(count, source, not by_text) if frames_by else [])
-    if count == len(source.frame):
-        rows = np.arange(count)
-        return [FrameAssignment("order", "order, one row for each frame that is read", rows, 0)]
+    if found := _by_frames_read(count, source):
+        return found
     last = int(source.frame[-1])
     found = by_numbers(np.arange(count), source, "rows")
     if frames_by or (source.images and count > source.count):
@@ -366,6 +355,13 @@ def _by_rows(
         f"{where}: {count} rows, frame numbers up to {last}; expected one row a frame, or --set "
         f"poses.frames_by={keys}"
     )
+
+
+def _by_frames_read(count: int, source: SourceFrames) -> list[FrameAssignment]:
+    """Assign rows in order to the frames that are read; [] for other counts."""
+    rule = "order, one row for each frame that is read"
+    known = [FrameAssignment("order", rule, np.arange(count), 0)]
+    return known if count == len(source.frame) else []
 
 
 def source_of(video: Any) -> SourceFrames:

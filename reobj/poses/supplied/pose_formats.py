@@ -190,6 +190,11 @@ Z_UP = np.array([0, 0, 1.0])
 CV_FROM_LLFF = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]])  # LLFF: x down, y right, z backward
 
 
+def _file(path: Path, name: str) -> Path:
+    """Return a file, or that of this name in a folder."""
+    return path / name if path.is_dir() else path
+
+
 # ---- Tables: TUM, ORB-SLAM3, EuRoC, rows of matrices ---------------------------------------------
 
 
@@ -251,7 +256,7 @@ def read_euroc(path: Path, size: tuple[int, int]) -> PoseFile:
     `T_BS` in the camera's sensor.yaml, beside it or in cam0 beside its folder, is body_from_cam;
     without one the body is taken for the camera, with a message.
     """
-    path = path / "data.csv" if path.is_dir() else path
+    path = _file(path, "data.csv")
     rows, where, header = read_table(path, (8, 17), finite=False)
     columns = named_columns(header, rows.shape[1]) or [1, 2, 3, 5, 6, 7, 4]
     body_from_world = invert_rigid(from_quaternions(rows, columns, where))
@@ -307,7 +312,7 @@ def read_stray(path: Path, size: tuple[int, int]) -> PoseFile:
 
     OpenCV axes, quaternion x first, a row for each frame of rgb.mp4, numbered from 0.
     """
-    path = path / "odometry.csv" if path.is_dir() else path
+    path = _file(path, "odometry.csv")
     names = [word.strip().lower() for word in read_lines(path)[0].split(",")]
     rows, where, header = read_table(path, (len(names),), finite=False)
     columns = named_columns(header, len(names))
@@ -338,7 +343,7 @@ def read_record3d(path: Path, size: tuple[int, int]) -> PoseFile:
 
     The file `metadata`, its folder, or an .r3d, which is a zip of the folder.
     """
-    path = path / "metadata" if path.is_dir() else path
+    path = _file(path, "metadata")
     if path.suffix.lower() == ".r3d":
         with zipfile.ZipFile(path) as file:
             name = next(n for n in file.namelist() if n.rpartition("/")[2] == "metadata")
@@ -398,42 +403,41 @@ def read_arkit(path: Path, size: tuple[int, int]) -> PoseFile:
     world_from_cam row by row, `t_00` to `t_23` or `cameraPoseARFrame`; ARKit's axes (those of
     OpenGL), metres, y up.
     """
-    files = arkit_files(path)
 
-    def read(entry: dict[str, Any]) -> tuple[Any, Camera | None]:
-        rows = entry.get("cameraPoseARFrame") or [
-            entry[f"t_{i}{j}"] for i in range(3) for j in range(4)
-        ]
-        return [*rows, 0, 0, 0, 1][:16], camera_of_keys(entry, size)
+    def read(entry: Any) -> Entry:
+        path, keys = entry
+        rows = keys.get("cameraPoseARFrame") or [keys[f"t_{k // 4}{k % 4}"] for k in range(12)]
+        return rows, camera_of_keys(keys, size), path.stem
 
-    return _listed(
-        {str(file): load_json(file) for file in files}, read, CV_FROM_GL,
-        names=tuple(file.stem for file in files), up_in_world=Y_UP,
-    )  # fmt: skip
+    files = {str(file): (file, load_json(file)) for file in arkit_files(path)}
+    return _listed(files, read, CV_FROM_GL, up_in_world=Y_UP)
+
+
+# world_from_cam, 12 or 16 numbers row by row; camera; name of the image, or ""
+Entry = tuple[Any, Camera | None, str]
 
 
 def _listed(
-    entries: dict[str, Any],
-    read: Callable[[Any], tuple[Any, Camera | None]],
-    axes: Array,
-    **more: Any,
+    entries: dict[str, Any], read: Callable[[Any], Entry], axes: Array, **more: Any
 ) -> PoseFile:
-    """Read entries, by their location: world_from_cam, 12 or 16 numbers row by row, and camera."""
+    """Read entries, by their location, whose camera axes are these."""
     matrices = np.tile(np.eye(4).ravel(), (len(entries), 1))  # (N, 16)
     cameras = list[Camera | None]()
+    names = list[str]()
     for row, (where, entry) in enumerate(entries.items()):
         try:
-            numbers, camera = read(entry)
+            numbers, camera, name = read(entry)
             numbers = np.array(numbers, np.float64).ravel()
             matrices[row, : 12 if numbers.size == 12 else 16] = numbers
             cameras.append(camera)
+            names += [name] * bool(name)
         except ReobjError as error:
             raise ReobjError(f"{where}: {error}") from None
         except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
             raise ReobjError(f"{where}: no pose and camera as the format has them "
                              f"({error!r:.100})") from None  # fmt: skip
     poses = axes @ invert_rigid(checked_rigid(matrices.reshape(-1, 4, 4), list(entries)))
-    return PoseFile(poses, tuple(cameras), axes=axes, **more)
+    return PoseFile(poses, tuple(cameras), tuple(names), axes=axes, **more)
 
 
 def read_transforms(path: Path, size: tuple[int, int]) -> PoseFile:
@@ -442,20 +446,22 @@ def read_transforms(path: Path, size: tuple[int, int]) -> PoseFile:
     nerfstudio transformed the world by `applied_transform` A; this is undone:
     world_from_cv = inv(A) world_from_gl diag(1, -1, -1, 1).
     """
-    path = path / "transforms.json" if path.is_dir() else path
+    path = _file(path, "transforms.json")
     data = load_json(path)
-    shared = {key: value for key, value in data.items() if key != "frames"}
-    found = _listed(
-        {f"{path}, frames[{i}]": frame for i, frame in enumerate(data["frames"])},
-        lambda frame: (frame["transform_matrix"], camera_of_keys({**shared, **frame}, size)),
-        CV_FROM_GL, names=tuple(str(frame["file_path"]) for frame in data["frames"]),
-    )  # fmt: skip
+    frames = data.pop("frames")
+
+    def read(frame: Any) -> Entry:
+        camera = camera_of_keys({**data, **frame}, size)
+        return frame["transform_matrix"], camera, str(frame["file_path"])
+
+    named = {f"{path}, frames[{i}]": frame for i, frame in enumerate(frames)}
+    found = _listed(named, read, CV_FROM_GL)
     where = [f"{path}, applied_transform"]
     applied = np.eye(4)
     applied[:3] = np.array(data.get("applied_transform", applied), np.float64)[:3]
     raise_where([not np.isfinite(applied).all()], where, "expected 3x4 or 4x4 finite numbers")
-    applied[:3] = checked_rigid(applied[None], where)[0]
-    return dataclasses.replace(found, cam_from_world=found.cam_from_world @ applied)
+    turn = homogeneous(checked_rigid(applied[None], where))
+    return dataclasses.replace(found, cam_from_world=found.cam_from_world @ turn)
 
 
 # ---- Datasets and radiance fields ----------------------------------------------------------------
@@ -466,18 +472,17 @@ def read_scannetpp(path: Path, size: tuple[int, int]) -> PoseFile:
 
     `aligned_pose` (of the laser scan) or else `pose`, and `intrinsic`; OpenCV axes, metres.
     """
-    path = path / "pose_intrinsic_imu.json" if path.is_dir() else path
+    path = _file(path, "pose_intrinsic_imu.json")
     data = load_json(path)
-
-    def read(entry: dict[str, Any]) -> tuple[Any, Camera]:
-        K = np.array(entry["intrinsic"], np.float64).reshape(3, 3)
-        return entry.get("aligned_pose", entry.get("pose")), _phone_camera(K, size)
-
     is_aligned = all("aligned_pose" in entry for entry in data.values())
-    return _listed(
-        {f"{path}, {name}": entry for name, entry in data.items()}, read, np.eye(3),
-        names=tuple(data), up_in_world=Z_UP if is_aligned else None,
-    )  # fmt: skip
+
+    def read(entry: Any) -> Entry:
+        name, keys = entry
+        K = np.array(keys["intrinsic"], np.float64).reshape(3, 3)
+        return keys["aligned_pose" if is_aligned else "pose"], _phone_camera(K, size), name
+
+    named = {f"{path}, {item[0]}": item for item in data.items()}
+    return _listed(named, read, np.eye(3), up_in_world=Z_UP if is_aligned else None)
 
 
 def read_llff(path: Path, size: tuple[int, int]) -> PoseFile:
@@ -486,23 +491,21 @@ def read_llff(path: Path, size: tuple[int, int]) -> PoseFile:
     world_from_cam with the axes down, right, backwards. One row per image, in the order of the
     names as text.
     """
-    path = path / "poses_bounds.npy" if path.is_dir() else path
+    path = _file(path, "poses_bounds.npy")
     rows = np.load(path, allow_pickle=False)
     if rows.ndim != 2 or rows.shape[1] != 17:
         raise ReobjError(f"{path}: an array of shape {rows.shape}; expected LLFF's (N, 17); write "
                          "matrices as text: np.savetxt(FILE, m.reshape(N, 16))")  # fmt: skip
 
-    def read(row: Array) -> tuple[Array, Camera]:
+    def read(row: Array) -> Entry:
         table = row[:15].astype(np.float64).reshape(3, 5)
         raise_where([not np.isfinite(table).all()], ["LLFF"], "a number is not finite")
         h, w, f = table[:, 4].tolist()
         camera = Camera("SIMPLE_PINHOLE", image_side(w), image_side(h), (f, w / 2, h / 2))
-        return table[:, :4], camera
+        return table[:, :4], camera, ""
 
-    return _listed(
-        {f"{path}, row {i}": row for i, row in enumerate(rows)}, read, CV_FROM_LLFF,
-        by_text=True,
-    )  # fmt: skip
+    named = {f"{path}, row {i}": row for i, row in enumerate(rows)}
+    return _listed(named, read, CV_FROM_LLFF, by_text=True)
 
 
 def read_splatting(path: Path, size: tuple[int, int]) -> PoseFile:
@@ -510,15 +513,11 @@ def read_splatting(path: Path, size: tuple[int, int]) -> PoseFile:
 
     OpenCV axes, no scale; the principal point is the middle of the image.
     """
-    path = path / "cameras.json" if path.is_dir() else path
-    data = load_json(path)
 
-    def read(entry: dict[str, Any]) -> tuple[Array, Camera]:
-        w, h = image_side(entry["width"]), image_side(entry["height"])
-        camera = brown_camera((w, h), float(entry["fx"]), float(entry["fy"]), w / 2, h / 2)
-        return np.column_stack([entry["rotation"], entry["position"]]), camera
+    def read(entry: Any) -> Entry:
+        numbers = np.column_stack([entry["rotation"], entry["position"]])
+        return numbers, camera_of_keys(entry, None), str(entry["img_name"])
 
-    return _listed(
-        {f"{path}, entry {i}": entry for i, entry in enumerate(data)}, read, np.eye(3),
-        names=tuple(str(entry["img_name"]) for entry in data),
-    )  # fmt: skip
+    path = _file(path, "cameras.json")
+    named = {f"{path}, entry {i}": entry for i, entry in enumerate(load_json(path))}
+    return _listed(named, read, np.eye(3))

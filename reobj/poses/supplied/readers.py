@@ -167,7 +167,7 @@ def _check_units(cam_from_world: Array, path: Path) -> None:
         )
 
 
-MAX_FOCAL_SPREAD = 0.02  # relative, over the images of one camera: autofocus (chosen)
+MAX_SPREAD = 0.02  # focal lengths, over the images of one camera: autofocus (chosen)
 
 
 def one_camera(cameras: Sequence[Camera | None], path: Path, size: tuple[int, int]) -> Camera:
@@ -176,22 +176,20 @@ def one_camera(cameras: Sequence[Camera | None], path: Path, size: tuple[int, in
     Args:
         size: (w, h) of the frames, to which it is resized.
     Raises:
-        ReobjError: none, or they differ by more than MAX_FOCAL_SPREAD in focal length or (in longer
-            sides) in the principal point, or in model or size.
+        ReobjError: none, or they differ by more than MAX_SPREAD in focal length or principal point,
+            or in model or size.
     """
     found = sorted((c for c in cameras if c is not None), key=lambda c: c.params[0])
     if not found:
         raise ReobjError(f"{path}: no intrinsics; add --camera {CAMERA_FORMS}")
     kinds = sorted({f"{c.model} {c.width}x{c.height}" for c in found})
     K = np.array([camera.K for camera in found])  # (n, 3, 3)
-    spread = np.ptp(K[:, :2], axis=0) / max(found[0].width, found[0].height)
-    spread[[0, 1], [0, 1]] = np.ptp(K[:, [0, 1], [0, 1]], axis=0) / np.maximum(K[0, 0, 0], 1e-9)
-    if len(kinds) > 1 or spread.max() > MAX_FOCAL_SPREAD:
+    if len(kinds) > 1 or np.ptp(K, axis=0).max() > MAX_SPREAD * K[0, 0, 0]:
         least, most = K[0, 0], K[-1, 0]
-        cameras_text = f"focal lengths {least[0]:.4g}-{most[0]:.4g}, centres {least[2]:.4g}-"
-        cameras_text = ", ".join(kinds[:3]) if len(kinds) > 1 else f"{cameras_text}{most[2]:.4g}"
+        text = f"focal lengths {least[0]:.4g}-{most[0]:.4g}, centres {least[2]:.4g}-{most[2]:.4g}"
+        text = ", ".join(kinds[:3]) if len(kinds) > 1 else text
         raise ReobjError(
-            f"{path}: several different cameras took the frames ({cameras_text}); expected one: "
+            f"{path}: several different cameras took the frames ({text}); expected one: "
             "give its intrinsics with --camera, or reconstruct with a single camera"
         )
     return fitted_camera(found[len(found) // 2], size, str(path))
@@ -332,8 +330,11 @@ def _is_reality_capture(probe: Probe) -> bool:
 
 
 def _has(probe: Probe, name: str, *keys: str) -> bool:
-    """Test for a folder with a file, or a JSON file of objects with these keys."""
-    return name in probe.names or (not probe.is_dir and bool(keys) and {*keys} <= probe.keys())
+    """Test for a folder with a file, or a JSON file whose (first) object has these keys."""
+    if probe.is_dir or not isinstance(probe.json, dict | list):
+        return name in probe.names
+    first = next(iter(probe.json.values() if isinstance(probe.json, dict) else probe.json), None)
+    return any(isinstance(one, dict) and {*keys} <= one.keys() for one in (probe.json, first))
 
 
 ReadPoses = Callable[[Path, tuple[int, int]], PoseFile]
@@ -364,7 +365,7 @@ POSES: Registry[ReadPoses] = Registry("poses", "--pose-format", [
            lambda p: p.is_dir and bool(formats.scannet_files(p.path)), formats.read_scannet, NAME,
            METRES, "7-Scenes: no intrinsics"),
     Format("scannetpp", "ScanNet++ (iPhone): `pose_intrinsic_imu.json`, `aligned_pose` (z up) or "
-           "`pose`", lambda p: _has(p, "pose_intrinsic_imu.json") or _is_scannetpp(p),
+           "`pose`", lambda p: _has(p, "pose_intrinsic_imu.json", "intrinsic"),
            formats.read_scannetpp, NAME, METRES, "IMU"),
     Format("arkitscenes", "ARKitScenes: `.traj`, axis-angle of cam_from_world; `.pincam` beside it",
            lambda p: any(name.endswith(".traj") for name in (*p.names, p.path.name)),
@@ -379,7 +380,7 @@ POSES: Registry[ReadPoses] = Registry("poses", "--pose-format", [
            lambda p: "odometry.csv" in {*p.names, p.path.name}, formats.read_stray, "number",
            METRES, "IMU"),
     Format("llff", "LLFF: `poses_bounds.npy`; axes down, right, backwards",
-           lambda p: p.suffix == ".npy" or _has(p, "poses_bounds.npy"), formats.read_llff,
+           lambda p: p.suffix == ".npy" or "poses_bounds.npy" in p.names, formats.read_llff,
            "order of the names as text: 1, 10, 2", UNKNOWN, "depth bounds"),
     Format("splatting", "3D Gaussian splatting: `cameras.json`",
            lambda p: _has(p, "cameras.json", "img_name", "position"), formats.read_splatting, NAME,
@@ -408,8 +409,3 @@ POSES: Registry[ReadPoses] = Registry("poses", "--pose-format", [
            advice="their world is scaled, and they have no intrinsics: give the transforms.json of "
            "the data"),
 ])  # fmt: skip
-
-
-def _is_scannetpp(probe: Probe) -> bool:
-    first = next(iter(probe.json.values()), None) if isinstance(probe.json, dict) else None
-    return isinstance(first, dict) and "intrinsic" in first
