@@ -13,7 +13,6 @@ from reobj.poses.supplied.frame_assignment import (
     FrameAssignment,
     SourceFrames,
     _assignment,
-    _by_stamps,
     by_numbers,
     interpolated,
     rows_by_time,
@@ -107,14 +106,6 @@ def test_numbers_with_an_offset_from_the_images() -> None:
     assert found["number0"] == ([0, 1, 2], 0) and found["number"] == ([1, 2, -1], 1)
     found = rows_of(by_numbers(np.array([1, 2, 3]), from_1, "numbers"))
     assert set(found) <= {"number", "order"} and found["number"] == ([0, 1, 2], 0)
-
-
-def test_times_outside_the_source_are_counted() -> None:
-    """Half a frame before the first and after the last is inside."""
-    seen = source([0, 1, 2], [0, 0.1, 0.2], 4)  # the fourth frame, at .3, is not read
-    stamps = np.array([-0.06, -0.04, 0.0, 0.3, 0.34, 0.36, 0.5])
-    (found,) = _by_stamps(stamps, seen, is_ours=True)
-    assert found.key == "time" and found.outside == 3 and found.row.tolist() == [2, -1, -1]
 
 
 def test_numbers_after_the_last_frame_are_counted() -> None:

@@ -53,7 +53,7 @@ def parts(rotation: np.ndarray, translation: np.ndarray, scale: float = 1) -> np
 
 def tum_of(path: Path, matrices: np.ndarray) -> Path:
     xyzw = Rotation.from_matrix(matrices[:, :3, :3]).as_quat()
-    np.savetxt(path, np.column_stack([np.arange(FRAMES) / 30, matrices[:, :3, 3], xyzw]))
+    np.savetxt(path, np.column_stack([np.arange(len(xyzw)) / 30, matrices[:, :3, 3], xyzw]))
     return path
 
 
@@ -94,6 +94,22 @@ def test_a_convention_is_named_by_boxes_alone(tmp_path: Path, name: str, capsys:
     assert code == 2 and named in error and error.count("\n") == 1
     assert "the poses look like ones with" in error or "metres" in error
     assert not (tmp_path / "out" / "objects.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("convert", "named"),
+    [
+        (lambda m: np.repeat(m, 2, 0), "2 poses for each frame"),
+        (lambda m: m[::2], "frame 29, but"),
+        (lambda m: np.concatenate([m[::2], m[::-2]]), "one pose for 2 frames"),
+    ],
+)
+def test_poses_at_another_rate_are_named(
+    tmp_path: Path, convert: object, named: str, capsys: Capture
+) -> None:
+    path = tum_of(tmp_path / "poses.txt", convert(world_from_cam()))  # type: ignore[operator]
+    assert run(tmp_path, None, path, "--camera", LINE) == 2
+    assert named in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

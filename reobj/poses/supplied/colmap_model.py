@@ -98,10 +98,8 @@ def _read_model(images: Path) -> PoseFile:
     lost = ~np.isfinite(model.cam_from_world).all((1, 2))
     raise_where(lost, where, "a number of the pose is not finite; leave out images without pose")
     if far.any():
-        number, xyz = sorted(ids)[int(np.argmax(far))], model.points[far][0]
-        fault = "not finite"
-        if np.isfinite(xyz).all():
-            fault = f"more than {WORLD_MAX:g} units away from the origin"
+        number = sorted(ids)[int(np.argmax(far))]
+        fault = f"not finite, or more than {WORLD_MAX:g} units away from the origin"
         raise ReobjError(f"{images.with_stem('points3D')}: point {number} is {fault}; remove it")
     return PoseFile(
         checked_rigid(homogeneous(model.cam_from_world), where), tuple(model.cameras), names_of,

@@ -258,16 +258,14 @@ def _log_ratio(poses: Poses, maps: DepthMaps, visible: VisiblePoints, row: int) 
         return None
     depth, K = maps.read(row)
     in_color = moved(points, poses.cam_from_world[row])
-    rotation, shift = np.split(maps.depth_from_color, [3], 1)
-    log_scale = 0.0
-    for offset in (0 * shift, shift, shift):  # the shift between the cameras needs the scale
-        in_depth = moved(np.exp(log_scale) * in_color, np.hstack([rotation, offset]))
-        measured = look_up_depth(depth, K, in_depth)
-        good = (measured > 0) & (in_depth[:, 2] > 0)
-        if good.sum() < least:
-            return None
-        log_scale += float(np.median(np.log(measured[good] / in_depth[good, 2])))
-    return log_scale
+    in_depth = in_color @ maps.depth_from_color[:, :3].T  # without the shift, which needs the scale
+    measured = look_up_depth(depth, K, in_depth)
+    good = (measured > 0) & (in_depth[:, 2] > 0)
+    return (
+        float(np.median(np.log(measured[good] / in_depth[good, 2])))
+        if good.sum() >= least
+        else None
+    )
 
 
 def moved(points: Array, b_from_a: Array) -> Array:

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from reobj.cameras import invert_rigid
 from reobj.frame_lookup import frames_by_name
+from reobj.poses.supplied.pose_formats import PoseFile
 from reobj.sources.image_files import TimeUnit, is_date
 from reobj.types import Array, BoolArray, IntArray, ReobjError, nearest_of
 
@@ -45,7 +46,7 @@ class FrameAssignment:
     Attributes:
         key: its name in `--set poses.frames_by=`. rule: the same in words.
         row: (F,) pose of each frame that is read, -1: none.
-        outside: number of poses without a frame in the source.
+        outside: number of poses without a frame in the source; 0 of times, which may begin earlier.
     """
 
     key: str
@@ -63,44 +64,34 @@ def _assignment(key: str, rule: str, frame: IntArray, source: SourceFrames) -> F
 
 
 def assign(
-    count: int,
-    names: Sequence[str],
-    stamps_s: Array | None,
-    source: SourceFrames,
-    where: str,
-    frames_by: str = "",
-    is_ours: bool = False,
-    by_text: bool = False,
+    file: PoseFile, stamps_s: Array | None, source: SourceFrames, where: str, frames_by: str = ""
 ) -> FrameAssignment:
-    """Return the only assignment of `count` poses that the file allows, or the declared one.
+    """Return the only assignment of a file's N poses that it allows, or the declared one.
 
     Names are unique keys. Without names numbers are used, then times, then the order.
 
     Args:
-        names, stamps_s: of the poses, or () and None. where: the file, for errors.
+        stamps_s: (N,) of the poses, or None. where: the file, for errors.
         frames_by: key of the declared assignment; "": none.
-        is_ours: this tool wrote the stamps, for the same source.
-        by_text: the order of rows is that of the images' names as text.
     Raises:
         ReobjError: no pose belongs to a frame, several assignments, or not the declared one.
     """
-    if names:
-        found = _by_names(names, source, where)
+    count = len(file.cam_from_world)
+    if file.names:
+        found = _by_names(file.names, source, where)
     elif stamps_s is not None:
-        found = _by_stamps(stamps_s, source, is_ours)
+        found = _by_stamps(stamps_s, source, file.is_ours)
     else:
-        found = _by_rows(count, source, where, frames_by, by_text)
-    some_fit = any(a.key != "time" and not a.outside for a in found)
+        found = _by_rows(count, source, where, frames_by, file.by_text)
+    fits = any(not one.outside for one in found if one.key != "time")
     kept: list[FrameAssignment] = []
-    for candidate in found:
-        # a clock may start before the video and end after it
-        limit = count / 2 if candidate.key == "time" else 0
-        excluded = candidate.outside > limit and some_fit
-        same = any(np.array_equal(candidate.row, other.row) for other in kept)
-        if not excluded and not same and (candidate.row >= 0).any():
-            kept.append(candidate)
+    for one in found:
+        same = any(np.array_equal(one.row, other.row) for other in kept)
+        is_excluded = one.outside > 0 and fits  # another assigns all poses
+        if not is_excluded and not same and (one.row >= 0).any():
+            kept.append(one)
     if not kept:
-        compared = _compared(names, stamps_s, source)
+        compared = _compared(file.names, stamps_s, source)
         raise ReobjError(f"{where}: none of its {count} poses belongs to a frame ({compared})")
     keys = [one.key for one in kept]
     if frames_by and frames_by not in keys:
@@ -259,12 +250,7 @@ def _by_stamps(stamps_s: Array, source: SourceFrames, is_ours: bool) -> list[Fra
     overlap = stamps_s[0] <= time_s[-1] and stamps_s[-1] >= time_s[0]
     if overlap and (is_ours or (source.timed and not is_number)):
         row = rows_by_time(stamps_s, source.frame, time_s)
-        step = float(np.median(np.diff(time_s) / np.diff(source.frame))) if len(time_s) > 1 else 0.0
-        frames = np.array([0, max(source.count - 1, source.frame[-1])])
-        start, end = time_s[[0, -1]] + step * (frames - source.frame[[0, -1]])
-        tolerance = max(step / 2, STAMP_TOLERANCE_S)
-        outside = (stamps_s < start - tolerance) | (stamps_s > end + tolerance)
-        found.append(FrameAssignment("time", "time stamps", row, int(outside.sum())))
+        found.append(FrameAssignment("time", "time stamps", row, 0))
     if found and (is_ours or (found[0].row < 0).all()):  # the same clock, none within the tolerance
         return found
     if is_number and 0 <= stamps_s[0] and stamps_s[-1] <= source.count:

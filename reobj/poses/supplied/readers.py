@@ -84,11 +84,7 @@ def read_supplied(video: Any, config: PosesConfig) -> Supplied:
     stamps_s = None
     if pose_file.stamps is not None:
         stamps_s = seconds_of(pose_file.stamps, pose_file.unit)
-    count = len(pose_file.cam_from_world)
-    assignment = assign(
-        count, pose_file.names, stamps_s, source, str(path),
-        config.frames_by, pose_file.is_ours, pose_file.by_text,
-    )  # fmt: skip
+    assignment = assign(pose_file, stamps_s, source, str(path), config.frames_by)
     row = assignment.row
     turns = turns_of(source, size, pose_file.cameras, row) if pose_file.stored_pixels else {}
     camera = stated or one_camera(_cameras_of(pose_file, row, turns), path, size)
@@ -115,7 +111,7 @@ def read_supplied(video: Any, config: PosesConfig) -> Supplied:
         f"the {one.rule} (--set poses.frames_by={one.key})": _of_frames(
             pose_file.cam_from_world, one, source
         )
-        for one in by_order(count, source, assignment.key == "order")
+        for one in by_order(len(pose_file.cam_from_world), source, assignment.key == "order")
         if assignment.key in ("order", "text") and one.key != assignment.key
     }
     return Supplied(poses, pose_file.axes, orders)
@@ -237,46 +233,40 @@ def read_pose_file(path: Path, fmt: str, size: tuple[int, int]) -> PoseFile:
     except Exception as error:  # files of other tools lack any key, or hold any type
         text = f"damaged, or no file of format {entry.name} ({error!r:.100})"
         raise ReobjError(f"{path}: {text}") from None
-    metric = {METRES: True, UNKNOWN: False}.get(entry.units, found.metric)
-    kind = " ".join(filter(None, (entry.name, found.kind)))
-    found = dataclasses.replace(found, metric=metric, kind=kind)
-    return _without_lost(_by_time(found, path), path)
+    return _settled(found, entry, path)
 
 
-def _by_time(pose_file: PoseFile, path: Path) -> PoseFile:
-    """Sort poses by their time stamps, without repeated ones."""
-    stamps = pose_file.stamps
-    if stamps is None:
-        return pose_file
-    if not np.isfinite(stamps).all():
-        raise ReobjError(f"{path}: a time stamp is not finite")
-    stamps, kept = np.unique(stamps, return_index=True)
-    poses = pose_file.cam_from_world
-    messages = pose_file.messages
-    if repeated := len(poses) - len(kept):
-        messages += (f"{path}: {repeated} rows repeat a time stamp and are left out",)
-    return dataclasses.replace(
-        pose_file, cam_from_world=poses[kept], stamps=stamps, messages=messages
-    )
+def _settled(found: PoseFile, entry: Format[ReadPoses], path: Path) -> PoseFile:
+    """Sort poses by their time stamps, without repeated ones, and remove those of lost frames.
 
-
-def _without_lost(pose_file: PoseFile, path: Path) -> PoseFile:
-    """Remove poses that are the identity in the axes of the file, as of lost frames.
-
-    It is a pose where it begins the path, and where it is the only one of poses with names.
+    These are the identity in the axes of the file. It is a pose where it begins the path, and where
+    it is the only one of poses with names.
     """
-    cam_from_world = pose_file.cam_from_world
-    identity = np.column_stack([pose_file.axes, np.zeros(3)])
-    identity = identity if pose_file.identity is None else pose_file.identity
-    same: BoolArray = np.all(np.abs(cam_from_world - identity) < 1e-9, axis=(1, 2))  # (N,)
+    poses = found.cam_from_world
+    stamps = found.stamps
+    messages = found.messages
+    if stamps is not None:
+        if not np.isfinite(stamps).all():
+            raise ReobjError(f"{path}: a time stamp is not finite")
+        stamps, kept = np.unique(stamps, return_index=True)
+        if repeated := len(poses) - len(kept):
+            messages += (f"{path}: {repeated} rows repeat a time stamp and are left out",)
+        poses = poses[kept]
+    identity = np.column_stack([found.axes, np.zeros(3)])
+    identity = identity if found.identity is None else found.identity
+    same: BoolArray = np.all(np.abs(poses - identity) < 1e-9, axis=(1, 2))  # (N,)
     begins = same[:1].any() and not same[1:2].any()
-    if begins or (pose_file.names and same.sum() == 1):
+    if begins or (found.names and same.sum() == 1):
         same[same.argmax()] = False
-    cam_from_world = np.where(same[:, None, None], np.nan, cam_from_world)
-    lost = int((~np.isfinite(cam_from_world).all((1, 2))).sum())
-    if lost == len(cam_from_world):
+    poses = np.where(same[:, None, None], np.nan, poses)
+    lost = int((~np.isfinite(poses).all((1, 2))).sum())
+    if lost == len(poses):
         raise ReobjError(f"{path}: no poses in it, or only those of lost frames")
-    return dataclasses.replace(pose_file, cam_from_world=cam_from_world, lost=lost)
+    return dataclasses.replace(
+        found, cam_from_world=poses, stamps=stamps, messages=messages, lost=lost,
+        metric={METRES: True, UNKNOWN: False}.get(entry.units, found.metric),
+        kind=f"{entry.name} {found.kind}".strip(),
+    )  # fmt: skip
 
 
 def _head(probe: Probe) -> tuple[str, list[str], str]:
