@@ -313,15 +313,14 @@ def test_any_format_can_be_declared_metric(tmp_path, write, metric, up):
 def test_a_unit_that_the_format_does_not_state_is_declared_or_assumed_once(tmp_path, write):
     path = write(tmp_path, some_cameras())
     path = path / "traj.txt" if path.is_dir() else path
-    assumed = [t for t in read(path, camera=CAMERA).messages if "metres are assumed" in t]
-    assert len(assumed) == 1 and assumed[0].startswith("note: ")
-    assert read(path, camera=CAMERA, metric=True).messages == ()
-    path.write_text("# units: arbitrary\n" + path.read_text())
     poses = read(path, camera=CAMERA)
-    assert not poses.metric and poses.messages == ()
-    path.write_text(path.read_text().replace("arbitrary", "metres"))
-    poses = read(path, camera=CAMERA)
-    assert poses.metric and poses.messages == ()
+    assert poses.metric and "metres assumed" in poses.reading
+    assert "assumed" not in read(path, camera=CAMERA, metric=True).reading
+    content = path.read_text()
+    for unit in ("arbitrary", "metres"):
+        path.write_text(f"# units: {unit}\n{content}")
+        poses = read(path, camera=CAMERA)
+        assert poses.metric == (unit == "metres") and "assumed" not in poses.reading
 
 
 @pytest.mark.parametrize("write, metric, up", FORMATS, ids=lambda v: getattr(v, "__name__", None))

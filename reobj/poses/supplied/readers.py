@@ -40,7 +40,7 @@ from reobj.poses.supplied.frame_assignment import (
 )
 from reobj.poses.supplied.orientation import turned, turns_of
 from reobj.poses.supplied.pose_formats import PoseFile
-from reobj.types import NOTE_START, Array, BoolArray, IntArray, ReobjError
+from reobj.types import Array, BoolArray, IntArray, ReobjError
 
 
 def read_poses(
@@ -97,6 +97,7 @@ def read_supplied(video: Any, config: PosesConfig) -> Supplied:
         cam_from_world[f, :2] = turn @ cam_from_world[f, :2]
     known = np.asarray(np.isfinite(cam_from_world).all((1, 2)), bool)
     metric = config.metric or pose_file.metric is not False
+    is_assumed = pose_file.metric is None and not config.metric
     if metric:
         _check_units(cam_from_world, path)
     poses = Poses(
@@ -104,8 +105,8 @@ def read_supplied(video: Any, config: PosesConfig) -> Supplied:
         np.where(known, "supplied", "none"), "user", metric=metric,
         up_in_world=pose_file.up_in_world, points=pose_file.points, colors=pose_file.colors,
         visibility=_in_frames(pose_file.visibility, row),
-        messages=(*pose_file.messages, *_messages(pose_file, source, known, len(turns), config)),
-        reading=f"{pose_file.kind}, frames by {assignment.rule}",
+        messages=tuple(_messages(pose_file, path, source, known, len(turns))),
+        reading=f"{pose_file.kind}{METRES_ASSUMED * is_assumed}, frames by {assignment.rule}",
     )  # fmt: skip
     orders = {
         f"the {one.rule} (--set poses.frames_by={one.key})": _of_frames(
@@ -128,22 +129,20 @@ def _cameras_of(
 
 
 def _messages(
-    pose_file: PoseFile, source: SourceFrames, known: BoolArray, turned: int, config: PosesConfig
+    pose_file: PoseFile, path: Path, source: SourceFrames, known: BoolArray, turned: int
 ) -> list[str]:
-    """List what was assumed about poses, and the frames (F,) without one."""
-    path = config.mode
-    messages = []
-    if pose_file.metric is None and not config.metric:
-        messages.append(f"{NOTE_START}{path}: {METRES_ASSUMED}")
+    """List photos that were turned, frames (F,) without a pose, and poses of lost frames."""
+    messages = list(pose_file.messages)
     if turned:
         messages.append(f"{turned} photos have an EXIF orientation, which COLMAP ignores: its "
                         "cameras are turned with them")  # fmt: skip
-    lost = f"{pose_file.lost} poses of lost frames (the identity, zeros, not finite)"
-    facts = [lost] * bool(pose_file.lost)
+    facts = []
     if not known.all():
         step = int(np.median(np.diff(source.frame))) if len(known) > 1 else 1
         without = spans(source.frame[~known].tolist(), step)
-        facts.insert(0, f"poses for {known.sum()} of {len(known)} frames, none for {without}")
+        facts.append(f"poses for {known.sum()} of {len(known)} frames, none for {without}")
+    if pose_file.lost:
+        facts.append(f"{pose_file.lost} poses of lost frames (the identity, zeros, not finite)")
     return messages + [f"{path}: {'; '.join(facts)}"] * bool(facts)
 
 
@@ -330,11 +329,8 @@ def _has(probe: Probe, name: str, *keys: str) -> bool:
 ReadPoses = Callable[[Path, tuple[int, int]], PoseFile]
 NAME, TIME, ORDER = "name, number", "time", "order"
 METRES, UNKNOWN = "metres", "unknown"
-UNSTATED = "not stated: metres with a note, or as `# units: arbitrary` in the file says"
-METRES_ASSUMED = (
-    "the file does not state the unit of its poses: metres are assumed (--metric confirms them; a "
-    "line `# units: arbitrary` at the start of the file denies them, as of monocular SLAM)"
-)
+UNSTATED = "not stated: metres, or as `# units: arbitrary` in the file says"
+METRES_ASSUMED = ", metres assumed (a line `# units: arbitrary` in the file denies them)"
 GIVE = "no intrinsics (`--camera`)"
 POSES: Registry[ReadPoses] = Registry("poses", "--pose-format", [
     Format("colmap", "COLMAP: model, binary (preferred) or text, with its points", _is_colmap,
