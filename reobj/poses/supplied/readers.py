@@ -330,7 +330,7 @@ ReadPoses = Callable[[Path, tuple[int, int]], PoseFile]
 NAME, TIME, ORDER = "name, number", "time", "order"
 METRES, UNKNOWN = "metres", "unknown"
 UNSTATED = "not stated: metres, or as `# units: arbitrary` in the file says"
-METRES_ASSUMED = ", metres assumed (a line `# units: arbitrary` in the file denies them)"
+METRES_ASSUMED = ", metres assumed (no `# units:` in the file)"
 GIVE = "no intrinsics (`--camera`)"
 POSES: Registry[ReadPoses] = Registry("poses", "--pose-format", [
     Format("colmap", "COLMAP: model, binary (preferred) or text, with its points", _is_colmap,
