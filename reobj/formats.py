@@ -155,7 +155,7 @@ class Registry(Generic[R]):
     def find(self, path: Path, name: str = AUTO) -> Format[R]:
         """Return the format of a file, as `reader` does."""
         if not path.exists():
-            raise ReobjError(f"{path}: no such file of {self.what}")
+            raise ReobjError(f"{path} does not exist")
         return self.choose(Probe(path), name)
 
     def choose(self, probe: Probe, name: str = AUTO) -> Format[R]:

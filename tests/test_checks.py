@@ -109,10 +109,34 @@ def test_the_axes_of_the_file_are_named_not_those_of_the_reading():
 
 @pytest.mark.parametrize("kind", ["orbit", "pan"])
 def test_poses_of_other_frames_fit_in_no_convention(kind):
-    """Every 4th pose given to every frame."""
-    cams = motion(kind, 240)
+    cams = motion(kind)
+    shuffled = np.random.default_rng(0).permutation(cams)
     with pytest.raises(rt.ReobjError, match="fit in no convention"):
-        check_matches(Supplied(supplied(cams[::4])), False, *matches(cams[:60], 0.5))
+        check_matches(Supplied(supplied(shuffled)), False, *matches(cams, 0.5))
+
+
+@pytest.mark.parametrize("kind", ["orbit", "walk", "forward"])
+@pytest.mark.parametrize("step", [2, 3])
+def test_another_number_of_poses_than_one_a_frame_is_named(kind, step):
+    """By boxes alone: every k-th pose as one for each frame, and poses at k times the rate."""
+    cams = motion(kind, 60)
+    seen = box_tracks(cams, 1, 0)
+    sparse = np.concatenate([cams[::step], np.full((60 - len(cams[::step]), 3, 4), np.nan)])
+    with pytest.raises(rt.ReobjError, match=f"one pose for {step} frames"):
+        check_boxes(Supplied(supplied(sparse)), seen)
+    first = box_tracks(cams[::step], 1, 0)
+    with pytest.raises(rt.ReobjError, match=f"{step} poses for each frame"):
+        check_boxes(Supplied(supplied(cams)), first)
+
+
+@pytest.mark.parametrize("kind", ["orbit", "walk", "pan", "forward"])
+@pytest.mark.parametrize("shift", [-1, 1])
+def test_poses_of_the_next_frame_are_named_by_boxes(kind, shift):
+    """Where the error exceeds that of the boxes: here by .3 deg and more."""
+    cams = motion(kind)
+    late = cams[(np.arange(len(cams)) - shift).clip(0, len(cams) - 1)]
+    with pytest.raises(rt.ReobjError, match=f"1 frames {'earlier' if shift > 0 else 'later'}"):
+        check_boxes(Supplied(supplied(late)), box_tracks(cams, 1, 0))
 
 
 def test_another_order_of_the_images_is_named():
@@ -128,7 +152,7 @@ def test_matches_that_fit_nothing_do_not_contradict_boxes_that_agree():
     cams = motion("orbit")
     given = Supplied(supplied(cams))
     confirmed = check_boxes(given, box_tracks(cams, 1, 0))
-    rows, match_rows, rays = matches(motion("orbit", 240)[:60], 0.5)
+    rows, match_rows, rays = matches(np.random.default_rng(0).permutation(cams), 0.5)
     assert check_matches(given, confirmed, rows, match_rows, rays) < 0.3
     with pytest.raises(rt.ReobjError, match="fit in no convention"):
         check_matches(given, False, rows, match_rows, rays)

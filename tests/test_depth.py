@@ -296,7 +296,7 @@ def test_maps_without_depth_are_reported(tmp_path, walk):
     for path in folder.glob("*.png"):
         cv2.imwrite(str(path), np.zeros((24, 32), np.uint16))
     poses = add(metric(walk), folder)
-    assert len(poses.points) == 0 and "12 maps show no surface" in poses.messages[0]
+    assert len(poses.points) == 0 and "show no surface" in poses.messages[0]
 
 
 # ---- Assignment of maps to frames ----------------------------------------------------------------

@@ -495,7 +495,7 @@ def test_a_damaged_zip_gives_one_line(tmp_path: Path, video: rt.Video) -> None:
 
 
 def test_missing_file_and_unknown_class(tmp_path: Path, video: rt.Video) -> None:
-    with pytest.raises(rt.ReobjError, match="no such file of detections"):
+    with pytest.raises(rt.ReobjError, match=r"none\.txt does not exist"):
         rt.read_detections(tmp_path / "none.txt", video)
     with pytest.raises(rt.ReobjError, match=r"--classes: no class chaise; did you mean chair\?"):
         read(tmp_path, "a.csv", CSV, video, classes="chaise")

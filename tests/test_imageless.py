@@ -220,8 +220,8 @@ def test_the_image_size_comes_from_the_detections(tmp_path: Path) -> None:
         ("csv", "none", LINE, "no video: name one, or use"),
         ("csv", "tum", "300,300,160,120", "no image size"),
         ("csv", "tum", "", "groundtruth.txt: no image size"),
-        ("no.csv", "tum", LINE, "no.csv: no such file of detections"),
-        ("csv", "no.txt", LINE, "no.txt: no such file"),
+        ("no.csv", "tum", LINE, "no.csv does not exist"),
+        ("csv", "no.txt", LINE, "no.txt does not exist"),
         ("late", "tum", LINE, "frame 99, but .*groundtruth.txt has 24 poses"),
     ],
 )

@@ -76,6 +76,10 @@ FILES = {
     "camera.txt": "PINHOLE 640 480 500 510 320 240",
     "K.txt": "5.00e+02 0 3.2e+02\n0 5.1e+02 2.4e+02\n0 0 1\n",
     "intrinsic_color.txt": "500 0 320 0\n0 510 240 0\n0 0 1 0\n0 0 0 1\n",
+    "calib.txt": "".join(f"P{i}: 500 0 320 {-9 * i} 0 510 240 0 0 0 1 0\n" for i in range(4))
+    + "Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0\n",
+    "calib_cam_to_cam.txt": "calib_time: 09-Jan-2012 13:57:47\nK_00: 900 0 1 0 900 1 0 0 1\n"
+    "P_rect_00: 5e2 0 3.2e2 0 0 5.1e2 2.4e2 0 0 0 1 0\n",
     "numbers.txt": "# fx fy cx cy\n500, 510, 320, 240\n",
 }
 JSON = {
@@ -100,6 +104,21 @@ JSON = {
 def test_text_files_are_read(tmp_path, name):
     (tmp_path / name).write_text(FILES[name])
     assert parse_camera(str(tmp_path / name), SIZE) == PINHOLE
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("calib.txt", "P0: 1 0 1 0 0 1 1 0 0 0 1 0\nP2: 2 0 1 0 0 1 1 0 0 0 1 0\n", "different"),
+        ("camera.txt", "Pinhole 0.5 0.6 0.5 0.5 0\n640 480\ncrop\n640 480\n", "DSO.*MODEL WIDTH"),
+        ("camera.txt", "0.5 0.6 0.5 0.5 0.93\n640 480\nfull\n640 480\n", "DSO.*MODEL WIDTH"),
+        ("cameras.bin", "\0\0", "COLMAP model, not read; give cameras.txt"),
+    ],
+)
+def test_other_camera_files_are_named(tmp_path, name, text, message):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(rt.ReobjError, match=message):
+        parse_camera(str(tmp_path / name), SIZE)
 
 
 @pytest.mark.parametrize("name", JSON)
@@ -340,7 +359,7 @@ def test_a_camera_of_another_size_is_resized_and_of_another_shape_refused(tmp_pa
         ("a.json", '{"fx": 500, "model": "MAGIC"}', "no camera model MAGIC"),
         ("cameras.txt", "1 PINHOLE 640 480 500 510 320 240\n" * 2, "2 cameras; expected one"),
         ("K.txt", "1 2\n3 4\n", "no known format"),
-        ("K.txt", "1 2 3\n3 4\n5 6 7", "not a camera file"),
+        ("K.txt", "1 2 3\n3 4\n5 6 7", "no known format of cameras"),
         ("empty.txt", "", "no known format"),
         ("picture.txt", bytes(range(256)), "no known format"),
     ],

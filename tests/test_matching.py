@@ -13,8 +13,7 @@ from reobj.poses.supplied.frame_assignment import (
     FrameAssignment,
     SourceFrames,
     _assignment,
-    _by_image_numbers,
-    _by_stamps,
+    by_numbers,
     interpolated,
     rows_by_time,
     source_of,
@@ -79,33 +78,34 @@ def test_of_fast_frames_a_time_matches_within_half_a_frame() -> None:
     assert rows_by_time(np.array([0.004, 0.036, 0.06]), frame, frame / 100).tolist() == [0, -1, 2]
 
 
+class Frames(SimpleNamespace):
+    def __iter__(self):
+        return (SimpleNamespace(index=i, time_s=i / 10) for i in range(9))
+
+
 def test_a_fully_decoded_video_has_its_decoded_frame_count() -> None:
     for config, names, count in (
-        (None, (), 9), (InputConfig(), (), 9), (InputConfig(every=2), (), 30),
+        (InputConfig(), (), 9), (InputConfig(every=2), (), 30),
         (InputConfig(stop=9), (), 30), (InputConfig(), ("a.png",) * 30, 30),
     ):  # fmt: skip
-        video = SimpleNamespace(config=config, names=names, frame_count=30)
-        assert source_of(video, np.arange(9), np.arange(9) / 10).count == count
+        assert (
+            source_of(Frames(config=config, names=names, files=(), frame_count=30)).count == count
+        )
 
 
 def test_numbers_with_an_offset_from_the_images() -> None:
-    seen = source([0, 1, 2], [0, 0.1, 0.2], 3)
-    from_1 = _by_image_numbers(np.array([1, 2, 3]), np.array([0, 1, 2]), seen, "numbers")
-    assert rows_of(from_1)["number1"] == ([0, 1, 2], 0)
-    assert rows_of(from_1)["number"] == ([-1, 0, 1], 1)
-    from_0 = _by_image_numbers(np.array([0, 1, 2]), np.array([1, 2, 3]), seen, "numbers")
-    assert rows_of(from_0)["number0"] == ([0, 1, 2], 0)
-    assert rows_of(from_0)["number"] == ([1, 2, -1], 1)
-    same = _by_image_numbers(np.array([1, 2, 3]), np.array([1, 2, 3]), seen, "numbers")
-    assert set(rows_of(same)) <= {"number", "order"} and rows_of(same)["number"] == ([0, 1, 2], 0)
-
-
-def test_times_outside_the_source_are_counted() -> None:
-    """Half a frame before the first and after the last is inside."""
-    seen = source([0, 1, 2], [0, 0.1, 0.2], 4)  # the fourth frame, at .3, is not read
-    stamps = np.array([-0.06, -0.04, 0.0, 0.3, 0.34, 0.36, 0.5])
-    (found,) = _by_stamps(stamps, seen, is_ours=True)
-    assert found.key == "time" and found.outside == 3 and found.row.tolist() == [2, -1, -1]
+    from_0, from_1 = (
+        SourceFrames(
+            np.arange(3), np.arange(3) / 10, 3, tuple(f"{i + first}.png" for i in range(3))
+        )
+        for first in (0, 1)
+    )
+    found = rows_of(by_numbers(np.array([1, 2, 3]), from_0, "numbers"))
+    assert found["number1"] == ([0, 1, 2], 0) and found["number"] == ([-1, 0, 1], 1)
+    found = rows_of(by_numbers(np.array([0, 1, 2]), from_1, "numbers"))
+    assert found["number0"] == ([0, 1, 2], 0) and found["number"] == ([1, 2, -1], 1)
+    found = rows_of(by_numbers(np.array([1, 2, 3]), from_1, "numbers"))
+    assert set(found) <= {"number", "order"} and found["number"] == ([0, 1, 2], 0)
 
 
 def test_numbers_after_the_last_frame_are_counted() -> None:

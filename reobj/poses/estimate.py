@@ -52,7 +52,7 @@ class PosesConfig:
     fmt: str = option(
         "auto",
         "format of supplied poses: auto, colmap, tum, transforms, scannet, record3d, arkit, "
-        "matrices, euroc, stray, arkitscenes, scannetpp, llff, splatting",
+        "matrices, euroc, stray, arkitscenes, scannetpp, llff, splatting, reobj",
         "--pose-format",
     )
     frames_by: str = option(
@@ -68,8 +68,8 @@ class PosesConfig:
     )
     camera_format: str = option(
         "auto",
-        "format of the file of --camera: auto, colmap, numbers, matrix, pincam, json, yaml, xml, "
-        "npz",
+        "format of the file of --camera: auto, colmap, numbers, kitti, matrix, pincam, json, yaml, "
+        "xml, npz",
         "--camera-format",
     )
     metric: bool = option(False, "supplied poses are in metres, whatever their format", "--metric")

@@ -436,6 +436,29 @@ def _text_rows(probe: Probe) -> list[list[str]]:
     return [] if marked or probe.lines[0][0] in "[{<%" else _rows("\n".join(probe.lines))
 
 
+def is_kitti_calibration(probe: Probe) -> bool:
+    """Test for lines `P0: ...` or `P_rect_00: ...` of 12 numbers."""
+    return any(KITTI_LINE.fullmatch(line) for line in probe.lines)
+
+
+KITTI_LINE = re.compile(r"P(_rect_0)?\d:(\s+\S+){12}")
+
+
+def _read_kitti(path: Path, size: Size) -> Camera:
+    """Read the matrix of rectified images, the same for all cameras."""
+    lines = filter(KITTI_LINE.fullmatch, map(str.strip, read_text(path, CAMERA_MAX).splitlines()))
+    rows = np.array([line.split()[1:] for line in lines], np.float64).reshape(-1, 3, 4)
+    if np.ptp(rows[:, :, :3], axis=0).any():
+        raise ReobjError("cameras with different matrices; expected one: leave the others out")
+    return brown_camera(size, *_focal_and_centre(rows[0, :, :3]))
+
+
+def is_dso_camera(probe: Probe) -> bool:
+    """Test for DSO's four lines: lens, size, crop mode, size."""
+    rows = _text_rows(probe)
+    return len(rows) >= 3 and len(rows[0]) >= 5 and len(rows[1]) == 2
+
+
 def _read_rows(path: Path, size: Size) -> Camera:
     return _camera_of_rows(_rows(read_text(path, CAMERA_MAX)), size)
 
@@ -468,11 +491,13 @@ CAMERAS: Registry[ReadCamera] = Registry("cameras", "--camera-format", [
            "any model with a focal length", lambda p: _is_model_line(_text_rows(p)), _read_rows,
            units=OWN_PX),
     Format("numbers", "one line `fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]]`, OpenCV's order",
-           lambda p: len(rows := _text_rows(p)) == 1 and not _is_model_line(rows), _read_rows,
-           units=FRAME_PX),
+           lambda p: len(rows := _text_rows(p)) == 1 and not _is_model_line(rows)
+           and not is_kitti_calibration(p), _read_rows, units=FRAME_PX),
+    Format("kitti", "KITTI: `calib.txt` and `calib_cam_to_cam.txt`, `P0:` or `P_rect_00:`",
+           is_kitti_calibration, _read_kitti, units=FRAME_PX, unread="images before rectification"),
     Format("matrix", "K.txt, ScanNet: matrix K, 3x3 or 4x4",
-           lambda p: len(rows := _text_rows(p)) in (3, 4) and len(rows[0]) == len(rows), _read_rows,
-           units=FRAME_PX),
+           lambda p: len(rows := _text_rows(p)) in (3, 4) and {*map(len, rows)} == {len(rows)},
+           _read_rows, units=FRAME_PX),
     Format("pincam", "ARKitScenes: `w h fx fy cx cy`", lambda p: p.suffix == ".pincam",
            _read_pincam, units=OWN_PX),
     Format("json", "COLMAP, nerfstudio, instant-ngp, OpenCV, Open3D, Record3D, RealSense",
@@ -485,4 +510,8 @@ CAMERAS: Registry[ReadCamera] = Registry("cameras", "--camera-format", [
            _keys_of(lambda path: _of_xml(ElementTree.fromstring(read_text(path)))), units=OWN_PX),
     Format("npz", "OpenCV: arrays `mtx`, `dist`, or as in JSON; `.npy`: matrix K",
            lambda p: p.suffix in (".npz", ".npy"), _keys_of(_arrays), units=OWN_PX),
+    Format("", "DSO's camera.txt", is_dso_camera, None,
+           advice="give its lens as `MODEL WIDTH HEIGHT PARAMS` in pixels (FOV, PINHOLE, OPENCV)"),
+    Format("", "a file of a binary COLMAP model", lambda p: p.suffix == ".bin", None,
+           advice="give cameras.txt (`colmap model_converter --output_type TXT`)"),
 ])  # fmt: skip

@@ -18,6 +18,7 @@ from reobj.poses.estimate import PosesConfig, estimate_poses
 from reobj.poses.intrinsics import camera_line, parse_camera
 from reobj.poses.sfm import CheckMatches, triangulate
 from reobj.poses.supplied.check import Supplied, check_boxes, check_matches, without_frozen
+from reobj.poses.supplied.colmap_model import UPRIGHT
 from reobj.poses.supplied.depth import add_depth
 from reobj.poses.supplied.readers import read_supplied
 from reobj.sources.video import Video, source_fingerprint
@@ -226,9 +227,12 @@ def _with_depth(
 
 
 def write_supplied_model(poses: Poses | None, video: Video, out: Path) -> None:
-    """Write sparse/ of supplied poses; a reconstruction writes its own, with observations."""
-    if poses is not None and poses.source == "user" and poses.known.any():
-        for k in range(poses.part_count):
+    """Write sparse/ of supplied poses, and mark it, or a reconstruction's, as of upright photos."""
+    for k in range(0 if poses is None else poses.part_count):
+        folder = part_path(out / "sparse", k)
+        if poses is not None and poses.source == "user" and poses.known.any():
             component = poses.of_part(k)
             names = [video.name(int(f)) or f"{f:06d}" for f in component.frame]
-            write_colmap(part_path(out / "sparse", k), component, names)
+            write_colmap(folder, component, names)
+        if folder.is_dir():
+            (folder / UPRIGHT).write_text("cameras of upright photos: EXIF orientations applied\n")

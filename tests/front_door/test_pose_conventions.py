@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -52,7 +53,7 @@ def parts(rotation: np.ndarray, translation: np.ndarray, scale: float = 1) -> np
 
 def tum_of(path: Path, matrices: np.ndarray) -> Path:
     xyzw = Rotation.from_matrix(matrices[:, :3, :3]).as_quat()
-    np.savetxt(path, np.column_stack([np.arange(FRAMES) / 30, matrices[:, :3, 3], xyzw]))
+    np.savetxt(path, np.column_stack([np.arange(len(xyzw)) / 30, matrices[:, :3, 3], xyzw]))
     return path
 
 
@@ -71,6 +72,8 @@ CONVENTIONS = {
     ),
     "reversed": (lambda m: m[::-1], "the order reversed"),
     "late": (lambda m: np.concatenate([m[:1], m[:1], m[:1], m[:-3]]), "3 frames earlier"),
+    "one late": (lambda m: np.concatenate([m[:1], m[:-1]]), "1 frames earlier"),
+    "one early": (lambda m: np.concatenate([m[1:], m[-1:]]), "1 frames later"),
     "early": (lambda m: np.concatenate([m[3:], m[-3:]]), "3 frames later"),
     "as text": (lambda m: m[np.argsort([str(n) for n in ALL])], "as text (1, 10, 2)"),
     "mm": (lambda m: parts(m, m, 1000), "expected metres (mm"),
@@ -91,6 +94,22 @@ def test_a_convention_is_named_by_boxes_alone(tmp_path: Path, name: str, capsys:
     assert code == 2 and named in error and error.count("\n") == 1
     assert "the poses look like ones with" in error or "metres" in error
     assert not (tmp_path / "out" / "objects.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("convert", "named"),
+    [
+        (lambda m: np.repeat(m, 2, 0), "2 poses for each frame"),
+        (lambda m: m[::2], "frame 29, but"),
+        (lambda m: np.concatenate([m[::2], m[::-2]]), "one pose for 2 frames"),
+    ],
+)
+def test_poses_at_another_rate_are_named(
+    tmp_path: Path, convert: object, named: str, capsys: Capture
+) -> None:
+    path = tum_of(tmp_path / "poses.txt", convert(world_from_cam()))  # type: ignore[operator]
+    assert run(tmp_path, None, path, "--camera", LINE) == 2
+    assert named in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -245,6 +264,22 @@ def test_our_own_model_of_upright_photos_is_not_turned(tmp_path: Path) -> None:
     assert poses.camera == CAMERA
 
 
+@pytest.mark.parametrize("orientation", [3, 6])
+@pytest.mark.parametrize("given", ["out", "out/sparse", "copy"])
+def test_our_own_output_is_read_back(tmp_path: Path, orientation: int, given: str) -> None:
+    """Photos turned by EXIF: our model has upright cameras, which are not turned again."""
+    source, path = turned_photos(tmp_path, [orientation] * FRAMES)
+    size = (240, 320) if orientation > 4 else (320, 240)
+    line = f"1 PINHOLE {size[0]} {size[1]} 290 290 {size[0] / 2} {size[1] / 2}"
+    (path / "cameras.txt").write_text(f"{line}\n")
+    words = ["poses", str(source), "-o", str(tmp_path / "out"), "--poses", str(path)]
+    assert rt.main(words) == 0
+    shutil.copytree(tmp_path / "out" / "sparse", tmp_path / "copy")
+    poses = rt.read_poses(tmp_path / given, rt.Video(source))
+    assert_right(poses, ALL)
+    assert poses.camera == CAMERA and not poses.metric
+
+
 # ---- Other tools ---------------------------------------------------------------------------------
 
 
@@ -262,6 +297,8 @@ def test_our_own_model_of_upright_photos_is_not_turned(tmp_path: Path) -> None:
         ("model.nvm", "NVM_V3\n\n1\n", "VisualSFM.*COLMAP"),
         ("poses.csv", "#name,x,y,alt,heading,pitch,roll\na.jpg,0,0,0,0,0,0\n",
          "RealityCapture.*COLMAP"),
+        ("calib.txt", "P0: 7e2 0 6e2 0 0 7e2 1e2 0 0 0 1 0\n", "KITTI.*--camera.*poses/NN.txt"),
+        ("camera.txt", "Pinhole .5 .6 .5 .5 0\n640 480\ncrop\n640 480\n", "DSO.*result.txt"),
         ("poses.txt", "0,1 1,5 1,5 1,5 0,0 0,0 0,0 1,0\n", "decimal commas"),
     ],
 )  # fmt: skip

@@ -91,15 +91,19 @@ def _orders(given: Supplied) -> Iterator[tuple[str, Array]]:
     at = np.arange(len(poses))
     known = np.isfinite(poses).all((1, 2))
     filled = np.maximum.accumulate(np.where(known, at, known.argmax()))  # (F,)
-    yield from given.orders.items()
-    yield "the order reversed", poses[filled[::-1]]
+    rows = {"the order reversed": at[::-1]}
     for first in (0, 1) if not given.orders else ():
         order = np.argsort(np.argsort([str(n + first) for n in at]))
-        yield f"the order of numbers from {first} as text (1, 10, 2)", poses[filled[order]]
-    for shift in (*range(-10, 0), *range(1, 11)):
-        frames = f"{abs(shift)} frames {'earlier' if shift > 0 else 'later'}"
-        text = f"the order shifted (each pose is that of {frames})"
-        yield text, poses[filled[(at + shift).clip(0, len(at) - 1)]]
+        rows[f"the order of numbers from {first} as text (1, 10, 2)"] = order
+    for k in (*range(-10, 0), *range(1, 11)):
+        frames = f"{abs(k)} frames {'earlier' if k > 0 else 'later'}"
+        rows[f"the order shifted (each pose is that of {frames})"] = at + k
+    for k in (2, 3, 4, 5):
+        rows[f"the order of {k} poses for each frame (frame n has pose {k}n)"] = k * at
+        rows[f"the order of one pose for {k} frames (frame n has pose n/{k})"] = at // k
+    yield from given.orders.items()
+    for text, row in rows.items():
+        yield text, poses[filled[row.clip(0, len(at) - 1)]]
 
 
 def _rolled(cam_from_world: Array, count: int) -> Array:
@@ -192,8 +196,10 @@ def _explained(cam_from_world: Array, views: IntArray, rays: Array) -> float:
 
 GOOD_DEG = 1.0  # residual of poses that are certainly right (chosen: 9 px at 500 px focal length)
 MAX_RATIO = 0.3  # of residuals of a clearly better convention (chosen; higher: refuses right poses)
-ORDER_DEG = 0.4  # least residual of a wrong order (chosen: above the noise of boxes)
-MAX_ORDER_RATIO = 0.6  # of residuals of a better order; measured, right poses: .92 and more
+ORDER_DEG = 0.2  # least residual of a wrong order (chosen: 2 px at 500 px focal length)
+# Of residuals of a better order: below and above GOOD_DEG. Measured, right poses: recordings .93
+# and more; noise of the boxes up to 8 px .82, of 20 px (residuals above 1.2 deg) .70 and more
+MAX_ORDER_RATIO = (0.75, 0.6)
 WRONG_DEG = 6.0  # of poses that are certainly wrong; measured, right ones: up to 2.0
 MIN_TRACKS = 4  # chosen: three triangulate by chance in a trajectory read backwards
 
@@ -203,7 +209,7 @@ def check_boxes(given: Supplied, tracks: Tracks, refuse: bool = True) -> bool:
 
     Triangulates the box centres of each track. The residual is the angle between a viewing ray and
     the direction to the triangulated point (180 deg behind the camera), the median over rays and
-    tracks. A track is used while consecutive boxes overlap: then they show one object.
+    tracks. A track is used while consecutive boxes overlap by half: then they show one object.
 
     Returns:
         True if the boxes agree with the poses; False: they do not, or are too few.
@@ -226,7 +232,8 @@ def check_boxes(given: Supplied, tracks: Tracks, refuse: bool = True) -> bool:
             _refuse(given, likely, f"{measured}, then {best:.1f} deg")
     orders = {name: _residual_deg(poses, views) for name, poses in _orders(given)}
     best = min(orders.values())
-    if as_given > ORDER_DEG and best < MAX_ORDER_RATIO * as_given and best < GOOD_DEG:
+    ratio = MAX_ORDER_RATIO[as_given >= GOOD_DEG]
+    if as_given > ORDER_DEG and best < min(ratio * as_given, GOOD_DEG):
         _refuse(given, [min(orders, key=orders.__getitem__)], f"{measured}, then {best:.1f} deg")
     if as_given < GOOD_DEG:
         return True
@@ -236,13 +243,11 @@ def check_boxes(given: Supplied, tracks: Tracks, refuse: bool = True) -> bool:
 
 
 def _overlapping(tracks: Tracks, rows: IntArray) -> IntArray:
-    """Return the longest run of the rows (n,) of a track whose consecutive boxes overlap by .5."""
-    a, b = tracks.xyxy[rows[:-1]], tracks.xyxy[rows[1:]]  # (n - 1, 4)
-    low, high = np.maximum(a[:, :2], b[:, :2]), np.minimum(a[:, 2:], b[:, 2:])
-    sides = (high - low).clip(0), a[:, 2:] - a[:, :2], b[:, 2:] - b[:, :2]
-    common, area_a, area_b = (np.prod(side, 1) for side in sides)  # (n - 1,) each
-    cuts = np.flatnonzero(common < 0.5 * (area_a + area_b - common)) + 1
-    return max(np.split(rows, cuts), key=len)
+    """Return the longest run of a track's rows (n,) whose edges move by at most 1/3 side."""
+    xyxy = tracks.xyxy[rows]
+    side = np.tile(xyxy[:, 2:] - xyxy[:, :2], 2)  # (n, 4)
+    moved = np.abs(np.diff(xyxy, axis=0)) > side[1:] / 3
+    return max(np.split(rows, np.flatnonzero(moved.any(1)) + 1), key=len)
 
 
 def _rays(poses: Poses, track: Tracks) -> tuple[IntArray, Array] | None:
@@ -298,9 +303,7 @@ def without_frozen(poses: Poses, tracks: Tracks) -> Poses:
 def _boxes_move(tracks: Tracks, first: int, last: int) -> bool:
     """Test whether the boxes of tracks move by more than 3 px between two frames."""
     centre = (tracks.xyxy[:, :2] + tracks.xyxy[:, 2:]) / 2
-    ends = [
-        dict(zip(tracks.tracklet_id[at].tolist(), centre[at], strict=True))
-        for at in (tracks.frame == first, tracks.frame == last)
-    ]
-    moves = [np.linalg.norm(ends[0][key] - ends[1][key]) for key in ends[0].keys() & ends[1].keys()]
-    return not moves or bool(np.median(moves) > 3)
+    start, end = (np.flatnonzero(tracks.frame == frame) for frame in (first, last))
+    _, i, j = np.intersect1d(tracks.tracklet_id[start], tracks.tracklet_id[end], True, True)
+    moves = np.linalg.norm(centre[start[i]] - centre[end[j]], axis=1)
+    return not len(moves) or bool(np.median(moves) > 3)

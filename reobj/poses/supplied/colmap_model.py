@@ -24,6 +24,8 @@ from reobj.poses.supplied.pose_formats import (
 )
 from reobj.types import ReobjError
 
+UPRIGHT = "upright.txt"  # file in our models: their cameras are those of upright photos
+
 
 def find_models(path: Path) -> list[Path]:
     """List the image files of the COLMAP models at a path or below it.
@@ -31,7 +33,7 @@ def find_models(path: Path) -> list[Path]:
     Below a folder without a model: `sparse/N` and `sparse`, else `N`, else `colmap/sparse/N`.
     """
     if path.is_file():
-        return [path] if path.name == "images.txt" else _model_in(path.parent)
+        return [path] if path.stem == "images" else _model_in(path.parent)
     models = _model_in(path)
     levels = (("sparse", "sparse/*"), ("*",), ("colmap/sparse", "colmap/sparse/*"))
     for patterns in levels if not models else ():
@@ -48,28 +50,23 @@ def _model_in(folder: Path) -> list[Path]:
 def read_colmap(path: Path, size: tuple[int, int]) -> PoseFile:
     """Read a COLMAP model, binary (preferred) or text, with or without rigs; scale unknown.
 
-    Of several models in a folder the one with the most images is read.
+    Raises:
+        ReobjError: none, several, or one of which a file is missing.
     """
     models = find_models(path)
-    if not models:
-        raise ReobjError(f"{path}: no images.bin or .txt in it; expected a COLMAP model")
-    found = [_read_model(model) for model in models]
-    count = np.array([len(one.names) for one in found])
-    chosen = int(count.argmax())
-    names = [str(model.parent) for model in models]
-    largest = [name for name, n in zip(names, count.tolist(), strict=True) if n == count.max()]
-    if len(largest) > 1:
-        raise ReobjError(
-            f"{path}: {' and '.join(largest)} are models of {count.max()} images each; name one of "
-            "them with --poses"
-        )
-    others = [f"{n} ({c})" for n, c in zip(names, count.tolist(), strict=True) if c < count.max()]
-    note = f"{names[chosen]} taken, the model with most images ({count.max()}), not "
-    messages = (f"{path}: {note}{', '.join(others)}",) if others else ()
-    form = "binary" if models[chosen].suffix == ".bin" else "text"
-    folder = models[chosen].parent
-    kind = f"COLMAP model ({form})" + (f" in {folder}" if folder != path else "")
-    return dataclasses.replace(found[chosen], kind=kind, messages=messages)
+    if len(models) > 1:
+        names = " and ".join(str(model.parent) for model in models)
+        raise ReobjError(f"{path}: several COLMAP models: {names}; name one of them with --poses")
+    lacking = [models[0].with_stem("cameras").name] if models else ["images.bin"]
+    if not models or not models[0].with_name(lacking[0]).is_file():
+        raise ReobjError(f"{path}: no {lacking[0]} beside it; a COLMAP model is a folder with "
+                         "cameras, images and points3D: give that folder")  # fmt: skip
+    found = _read_model(models[0])
+    form = "binary" if models[0].suffix == ".bin" else "text"
+    folder = models[0].parent
+    kind = f"({form})" + (f" in {folder}" if folder not in (path, path.parent) else "")
+    stored = not (folder / UPRIGHT).exists()
+    return dataclasses.replace(found, kind=kind, stored_pixels=stored)
 
 
 def _read_model(images: Path) -> PoseFile:
@@ -101,15 +98,13 @@ def _read_model(images: Path) -> PoseFile:
     lost = ~np.isfinite(model.cam_from_world).all((1, 2))
     raise_where(lost, where, "a number of the pose is not finite; leave out images without pose")
     if far.any():
-        number, xyz = sorted(ids)[int(np.argmax(far))], model.points[far][0]
-        fault = "not finite"
-        if np.isfinite(xyz).all():
-            fault = f"more than {WORLD_MAX:g} units away from the origin"
+        number = sorted(ids)[int(np.argmax(far))]
+        fault = f"not finite, or more than {WORLD_MAX:g} units away from the origin"
         raise ReobjError(f"{images.with_stem('points3D')}: point {number} is {fault}; remove it")
     return PoseFile(
         checked_rigid(homogeneous(model.cam_from_world), where), tuple(model.cameras), names_of,
         points=model.points, colors=model.colors,
-        visibility=np.column_stack([model.obs_image, model.obs_point]), stored_pixels=True,
+        visibility=np.column_stack([model.obs_image, model.obs_point]),
     )  # fmt: skip
 
 
@@ -124,8 +119,6 @@ def _copy_text(folder: Path, copy: Path) -> dict[str, str]:
     """
     for file in folder.glob("*.txt"):
         shutil.copy(file, copy)
-    if not (copy / "cameras.txt").exists():
-        raise ReobjError(f"{folder / 'cameras.txt'}: no such file")
     points = copy / "points3D.txt"
     points.touch()
     known = {"-1", *(line.split(maxsplit=1)[0] for line in read_lines(points) if line.strip())}

@@ -6,7 +6,6 @@ points with their visibility. Frames without a map are unchanged.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import re
 from collections.abc import Sequence
@@ -20,8 +19,9 @@ import numpy.typing as npt
 
 from reobj.cameras import Camera, Poses, invert_rigid
 from reobj.files import load_json
-from reobj.poses.intrinsics import camera_of_keys, read_camera
+from reobj.poses.intrinsics import camera_of_keys
 from reobj.poses.supplied.frame_assignment import rows_by_time
+from reobj.poses.supplied.pose_formats import scannet_camera
 from reobj.sources.image_files import read_image
 from reobj.types import Array, BoolArray, Floats, IntArray, ReobjError, log
 from reobj.visible_points import VisiblePoints
@@ -104,14 +104,12 @@ def find_depth_maps(text: str, poses: Poses, video: Any) -> DepthMaps:
 
 
 def _folder_and_units(text: str) -> tuple[Path, float]:
-    """Split FOLDER:UNITS."""
-    head, colon, tail = text.rpartition(":")
+    """Split FOLDER:UNITS; without units mm, as in ScanNet, 7-Scenes and Record3D."""
     folder = Path(text)
-    units = 1000.0  # mm: ScanNet, 7-Scenes, Record3D
-    if colon and not folder.is_dir():
-        with contextlib.suppress(ValueError):
-            units = float(tail)
-            folder = Path(head)
+    units = 1000.0
+    if not folder.is_dir() and (match := re.fullmatch(r"(.*):([\d.eE+-]+)", text)):
+        folder = Path(match[1])
+        units = float(match[2])
     if not folder.is_dir() or not 0 < units < np.inf:
         expected = "FOLDER, or FOLDER:UNITS with units per metre (1000: mm; TUM: 5000)"
         raise ReobjError(f"--depth {text}: no such folder; expected {expected}")
@@ -149,27 +147,23 @@ def _depth_camera(folder: Path, size: tuple[int, int], color: Camera) -> tuple[C
     """
     same = np.eye(3, 4)
     for path in (folder, folder.parent, folder.parent / "intrinsic"):
-        if (file := path / "intrinsic_depth.txt").exists():  # ScanNet: first pixel's centre at 0, 0
-            fx, fy, cx, cy = read_camera(file, size, "matrix").params
-            return Camera("PINHOLE", *size, (fx, fy, cx + 0.5, cy + 0.5)), same
+        if (file := path / "intrinsic_depth.txt").exists():
+            return scannet_camera(file, size), same
     for path in (folder / "intrinsics.json", folder.parent / "intrinsics.json"):
         content = load_json(path) if path.exists() else {}
-        depth = content.get("depth") if isinstance(content, dict) else None
-        if path.parent == folder and path.exists():
-            depth = depth or content
-        if depth is None:
-            continue
         try:
+            depth = content.get("depth", content if path.parent == folder else {})
             transform = np.array(content.get("T_color_from_depth", [0, 0, 0]), np.float64)
             if transform.shape == (3,):
                 transform = np.column_stack([np.eye(3), transform])
-            camera = camera_of_keys({key: depth[key] for key in depth if key != "depth"}, size)
-            if camera is not None and {"fy", "cx", "cy"} <= depth.keys():
-                return camera.resized(size), transform.reshape(-1, 4)[:3]
-        except (AttributeError, KeyError, TypeError, ValueError):
-            pass
-        expected = "fx, fy, cx, cy of the depth maps, T_color_from_depth: 3 or 3x4 numbers in m"
-        raise ReobjError(f"{path}: expected {expected}")
+            if {"fx", "fy", "cx", "cy"} <= depth.keys():
+                camera = camera_of_keys({k: v for k, v in depth.items() if k != "depth"}, size)
+                return camera.resized(size), transform.reshape(-1, 4)[:3]  # type: ignore[union-attr]
+        except (AttributeError, TypeError, ValueError):
+            depth = {"": 0}
+        if depth:
+            expected = "fx, fy, cx, cy of the depth maps, T_color_from_depth: 3 or 3x4 numbers in m"
+            raise ReobjError(f"{path}: expected {expected}")
     if abs(color.width * size[1] - color.height * size[0]) > max(color.width, color.height, *size):
         raise ReobjError(
             f"{folder}: depth maps of {size[0]}x{size[1]}, frames of {color.width}x{color.height}: "
@@ -182,23 +176,27 @@ def _depth_camera(folder: Path, size: tuple[int, int], color: Camera) -> tuple[C
 # ---- Scale and points ----------------------------------------------------------------------------
 
 
+class UnusableError(ReobjError):
+    """Depth maps do not give the scale, or no points; the poses are used without."""
+
+
 def add_depth(poses: Poses, text: str, video: Any) -> Poses:
     """Add points from depth maps to poses, and make these metric if they were not.
 
     Args:
         text: FOLDER or FOLDER:UNITS. video: of the poses; its images give the points' colours.
     Returns:
-        the poses with more points; unchanged, with a message, where the scale is not observable.
+        the poses with more points; a message says why not, or why the scale is unknown.
     """
     maps = find_depth_maps(text, poses, video)
-    if not poses.metric:
-        scale = depth_scale(poses, maps)
-        if isinstance(scale, str):
-            return dataclasses.replace(poses, messages=(*poses.messages, scale))
-        metres, sigma, used = scale
-        log.info("metres per unit of the reconstruction by %d depth maps: %s", used, metres)
-        poses = _scaled(poses, metres, sigma)
-    return _with_points(poses, maps, video)
+    try:
+        if not poses.metric:
+            metres, sigma, used = depth_scale(poses, maps)
+            log.info("metres per unit of the reconstruction by %d depth maps: %s", used, metres)
+            poses = _scaled(poses, metres, sigma)
+        return _with_points(poses, maps, video)
+    except UnusableError as reason:
+        return dataclasses.replace(poses, messages=(*poses.messages, f"--depth: {reason}"))
 
 
 # Systematic relative sigma: of the depth camera itself (Khoshelham and Elberink 2012: ~1 %), of its
@@ -206,20 +204,19 @@ def add_depth(poses: Poses, text: str, video: Any) -> Poses:
 SENSOR_SIGMA = 0.02
 
 
-def depth_scale(
-    poses: Poses, maps: DepthMaps, max_spread: float = 0.2
-) -> tuple[Array, Array, int] | str:
+def depth_scale(poses: Poses, maps: DepthMaps, max_spread: float = 0.2) -> tuple[Array, Array, int]:
     """Estimate metres per unit of each component: depth of the maps over that of sparse points.
 
     Args:
         max_spread: relative, between maps; more contradicts the poses (chosen; higher: a wrong
             scale is taken).
     Returns:
-        scale and relative sigma of each component, and the number of maps; or a message why not.
+        scale and relative sigma of each component, and the number of maps.
+    Raises:
+        UnusableError: too few maps show sparse points, or they contradict the poses.
     """
     visible = VisiblePoints(poses)
-    scales = []
-    sigmas = []
+    found = []
     used = 0
     for component in range(poses.part_count):
         rows = [r for r in _spread_rows(poses, maps) if poses.part[r] == component]
@@ -227,24 +224,23 @@ def depth_scale(
         logs = np.array([log for log in ratios if log is not None])
         where = "" if poses.part_count == 1 else f" of component {component}"
         if len(logs) < 3:  # no median and spread
-            return (
-                f"--depth: the maps do not give the scale{where}, and no points are added from "
-                f"them: {len(logs)} of {len(rows)} maps show enough sparse points; 3 maps are "
-                "needed"
+            raise UnusableError(
+                f"the maps do not give the scale{where}, and no points are added from them: "
+                f"{len(logs)} of {len(rows)} maps show enough sparse points; 3 maps are needed"
             )
         spread = 1.4826 * float(np.median(np.abs(logs - np.median(logs))))
         if spread > max_spread:
-            return (
-                f"--depth: the ratio of depth to the poses{where} varies by {100 * spread:.0f} % "
-                "between maps: depth or poses are wrong; the maps do not give the scale"
+            raise UnusableError(
+                f"the ratio of depth to the poses{where} varies by {100 * spread:.0f} % between "
+                "maps: depth or poses are wrong; the maps do not give the scale"
             )
         used += len(logs)
-        scales.append(float(np.exp(np.median(logs))))
         # errors of neighbouring maps are correlated: 8 runs of them count as one measurement each
         runs = np.array([np.median(run) for run in np.array_split(logs, min(8, len(logs)))])
         sigma = float(runs.std(ddof=1)) / np.sqrt(len(runs))
-        sigmas.append(float(np.hypot(sigma, SENSOR_SIGMA)))
-    return np.array(scales), np.array(sigmas), used
+        found.append((np.exp(np.median(logs)), np.hypot(sigma, SENSOR_SIGMA)))
+    scale, sigmas = np.array(found).T  # (C,) each
+    return scale, sigmas, used
 
 
 def _spread_rows(poses: Poses, maps: DepthMaps) -> list[int]:
@@ -262,16 +258,14 @@ def _log_ratio(poses: Poses, maps: DepthMaps, visible: VisiblePoints, row: int) 
         return None
     depth, K = maps.read(row)
     in_color = moved(points, poses.cam_from_world[row])
-    rotation, shift = np.split(maps.depth_from_color, [3], 1)
-    log_scale = 0.0
-    for offset in (0 * shift, shift, shift):  # the shift between the cameras needs the scale
-        in_depth = moved(np.exp(log_scale) * in_color, np.hstack([rotation, offset]))
-        measured = look_up_depth(depth, K, in_depth)
-        good = (measured > 0) & (in_depth[:, 2] > 0)
-        if good.sum() < least:
-            return None
-        log_scale += float(np.median(np.log(measured[good] / in_depth[good, 2])))
-    return log_scale
+    in_depth = in_color @ maps.depth_from_color[:, :3].T  # without the shift, which needs the scale
+    measured = look_up_depth(depth, K, in_depth)
+    good = (measured > 0) & (in_depth[:, 2] > 0)
+    return (
+        float(np.median(np.log(measured[good] / in_depth[good, 2])))
+        if good.sum() >= least
+        else None
+    )
 
 
 def moved(points: Array, b_from_a: Array) -> Array:
@@ -330,42 +324,35 @@ MAX_CONTRADICTED = 0.3
 def _with_points(poses: Poses, maps: DepthMaps, video: Any) -> Poses:
     """Add thinned points of the maps, observed in the frames whose depth agrees."""
     rows = _spread_rows(poses, maps)
-    if not rows:
-        return _with_message(poses, "no frame with a depth map has a pose")
     depths = {row: maps.read(row) for row in rows}
-    depth_from_world = {
-        row: composed(maps.depth_from_color, poses.cam_from_world[row]) for row in rows
-    }
+    cams = {row: composed(maps.depth_from_color, poses.cam_from_world[row]) for row in rows}
     grids = [_grid_points(*depths[row]) for row in rows]
-    worlds = [moved(g, invert_rigid(depth_from_world[r])) for r, g in zip(rows, grids, strict=True)]
+    if not sum(map(len, grids)):
+        raise UnusableError(f"no points from depth: {len(rows)} maps of frames with a pose show no "
+                            "surface; are they depth maps?")  # fmt: skip
+    worlds = [moved(g, invert_rigid(cams[r])) for r, g in zip(rows, grids, strict=True)]
     points = np.concatenate(worlds)
     origin = np.repeat(rows, list(map(len, grids)))
     kept = _thin(points, np.concatenate(grids)[:, 2], poses.part[origin])
-    points = points[kept]
-    origin = origin[kept]
-    observations = []
-    seen_through = np.zeros(len(points), np.int64)
-    for row in rows:
-        same = np.flatnonzero(poses.part[origin] == poses.part[row])
-        in_depth = moved(points[same], depth_from_world[row])
-        agrees, through = compared(look_up_depth(*depths[row], in_depth), in_depth[:, 2])
-        observations.append(np.column_stack([np.full(agrees.sum(), row), same[agrees]]))
-        seen_through[same[through]] += 1
-    visibility = np.concatenate(observations)
-    views = np.bincount(visibility[:, 1], minlength=len(points))
-    confirmed = int((views - 1).clip(0).sum())
-    contradicted = int(seen_through.sum())
+    points, origin = points[kept], origin[kept]
+    agrees = np.zeros((len(rows), len(points)), bool)
+    through = np.zeros_like(agrees)
+    for k, row in enumerate(rows):
+        in_depth = moved(points, cams[row])
+        measured = look_up_depth(*depths[row], in_depth)
+        measured[poses.part[origin] != poses.part[row]] = 0
+        agrees[k], through[k] = compared(measured, in_depth[:, 2])
+    views = agrees.sum(0)  # (N,)
+    confirmed = (views - 1).clip(0).sum()
+    contradicted = through.sum()
     if contradicted > MAX_CONTRADICTED * (confirmed + contradicted):
-        return _with_message(
-            poses,
-            f"in {contradicted} of {contradicted + confirmed} views another map sees through a "
-            "point; are units, intrinsics and poses those of these maps?",
+        raise UnusableError(
+            f"no points from depth: in {contradicted} of {contradicted + confirmed} views another "
+            "map sees through a point; are units, intrinsics and poses those of these maps?"
         )
-    good = (views > seen_through) & (views > 0)  # else it moved, or is a stray pixel
-    if not good.any():
-        return _with_message(poses, f"{len(rows)} maps show no surface; are they depth maps?")
-    visibility = visibility[good[visibility[:, 1]]]
-    visibility[:, 1] = np.cumsum(good)[visibility[:, 1]] - 1 + len(poses.points)
+    good = views > through.sum(0)  # else it moved, or is a stray pixel
+    seen, point = np.nonzero(agrees[:, good])
+    visibility = np.column_stack([np.array(rows)[seen], point + len(poses.points)])
     colors = _colors(points[good], origin[good], poses, video)
     return dataclasses.replace(
         poses,
@@ -373,11 +360,6 @@ def _with_points(poses: Poses, maps: DepthMaps, video: Any) -> Poses:
         colors=np.concatenate([poses.colors, colors]),
         visibility=np.concatenate([poses.visibility, visibility]),
     )
-
-
-def _with_message(poses: Poses, reason: str) -> Poses:
-    text = f"--depth: no points from depth: {reason}"
-    return dataclasses.replace(poses, messages=(*poses.messages, text))
 
 
 def composed(c_from_b: Array, b_from_a: Array) -> Array:
@@ -413,32 +395,25 @@ def _thin(points: Array, depth: Array, component: IntArray) -> IntArray:
     A reconstruction has about as many points.
     """
     order = np.argsort(depth, kind="stable")
+    first = order
     size = 0.02  # m, a side of a voxel; larger where the points are too many
-    low = points.min(0, initial=0)
-    component = component[order]
-    while True:
-        cell = np.floor((points[order] - low) / size).astype(np.int64)  # (N, 3)
-        count = cell.max(0, initial=0) + 1
-        key = ((component * count[0] + cell[:, 0]) * count[1] + cell[:, 1]) * count[2] + cell[:, 2]
-        first = np.unique(key, return_index=True)[1]
-        if len(first) <= 20000:
-            return np.sort(order[first])
+    while len(first) > 20000 or size == 0.02:
+        cell = np.column_stack([component, np.floor(points / size)]).astype(np.int64)  # (N, 4)
+        first = np.unique(cell[order], axis=0, return_index=True)[1]
         size *= 1.25
+    return np.sort(order[first])
 
 
 def _colors(points: Array, origin: IntArray, poses: Poses, video: Any) -> npt.NDArray[np.uint8]:
     """Return the colours (N, 3) of points in the images of the frames `origin` (N,): rows."""
     colors = np.full((len(points), 3), 128, np.uint8)  # where there is no image
-    row_of = {int(poses.frame[row]): int(row) for row in np.unique(origin)}
     for frame in video:
-        row = row_of.get(frame.index)
-        if row is None or frame.image is None:
+        chosen = np.flatnonzero(poses.frame[origin] == frame.index)
+        if not len(chosen) or frame.image is None:
             continue
-        chosen = np.flatnonzero(origin == row)
         height, width = frame.image.shape[:2]
-        K = poses.camera.resized((width, height)).K  # distortion hardly matters here
-        xyw = moved(points[chosen], poses.cam_from_world[row]) @ K.T
-        xy = xyw[:, :2] / np.maximum(xyw[:, 2:], 1e-9)
+        in_cam = moved(points[chosen], poses.cam_from_world[origin[chosen[0]]])
+        xy = np.nan_to_num(poses.camera.resized((width, height)).project(in_cam))  # (n, 2)
         x, y = xy.astype(int).clip(0, (width - 1, height - 1)).T
         colors[chosen] = frame.image[y, x, ::-1]
     return colors

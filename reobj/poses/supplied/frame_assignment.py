@@ -1,13 +1,13 @@
 """Assign the poses of a file to the frames of a video: by name, number, time stamp or order.
 
-Where a file is ambiguous, all assignments that it allows are returned; the user chooses.
+Where a file allows several assignments, an error names them; the user declares one.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from reobj.cameras import invert_rigid
 from reobj.frame_lookup import frames_by_name
-from reobj.sources.image_files import LEAST_STAMP, TimeUnit, is_date
+from reobj.poses.supplied.pose_formats import PoseFile
+from reobj.sources.image_files import TimeUnit, is_date
 from reobj.types import Array, BoolArray, IntArray, ReobjError, nearest_of
 
 
@@ -45,7 +46,7 @@ class FrameAssignment:
     Attributes:
         key: its name in `--set poses.frames_by=`. rule: the same in words.
         row: (F,) pose of each frame that is read, -1: none.
-        outside: number of poses without a frame in the source.
+        outside: number of poses without a frame in the source; 0 of times, which may begin earlier.
     """
 
     key: str
@@ -62,44 +63,63 @@ def _assignment(key: str, rule: str, frame: IntArray, source: SourceFrames) -> F
     return FrameAssignment(key, rule, row, int(((frame < 0) | (frame >= end)).sum()))
 
 
-def assignments(
-    count: int,
-    names: Sequence[str],
-    stamps_s: Array | None,
-    source: SourceFrames,
-    where: str,
-    is_ours: bool = False,
-    by_text: bool = False,
-) -> list[FrameAssignment]:
-    """List the assignments of `count` poses that the file and the source allow.
+def assign(
+    file: PoseFile, stamps_s: Array | None, source: SourceFrames, where: str, frames_by: str = ""
+) -> FrameAssignment:
+    """Return the only assignment of a file's N poses that it allows, or the declared one.
 
     Names are unique keys. Without names numbers are used, then times, then the order.
 
     Args:
-        names, stamps_s: of the poses, or () and None. where: the file, for errors.
-        is_ours: this tool wrote the stamps, for the same source.
-        by_text: the order of rows is that of the images' names as text.
-    Returns:
-        assignments that differ for the frames that are read; [] if no pose belongs to a frame.
+        stamps_s: (N,) of the poses, or None. where: the file, for errors.
+        frames_by: key of the declared assignment; "": none.
     Raises:
-        ReobjError: a key is not unique, or the number of rows is not that of the frames.
+        ReobjError: no pose belongs to a frame, several assignments, or not the declared one.
     """
-    if names:
-        found = _by_names(names, source, where)
+    count = len(file.cam_from_world)
+    if file.names:
+        found = _by_names(file.names, source, where)
     elif stamps_s is not None:
-        found = _by_stamps(stamps_s, source, is_ours)
+        found = _by_stamps(stamps_s, source, file.is_ours)
     else:
-        found = by_order(count, source, by_text) or _by_counts(count, source, where)
-    some_fit = any(a.key != "time" and not a.outside for a in found)
+        found = _by_rows(count, source, where, frames_by, file.by_text)
+    fits = any(not one.outside for one in found if one.key != "time")
     kept: list[FrameAssignment] = []
-    for candidate in found:
-        # a clock may start before the video and end after it
-        limit = count / 2 if candidate.key == "time" else 0
-        excluded = candidate.outside > limit and some_fit
-        same = any(np.array_equal(candidate.row, other.row) for other in kept)
-        if not excluded and not same and (candidate.row >= 0).any():
-            kept.append(candidate)
-    return kept
+    for one in found:
+        same = any(np.array_equal(one.row, other.row) for other in kept)
+        is_excluded = one.outside > 0 and fits  # another assigns all poses
+        if not is_excluded and not same and (one.row >= 0).any():
+            kept.append(one)
+    if not kept:
+        compared = _compared(file.names, stamps_s, source)
+        raise ReobjError(f"{where}: none of its {count} poses belongs to a frame ({compared})")
+    keys = [one.key for one in kept]
+    if frames_by and frames_by not in keys:
+        raise ReobjError(
+            f"--set poses.frames_by={frames_by}: {where} can be read by {', '.join(keys)}"
+        )
+    if len(kept) > 1 and not frames_by:
+        choices = "; or ".join(f"{one.key} ({one.rule})" for one in kept)
+        raise ReobjError(
+            f"{where}: its poses can be assigned to frames in {len(kept)} ways: {choices}; choose "
+            f"with --set poses.frames_by={keys[0]}"
+        )
+    return kept[keys.index(frames_by) if frames_by else 0]
+
+
+def _compared(names: Sequence[str], stamps_s: Array | None, source: SourceFrames) -> str:
+    """Describe what was compared without a match, for a message."""
+    if names:
+        first = source.images[int(source.frame[0])] if source.images else int(source.frame[0])
+        return f"images {names[0]!r} ..., frames {first!r} ..."
+    if stamps_s is None:
+        return "in order"
+    start, end = source.time_s[[0, -1]]
+    frames = f"frames {start:.3f}-{end:.3f} s" if source.timed else "the images have no times"
+    return (
+        f"{stamps_s[0]:.3f}-{stamps_s[-1]:.3f} s, {frames}; expected seconds of the same clock, "
+        "frame numbers, or one row for each frame"
+    )
 
 
 # ---- Names and numbers ---------------------------------------------------------------------------
@@ -123,56 +143,44 @@ def by_numbers(number: IntArray, source: SourceFrames, noun: str) -> list[FrameA
     known = number >= 0
     if not known.any():
         return []
-    images = _numbers_of_images(source.images)
-    if len(images):
-        return _by_image_numbers(number, images, source, noun)
+    images = _numbers_of_images(source.images)  # (F,) or (0,)
     least = int(number[known].min())
-    most = int(number[known].max())
-    rules = [(f"number{first}", 1, first) for first in (0, 1)]
-    for step in _steps(most - min(least, 1) + 1, int(known.sum()), source.count):
-        rules += [(f"every{step}from{first}", step, first) for first in (0, 1)]
-    found = []
-    for key, step, first in rules:
-        frame = np.where(known, step * (number - first), -1)
-        if least >= first and (step == 1 or frame.max() < source.count):
-            of = f" of one frame in {step}" if step > 1 else ""
-            found.append(_assignment(key, f"{noun}{of}, counted from {first}", frame, source))
-    return found
-
-
-def _by_image_numbers(
-    number: IntArray, images: IntArray, source: SourceFrames, noun: str
-) -> list[FrameAssignment]:
-    """List the assignments of numbers (N,) of poses to numbers of images (F,)."""
-    known = number >= 0
+    first_image = int(images.min()) if len(images) else 0
+    rules = (
+        [("number", noun, 0, 1)] if len(images) else [("number0", f"{noun}, counted from 0", 0, 1)]
+    )
+    if first_image == 0 < least:
+        rules.append(("number1", f"{noun}, counted from 1", 1, 1))
+    if least == 0 and first_image == 1:
+        rules.append(("number0", f"{noun}, counted from 0", -1, 1))
+    for k in [] if len(images) else _steps(number[known], source.count):
+        of = f"{noun} of one frame in {k}, counted from"
+        rules += [(f"every{k}from{first}", f"{of} {first}", first, k) for first in (0, 1)]
     frame_of = {n: frame for frame, n in enumerate(images.tolist())}
-    rules = [("number", noun, 0)]
-    if number[known].min() >= 1 and images.min() == 0:
-        rules.append(("number1", f"{noun}, counted from 1, those of the images from 0", -1))
-    if number[known].min() == 0 and images.min() == 1:
-        rules.append(("number0", f"{noun}, counted from 0, those of the images from 1", 1))
     found = []
-    for key, rule, offset in rules:
-        frame = np.array([frame_of.get(n + offset, -1) for n in number.tolist()], np.int64)
-        found.append(_assignment(key, rule, np.where(known, frame, -1), source))
+    for key, rule, first, step in rules:
+        frame = step * (number - first)
+        if frame_of:
+            frame = np.array([frame_of.get(n, -1) for n in frame.tolist()], np.int64)
+        if least >= first:
+            found.append(_assignment(key, rule, np.where(known, frame, -1), source))
     if known.all() and len(number) == len(images):
         order = np.argsort(np.argsort(number))
         found.append(_assignment("order", f"order of the {noun}", order, source))
     return found
 
 
-def _steps(numbers: int, known: int, count: int) -> list[int]:
-    """List the k for which every k-th of `count` frames gives `numbers` frames or few more.
+def _steps(number: IntArray, count: int) -> list[int]:
+    """List the k for which every k-th of `count` frames gives these numbers (n,), or few more.
 
-    A tenth of the frames, at the end, may have no pose.
-
-    known: how many of the numbers exist; if most are missing, the frames were not renumbered.
+    A tenth of the frames, at the end, may have no pose. If most numbers are missing, the frames
+    were not renumbered.
     """
-    if 2 * known < numbers or numbers < 2:
+    numbers = int(number.max()) - min(int(number.min()), 1) + 1
+    if 2 * len(number) < numbers or numbers < 2:
         return []
     steps = range(2, max(count // (numbers - 1), 1) + 1)
-    most = numbers + 0.1 * numbers + 1
-    return [k for k in steps if numbers <= -(-count // k) <= most]
+    return [k for k in steps if numbers <= -(-count // k) <= 1.1 * numbers + 1]
 
 
 def numbers_of_names(names: Sequence[str], where: str) -> IntArray:
@@ -184,22 +192,17 @@ def numbers_of_names(names: Sequence[str], where: str) -> IntArray:
     digits = [re.findall(r"\d+", PurePosixPath(name.replace("\\", "/")).stem) for name in names]
     numbered = [found for found in digits if found]
     counts = {len(found) for found in numbered}
-    groups = 1 if len(counts) > 1 else max(counts, default=0)
-    for group in range(1, groups + 1):
+    for group in range(1, max(counts, default=1) + 1 if len(counts) < 2 else 2):
         number = [int(found[-group][-18:]) if found else -1 for found in digits]  # int64 holds 18
-        if len({n for n in number if n >= 0}) == len(numbered):
+        if len({*number} - {-1}) == len(numbered):
             return np.array(number, np.int64)
-    if not numbered:
-        return np.full(len(names), -1)
-    first: dict[str, str] = {}
-    for name, found in zip(names, digits, strict=True):
-        if found and first.setdefault(found[-1].lstrip("0"), name) != name:
-            raise ReobjError(
-                f"{where}: {first[found[-1].lstrip('0')]!r} and {name!r} have the same number, and "
-                "neither is the name of a frame; give the poses of one camera, or a folder of "
-                "images with these names"
-            )
-    raise ReobjError(f"{where}: {names[0]!r} appears twice; expected each image once")
+    keys = [found[-1].lstrip("0") if found else "-" for found in digits]
+    twice = next(key for key in keys if key != "-" and keys.count(key) > 1)
+    same = [name for name, key in zip(names, keys, strict=True) if key == twice]
+    raise ReobjError(
+        f"{where}: {same[0]!r} and {same[1]!r} have the same number, and neither is the name of a "
+        "frame; give the poses of one camera, or a folder of images with these names"
+    )
 
 
 def _numbers_of_images(images: Sequence[str]) -> IntArray:
@@ -216,89 +219,44 @@ def _numbers_of_images(images: Sequence[str]) -> IntArray:
 
 def numbers_of_times(stamps_s: Array) -> IntArray:
     """Number times (N,), ascending: as multiples of their step from 0 on, else consecutively."""
-    number = _even_numbers(stamps_s)
-    return np.arange(len(stamps_s)) if number is None else number
-
-
-def _even_numbers(stamps_s: Array) -> IntArray | None:
-    """Return times (N,) as multiples of their step; None if they are uneven or start late."""
+    number = np.arange(len(stamps_s))
     steps = np.diff(stamps_s)
     if len(steps) and stamps_s[0] >= 0:
-        number = stamps_s / np.median(steps)
-        even = np.abs(number - number.round()).max() < 0.1
-        if even and number[-1] < 2 * len(number):  # few are missing: they start at 0
-            return np.asarray(number.round(), np.int64)
-    return None
+        multiple = stamps_s / np.median(steps)
+        even = np.abs(multiple - multiple.round()).max() < 0.1
+        if even and multiple[-1] < 2 * len(number):  # few are missing: they start at 0
+            number = multiple.round().astype(np.int64)
+    return number
 
 
-def unit_of_stamps(stamps: Array, end_s: float = 0.0) -> TimeUnit:
-    """Infer the unit of ascending stamps (N,).
-
-    It is the unit that gives a date after 2000. Else it is s, unless most stamps in s lie after the
-    end of the video and those in another unit end with it, or stamps of ten digits have a plausible
-    step in it.
-
-    Args:
-        end_s: of the video; 0: unknown.
-    """
-    step = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
-    least_s = 1e-3  # motion capture at 1 kHz
-    most_s = 10.0  # photos taken one by one
-    for unit in TimeUnit:
-        if is_date(float(stamps[0]) / unit.value):
-            return unit
-    if end_s > 0 and np.median(stamps) > end_s:
-        for unit in TimeUnit:
-            ends = 0.5 < stamps[-1] / unit.value / end_s < 2
-            if ends and least_s <= step / unit.value <= most_s:
-                return unit
-    if is_whole(stamps) and stamps[-1] >= LEAST_STAMP:
-        return next((unit for unit in TimeUnit if step / unit.value <= most_s), TimeUnit.s)
-    return TimeUnit.s
-
-
-def is_whole(stamps: Array) -> bool:
-    """True if all stamps (N,) are whole numbers."""
-    return bool((stamps == np.round(stamps)).all())
+def seconds_of(stamps: Array, unit: str) -> Array:
+    """Convert ascending stamps (N,) to s: of a unit; "": the one that gives a date, else s."""
+    dated = (one for one in TimeUnit if is_date(float(stamps[0]) / one.value))
+    return stamps / (TimeUnit[unit] if unit else next(dated, TimeUnit.s)).value
 
 
 STAMP_TOLERANCE_S = 0.02  # of a frame and its pose or depth map (default of TUM's associate.py)
 
 
 def _by_stamps(stamps_s: Array, source: SourceFrames, is_ours: bool) -> list[FrameAssignment]:
-    """Assign by stamps (N,), ascending: as times; whole numbers; or the order, if one a frame."""
+    """Assign by stamps (N,), ascending: as times; whole numbers; or the order, if one a frame.
+
+    Whole numbers that are no dates are not in seconds: they are frame numbers, or of another unit.
+    """
     found = list[FrameAssignment]()
     time_s = source.time_s
     count = len(stamps_s)
-    if (source.timed or is_ours) and stamps_s[0] <= time_s[-1] and stamps_s[-1] >= time_s[0]:
+    is_number = (stamps_s == stamps_s.round()).all() and not is_date(stamps_s[0])
+    overlap = stamps_s[0] <= time_s[-1] and stamps_s[-1] >= time_s[0]
+    if overlap and (is_ours or (source.timed and not is_number)):
         row = rows_by_time(stamps_s, source.frame, time_s)
-        step = float(np.median(np.diff(time_s) / np.diff(source.frame))) if len(time_s) > 1 else 0.0
-        end = time_s[-1] + step * max(source.count - 1 - int(source.frame[-1]), 0)
-        start = time_s[0] - step * int(source.frame[0])
-        tolerance = max(step / 2, STAMP_TOLERANCE_S)
-        outside = (stamps_s < start - tolerance) | (stamps_s > end + tolerance)
-        found.append(FrameAssignment("time", "time stamps", row, int(outside.sum())))
+        found.append(FrameAssignment("time", "time stamps", row, 0))
     if found and (is_ours or (found[0].row < 0).all()):  # the same clock, none within the tolerance
         return found
-    other_clock = not found and source.timed
-    clock = ", the time stamps are of another clock than the frames" * other_clock
-    if is_whole(stamps_s) and 0 <= stamps_s[0] and stamps_s[-1] < LEAST_STAMP:
+    if is_number and 0 <= stamps_s[0] and stamps_s[-1] <= source.count:
         noun = "whole numbers in place of time stamps"
         found += by_numbers(stamps_s.astype(np.int64), source, noun)
-    elif not source.timed and count != source.count:
-        if (number := _even_numbers(stamps_s)) is not None:
-            noun = f"time stamps as multiples of {float(np.median(np.diff(stamps_s))):.4g} s"
-            found += [
-                _assignment("number0", f"{noun}, from 0", number, source),
-                _assignment("first0", f"{noun}, from the first", number - number[0], source),
-            ]
-    if count == source.count:
-        rule = f"order, one row for each frame of the source{clock}"
-        found.append(_assignment("order", rule, np.arange(count), source))
-    elif count == len(source.frame) and not found:
-        rule = f"order, one row for each frame that is read{clock}"
-        found.append(FrameAssignment("order", rule, np.arange(count), 0))
-    return found
+    return found + by_order(count, source) or _by_frames_read(count, source)
 
 
 def rows_by_time(stamps_s: Array, frame: IntArray, time_s: Array) -> IntArray:
@@ -353,7 +311,7 @@ def by_order(count: int, source: SourceFrames, by_text: bool = False) -> list[Fr
     Args:
         by_text: in the order of the images' names as text (1, 10, 2), not of their numbers.
     """
-    if count != source.count or _by_picked_images(count, source):
+    if count != source.count:
         return []
     if not by_text or not source.images:
         rule = "order, one row for each frame of the source"
@@ -363,51 +321,46 @@ def by_order(count: int, source: SourceFrames, by_text: bool = False) -> list[Fr
     return [_assignment("text", rule, np.array(frame, np.int64), source)]
 
 
-def _by_counts(count: int, source: SourceFrames, where: str) -> list[FrameAssignment]:
-    """Assign `count` rows by the numbers of selected images, or one for each frame in k."""
-    if picked := _by_picked_images(count, source):
-        return picked
-    rows = np.arange(count)
+def _by_rows(
+    count: int, source: SourceFrames, where: str, frames_by: str, by_text: bool
+) -> list[FrameAssignment]:
+    """Assign rows without names or times by their order, or by the numbers of selected images."""
+    if found := by_order(count, source, by_text):
+        return found + (by_order(count, source, not by_text) if frames_by else [])
+    if found := _by_frames_read(count, source):
+        return found
     last = int(source.frame[-1])
-    if count == len(source.frame):
-        return [FrameAssignment("order", "order, one row for each frame that is read", rows, 0)]
+    found = by_numbers(np.arange(count), source, "rows")
+    if frames_by or (source.images and count > source.count):
+        return found
     if last < count:
         rule = f"order, row n for frame n of {source.count or 'an unknown number of'}"
         return [FrameAssignment("order", rule, source.frame.copy(), 0)]
-    found = [
-        _assignment(f"every{k}", f"order, a row for one frame in {k}", k * rows, source)
-        for k in range(2, source.count // max(count - 1, 1) + 1)
-        if -(-source.count // k) == count
-    ]
-    if not found:
-        raise ReobjError(
-            f"{where}: {count} rows, frame numbers up to {last}; expected one row a frame"
-        )
-    return found
-
-
-def _by_picked_images(count: int, source: SourceFrames) -> list[FrameAssignment]:
-    """Assign by the numbers in the names of images that were selected from `count`."""
-    number = _numbers_of_images(source.images if len(source.images) != count else ())
-    found = []
-    for first in (0, 1) if len(number) else ():
-        if first <= number.min() and number.max() < count + first:
-            frame_of = {n - first: frame for frame, n in enumerate(number.tolist())}
-            frame = np.array([frame_of.get(n, -1) for n in range(count)], np.int64)
-            rule = f"numbers in the image names, rows counted from {first}"
-            one = _assignment(f"number{first}", rule, frame, source)
-            found.append(replace(one, outside=0))
-    return found
-
-
-def source_of(video: Any, frame: IntArray, time_s: Array) -> SourceFrames:
-    """Describe a `Video` whose frames (F,) were read at times (F,) in s."""
-    paths = [str(Path(file).absolute()) for file in getattr(video, "files", ())]
-    images = tuple(paths or video.names)
-    config = getattr(video, "config", None)
-    count = int(video.frame_count)
-    if not images and (config is None or (not config.stop and config.every == 1)):
-        count = int(frame[-1]) + 1  # what was decoded, not what the container claims
-    return SourceFrames(
-        frame, time_s, count, images, not images or getattr(video, "times_s", None) is not None
+    keys = " or ".join(f"{one.key} ({one.rule})" for one in found)
+    raise ReobjError(
+        f"{where}: {count} rows, frame numbers up to {last}; expected one row a frame, or --set "
+        f"poses.frames_by={keys}"
     )
+
+
+def _by_frames_read(count: int, source: SourceFrames) -> list[FrameAssignment]:
+    """Assign rows in order to the frames that are read; [] for other counts."""
+    rule = "order, one row for each frame that is read"
+    known = [FrameAssignment("order", rule, np.arange(count), 0)]
+    return known if count == len(source.frame) else []
+
+
+def source_of(video: Any) -> SourceFrames:
+    """Describe the frames of a `Video`, which is decoded for it."""
+    times = [(frame.index, frame.time_s) for frame in video]
+    if not times:
+        raise ReobjError("no readable frame in the video, so no pose can be matched")
+    frame = np.array([n for n, _ in times], np.int64)
+    time_s = np.array([t for _, t in times])
+    paths = [str(Path(file).absolute()) for file in video.files]
+    images = tuple(paths or video.names)
+    count = int(video.frame_count)
+    if not images and not video.config.stop and video.config.every == 1:
+        count = int(frame[-1]) + 1  # what was decoded, not what the container claims
+    timed = not images or getattr(video, "times_s", None) is not None
+    return SourceFrames(frame, time_s, count, images, timed)

@@ -19,7 +19,7 @@ from reobj.poses.supplied.frame_assignment import (
     by_numbers,
     numbers_of_names,
     numbers_of_times,
-    unit_of_stamps,
+    seconds_of,
 )
 from reobj.poses.supplied.pose_formats import PoseFile
 from reobj.poses.supplied.readers import read_pose_file
@@ -28,7 +28,7 @@ from reobj.sources.detection_files import (
     described_images,
     read_detections,
 )
-from reobj.sources.image_files import TimeUnit, sorted_names
+from reobj.sources.image_files import sorted_names
 from reobj.sources.imageless import ImagelessVideo
 from reobj.sources.video import InputConfig, Video
 from reobj.types import NOTE_START, ReobjError
@@ -67,7 +67,7 @@ def open_video(
     path = Path(boxes)
     unknown = (1, 1)
     if not path.exists():
-        raise ReobjError(f"{path}: no such file of detections")
+        raise ReobjError(f"{path} does not exist")
     detect = detect or DetectConfig()
     size = described_images(path, detect)[0]
     stated = stated_camera(poses.camera, size, poses.camera_format)
@@ -127,8 +127,7 @@ def _frames_of(
     rows = len(pose_file.cam_from_world)
     stamps = pose_file.stamps
     if stamps is not None:
-        unit = TimeUnit[pose_file.unit] if pose_file.unit else unit_of_stamps(stamps)
-        stamps_s = stamps / unit.value
+        stamps_s = seconds_of(stamps, pose_file.unit)
         number = numbers_of_times(stamps_s)
         times_s = np.interp(np.arange(number[-1] + 1), number, stamps_s)
         rows = len(times_s)

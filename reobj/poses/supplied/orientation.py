@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +19,8 @@ TURNS = {3: -np.eye(2), 6: np.array([[0.0, -1], [1, 0]]), 8: np.array([[0.0, 1],
 
 def turns_of(
     source: SourceFrames, size: tuple[int, int], cameras: Sequence[Camera | None], row: IntArray
-) -> tuple[Mapping[int, Array], tuple[str, ...]]:
-    """Return the turns (2, 2) of the photos with an EXIF orientation, by frame row, and a message.
+) -> dict[int, Array]:
+    """Return the turns (2, 2) of the photos with an EXIF orientation, by frame row.
 
     A camera of the shape of the upright photos, where a turn by 90 deg changes it, is not turned.
 
@@ -43,11 +43,7 @@ def turns_of(
         is_upright = size[0] != size[1] and (camera.width > camera.height) == (size[0] > size[1])
         if orientation == 3 or not is_upright:
             turns[f] = TURNS[orientation]
-    text = (
-        f"{len(turns)} photos have an EXIF orientation, which COLMAP ignores: its cameras are "
-        "turned with them"
-    )
-    return turns, (text,) * bool(turns)
+    return turns
 
 
 def turned(camera: Camera | None, turn: Array | None) -> Camera | None:

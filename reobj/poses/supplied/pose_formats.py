@@ -18,9 +18,15 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from reobj.cameras import CV_FROM_GL, WORLD_MAX, Camera, invert_rigid
+from reobj.cameras import CV_FROM_GL, WORLD_MAX, Camera, invert_rigid, read_sparse_model
 from reobj.files import MEMORY_MAX, check_unpacked, load_json, read_lines
-from reobj.poses.intrinsics import brown_camera, camera_of_keys, image_side, read_yaml
+from reobj.poses.intrinsics import (
+    brown_camera,
+    camera_of_keys,
+    image_side,
+    read_camera,
+    read_yaml,
+)
 from reobj.types import Array, IntArray, ReobjError
 
 # ---- Result of a reader, and checks of all readers -----------------------------------------------
@@ -41,8 +47,9 @@ class PoseFile:
         identity: (3, 4) the identity in the file, as it was read; None: that in these axes.
         by_text: without names, poses are in the order of the images' names as text: 1, 10, 2.
         stored_pixels: cameras are those of images as they are stored, without their EXIF turn.
-        lost: number of poses that are missing.
-        kind: name of the format. messages: what was assumed or left out.
+        metric: whether the file states metres (True) or an unknown scale; None: it says nothing.
+        kind: name of the format. lost: number of poses that are missing.
+        messages: what was assumed or left out.
     """
 
     cam_from_world: Array
@@ -51,7 +58,7 @@ class PoseFile:
     stamps: Array | None = None
     unit: str = ""
     is_ours: bool = False
-    metric: bool = False
+    metric: bool | None = None
     up_in_world: Array | None = None
     points: Array = field(default_factory=lambda: np.empty((0, 3)))
     colors: npt.NDArray[np.uint8] = field(default_factory=lambda: np.empty((0, 3), np.uint8))
@@ -77,22 +84,20 @@ def read_table(
     """
     expected = " or ".join(map(str, columns))
     rows: list[list[float]] = []
-    where = []
+    where = list[str]()
     header = ""
     for number, text in enumerate(read_lines(path), 1):
         words = text.replace(",", " ").split()
         if not words or words[0].startswith("#") or (not rows and not is_number(words[0])):
             header += text if not rows else ""
             continue
-        at = f"{path}, line {number}"
-        if not all(map(is_number, words)) or len(words) not in columns:
-            raise ReobjError(f"{at}: {len(words)} words {text.strip()[:60]!r}; expected "
-                             f"{expected} numbers")  # fmt: skip
+        where.append(f"{path}, line {number}")
+        is_row = all(map(is_number, words)) and len(words) in columns
+        raise_where([not is_row], where[-1:], f"{len(words)} words {text.strip()[:60]!r}; expected "
+                    f"{expected} numbers")  # fmt: skip
         rows.append([float(word) for word in words])
-        where.append(at)
-        raise_where([len(row) != len(rows[0]) for row in rows[-1:]], [at], "another row length")
-    if not rows:
-        raise ReobjError(f"{path}: no poses in it; expected rows of {expected} numbers")
+        raise_where([len(rows[-1]) != len(rows[0])], where[-1:], "another row length")
+    raise_where([not rows], [str(path)], f"no poses in it; expected rows of {expected} numbers")
     table = np.array(rows)  # (N, C)
     raise_where(finite & ~np.isfinite(table).all(1), where, "a number is not finite")
     return table, where, header
@@ -163,12 +168,13 @@ def from_rotations(rotation: Rotation, translation: Array) -> Array:
     return homogeneous(np.concatenate([rotation.as_matrix(), translation[:, :, None]], 2))
 
 
-def from_quaternions(xyzw: Array, translation: Array, where: Sequence[str]) -> Array:
-    """Make rigid transforms (N, 3, 4) of unit quaternions (N, 4) and translations (N, 3).
+def from_quaternions(rows: Array, columns: Sequence[int], where: Sequence[str]) -> Array:
+    """Make rigid transforms (N, 3, 4) of rows (N, C) with columns x, y, z, qx, qy, qz, qw (7,).
 
     NaN where a number is not finite or the quaternion is 0: there is no pose.
     """
-    lost = ~np.isfinite(np.column_stack([xyzw, translation])).all(1) | (xyzw == 0).all(1)
+    translation, xyzw = np.split(rows[:, columns], [3], 1)
+    lost = ~np.isfinite(rows[:, columns]).all(1) | (xyzw == 0).all(1)
     xyzw = np.where(lost[:, None], [0, 0, 0, 1], xyzw).clip(-2, 2)
     raise_where(
         np.abs(np.linalg.norm(xyzw, axis=1) - 1) > POSE_TOLERANCE,
@@ -182,6 +188,11 @@ def from_quaternions(xyzw: Array, translation: Array, where: Sequence[str]) -> A
 Y_UP = np.array([0, 1.0, 0])
 Z_UP = np.array([0, 0, 1.0])
 CV_FROM_LLFF = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]])  # LLFF: x down, y right, z backward
+
+
+def _file(path: Path, name: str) -> Path:
+    """Return a file, or that of this name in a folder."""
+    return path / name if path.is_dir() else path
 
 
 # ---- Tables: TUM, ORB-SLAM3, EuRoC, rows of matrices ---------------------------------------------
@@ -199,50 +210,44 @@ def named_columns(header: str, count: int) -> list[int] | None:
     Returns:
         indices (7,); None where no line of the header names them all.
     """
+    form = r"(q|rot|orient)?[a-z]*?[._]?(?:rs_)?(?:r_)?([xyzw])"
+    wanted = ("x", "y", "z", "qx", "qy", "qz", "qw")
     for line in header.lower().splitlines()[::-1]:
         words = re.sub(r"\[.*?\]|\(.*?\)", "", line).replace(",", " ").lstrip("# ").split()
-        column_of: dict[str, int] = {}
-        for i, word in enumerate(words):
-            found = re.fullmatch(
-                r"(q|rot|orient|p|t|pos|trans|)[a-z]*?[._]?(?:rs_)?(?:r_)?([xyzw])", word
-            )
-            if found:
-                turn = "q" if found[1] in ("q", "rot", "orient") else ""
-                column_of.setdefault(turn + found[2], i)
-        wanted = ("x", "y", "z", "qx", "qy", "qz", "qw")
-        if len(words) == count and all(name in column_of for name in wanted):
-            return [column_of[name] for name in wanted]
+        found = [re.fullmatch(form, word) for word in words]
+        names = ["q" * bool(name[1]) + name[2] if name else "" for name in found]
+        if len(words) == count and {*wanted} <= {*names}:
+            return [names.index(name) for name in wanted]
     return None
 
 
-def read_tum(path: Path, size: tuple[int, int]) -> PoseFile:
-    """Read TUM rows: time, world_from_cam, w last; metres unless our own header says arbitrary.
+OUR_HEADER = "(world_from_cam, seconds, units: "  # of `cameras.write_tum`
 
-    Column names in the header override this order.
-    """
+
+def stated_metric(header: str) -> bool | None:
+    """Return whether a header states metres, as ours does; None: it states no unit."""
+    unit = re.search("#.*units: (metres|arbitrary)", header)
+    return unit[1] == "metres" if unit else None
+
+
+def read_tum(path: Path, size: tuple[int, int]) -> PoseFile:
+    """Read TUM rows: time, world_from_cam, w last. Column names in the header override this."""
     path = table_file(path)
     rows, where, header = read_table(path, (8,), finite=False)
     columns = named_columns(header, 8)
-    order = columns or list(range(1, 8))
-    world_from_cam = from_quaternions(rows[:, order[3:]], rows[:, order[:3]], where)
-    kept, messages = _by_time(rows[:, 0], path)
-    if columns is None and "," in read_lines(path)[-1]:  # TUM has spaces
-        messages += (f"{path}: no header names its columns: read as TUM's, quaternion w last",)
-    is_ours = "(world_from_cam, seconds, units: " in header  # of `cameras.write_tum`
+    is_open = columns is None and "," in read_lines(path)[-1]  # TUM has spaces
+    text = f"{path}: no header names its columns: read as TUM's, quaternion w last"
+    world_from_cam = from_quaternions(rows, columns or [1, 2, 3, 4, 5, 6, 7], where)
     return PoseFile(
-        invert_rigid(world_from_cam)[kept], stamps=rows[kept, 0], is_ours=is_ours,
-        metric=not re.search("#.*units: arbitrary", header), kind="TUM rows", messages=messages,
+        invert_rigid(world_from_cam), stamps=rows[:, 0], is_ours=OUR_HEADER in header,
+        metric=stated_metric(header), messages=(text,) * is_open,
     )  # fmt: skip
 
 
-def _by_time(stamps: Array, path: Path) -> tuple[IntArray, tuple[str, ...]]:
-    """Return the rows (n,) by ascending stamp, without repeated ones, and a message about these."""
-    raise_where(~np.isfinite(stamps), [str(path)] * len(stamps), "a time stamp is not finite")
-    kept = np.unique(stamps, return_index=True)[1]
-    repeated = len(stamps) - len(kept)
-    if not repeated:
-        return kept, ()
-    return kept, (f"{path}: {repeated} rows repeat a time stamp and are left out",)
+def read_ours(path: Path, size: tuple[int, int]) -> PoseFile:
+    """Read an output folder of this tool: poses.txt, with the camera of sparse/."""
+    cameras = read_sparse_model(path / "sparse").cameras[:1]
+    return dataclasses.replace(read_tum(path, size), cameras=tuple(cameras))
 
 
 def read_euroc(path: Path, size: tuple[int, int]) -> PoseFile:
@@ -251,67 +256,52 @@ def read_euroc(path: Path, size: tuple[int, int]) -> PoseFile:
     `T_BS` in the camera's sensor.yaml, beside it or in cam0 beside its folder, is body_from_cam;
     without one the body is taken for the camera, with a message.
     """
-    path = path / "data.csv" if path.is_dir() else path
+    path = _file(path, "data.csv")
     rows, where, header = read_table(path, (8, 17), finite=False)
     columns = named_columns(header, rows.shape[1]) or [1, 2, 3, 5, 6, 7, 4]
-    world_from_cam = from_quaternions(rows[:, columns[3:]], rows[:, columns[:3]], where)
-    kept, messages = _by_time(rows[:, 0], path)
-    cameras: tuple[Camera | None, ...] = ()
-    body_from_cam = np.eye(4)[None]
+    body_from_world = invert_rigid(from_quaternions(rows, columns, where))
     near = (path.parent, path.parent.parent / "cam0", path.parent / "cam0")
-    for sensor in filter(Path.is_file, (folder / "sensor.yaml" for folder in near)):
-        data = read_yaml(sensor)
-        if data.get("sensor_type", "camera") != "camera":
-            continue
-        matrix = np.array(data["T_BS"]["data"], np.float64).reshape(1, 4, 4)
-        body_from_cam = homogeneous(checked_rigid(matrix, [f"{sensor}, T_BS"]))
-        world_from_cam = (homogeneous(world_from_cam) @ body_from_cam)[:, :3]
-        cameras = (camera_of_keys(data, size),)
-        messages += (f"{path}: T_BS and intrinsics of {sensor}",)
-        break
-    else:
-        messages += (
+    sensors = {s: read_yaml(s) for s in (f / "sensor.yaml" for f in near) if s.is_file()}
+    is_camera = (s for s in sensors if sensors[s].get("sensor_type", "camera") == "camera")
+    if (sensor := next(is_camera, None)) is None:
+        text = (
             f"{path}: poses of the body, and no sensor.yaml with the camera's T_BS beside it: body "
-            "taken for camera",
+            "taken for camera"
         )
+        return PoseFile(body_from_world, stamps=rows[:, 0], unit="ns", messages=(text,))
+    matrix = np.array(sensors[sensor]["T_BS"]["data"], np.float64).reshape(1, 4, 4)
+    cam_from_body = invert_rigid(checked_rigid(matrix, [f"{sensor}, T_BS"]))
     return PoseFile(
-        invert_rigid(world_from_cam)[kept], cameras, stamps=rows[kept, 0], unit="ns",
-        metric=True, identity=invert_rigid(body_from_cam[0, :3]), kind="EuRoC rows",
-        messages=messages,
+        cam_from_body @ homogeneous(body_from_world), (camera_of_keys(sensors[sensor], size),),
+        stamps=rows[:, 0], unit="ns", identity=cam_from_body[0],
+        messages=(f"{path}: T_BS and intrinsics of {sensor}",),
     )  # fmt: skip
 
 
 def read_matrices(path: Path, size: tuple[int, int]) -> PoseFile:
     """Read rows of 12 (KITTI) or 16 numbers (Replica, NICE-SLAM): world_from_cam, OpenCV axes."""
-    rows, where = matrix_rows(table_file(path))
-    return PoseFile(invert_rigid(checked_rigid(rows, where)), metric=True, kind="rows of matrices")
+    matrices, where, header = matrix_rows(table_file(path))
+    return PoseFile(invert_rigid(checked_rigid(matrices, where)), metric=stated_metric(header))
 
 
-def matrix_rows(path: Path) -> tuple[Array, list[str]]:
-    """Read rows of 12 or 16 numbers: matrices (N, 4, 4), not finite where lost, and locations."""
-    rows, where, _ = read_table(path, (12, 16), finite=False)
+def matrix_rows(path: Path) -> tuple[Array, list[str], str]:
+    """Read rows of 12 or 16 numbers: matrices (N, 4, 4), locations, header; not finite: lost."""
+    rows, where, header = read_table(path, (12, 16), finite=False)
     whole = np.tile(np.eye(4), (len(rows), 1, 1))
     whole.reshape(-1, 16)[:, : rows.shape[1]] = rows
-    return whole, where
+    return whole, where, header
 
 
 def read_traj(path: Path, size: tuple[int, int]) -> PoseFile:
     """Read ARKitScenes' .traj: s, axis-angle, translation of cam_from_world; .pincam beside it."""
     path = next(iter(sorted(path.glob("*.traj"))), path) if path.is_dir() else path
     rows, where, _ = read_table(path, (7,))
-    kept, messages = _by_time(rows[:, 0], path)
+    files = sorted(path.parent.glob("*_intrinsics/*.pincam")) or path.parent.glob("*.pincam")
     poses = from_rotations(Rotation.from_rotvec(rows[:, 1:4]), rows[:, 4:])
-    files = sorted(path.parent.glob("*_intrinsics/*.pincam")) or sorted(
-        path.parent.glob("*.pincam")
-    )
-    cameras = []
-    for file in files:
-        (width, height, *params), *_ = read_table(file, (6,))[0].tolist()
-        cameras.append(brown_camera((image_side(width), image_side(height)), *params))
+    cameras = tuple(read_camera(file, None, "pincam") for file in files)
     return PoseFile(
-        checked_rigid(poses, where)[kept], tuple(cameras), stamps=rows[kept, 0], unit="s",
-        metric=True, up_in_world=Z_UP, kind="ARKitScenes poses", messages=messages,
-    )  # fmt: skip
+        checked_rigid(poses, where), cameras, stamps=rows[:, 0], unit="s", up_in_world=Z_UP
+    )
 
 
 # ---- Phones --------------------------------------------------------------------------------------
@@ -322,34 +312,30 @@ def read_stray(path: Path, size: tuple[int, int]) -> PoseFile:
 
     OpenCV axes, quaternion x first, a row for each frame of rgb.mp4, numbered from 0.
     """
-    path = path / "odometry.csv" if path.is_dir() else path
+    path = _file(path, "odometry.csv")
     names = [word.strip().lower() for word in read_lines(path)[0].split(",")]
     rows, where, header = read_table(path, (len(names),), finite=False)
     columns = named_columns(header, len(names))
     if columns is None or "frame" not in names:
         raise ReobjError(f"{path}: expected columns frame, x, y, z, qx, qy, qz, qw")
-    world_from_cam = from_quaternions(rows[:, columns[3:]], rows[:, columns[:3]], where)
     numbers = tuple(f"{number:06.0f}" for number in rows[:, names.index("frame")])
     matrix = path.with_name("camera_matrix.csv")
-    cameras = list[Camera]()
-    if matrix.is_file():
-        K = read_table(matrix, (3,))[0]
-        raise_where([K.shape != (3, 3)], [str(matrix)], "expected 3 rows of 3 numbers")
-        cameras.append(brown_camera(_size_of(K, size), K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+    cameras = (_phone_camera(read_camera(matrix, size, "matrix").K, size),) * matrix.is_file()
     return PoseFile(
-        invert_rigid(world_from_cam), tuple(cameras), numbers, metric=True, up_in_world=Y_UP,
-        kind="Stray Scanner folder",
-    )  # fmt: skip
+        invert_rigid(from_quaternions(rows, columns, where)), cameras, numbers, up_in_world=Y_UP
+    )
 
 
-def _size_of(K: Array, size: tuple[int, int]) -> tuple[int, int]:
-    """Return the size of the images of a matrix K: that of the frames, or the native one of ARKit.
+def _phone_camera(K: Array, size: tuple[int, int]) -> Camera:
+    """Return the camera of a matrix K at the size of the frames, or the native one of ARKit.
 
     The principal point is near the middle of the right one.
     """
     native = (1920, 1440)  # in landscape
     offset = [np.abs(2 * K[:2, 2] / some - 1).max() for some in (size, native)]
-    return size if offset[0] <= offset[1] else native
+    return brown_camera(
+        size if offset[0] <= offset[1] else native, *K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    )
 
 
 def read_record3d(path: Path, size: tuple[int, int]) -> PoseFile:
@@ -357,7 +343,7 @@ def read_record3d(path: Path, size: tuple[int, int]) -> PoseFile:
 
     The file `metadata`, its folder, or an .r3d, which is a zip of the folder.
     """
-    path = path / "metadata" if path.is_dir() else path
+    path = _file(path, "metadata")
     if path.suffix.lower() == ".r3d":
         with zipfile.ZipFile(path) as file:
             name = next(n for n in file.namelist() if n.rpartition("/")[2] == "metadata")
@@ -367,11 +353,9 @@ def read_record3d(path: Path, size: tuple[int, int]) -> PoseFile:
         data = load_json(path)
     rows = np.array(data["poses"], np.float64).reshape(-1, 7)
     where = [f"{path}, poses[{i}]" for i in range(len(rows))]
-    poses = CV_FROM_GL @ invert_rigid(from_quaternions(rows[:, :4], rows[:, 4:], where))
+    poses = CV_FROM_GL @ invert_rigid(from_quaternions(rows, [4, 5, 6, 0, 1, 2, 3], where))
     camera = camera_of_keys({key: data[key] for key in ("K", "w", "h")}, None)
-    return PoseFile(
-        poses, (camera,), metric=True, up_in_world=Y_UP, axes=CV_FROM_GL, kind="Record3D metadata"
-    )
+    return PoseFile(poses, (camera,), up_in_world=Y_UP, axes=CV_FROM_GL)
 
 
 def scannet_files(path: Path) -> list[Path]:
@@ -388,23 +372,22 @@ def read_scannet(path: Path, size: tuple[int, int]) -> PoseFile:
     """
     path = path.parent if path.name == "pose" else path
     files = scannet_files(path)
-    if not files:
-        raise ReobjError(f"{path}: no pose/<frame number>.txt or *.pose.txt in it")
     where = [str(file) for file in files]
     tables = [read_table(file, (4,), finite=False)[0] for file in files]
     raise_where([len(table) != 4 for table in tables], where, "expected 4 rows of 4 numbers")
-    poses = invert_rigid(checked_rigid(np.array(tables), where))
-    intrinsic = path / "intrinsic" / "intrinsic_color.txt"
-    cameras = list[Camera]()
-    if intrinsic.exists():
-        K, where_K, _ = read_table(intrinsic, (3, 4))
-        raise_where([len(K) != K.shape[1]], where_K, f"{len(K)} rows, expected 3x3 or 4x4")
-        cameras.append(brown_camera(size, K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5))
-    is_scannet = files[0].parent.name == "pose"
-    names = tuple(file.stem for file in files)
-    kind = "ScanNet poses" if is_scannet else "7-Scenes poses"
-    up = Z_UP if is_scannet else None
-    return PoseFile(poses, tuple(cameras), names, metric=True, up_in_world=up, kind=kind)
+    matrix = path / "intrinsic" / "intrinsic_color.txt"
+    return PoseFile(
+        invert_rigid(checked_rigid(np.array(tables), where)),
+        (scannet_camera(matrix, size),) if matrix.exists() else (),
+        tuple(file.stem for file in files),
+        up_in_world=Z_UP if files[0].parent.name == "pose" else None,
+    )
+
+
+def scannet_camera(path: Path, size: tuple[int, int]) -> Camera:
+    """Read a matrix of ScanNet, whose first pixel has its centre at (0, 0)."""
+    fx, fy, cx, cy = read_camera(path, size, "matrix").params
+    return Camera("PINHOLE", *size, (fx, fy, cx + 0.5, cy + 0.5))
 
 
 def arkit_files(path: Path) -> list[Path]:
@@ -420,43 +403,41 @@ def read_arkit(path: Path, size: tuple[int, int]) -> PoseFile:
     world_from_cam row by row, `t_00` to `t_23` or `cameraPoseARFrame`; ARKit's axes (those of
     OpenGL), metres, y up.
     """
-    files = arkit_files(path)
 
-    def read(entry: dict[str, Any]) -> tuple[Any, Camera | None]:
-        rows = entry.get("cameraPoseARFrame") or [
-            entry[f"t_{i}{j}"] for i in range(3) for j in range(4)
-        ]
-        return [*rows, 0, 0, 0, 1][:16], camera_of_keys(entry, size)
+    def read(entry: Any) -> Entry:
+        path, keys = entry
+        rows = keys.get("cameraPoseARFrame") or [keys[f"t_{k // 4}{k % 4}"] for k in range(12)]
+        return rows, camera_of_keys(keys, size), path.stem
 
-    return _listed(
-        {str(file): load_json(file) for file in files}, read, CV_FROM_GL,
-        names=tuple(file.stem for file in files), metric=True, up_in_world=Y_UP,
-        kind="raw ARKit export",
-    )  # fmt: skip
+    files = {str(file): (file, load_json(file)) for file in arkit_files(path)}
+    return _listed(files, read, CV_FROM_GL, up_in_world=Y_UP)
+
+
+# world_from_cam, 12 or 16 numbers row by row; camera; name of the image, or ""
+Entry = tuple[Any, Camera | None, str]
 
 
 def _listed(
-    entries: dict[str, Any],
-    read: Callable[[Any], tuple[Any, Camera | None]],
-    axes: Array,
-    **more: Any,
+    entries: dict[str, Any], read: Callable[[Any], Entry], axes: Array, **more: Any
 ) -> PoseFile:
-    """Read entries, by their location: world_from_cam, 12 or 16 numbers row by row, and camera."""
+    """Read entries, by their location, whose camera axes are these."""
     matrices = np.tile(np.eye(4).ravel(), (len(entries), 1))  # (N, 16)
     cameras = list[Camera | None]()
+    names = list[str]()
     for row, (where, entry) in enumerate(entries.items()):
         try:
-            numbers, camera = read(entry)
+            numbers, camera, name = read(entry)
             numbers = np.array(numbers, np.float64).ravel()
             matrices[row, : 12 if numbers.size == 12 else 16] = numbers
             cameras.append(camera)
+            names += [name] * bool(name)
         except ReobjError as error:
             raise ReobjError(f"{where}: {error}") from None
         except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
             raise ReobjError(f"{where}: no pose and camera as the format has them "
                              f"({error!r:.100})") from None  # fmt: skip
     poses = axes @ invert_rigid(checked_rigid(matrices.reshape(-1, 4, 4), list(entries)))
-    return PoseFile(poses, tuple(cameras), axes=axes, **more)
+    return PoseFile(poses, tuple(cameras), tuple(names), axes=axes, **more)
 
 
 def read_transforms(path: Path, size: tuple[int, int]) -> PoseFile:
@@ -465,21 +446,22 @@ def read_transforms(path: Path, size: tuple[int, int]) -> PoseFile:
     nerfstudio transformed the world by `applied_transform` A; this is undone:
     world_from_cv = inv(A) world_from_gl diag(1, -1, -1, 1).
     """
-    path = path / "transforms.json" if path.is_dir() else path
+    path = _file(path, "transforms.json")
     data = load_json(path)
-    shared = {key: value for key, value in data.items() if key != "frames"}
-    found = _listed(
-        {f"{path}, frames[{i}]": frame for i, frame in enumerate(data["frames"])},
-        lambda frame: (frame["transform_matrix"], camera_of_keys({**shared, **frame}, size)),
-        CV_FROM_GL, names=tuple(str(frame["file_path"]) for frame in data["frames"]),
-        kind="transforms",
-    )  # fmt: skip
+    frames = data.pop("frames")
+
+    def read(frame: Any) -> Entry:
+        camera = camera_of_keys({**data, **frame}, size)
+        return frame["transform_matrix"], camera, str(frame["file_path"])
+
+    named = {f"{path}, frames[{i}]": frame for i, frame in enumerate(frames)}
+    found = _listed(named, read, CV_FROM_GL)
     where = [f"{path}, applied_transform"]
     applied = np.eye(4)
     applied[:3] = np.array(data.get("applied_transform", applied), np.float64)[:3]
     raise_where([not np.isfinite(applied).all()], where, "expected 3x4 or 4x4 finite numbers")
-    applied[:3] = checked_rigid(applied[None], where)[0]
-    return dataclasses.replace(found, cam_from_world=found.cam_from_world @ applied)
+    turn = homogeneous(checked_rigid(applied[None], where))
+    return dataclasses.replace(found, cam_from_world=found.cam_from_world @ turn)
 
 
 # ---- Datasets and radiance fields ----------------------------------------------------------------
@@ -490,20 +472,17 @@ def read_scannetpp(path: Path, size: tuple[int, int]) -> PoseFile:
 
     `aligned_pose` (of the laser scan) or else `pose`, and `intrinsic`; OpenCV axes, metres.
     """
-    path = path / "pose_intrinsic_imu.json" if path.is_dir() else path
+    path = _file(path, "pose_intrinsic_imu.json")
     data = load_json(path)
-
-    def read(entry: dict[str, Any]) -> tuple[Any, Camera]:
-        K = np.array(entry["intrinsic"], np.float64).reshape(3, 3)
-        camera = brown_camera(_size_of(K, size), *K[[0, 1, 0, 1], [0, 1, 2, 2]])
-        return entry.get("aligned_pose", entry.get("pose")), camera
-
     is_aligned = all("aligned_pose" in entry for entry in data.values())
-    return _listed(
-        {f"{path}, {name}": entry for name, entry in data.items()}, read, np.eye(3),
-        names=tuple(data), metric=True, up_in_world=Z_UP if is_aligned else None,
-        kind="ScanNet++ iPhone poses",
-    )  # fmt: skip
+
+    def read(entry: Any) -> Entry:
+        name, keys = entry
+        K = np.array(keys["intrinsic"], np.float64).reshape(3, 3)
+        return keys["aligned_pose" if is_aligned else "pose"], _phone_camera(K, size), name
+
+    named = {f"{path}, {item[0]}": item for item in data.items()}
+    return _listed(named, read, np.eye(3), up_in_world=Z_UP if is_aligned else None)
 
 
 def read_llff(path: Path, size: tuple[int, int]) -> PoseFile:
@@ -512,23 +491,21 @@ def read_llff(path: Path, size: tuple[int, int]) -> PoseFile:
     world_from_cam with the axes down, right, backwards. One row per image, in the order of the
     names as text.
     """
-    path = path / "poses_bounds.npy" if path.is_dir() else path
+    path = _file(path, "poses_bounds.npy")
     rows = np.load(path, allow_pickle=False)
     if rows.ndim != 2 or rows.shape[1] != 17:
         raise ReobjError(f"{path}: an array of shape {rows.shape}; expected LLFF's (N, 17); write "
                          "matrices as text: np.savetxt(FILE, m.reshape(N, 16))")  # fmt: skip
 
-    def read(row: Array) -> tuple[Array, Camera]:
+    def read(row: Array) -> Entry:
         table = row[:15].astype(np.float64).reshape(3, 5)
         raise_where([not np.isfinite(table).all()], ["LLFF"], "a number is not finite")
         h, w, f = table[:, 4].tolist()
         camera = Camera("SIMPLE_PINHOLE", image_side(w), image_side(h), (f, w / 2, h / 2))
-        return table[:, :4], camera
+        return table[:, :4], camera, ""
 
-    return _listed(
-        {f"{path}, row {i}": row for i, row in enumerate(rows)}, read, CV_FROM_LLFF,
-        by_text=True, kind="LLFF poses",
-    )  # fmt: skip
+    named = {f"{path}, row {i}": row for i, row in enumerate(rows)}
+    return _listed(named, read, CV_FROM_LLFF, by_text=True)
 
 
 def read_splatting(path: Path, size: tuple[int, int]) -> PoseFile:
@@ -536,15 +513,11 @@ def read_splatting(path: Path, size: tuple[int, int]) -> PoseFile:
 
     OpenCV axes, no scale; the principal point is the middle of the image.
     """
-    path = path / "cameras.json" if path.is_dir() else path
-    data = load_json(path)
 
-    def read(entry: dict[str, Any]) -> tuple[Array, Camera]:
-        w, h = image_side(entry["width"]), image_side(entry["height"])
-        camera = brown_camera((w, h), float(entry["fx"]), float(entry["fy"]), w / 2, h / 2)
-        return np.column_stack([entry["rotation"], entry["position"]]), camera
+    def read(entry: Any) -> Entry:
+        numbers = np.column_stack([entry["rotation"], entry["position"]])
+        return numbers, camera_of_keys(entry, None), str(entry["img_name"])
 
-    return _listed(
-        {f"{path}, entry {i}": entry for i, entry in enumerate(data)}, read, np.eye(3),
-        names=tuple(str(entry["img_name"]) for entry in data), kind="Gaussian splatting cameras",
-    )  # fmt: skip
+    path = _file(path, "cameras.json")
+    named = {f"{path}, entry {i}": entry for i, entry in enumerate(load_json(path))}
+    return _listed(named, read, np.eye(3))

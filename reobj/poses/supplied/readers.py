@@ -19,22 +19,27 @@ from reobj.cameras import WORLD_MAX, Camera, Poses, invert_rigid, usable
 from reobj.files import spans
 from reobj.formats import AUTO, Format, Probe, Registry
 from reobj.poses.estimate import PosesConfig
-from reobj.poses.intrinsics import CAMERA_FORMS, fitted_camera, parse_camera
+from reobj.poses.intrinsics import (
+    CAMERA_FORMS,
+    fitted_camera,
+    is_dso_camera,
+    is_kitti_calibration,
+    parse_camera,
+)
 from reobj.poses.supplied import pose_formats as formats
 from reobj.poses.supplied.check import Supplied
 from reobj.poses.supplied.colmap_model import find_models, read_colmap
 from reobj.poses.supplied.frame_assignment import (
     FrameAssignment,
     SourceFrames,
-    assignments,
+    assign,
     by_order,
     interpolated,
+    seconds_of,
     source_of,
-    unit_of_stamps,
 )
 from reobj.poses.supplied.orientation import turned, turns_of
 from reobj.poses.supplied.pose_formats import PoseFile
-from reobj.sources.image_files import TimeUnit
 from reobj.types import Array, BoolArray, IntArray, ReobjError
 
 
@@ -75,52 +80,70 @@ def read_supplied(video: Any, config: PosesConfig) -> Supplied:
     stated = parse_camera(config.camera, size, config.camera_format)
     if stated is None and not any(pose_file.cameras):
         raise ReobjError(f"{path}: no intrinsics; add --camera {CAMERA_FORMS}")
-    if pose_file.lost == len(pose_file.cam_from_world):
-        raise ReobjError(f"{path}: no poses in it, or only those of lost frames")
-    times = [(frame.index, frame.time_s) for frame in video]
-    if not times:
-        raise ReobjError("no readable frame in the video, so no pose can be matched")
-    frame = np.array([n for n, _ in times], np.int64)
-    time_s = np.array([t for _, t in times])
-    source = source_of(video, frame, time_s)
-    stamps_s, messages = _in_seconds(pose_file, path, source)
-    assignment = _assignment(pose_file, stamps_s, source, path, config.frames_by)
+    source = source_of(video)
+    stamps_s = None
+    if pose_file.stamps is not None:
+        stamps_s = seconds_of(pose_file.stamps, pose_file.unit)
+    assignment = assign(pose_file, stamps_s, source, str(path), config.frames_by)
     row = assignment.row
-    cameras = pose_file.cameras
-    turns, turn_messages = (
-        turns_of(source, size, cameras, row) if pose_file.stored_pixels else ({}, ())
-    )
-    if len(cameras) == len(pose_file.cam_from_world) > 1:
-        cameras = tuple(turned(cameras[r], turns.get(f)) for f, r in enumerate(row) if r >= 0)
-    intrinsics = stated or one_camera(cameras, path, size)
-    if not usable(intrinsics):
-        raise ReobjError(f"{path}: {intrinsics}: expected finite numbers, focal lengths above 0")
-    cam_from_world, lost = _of_frames(pose_file.cam_from_world, stamps_s, assignment, source, path)
-    if pose_file.lost:
-        lost = lost or f"{path}: a pose for each frame"
-        lost += f"; {pose_file.lost} poses of lost frames (the identity, zeros, not finite)"
+    turns = turns_of(source, size, pose_file.cameras, row) if pose_file.stored_pixels else {}
+    camera = stated or one_camera(_cameras_of(pose_file, row, turns), path, size)
+    if not usable(camera):
+        raise ReobjError(f"{path}: {camera}: expected finite numbers, focal lengths above 0")
+    cam_from_world = _of_frames(pose_file.cam_from_world, assignment, source, stamps_s)
+    if (np.abs(cam_from_world) >= WORLD_MAX).any():
+        raise ReobjError(f"{path}: a camera is more than {WORLD_MAX:g} units away from the origin")
     for f, turn in turns.items():
         cam_from_world[f, :2] = turn @ cam_from_world[f, :2]
-    poses = Poses(
-        intrinsics, frame, time_s, cam_from_world,
-        np.where(np.isfinite(cam_from_world).all((1, 2)), "supplied", "none"), "user",
-        metric=pose_file.metric or config.metric, up_in_world=pose_file.up_in_world,
-        points=pose_file.points, colors=pose_file.colors,
-        visibility=_in_frames(pose_file.visibility, row),
-        messages=(*pose_file.messages, *messages, *turn_messages, *[lost] * bool(lost)),
-        reading=f"{pose_file.kind}, frames by {assignment.rule}",
-    )  # fmt: skip
-    if poses.metric:
+    known = np.asarray(np.isfinite(cam_from_world).all((1, 2)), bool)
+    metric = config.metric or pose_file.metric is not False
+    is_assumed = pose_file.metric is None and not config.metric
+    if metric:
         _check_units(cam_from_world, path)
-    others = by_order(len(pose_file.cam_from_world), source, assignment.key == "order")
+    poses = Poses(
+        camera, source.frame, source.time_s, cam_from_world,
+        np.where(known, "supplied", "none"), "user", metric=metric,
+        up_in_world=pose_file.up_in_world, points=pose_file.points, colors=pose_file.colors,
+        visibility=_in_frames(pose_file.visibility, row),
+        messages=tuple(_messages(pose_file, path, source, known, len(turns))),
+        reading=f"{pose_file.kind}{METRES_ASSUMED * is_assumed}, frames by {assignment.rule}",
+    )  # fmt: skip
     orders = {
         f"the {one.rule} (--set poses.frames_by={one.key})": _of_frames(
-            pose_file.cam_from_world, None, one, source, path
-        )[0]
-        for one in others
+            pose_file.cam_from_world, one, source
+        )
+        for one in by_order(len(pose_file.cam_from_world), source, assignment.key == "order")
         if assignment.key in ("order", "text") and one.key != assignment.key
     }
     return Supplied(poses, pose_file.axes, orders)
+
+
+def _cameras_of(
+    pose_file: PoseFile, row: IntArray, turns: dict[int, Array]
+) -> Sequence[Camera | None]:
+    """Return the cameras of the frames with a pose, turned with their photos, or that of all."""
+    cameras = pose_file.cameras
+    if not len(cameras) == len(pose_file.cam_from_world) > 1:
+        return cameras
+    return [turned(cameras[r], turns.get(f)) for f, r in enumerate(row.tolist()) if r >= 0]
+
+
+def _messages(
+    pose_file: PoseFile, path: Path, source: SourceFrames, known: BoolArray, turned: int
+) -> list[str]:
+    """List photos that were turned, frames (F,) without a pose, and poses of lost frames."""
+    messages = list(pose_file.messages)
+    if turned:
+        messages.append(f"{turned} photos have an EXIF orientation, which COLMAP ignores: its "
+                        "cameras are turned with them")  # fmt: skip
+    facts = []
+    if not known.all():
+        step = int(np.median(np.diff(source.frame))) if len(known) > 1 else 1
+        without = spans(source.frame[~known].tolist(), step)
+        facts.append(f"poses for {known.sum()} of {len(known)} frames, none for {without}")
+    if pose_file.lost:
+        facts.append(f"{pose_file.lost} poses of lost frames (the identity, zeros, not finite)")
+    return messages + [f"{path}: {'; '.join(facts)}"] * bool(facts)
 
 
 LARGE_M, FAST_M = 100.0, 0.5  # radius of an indoor path, and of a step in it (chosen)
@@ -139,35 +162,7 @@ def _check_units(cam_from_world: Array, path: Path) -> None:
         )
 
 
-def _assignment(
-    pose_file: PoseFile, stamps_s: Array | None, source: SourceFrames, path: Path, frames_by: str
-) -> FrameAssignment:
-    """Return the only assignment to frames that the file allows, or the one that is named."""
-    count = len(pose_file.cam_from_world)
-    found = assignments(
-        count, pose_file.names, stamps_s, source, str(path), pose_file.is_ours, pose_file.by_text
-    )
-    if not found:
-        compared = _compared(pose_file, stamps_s, source)
-        raise ReobjError(f"{path}: none of its {count} poses belongs to a frame ({compared})")
-    if frames_by:
-        if not pose_file.names and stamps_s is None:
-            found += by_order(count, source, not pose_file.by_text)
-        chosen = [one for one in found if one.key == frames_by]
-        if not chosen:
-            keys = ", ".join(one.key for one in found)
-            raise ReobjError(f"--set poses.frames_by={frames_by}: {path} can be read by {keys}")
-        return chosen[0]
-    if len(found) > 1:
-        choices = "; or ".join(f"{one.key} ({one.rule})" for one in found)
-        raise ReobjError(
-            f"{path}: its poses can be assigned to frames in {len(found)} ways: {choices}; choose "
-            f"with --set poses.frames_by={found[0].key}"
-        )
-    return found[0]
-
-
-MAX_FOCAL_SPREAD = 0.02  # relative, over the images of one camera: autofocus (chosen)
+MAX_SPREAD = 0.02  # focal lengths, over the images of one camera: autofocus (chosen)
 
 
 def one_camera(cameras: Sequence[Camera | None], path: Path, size: tuple[int, int]) -> Camera:
@@ -176,83 +171,38 @@ def one_camera(cameras: Sequence[Camera | None], path: Path, size: tuple[int, in
     Args:
         size: (w, h) of the frames, to which it is resized.
     Raises:
-        ReobjError: none, or they differ by more than MAX_FOCAL_SPREAD in focal length or (in longer
-            sides) in the principal point, or in model or size.
+        ReobjError: none, or they differ by more than MAX_SPREAD in focal length or principal point,
+            or in model or size.
     """
     found = sorted((c for c in cameras if c is not None), key=lambda c: c.params[0])
     if not found:
         raise ReobjError(f"{path}: no intrinsics; add --camera {CAMERA_FORMS}")
     kinds = sorted({f"{c.model} {c.width}x{c.height}" for c in found})
     K = np.array([camera.K for camera in found])  # (n, 3, 3)
-    spread = np.ptp(K[:, :2], axis=0) / max(found[0].width, found[0].height)
-    spread[[0, 1], [0, 1]] = np.ptp(K[:, [0, 1], [0, 1]], axis=0) / np.maximum(K[0, 0, 0], 1e-9)
-    if len(kinds) > 1 or spread.max() > MAX_FOCAL_SPREAD:
+    if len(kinds) > 1 or np.ptp(K, axis=0).max() > MAX_SPREAD * K[0, 0, 0]:
         least, most = K[0, 0], K[-1, 0]
-        cameras_text = f"focal lengths {least[0]:.4g}-{most[0]:.4g}, centres {least[2]:.4g}-"
-        cameras_text = ", ".join(kinds[:3]) if len(kinds) > 1 else f"{cameras_text}{most[2]:.4g}"
+        text = f"focal lengths {least[0]:.4g}-{most[0]:.4g}, centres {least[2]:.4g}-{most[2]:.4g}"
+        text = ", ".join(kinds[:3]) if len(kinds) > 1 else text
         raise ReobjError(
-            f"{path}: several different cameras took the frames ({cameras_text}); expected one: "
+            f"{path}: several different cameras took the frames ({text}); expected one: "
             "give its intrinsics with --camera, or reconstruct with a single camera"
         )
     return fitted_camera(found[len(found) // 2], size, str(path))
 
 
-def _in_seconds(
-    pose_file: PoseFile, path: Path, source: SourceFrames
-) -> tuple[Array | None, tuple[str, ...]]:
-    """Convert the stamps (N,) of a file to seconds; report the unit if it was inferred."""
-    if pose_file.stamps is None:
-        return None, ()
-    if pose_file.unit:
-        return pose_file.stamps / TimeUnit[pose_file.unit].value, ()
-    end_s = float(source.time_s[-1]) if source.timed else 0.0
-    unit = unit_of_stamps(pose_file.stamps, end_s)
-    messages = () if unit is TimeUnit.s else (f"{path}: time stamps taken for {unit.name}",)
-    return pose_file.stamps / unit.value, messages
-
-
 def _of_frames(
     cam_from_world: Array,
-    stamps_s: Array | None,
     assignment: FrameAssignment,
     source: SourceFrames,
-    path: Path,
-) -> tuple[Array, str]:
-    """Return the poses (F, 3, 4) of the frames by one assignment; report frames without, if any.
-
-    Returns:
-        the poses, and which frames have none: "" or a text.
-    """
+    stamps_s: Array | None = None,
+) -> Array:
+    """Return the poses (F, 3, 4) of the frames by one assignment, NaN where there is none."""
     row = assignment.row
-    known = row >= 0
-    poses = np.full((len(row), 3, 4), np.nan)
-    poses[known] = cam_from_world[row[known]]
-    if assignment.key == "time" and stamps_s is not None and len(stamps_s) > 1:
+    poses = np.where((row >= 0)[:, None, None], cam_from_world[row], np.nan)
+    if assignment.key == "time" and stamps_s is not None:
         exact, use = interpolated(cam_from_world, stamps_s, source.time_s)
-        poses[use & known] = exact[row[use] >= 0]
-    known = np.isfinite(poses).all((1, 2))
-    if (np.abs(poses[known]) >= WORLD_MAX).any():
-        raise ReobjError(f"{path}: a camera is more than {WORLD_MAX:g} units away from the origin")
-    if known.all():
-        return poses, ""
-    step = int(np.median(np.diff(source.frame))) if len(row) > 1 else 1
-    lost = spans(source.frame[~known].tolist(), step)
-    return poses, f"{path}: poses for {known.sum()} of {len(row)} frames, none for {lost}"
-
-
-def _compared(pose_file: PoseFile, stamps_s: Array | None, source: SourceFrames) -> str:
-    """Describe what was compared without a match, for a message."""
-    if pose_file.names:
-        first = source.images[int(source.frame[0])] if source.images else int(source.frame[0])
-        return f"images {pose_file.names[0]!r} ..., frames {first!r} ..."
-    if stamps_s is None:
-        return "in order"
-    start, end = source.time_s[[0, -1]]
-    frames = f"frames {start:.3f}-{end:.3f} s" if source.timed else "the images have no times"
-    return (
-        f"{stamps_s[0]:.3f}-{stamps_s[-1]:.3f} s, {frames}; stamps of another clock need one row "
-        "for each frame"
-    )
+        poses[use & (row >= 0)] = exact[row[use] >= 0]
+    return poses
 
 
 def _in_frames(visibility: IntArray, row: IntArray) -> IntArray:
@@ -273,31 +223,49 @@ def read_pose_file(path: Path, fmt: str, size: tuple[int, int]) -> PoseFile:
         size: (w, h) of the images, for formats that do not state it.
     """
     read = POSES.reader(path, fmt)
+    entry = POSES.find(path, fmt)
     try:
-        return _without_lost(read(path, size))
+        found = read(path, size)
     except ReobjError as error:
         text = str(error)  # of a file beside it, or without a name
         raise ReobjError(text if str(path) in text else f"{path}: {text}") from None
     except Exception as error:  # files of other tools lack any key, or hold any type
-        name = POSES.find(path, fmt).name
-        raise ReobjError(f"{path}: damaged, or no file of format {name} ({error!r:.100})") from None
+        text = f"damaged, or no file of format {entry.name} ({error!r:.100})"
+        raise ReobjError(f"{path}: {text}") from None
+    return _settled(found, entry, path)
 
 
-def _without_lost(pose_file: PoseFile) -> PoseFile:
-    """Remove poses that are the identity in the axes of the file, as of lost frames.
+def _settled(found: PoseFile, entry: Format[ReadPoses], path: Path) -> PoseFile:
+    """Sort poses by their time stamps, without repeated ones, and remove those of lost frames.
 
-    It is a pose where it begins the path, and where it is the only one of poses with names.
+    These are the identity in the axes of the file. It is a pose where it begins the path, and where
+    it is the only one of poses with names.
     """
-    cam_from_world = pose_file.cam_from_world
-    identity = np.column_stack([pose_file.axes, np.zeros(3)])
-    identity = identity if pose_file.identity is None else pose_file.identity
-    same: BoolArray = np.all(np.abs(cam_from_world - identity) < 1e-9, axis=(1, 2))  # (N,)
+    poses = found.cam_from_world
+    stamps = found.stamps
+    messages = found.messages
+    if stamps is not None:
+        if not np.isfinite(stamps).all():
+            raise ReobjError(f"{path}: a time stamp is not finite")
+        stamps, kept = np.unique(stamps, return_index=True)
+        if repeated := len(poses) - len(kept):
+            messages += (f"{path}: {repeated} rows repeat a time stamp and are left out",)
+        poses = poses[kept]
+    identity = np.column_stack([found.axes, np.zeros(3)])
+    identity = identity if found.identity is None else found.identity
+    same: BoolArray = np.all(np.abs(poses - identity) < 1e-9, axis=(1, 2))  # (N,)
     begins = same[:1].any() and not same[1:2].any()
-    if begins or (pose_file.names and same.sum() == 1):
+    if begins or (found.names and same.sum() == 1):
         same[same.argmax()] = False
-    cam_from_world = np.where(same[:, None, None], np.nan, cam_from_world)
-    lost: BoolArray = ~np.all(np.isfinite(cam_from_world), axis=(1, 2))
-    return dataclasses.replace(pose_file, cam_from_world=cam_from_world, lost=int(lost.sum()))
+    poses = np.where(same[:, None, None], np.nan, poses)
+    lost = int((~np.isfinite(poses).all((1, 2))).sum())
+    if lost == len(poses):
+        raise ReobjError(f"{path}: no poses in it, or only those of lost frames")
+    return dataclasses.replace(
+        found, cam_from_world=poses, stamps=stamps, messages=messages, lost=lost,
+        metric={METRES: True, UNKNOWN: False}.get(entry.units, found.metric),
+        kind=f"{entry.name} {found.kind}".strip(),
+    )  # fmt: skip
 
 
 def _head(probe: Probe) -> tuple[str, list[str], str]:
@@ -310,6 +278,11 @@ def _head(probe: Probe) -> tuple[str, list[str], str]:
         if words and all(map(formats.is_number, words)):
             return "\n".join(probe.lines[:k]), words, line
     return "", [], ""
+
+
+def _is_ours(probe: Probe) -> bool:
+    """Test for an output folder of this tool."""
+    return {"poses.txt", "sparse"} <= probe.names and formats.OUR_HEADER in _head(probe)[0]
 
 
 def _is_euroc(probe: Probe) -> bool:
@@ -327,14 +300,17 @@ def _is_tum(probe: Probe) -> bool:
     """Test for 8 columns; without a header ns with commas may be EuRoC's as well."""
     header, words, _ = _head(probe)
     is_euroc = formats.named_columns(header, 8) is not None and _is_euroc(probe)
-    return len(words) == 8 and not is_euroc and "_RS_" not in header
+    return len(words) == 8 and not is_euroc and "_RS_" not in header and not _is_ours(probe)
 
 
 def _is_colmap(probe: Probe) -> bool:
     """Test for a model; not that from which nerfstudio's transforms.json beside it was made."""
     if probe.is_dir:
-        return not {"transforms.json", "colmap"} <= probe.names and bool(find_models(probe.path))
-    return probe.suffix == ".bin" or probe.path.name == "images.txt"
+        has_copy = {"transforms.json", "colmap"} <= probe.names or _is_ours(probe)
+        return not has_copy and bool(find_models(probe.path))
+    return probe.path.stem in ("cameras", "images", "points3D", "frames", "rigs") and (
+        probe.suffix in (".bin", ".txt")
+    )
 
 
 def _is_reality_capture(probe: Probe) -> bool:
@@ -343,24 +319,31 @@ def _is_reality_capture(probe: Probe) -> bool:
 
 
 def _has(probe: Probe, name: str, *keys: str) -> bool:
-    """Test for a folder with a file, or a JSON file of objects with these keys."""
-    return name in probe.names or (not probe.is_dir and bool(keys) and {*keys} <= probe.keys())
+    """Test for a folder with a file, or a JSON file whose (first) object has these keys."""
+    if probe.is_dir or not isinstance(probe.json, dict | list):
+        return name in probe.names
+    first = next(iter(probe.json.values() if isinstance(probe.json, dict) else probe.json), None)
+    return any(isinstance(one, dict) and {*keys} <= one.keys() for one in (probe.json, first))
 
 
 ReadPoses = Callable[[Path, tuple[int, int]], PoseFile]
 NAME, TIME, ORDER = "name, number", "time", "order"
 METRES, UNKNOWN = "metres", "unknown"
+UNSTATED = "not stated: metres, or as `# units: arbitrary` in the file says"
+METRES_ASSUMED = ", metres assumed (no `# units:` in the file)"
 GIVE = "no intrinsics (`--camera`)"
 POSES: Registry[ReadPoses] = Registry("poses", "--pose-format", [
     Format("colmap", "COLMAP: model, binary (preferred) or text, with its points", _is_colmap,
            read_colmap, NAME, UNKNOWN, "cameras of images that are no frames"),
     Format("tum", "TUM, ORB-SLAM3: rows `t tx ty tz qx qy qz qw`, or as a header names them",
-           _is_tum, formats.read_tum, TIME, f"{METRES}; ours, as its header says", GIVE),
+           _is_tum, formats.read_tum, TIME, UNSTATED, GIVE),
+    Format("reobj", "this tool: output folder, `poses.txt` with the camera of `sparse/`", _is_ours,
+           formats.read_ours, TIME, "as the header says", "points"),
     Format("euroc", "EuRoC: CSV of 8 or 17 columns, ns, body, quaternion w first; `T_BS` of "
            "`sensor.yaml` beside it or in `cam0`", _is_euroc, formats.read_euroc, TIME, METRES,
            "velocities, biases"),
     Format("matrices", "KITTI (12), Replica, NICE-SLAM (16): rows of matrices, row-major",
-           lambda p: len(_head(p)[1]) in (12, 16), formats.read_matrices, ORDER, METRES, GIVE),
+           lambda p: len(_head(p)[1]) in (12, 16), formats.read_matrices, ORDER, UNSTATED, GIVE),
     Format("transforms", "nerfstudio, instant-ngp, NeRF synthetic: `transforms.json`, OpenGL axes; "
            "`applied_transform` is undone", lambda p: _has(p, "transforms.json", "frames"),
            formats.read_transforms, NAME, UNKNOWN, "`applied_scale`"),
@@ -368,7 +351,7 @@ POSES: Registry[ReadPoses] = Registry("poses", "--pose-format", [
            lambda p: p.is_dir and bool(formats.scannet_files(p.path)), formats.read_scannet, NAME,
            METRES, "7-Scenes: no intrinsics"),
     Format("scannetpp", "ScanNet++ (iPhone): `pose_intrinsic_imu.json`, `aligned_pose` (z up) or "
-           "`pose`", lambda p: _has(p, "pose_intrinsic_imu.json") or _is_scannetpp(p),
+           "`pose`", lambda p: _has(p, "pose_intrinsic_imu.json", "intrinsic"),
            formats.read_scannetpp, NAME, METRES, "IMU"),
     Format("arkitscenes", "ARKitScenes: `.traj`, axis-angle of cam_from_world; `.pincam` beside it",
            lambda p: any(name.endswith(".traj") for name in (*p.names, p.path.name)),
@@ -383,7 +366,7 @@ POSES: Registry[ReadPoses] = Registry("poses", "--pose-format", [
            lambda p: "odometry.csv" in {*p.names, p.path.name}, formats.read_stray, "number",
            METRES, "IMU"),
     Format("llff", "LLFF: `poses_bounds.npy`; axes down, right, backwards",
-           lambda p: p.suffix == ".npy" or _has(p, "poses_bounds.npy"), formats.read_llff,
+           lambda p: p.suffix == ".npy" or "poses_bounds.npy" in p.names, formats.read_llff,
            "order of the names as text: 1, 10, 2", UNKNOWN, "depth bounds"),
     Format("splatting", "3D Gaussian splatting: `cameras.json`",
            lambda p: _has(p, "cameras.json", "img_name", "position"), formats.read_splatting, NAME,
@@ -401,6 +384,9 @@ POSES: Registry[ReadPoses] = Registry("poses", "--pose-format", [
            advice="reconstruct the images with COLMAP"),
     Format("", "RealityCapture's CSV or XMP", _is_reality_capture, None,
            advice="export the registration as COLMAP"),
+    Format("", "KITTI's calib.txt", is_kitti_calibration, None,
+           advice="it holds cameras: give it as --camera, and the rows of poses/NN.txt as --poses"),
+    Format("", "DSO's camera.txt", is_dso_camera, None, advice="give its result.txt as --poses"),
     Format("", "a folder of NeRF splits", lambda p: "transforms_train.json" in p.names
            and "transforms.json" not in p.names, None,
            advice="give the file transforms_....json of the images"),
@@ -409,8 +395,3 @@ POSES: Registry[ReadPoses] = Registry("poses", "--pose-format", [
            advice="their world is scaled, and they have no intrinsics: give the transforms.json of "
            "the data"),
 ])  # fmt: skip
-
-
-def _is_scannetpp(probe: Probe) -> bool:
-    first = next(iter(probe.json.values()), None) if isinstance(probe.json, dict) else None
-    return isinstance(first, dict) and "intrinsic" in first
