@@ -340,8 +340,8 @@ class Video:
         last_s = times_s.max(initial=0.0)
         lost_s = self._declared_s - last_s
         if complete and known and lost_s > max(2 / fps, 0.02 * self._declared_s):
-            readable = f"{len(times_s)} frames up to {last_s:.2f} s can be read"
-            self._warn(f"it ends early or is damaged: {readable}, {self._declared_s:.2f} s declared")
+            read = f"{len(times_s)} frames up to {last_s:.2f} s can be read"
+            self._warn(f"it ends early or is damaged: {read}, {self._declared_s:.2f} s declared")
         self._clock = Clock(times_s, complete, known)
         return self._clock
 

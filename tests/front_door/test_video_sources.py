@@ -568,7 +568,7 @@ def test_depth_maps_and_masks_beside_images_are_no_frames(tmp_path: Path) -> Non
 
     few = write(tmp_path / "few", numbered("%04d.jpg", 20))
     write(few, ["0004_mask.png", "0010_mask.png"])  # in colour, of some
-    read(few, 20, "2 images are no frames (by its name; others have the same numbers): 0004_mask")
+    read(few, 20, "2 images are no frames (by their name): 0004_mask")
 
     named = write(tmp_path / "named", numbered("rgb_%d.png"))
     write(named, numbered("edges_%d.png"))
@@ -578,7 +578,7 @@ def test_depth_maps_and_masks_beside_images_are_no_frames(tmp_path: Path) -> Non
     nerf = write(tmp_path / "synthetic", numbered("r_%d.png"))
     for name in ("r_%d_depth_0000.png", "r_%d_normal_0000.png"):  # in colour
         write(nerf, numbered(name))
-    read(nerf, 6, "6 images are no frames (by its name", "6 images are no frames (by its name")
+    read(nerf, 6, "6 images are no frames (by their name", "6 images are no frames (by their name")
 
 
 def test_images_of_a_single_kind_are_frames(tmp_path: Path) -> None:
@@ -734,7 +734,7 @@ def test_an_image_of_gigabytes_is_refused_by_its_header(
 ) -> None:
     (tmp_path / f"a.{kind}").write_bytes(claiming(kind, 30_000, 30_000, tmp_path))
     monkeypatch.setattr(cv2, "imdecode", None)
-    with pytest.raises(rt.ReobjError, match=f"a.{kind}: 900000000 pixels, at most 268435456"):
+    with pytest.raises(rt.ReobjError, match=f"a.{kind}: .*900000000 pixels.* exceeds"):
         rt.Video(tmp_path / f"a.{kind}")
 
 
@@ -797,10 +797,7 @@ START = 1305031102.175304
          START + 0.033333 * np.arange(3)),
         ([f"{1305031102175304000 + 33333000 * i}.jpg" for i in range(3)],
          START + 0.033333 * np.arange(3)),  # EuRoC, ROS
-        ([f"video_{87551170813262 + 33333333 * i}.jpg" for i in range(3)],
-         87551.170813262 + 0.033333333 * np.arange(3)),  # since the device was switched on
-        ([f"{1500000000000000 + 33333333 * i}.jpg" for i in range(3)],
-         1500000 + 0.033333333 * np.arange(3)),  # ns, switched on 17 days ago
+        ([f"video_{87551170813262 + 33333333 * i}.jpg" for i in range(3)], None),  # not a date
         ([f"{i / 30:.6f}.png" for i in range(4)], np.arange(4) / 30),
         ([f"{1305031102 + 5 * i}.jpg" for i in range(3)], 1305031102 + 5.0 * np.arange(3)),
         (["1305031102.175304.png"], [START]),
