@@ -17,6 +17,8 @@ import pytest
 
 import reobj_track as rt
 from reobj.options import read_config
+from reobj.results.stages import keep_detections
+from reobj.results.workspace import Workspace
 from reobj.sources import detectors, weights
 from reobj.sources.detectors import (
     DetectionCache,
@@ -533,7 +535,7 @@ def assert_same(a: rt.Detections | None, b: rt.Detections) -> None:
 
 @pytest.mark.parametrize("masks", [False, True])
 def test_cache_survives_a_kill_between_flushes(tmp_path: Path, masks: bool) -> None:
-    cache = DetectionCache(tmp_path / "c", (32, 24), file_frames=64)
+    cache = DetectionCache(tmp_path / "c", (32, 24), file_frames=64, mask_frames=64)
     for index in range(0, 300, 2):
         cache.put(index, some(index, masks))
         assert_same(cache.get(index), some(index, masks))
@@ -550,7 +552,7 @@ def test_cache_survives_a_kill_between_flushes(tmp_path: Path, masks: bool) -> N
 
 
 def test_masks_are_written_before_they_fill_the_memory(tmp_path: Path) -> None:
-    cache = DetectionCache(tmp_path, (32, 24), mask_bytes=5 * 32 * 24)
+    cache = DetectionCache(tmp_path, (32, 24), mask_frames=3)
     files = []
     for index in (1, 2, 3):  # of as many masks each
         cache.put(index, some(index, masks=True))
@@ -625,6 +627,13 @@ def frame(index: int = 0, image: Image = IMAGE) -> rt.Frame:
     return rt.Frame(index, 0.0, image)
 
 
+def at(source: DetectionSource, frame: rt.Frame) -> rt.Detections:
+    """Detections of one frame."""
+    (found,) = source.detect([frame])
+    assert found is not None
+    return found
+
+
 @pytest.mark.parametrize(
     "found",
     [
@@ -641,12 +650,12 @@ def frame(index: int = 0, image: Image = IMAGE) -> rt.Frame:
 def test_a_function_is_a_source_of_detections(found: Any) -> None:
     images = []
     source = as_source(lambda image: images.append(image) or found)
-    made = source(frame(4))
+    made = at(source, frame(4))
     assert made.xyxy.tolist() == [BOX] and made.score.tolist() == [0.5]
     assert made.class_id.tolist() == [3] and images[0] is IMAGE
     assert source.key == "" and source.class_names == rt.COCO_NAMES and source.messages == ()
     assert as_source(source) is source
-    assert len(as_source(lambda image: [])(frame())) == 0
+    assert len(at(as_source(lambda image: []), frame())) == 0
 
 
 def test_class_names_of_a_function() -> None:
@@ -658,9 +667,9 @@ def test_class_names_of_a_function() -> None:
 
     assert as_source(Own()).class_names == ("cup", "wok")
     source = as_source(Own(), ["a", "b", "c"])
-    assert source.class_names == ("a", "b", "c") and source(frame()).class_id.tolist() == [2]
+    assert source.class_names == ("a", "b", "c") and at(source, frame()).class_id.tolist() == [2]
     with pytest.raises(rt.ReobjError, match="frame 9: class 2, but there are only 2 class names"):
-        as_source(Own())(frame(9))
+        at(as_source(Own()), frame(9))
 
 
 @pytest.mark.parametrize(
@@ -684,7 +693,7 @@ def test_a_model_states_its_class_names(stated: Any, names: tuple[str, ...]) -> 
 
 def test_a_wrong_answer_names_the_frame() -> None:
     with pytest.raises(rt.ReobjError, match=r"frame 7: detections are an array of shape \(1, 5\)"):
-        as_source(lambda image: [[*BOX, 0.5]])(frame(7))
+        at(as_source(lambda image: [[*BOX, 0.5]]), frame(7))
 
 
 def test_a_network_that_fails_names_the_frame(
@@ -698,7 +707,7 @@ def test_a_network_that_fails_names_the_frame(
 
     monkeypatch.setattr(detector, "_session", Full())
     with pytest.raises(rt.ReobjError) as caught:
-        as_source(detector)(frame(7))
+        at(as_source(detector), frame(7))
     assert str(caught.value) == f"frame 7: {detector.path} failed: CUDA failure 2: out of memory"
 
 
@@ -722,12 +731,11 @@ def test_a_file_is_indexed_by_frame_number(clip: rt.Video, tmp_path: Path) -> No
     path.write_text("".join(f"{i + 1},-1,{10 + i},20,30,10,.9\n" for i in range(7)))
     source = open_detections(clip, rt.DetectConfig(), path)
     assert [f.index for f in clip] == [0, 2, 4]
-    assert [source(f).xyxy[0, 0] for f in clip] == [5, 6, 7]  # half of 10, 12, 14
+    assert [at(source, f).xyxy[0, 0] for f in clip] == [5, 6, 7]  # half of 10, 12, 14
     assert source.class_names == ("object",)
     assert any("frames that the video lacks" in text for text in source.messages)
-    assert source.cached(tmp_path / "cache", clip.working_size) is source  # it is on disk
     recorded = as_source(rt.read_detections(path, clip))
-    assert recorded(frame(4)).xyxy[0, 0] == 7 and recorded.messages == source.messages
+    assert at(recorded, frame(4)).xyxy[0, 0] == 7 and recorded.messages == source.messages
     assert recorded.class_names == ("object",)
     path.write_text("1,-1,10,20,30,10,.9\n")
     assert source.key != open_detections(clip, rt.DetectConfig(), str(path)).key != ""
@@ -736,14 +744,14 @@ def test_a_file_is_indexed_by_frame_number(clip: rt.Video, tmp_path: Path) -> No
         ("cup",), (64, 48), (32, 24), np.empty(0, np.int64), "row",
     )  # fmt: skip
     for made in (as_source(empty), open_detections(clip, rt.DetectConfig(), empty)):
-        assert made.class_names == ("cup",) and len(made(frame())) == 0
+        assert made.class_names == ("cup",) and len(at(made, frame())) == 0
 
 
 def test_the_options_of_a_file_apply(clip: rt.Video, tmp_path: Path) -> None:
     path = tmp_path / "det.txt"
     path.write_text("1,-1,10,20,30,10,.9\n1,-1,12,20,30,10,.3\n")
-    assert len(open_detections(clip, rt.DetectConfig(), path)(frame())) == 2
-    assert len(open_detections(clip, rt.DetectConfig(min_score=0.5), path)(frame())) == 1
+    assert len(at(open_detections(clip, rt.DetectConfig(), path), frame())) == 2
+    assert len(at(open_detections(clip, rt.DetectConfig(min_score=0.5), path), frame())) == 1
 
 
 def test_a_changed_option_or_file_changes_the_key(clip: rt.Video, tmp_path: Path) -> None:
@@ -767,7 +775,7 @@ def test_a_function_gets_its_class_names_from_the_options(clip: rt.Video, tmp_pa
     config = rt.DetectConfig(class_names=str(tmp_path / "names.txt"))
     source = open_detections(clip, config, lambda image: [[*BOX, 0.5, 1]])
     assert source.class_names == ("cup", "wok") and source.key == ""
-    assert source(frame()).class_id.tolist() == [1]
+    assert at(source, frame()).class_id.tolist() == [1]
 
 
 def test_a_model_is_a_source_of_detections(
@@ -784,19 +792,15 @@ def test_a_model_is_a_source_of_detections(
     config = rt.DetectConfig(model=str(path))
     source = open_detections(clip, config, threads=1)
     assert source.class_names == ("cup", "bowl", "tv") and threads == [(1, "cpu")]
-    np.testing.assert_allclose(source(frame()).xyxy, [BOX], atol=1e-3)
+    np.testing.assert_allclose(at(source, frame()).xyxy, [BOX], atol=1e-3)
     direct = as_source(rt.OnnxDetector(path))
-    np.testing.assert_array_equal(direct(frame()).xyxy, source(frame()).xyxy)
+    np.testing.assert_array_equal(at(direct, frame()).xyxy, at(source, frame()).xyxy)
     assert direct.class_names == source.class_names
-    cached = source.cached(tmp_path / "cache", (320, 160))
-    assert len(cached(frame(5))) == 1
-    cached.flush()
-    assert len(list((tmp_path / "cache").iterdir())) == 1
     keys = {source.key, open_detections(clip, config).key}
     assert len(keys) == 1 and "" not in keys and str(tmp_path) in source.key
-    for change in ({"min_score": 0.2}, {"tiles": "2x2"}, {"classes": "tv"}):
+    for change in ({"min_score": 0.2}, {"classes": "tv"}):
         keys.add(open_detections(clip, rt.DetectConfig(model=str(path), **change)).key)
-    assert len(keys) == 4
+    assert len(keys) == 3
 
 
 def test_a_detector_is_named_where_detections_are_given(
@@ -892,40 +896,39 @@ class Counting:
 
 def test_a_slow_source_is_called_once_per_frame(tmp_path: Path) -> None:
     counting = Counting()
-    first = counting.source.cached(tmp_path, (32, 24))
+    first = dataclasses.replace(counting.source, cache=DetectionCache(tmp_path, (32, 24)))
     for index in (1, 2, 3, 2):
-        assert_same(first(frame(index)), some(index))
+        assert_same(at(first, frame(index)), some(index))
     assert counting.asked == [1, 2, 3]
     assert (first.class_names, first.key, first.messages) == (("cup",), "key", ["a message"])
-    first.flush()
-    second = counting.source.cached(tmp_path, (32, 24))  # the next run
+    assert first.cache is not None
+    first.cache.flush()
+    second = dataclasses.replace(first, cache=DetectionCache(tmp_path, (32, 24)))  # the next run
     for index in (3, 4):
-        assert_same(second(frame(index)), some(index))
+        assert_same(at(second, frame(index)), some(index))
     assert counting.asked == [1, 2, 3, 4]
 
 
 @pytest.mark.parametrize("options", [{"key": ""}, {"slow": False}])
-def test_sources_that_are_not_cached(tmp_path: Path, options: dict[str, Any]) -> None:
-    counting = Counting(**options)
-    source = counting.source.cached(tmp_path / "cache", (32, 24))
-    for _ in range(2):
-        source(frame(1))
-    source.flush()
-    assert counting.asked == [1, 1] and not (tmp_path / "cache").exists()
+def test_sources_that_are_not_cached(
+    clip: rt.Video, tmp_path: Path, options: dict[str, Any]
+) -> None:
+    source = Counting(**options).source
+    assert keep_detections(source, clip, Workspace(tmp_path / "out")) is source
 
 
 def test_flush_never_replaces_an_error(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """It is called in a `finally`: a failed write is a warning, and the first error is kept."""
     (tmp_path / "cache").write_text("a file where the folder should be")
-    source = Counting().source.cached(tmp_path / "cache", (32, 24))
+    cache = DetectionCache(tmp_path / "cache", (32, 24))
     with pytest.raises(KeyboardInterrupt):
         try:
-            source(frame(1))
+            cache.put(1, some(1))
             raise KeyboardInterrupt
         finally:
-            source.flush()
+            cache.flush()
     assert "cannot be written" in caplog.text and "detected again" in caplog.text
-    source.flush()  # as often as wanted
+    cache.flush()  # as often as wanted
 
 
 # ---- Real weights --------------------------------------------------------------------------------

@@ -43,7 +43,8 @@ def detect(video: rt.Video, model: str, **config: Any) -> tuple[Detections, Dete
     """Detections of the photo, checked as those of any detector."""
     source = open_detections(video, rt.DetectConfig(model=model, **config))
     (frame,) = list(video)
-    found = source(frame)
+    (found,) = source.detect([frame])
+    assert found is not None
     assert np.isfinite(found.xyxy).all() and (found.xyxy >= 0).all()
     assert (found.xyxy <= (320, 240, 320, 240)).all()
     assert (found.xyxy[:, 2:] > found.xyxy[:, :2]).all()

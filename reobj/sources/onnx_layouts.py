@@ -54,11 +54,11 @@ class ModelProbe(Probe):
     """What a layout is recognised by.
 
     Attributes:
-        inputs: their names. outputs: of a trial run, by name. size: (w, h) of the input.
+        inputs: their shapes by name. outputs: of a trial run, by name. size: (w, h) of the input.
         metadata: of the file. count: number of class names, then of classes of the layout.
     """
 
-    def __init__(self, path: Path, inputs: Sequence[str], outputs: Mapping[str, Any],
+    def __init__(self, path: Path, inputs: Mapping[str, Sequence[Any]], outputs: Mapping[str, Any],
                  size: tuple[int, int], metadata: Mapping[str, str]) -> None:  # fmt: skip
         super().__init__(path)
         self.inputs = inputs
@@ -190,6 +190,25 @@ def _decode_detr(outs: Sequence[Any], geometry: Geometry, model: ModelProbe) -> 
     of = dict(zip(model.outputs, outs, strict=True))
     boxes, score = (of[name].astype(np.float64) for name in ("boxes", "scores"))
     return Decoded(boxes.reshape(-1, 4), score.ravel(), of["labels"].ravel().astype(np.int64))
+
+
+def _decode_zoo(outs: Sequence[Any], geometry: Geometry, model: ModelProbe) -> Decoded:
+    """Decode boxes, labels from 1 (0: background), scores[, masks of the boxes, 0..1]."""
+    unit = geometry.input_size if "bboxes" in model.outputs else (1, 1)  # SSD: in 0..1
+    boxes = geometry.to_image(outs[0].reshape(-1, 4) * np.tile(unit, 2))
+    label = outs[1].ravel().astype(np.int64) - 1
+
+    def masks(chosen: IntArray) -> BoolArray:
+        found = np.zeros((len(chosen), *geometry.image_size[::-1]), bool)  # (K, H, W)
+        corners = np.clip(np.round(boxes[chosen]), 0, np.tile(geometry.image_size, 2))
+        for mask, row, corner in zip(found, chosen, corners.astype(int).tolist(), strict=True):
+            x1, y1, x2, y2 = corner
+            if x2 > x1 and y2 > y1:
+                mask[y1:y2, x1:x2] = cv2.resize(outs[3][row, 0], (x2 - x1, y2 - y1)) > 0.5
+        return found
+
+    score = outs[2].ravel().astype(np.float64)
+    return Decoded(boxes, score, label, masks if len(outs) > 3 else None)
 
 
 def _decode_yolox(outs: Sequence[Any], geometry: Geometry, model: ModelProbe) -> Decoded:
@@ -324,13 +343,22 @@ def _layout(
 IMAGENET_RGB = Pixels("RGB, ImageNet", True, IMAGENET_MEAN, IMAGENET_STD)
 IMAGENET_BGR = Pixels("BGR, ImageNet", False, IMAGENET_MEAN[::-1], IMAGENET_STD[::-1])
 BYTES_BGR = Pixels("BGR, 0..255", False, std=(1.0, 1.0, 1.0))
+CAFFE_BGR = Pixels("BGR, less the mean", False, (102.9801, 115.9465, 122.7717), (1.0, 1.0, 1.0))
 YOLO = "YOLOv8, YOLO11"
 
-LAYOUTS: Registry[Decode] = Registry("object detectors", "--detector-layout", [
+ENTRIES: list[Layout] = [
     _layout("detr", "DEIM, D-FINE, RT-DETR", "labels, boxes, scores",
             lambda m: None if "orig_target_sizes" in m.inputs
             and {"labels", "boxes", "scores"} <= m.outputs.keys() else 0,
             _decode_detr, nms_iou=None),
+    _layout("ssd", "SSD of ONNX' model zoo", "bboxes, labels, scores",
+            lambda m: None if m.outputs.keys() == {"bboxes", "labels", "scores"} else 0,
+            _decode_zoo, pixels=IMAGENET_RGB, nms_iou=None),
+    _layout("r-cnn", "Mask R-CNN and Faster R-CNN of ONNX' model zoo",
+            "boxes, labels, scores[, (n, 1, 28, 28)]",
+            lambda m: None if [*map(len, m.inputs.values())] == [3]
+            and [*map(len, m.shapes)] in ([2, 1, 1], [2, 1, 1, 4]) else 0,
+            _decode_zoo, fit="corner", pixels=CAFFE_BGR, nms_iou=None),
     _layout("yolo", f"{YOLO}, also -seg", "(1, 4 + classes [+ 32], cells)[, (1, 32, h, w)]",
             lambda m: m.values(0) - 4 - sum(shape[1] for shape in m.shapes[1:] if len(shape) == 4),
             _decode_yolo, ("", "detect", "segment"), also=lambda m: not m.in_fractions,
@@ -358,7 +386,8 @@ LAYOUTS: Registry[Decode] = Registry("object detectors", "--detector-layout", [
             lambda m: m.shapes[0][2] if [*map(len, m.shapes)] in ([3] * 6, [3] * 8)
             and m.shapes[-1][2] == 4 * GFL_BINS else 0,
             _decode_gfl, pixels=IMAGENET_RGB),
-])  # fmt: skip
+]  # fmt: skip
+LAYOUTS: Registry[Decode] = Registry("object detectors", "--detector-layout", ENTRIES)
 
 
 def find_layout(model: ModelProbe, declared: str, names_of: str) -> Layout:
@@ -370,31 +399,27 @@ def find_layout(model: ModelProbe, declared: str, names_of: str) -> Layout:
         ReobjError: its outputs fit no layout, or several, or not the declared one.
     """
     shapes = ", ".join(f"{name} {output.shape}" for name, output in model.outputs.items())
-    near = []
-    for entry in LAYOUTS.formats:
-        assert isinstance(entry, Layout)
-        count = entry.classes(model)
-        if entry.name == declared and count is not None and count < 1:
-            raise ReobjError(f"{model.path}: {shapes}: not the outputs of layout {declared}, "
-                             f"{entry.shape}")  # fmt: skip
-        near += [f"{entry.name} with {count} classes"] if count and count > 0 else []
+    counts = {entry.name: entry.classes(model) for entry in ENTRIES}
+    near = [f"{name} with {count} classes" for name, count in counts.items() if count and count > 0]
     model.found = f": {shapes}"
     if near:
         task = f" and task {task}" if (task := model.metadata.get("task")) else ""
-        small = near[0].startswith("yolo ") and model.in_fractions
-        fractions = ", but its boxes are fractions: export them in px of the input" * bool(small)
+        small = "yolo with" in near[0] and model.in_fractions
+        fractions = ", but its boxes are fractions: export them in px of the input" * small
         model.found += (f" with {model.count} class names ({names_of}){task}; by its shape "
                         f"{' or '.join(near)}{fractions}")  # fmt: skip
-    layout = LAYOUTS.choose(model, declared)
-    assert isinstance(layout, Layout)
+    layout = ENTRIES[LAYOUTS.formats.index(LAYOUTS.choose(model, declared))]
+    count = counts[layout.name]
+    if count is not None and count < 1:
+        raise ReobjError(f"{model.path}: {shapes}: not the outputs of layout {declared}, "
+                         f"{layout.shape}")  # fmt: skip
     return layout
 
 
 def layouts_table() -> str:
     """Return the Markdown table of docs/input_formats.md."""
     rows = [("layout", "models", "outputs", "image", "not read"), ("---",) * 5]
-    for entry in LAYOUTS.formats:
-        assert isinstance(entry, Layout)
+    for entry in ENTRIES:
         image = f"{entry.fit}, {entry.pixels.title}"
         rows.append((f"`{entry.name}`", entry.title, entry.shape, image, entry.unread))
     return "".join(f"| {' | '.join(row)} |\n" for row in rows)
