@@ -197,12 +197,6 @@ def test_a_missing_package_of_one_model_is_not_taken_for_the_library(
         detect(video, "ultralytics:yolov8s-worldv2.pt", words="toolbox")
 
 
-@pytest.mark.parametrize("device", ["openvino", "coreml"])
-def test_a_device_of_onnxruntime_is_refused(video: rt.Video, device: str) -> None:
-    with pytest.raises(rt.ReobjError, match=f"--device {device}: detectors of hf run on cpu, cuda"):
-        open_detections(video, rt.DetectConfig(model="hf:some/model"), device=device)
-
-
 def test_words_need_a_detector_of_free_text(video: rt.Video) -> None:
     with pytest.raises(rt.ReobjError, match=r"--words: deimv2-femto has .*grounding"):
         detect(video, "deimv2-femto", words="toolbox")

@@ -82,7 +82,6 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     toy = weights.Weights("toy", "detector", "toy_416.onnx", url, SHA256, len(BLOB), "MIT")
     monkeypatch.setattr(weights, "WEIGHTS", (toy,))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.delenv("REOBJ_MODELS", raising=False)
     for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
         monkeypatch.delenv(name, raising=False)
@@ -275,26 +274,12 @@ def test_the_users_folder_comes_first(
     assert rt.model_path("toy") == own / "toy_416.onnx"  # downloads go there too
 
 
-@pytest.mark.parametrize(
-    ("platform", "variable", "expected"),
-    [
-        ("linux", "", "home/.cache"),
-        ("darwin", "", "home/Library/Caches"),
-        ("win32", "", "home/AppData/Local"),
-        ("win32", "LOCALAPPDATA", "local"),
-        ("linux", "XDG_CACHE_HOME", "local"),
-    ],
-)
-def test_the_cache_of_each_platform(
-    server: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    platform: str, variable: str, expected: str,
-) -> None:  # fmt: skip
-    for name in ("XDG_CACHE_HOME", "LOCALAPPDATA"):
-        monkeypatch.delenv(name, raising=False)
-    if variable:
-        monkeypatch.setenv(variable, str(tmp_path / "local"))
+@pytest.mark.parametrize(("variable", "expected"), [("", "home/.cache"), ("local", "local")])
+def test_the_cache_of_the_user(
+    server: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variable: str, expected: str
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / variable) if variable else "")
     monkeypatch.setattr(Path, "home", lambda: tmp_path / "home")
-    monkeypatch.setattr(sys, "platform", platform)
     assert rt.model_path("toy") == tmp_path / expected / "reobj_track" / "toy_416.onnx"
 
 
@@ -394,37 +379,22 @@ def test_a_missing_onnxruntime_is_named(monkeypatch: pytest.MonkeyPatch) -> None
 REOBJ = weights.own_models() / "reobj.onnx"
 
 
-def test_unavailable_devices_are_named() -> None:
-    import onnxruntime
-
+def test_an_unknown_device_is_named() -> None:
     assert weights.onnx_session(REOBJ, 1, "cpu").get_providers() == ["CPUExecutionProvider"]
-    with pytest.raises(rt.ReobjError, match=r"--device gpu: unknown; known are cpu, cuda"):
+    with pytest.raises(rt.ReobjError, match=r"--device gpu: this onnxruntime has .*cpu.* only$"):
         weights.onnx_session(REOBJ, 1, "gpu")
-    if "CUDAExecutionProvider" in onnxruntime.get_available_providers():
-        pytest.skip("this onnxruntime has CUDA")
-    with pytest.raises(rt.ReobjError, match=r"--device cuda: .* has cpu only; .*onnxruntime-gpu"):
-        weights.onnx_session(REOBJ, 1, "cuda")
 
 
 @pytest.mark.parametrize(
-    ("device", "package"),
-    [
-        ("cuda", "onnxruntime-gpu"),
-        ("tensorrt", "onnxruntime-gpu"),
-        ("coreml", "onnxruntime, on a Mac"),
-        ("directml", "onnxruntime-directml"),
-        ("openvino", "onnxruntime-openvino"),
-        ("migraphx", "onnxruntime-migraphx"),
-    ],
-)
+    ("device", "provider"),
+    [("cuda", "CUDA"), ("tensorrt", "Tensorrt"), ("coreml", "CoreML"), ("directml", "Dml"),
+     ("openvino", "OpenVINO"), ("migraphx", "MIGraphX")],
+)  # fmt: skip
 def test_a_missing_device_is_one_line(
-    device: str,
-    package: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    device: str, provider: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-) -> None:
-    """From the command line: what this onnxruntime has, and the package to install."""
+) -> None:  # fmt: skip
+    """From the command line: what this onnxruntime has."""
     import onnxruntime
 
     monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: ["CPUExecutionProvider"])
@@ -433,7 +403,7 @@ def test_a_missing_device_is_one_line(
     assert rt.main([*words, "--detector", str(REOBJ)]) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert line.startswith(f"error: --device {device}: this onnxruntime has cpu only; ")
-    assert line.endswith(f"comes with {package} (in place of onnxruntime)")
+    assert f"{provider}ExecutionProvider needs another package" in line
     assert not (tmp_path / "out" / "tracks.txt").exists()
 
 

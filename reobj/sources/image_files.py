@@ -287,25 +287,14 @@ class Header:
     Attributes:
         size: (w, h) in px, upright. frames: of an animated file, else 1.
         is_gray: one channel; also with a palette: masks use palettes, photos do not.
-        is_deep: one channel of more than 8 bits.
+        is_deep: one channel of more than 8 bits. orientation: EXIF's, 1 (upright) to 8.
     """
 
     size: tuple[int, int]
     is_gray: bool = False
     is_deep: bool = False
     frames: int = 1
-
-
-@contextlib.contextmanager
-def _opened(path: Path) -> Iterator[PillowImage.Image]:
-    """Open an image; Pillow's warning of many pixels does not concern photos of phones."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            with PillowImage.open(path) as image:
-                yield image
-        except PillowImage.DecompressionBombError as error:
-            raise ReobjError(f"{path}: {error}") from None
+    orientation: int = 1
 
 
 def _orientation(image: PillowImage.Image) -> int:
@@ -325,9 +314,8 @@ def exif_orientation(path: Path) -> int:
     `read_image` returns images upright: 2 to 4 are mirrored or turned by 180 deg, 5 to 8 have width
     and height exchanged. 6 turns the stored pixels clockwise, 8 anticlockwise.
     """
-    with contextlib.suppress(Exception), _opened(path) as image:
-        return _orientation(image)
-    return 1
+    head = header(path)
+    return head.orientation if head is not None else 1
 
 
 def header(path: Path) -> Header | None:
@@ -337,17 +325,21 @@ def header(path: Path) -> Header | None:
         ReobjError: more pixels than Pillow allows.
     """
     try:
-        with _opened(path) as image:
-            turned = image.format != "TIFF" and _orientation(image) >= 5  # Pillow turns TIFF itself
-            return Header(
-                image.size[::-1] if turned else image.size,
-                image.mode[0] in "1LPIF" and image.mode != "LAB",
-                image.mode[0] in "IF",
-                # The second picture of a JPEG (MPO) is a preview or a gain map
-                1 if image.format == "MPO" else getattr(image, "n_frames", 1),
-            )
-    except ReobjError:
-        raise
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # half as many pixels, as photos of phones have
+            with PillowImage.open(path) as image:
+                turn = _orientation(image)
+                turned = image.format != "TIFF" and turn >= 5  # Pillow turns TIFF itself
+                return Header(
+                    image.size[::-1] if turned else image.size,
+                    image.mode[0] in "1LPIF" and image.mode != "LAB",
+                    image.mode[0] in "IF",
+                    # The second picture of a JPEG (MPO) is a preview or a gain map
+                    1 if image.format == "MPO" else getattr(image, "n_frames", 1),
+                    turn,
+                )
+    except PillowImage.DecompressionBombError as error:
+        raise ReobjError(f"{path}: {error}") from None
     except Exception:  # Pillow raises ten types of errors for damaged files
         return None
 

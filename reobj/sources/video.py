@@ -354,19 +354,20 @@ class Video:
         self._opened = None
         self.read = self.dropped = self._seen = attempts = 0
         began_s = time.monotonic()
-        while opened is not None:
+        while True:
             before = self._seen
-            yield from self._from_connection(opened, began_s)
-            attempts = attempts if self._seen == before else 0  # consecutive, without a frame
+            if opened is not None:
+                yield from self._from_connection(opened, began_s)
+            attempts = attempts + 1 if self._seen == before else 1  # consecutive, without a frame
+            if attempts > self.config.reconnect or self._at_stop:
+                return
+            wait_s = self._live.first_wait_s * 2.0 ** min(attempts - 1, 9)
+            wait_s = min(wait_s, self._live.longest_wait_s)
+            log.warning("%s: ended; reconnecting in %g s", self.source, wait_s)
+            time.sleep(wait_s)
             opened = None
-            while opened is None and attempts < self.config.reconnect and not self._at_stop:
-                wait_s = self._live.first_wait_s * 2.0 ** min(attempts, 9)
-                wait_s = min(wait_s, self._live.longest_wait_s)
-                attempts += 1
-                log.warning("%s: ended; reconnecting in %g s", self.source, wait_s)
-                time.sleep(wait_s)
-                with contextlib.suppress(ReobjError):
-                    opened = self._open()
+            with contextlib.suppress(ReobjError):
+                opened = self._open()
 
     @property
     def _at_stop(self) -> bool:

@@ -9,7 +9,6 @@ import hashlib
 import http.client
 import json
 import os
-import sys
 import urllib.request
 from dataclasses import dataclass
 from pathlib import Path
@@ -109,16 +108,10 @@ class ModelRow:
 
 
 def _model_folders() -> list[Path]:
-    """List the folders for downloads: REOBJ_MODELS, if set, then the platform's cache."""
-    home = Path.home()
-    if sys.platform == "win32":
-        cache = os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local"
-    elif sys.platform == "darwin":
-        cache = home / "Library" / "Caches"
-    else:
-        cache = os.environ.get("XDG_CACHE_HOME") or home / ".cache"
+    """List the folders for downloads: REOBJ_MODELS, if set, then the cache of the user."""
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     chosen = os.environ.get("REOBJ_MODELS")
-    return [*([Path(chosen).expanduser()] if chosen else []), Path(cache) / "reobj_track"]
+    return [*([Path(chosen).expanduser()] if chosen else []), cache / "reobj_track"]
 
 
 def own_models() -> Path:
@@ -237,33 +230,28 @@ def onnx_session(path: Path, threads: int = 0, device: str = "cpu") -> Any:
     Raises:
         ReobjError: the device is unknown or not supported by this onnxruntime; or no ONNX model.
     """
-    devices = {  # onnxruntime's provider of each, and the package that has it
-        "cpu": ("CPUExecutionProvider", "onnxruntime"),
-        "cuda": ("CUDAExecutionProvider", "onnxruntime-gpu"),
-        "tensorrt": ("TensorrtExecutionProvider", "onnxruntime-gpu"),
-        "coreml": ("CoreMLExecutionProvider", "onnxruntime, on a Mac"),
-        "directml": ("DmlExecutionProvider", "onnxruntime-directml"),
-        "openvino": ("OpenVINOExecutionProvider", "onnxruntime-openvino"),
-        "migraphx": ("MIGraphXExecutionProvider", "onnxruntime-migraphx"),
-    }
-    if device not in devices:
-        raise ReobjError(f"--device {device}: unknown; known are {', '.join(devices)}")
     try:
         import onnxruntime
     except ImportError as error:
         raise ReobjError("ONNX models need onnxruntime: pip install onnxruntime") from error
-    provider, package = devices[device]
-    if provider not in (available := onnxruntime.get_available_providers()):
-        have = ", ".join(name for name, (known, _) in devices.items() if known in available)
-        raise ReobjError(f"--device {device}: this onnxruntime has {have} only; {provider} comes "
-                         f"with {package} (in place of onnxruntime)")  # fmt: skip
+    names = {"DmlExecutionProvider": "directml"}
+    providers = {
+        names.get(provider, provider.removesuffix("ExecutionProvider").lower()): provider
+        for provider in onnxruntime.get_all_providers()
+    }
+    available = onnxruntime.get_available_providers()
+    provider = providers.get(device)
+    if provider not in available:
+        have = ", ".join(name for name, known in providers.items() if known in available)
+        need = f"; {provider} needs another package in place of onnxruntime" * bool(provider)
+        raise ReobjError(f"--device {device}: this onnxruntime has {have} only{need}")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     options.log_severity_level = 3  # errors only: warnings concern the export of the model
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # no busy waiting
     try:
-        providers = list(dict.fromkeys([provider, devices["cpu"][0]]))  # CPU for missing operators
-        session = onnxruntime.InferenceSession(str(path), options, providers=providers)
+        order = list(dict.fromkeys([provider, providers["cpu"]]))  # CPU for missing operators
+        session = onnxruntime.InferenceSession(str(path), options, providers=order)
     except Exception as error:
         reason = str(error).partition("\n")[0]
         raise ReobjError(f"{path}: onnxruntime cannot load it: {reason}") from error
