@@ -157,6 +157,20 @@ def detr() -> dict[str, Any]:
     return {"labels": np.array([[LABEL, 1]]), "boxes": [[BOX, BOX]], "scores": [[SCORE, 0.01]]}
 
 
+def ssd() -> dict[str, Any]:
+    """ONNX' model zoo: boxes are fractions, label 0 is the background."""
+    boxes = np.divide([[STRETCHED, STRETCHED]], 64)
+    return {"bboxes": boxes, "labels": np.array([[LABEL + 1, 0]]), "scores": [[SCORE, 0.9]]}
+
+
+def mask_rcnn() -> dict[str, Any]:
+    """ONNX' model zoo: 28 x 28 probabilities of each box; its left half is the object."""
+    maps = np.zeros((2, 1, 28, 28))
+    maps[..., :14] = 1
+    return {"6568": [CORNER, CORNER], "6570": np.array([LABEL + 1, 0]), "6572": [SCORE, 0.9],
+            "6887": maps}  # fmt: skip
+
+
 def yolov5(boxes: int, name: str) -> dict[str, Any]:
     """Rows in px with an objectness, for one or three boxes a cell."""
     rows = np.tile([32.0, 32, 1, 1, 0.01, 0, 0, 0], (1, 84 * boxes, 1))
@@ -175,6 +189,9 @@ LAYOUT_ROWS = [
     ("nanodet", nanodet(), {}, 0),
     ("picodet", picodet(), {}, 0),
     ("detr", detr(), {"sizes": True}, 0),
+    ("ssd", ssd(), {}, 0),
+    ("r-cnn", mask_rcnn(), {"shape": (3, 64, 64)}, 120),
+    ("r-cnn", dict(list(mask_rcnn().items())[:3]), {"shape": (3, 64, 64)}, 0),  # Faster R-CNN
 ]
 
 
@@ -286,6 +303,9 @@ SEEN_ROWS = [
      [103.53, 116.28, 123.675], [57.375, 57.12, 58.395]),
     ("yolox", yolox(raw=False), ("output", (0, 7, 7)), {}, "BGR", 0, 1),
     ("yolo", yolov8(), ("output0", (0, 6, 50)), {}, "RGB", 0, 255),
+    ("ssd", ssd(), ("scores", (0, 0)), {}, "RGB", *TORCHVISION),
+    ("r-cnn", mask_rcnn(), ("6572", (0,)), {"shape": (3, 64, 64)}, "BGR",
+     [102.9801, 115.9465, 122.7717], 1),
 ]  # fmt: skip
 
 

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 from PIL import Image as PillowImage
+from PIL import ImageSequence
 
 from reobj.runtime import quiet_opencv
 from reobj.types import Array, Image, ReobjError
@@ -83,15 +84,14 @@ def open_animation(path: Path) -> Opened:
 def _animation_frames(path: Path) -> Generator[Decoded]:
     milliseconds = 0.0
     with PillowImage.open(path) as image:
-        for k in range(getattr(image, "n_frames", 1)):
+        for frame in ImageSequence.Iterator(image):
             try:
-                image.seek(k)
-                bgr = np.asarray(image.convert("RGB"))[..., ::-1]
-            except (OSError, ValueError, EOFError):
+                bgr = np.asarray(frame.convert("RGB"))[..., ::-1]
+            except (OSError, ValueError):
                 yield Decoded()
                 continue
             yield Decoded(milliseconds / 1000, partial(np.ascontiguousarray, bgr))
-            milliseconds += image.info.get("duration", 0)
+            milliseconds += frame.info.get("duration", 0)
 
 
 def open_file(address: str, open_s: float | None = None, read_s: float | None = None) -> Opened:
@@ -153,6 +153,8 @@ def _file_frames(file: Any, stream: Any) -> Generator[Decoded]:
         for packet in _packets(file, stream):
             try:
                 frames = stream.decode(packet)
+            except av.EOFError:  # the decoder has returned all frames
+                return
             except av.FFmpegError:
                 yield Decoded()
                 continue
@@ -166,9 +168,8 @@ def _bgr(reformatter: Any, frame: Any) -> Image:
     """Convert a frame to BGR, upright by the rotation in its metadata."""
     # Bicubic: the pixels are those of OpenCV's VideoCapture
     image = reformatter.reformat(frame, format="bgr24", interpolation="BICUBIC").to_ndarray()
-    turns = {90: cv2.ROTATE_90_COUNTERCLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_CLOCKWISE}
-    turn = turns.get(frame.rotation % 360)
-    return np.asarray(image if turn is None else cv2.rotate(image, turn), np.uint8)
+    quarters = round(frame.rotation / 90) % 4  # anticlockwise; OpenCV's codes count clockwise
+    return np.asarray(cv2.rotate(image, 3 - quarters) if quarters else image, np.uint8)
 
 
 def settled_times(raw_s: Array, step_s: float) -> tuple[Array, int, bool]:

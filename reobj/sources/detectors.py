@@ -112,8 +112,9 @@ class OnnxDetector:
         weights = known_weights(name)
         self.path = model_path(name, offline)
         self._session = onnx_session(self.path, threads, device)
-        self._inputs = [(i.name, list(i.shape), i.type) for i in self._session.get_inputs()]
-        _, shape, kind = self._inputs[0]
+        self._inputs = {i.name: list(i.shape) for i in self._session.get_inputs()}
+        kind = self._session.get_inputs()[0].type
+        self._image_input, shape = next(iter(self._inputs.items()))
         if kind != "tensor(float)" or len(shape) not in (3, 4) or shape[-3] != 3:
             raise ReobjError(f"{self.path}: no known object detector: input is {kind} {shape}, "
                              "expected an image (1, 3, H, W)")  # fmt: skip
@@ -162,7 +163,7 @@ class OnnxDetector:
 
     def _input_size(self, width: int, height: int) -> tuple[int, int]:
         """Return the input (w, h) for an image: the model's, or, if dynamic, the image's shape."""
-        fixed = self._inputs[0][1][:-3:-1]
+        fixed = self._inputs[self._image_input][:-3:-1]
         longer = 640  # px, longer side (YOLO11's training size)
         stride = 32  # px, largest cells of YOLO: sides are multiples of it
         ratio = longer / max(width, height) / stride
@@ -177,14 +178,13 @@ class OnnxDetector:
         """
         count = len(fitted)
         fitted = fitted + fitted[-1:] * (self._fixed - count)
-        name, shape, _ = self._inputs[0]
         mean, std = np.array([pixels.mean, pixels.std], np.float32)
         canvases = np.stack([canvas for canvas, _ in fitted])
         blob = (canvases[..., ::-1] if pixels.rgb else canvases).astype(np.float32)
         blob = np.ascontiguousarray(((blob - mean) / std).transpose(0, 3, 1, 2))  # (B, 3, H, W)
         sizes = np.array([geometry.image_size for _, geometry in fitted])
-        feeds = {name: blob if len(shape) == 4 else blob[0]}
-        feeds |= {other: sizes for other, _, _ in self._inputs[1:]}
+        image = blob if len(self._inputs[self._image_input]) == 4 else blob[0]
+        feeds = dict.fromkeys(self._inputs, sizes) | {self._image_input: image}
         outputs = [np.asarray(output) for output in self._session.run(None, feeds)]
         if len(fitted) == 1:
             return [outputs]  # some have no batch axis
@@ -200,9 +200,8 @@ class OnnxDetector:
             (outputs,) = self._run([(grey, Geometry(size, size, (1.0, 1.0), (0, 0)))], UNIT_RGB)
             names = [output.name for output in self._session.get_outputs()]
             metadata = self._session.get_modelmeta().custom_metadata_map
-        inputs = {name: shape for name, shape, _ in self._inputs}
         of_name = dict(zip(names, outputs, strict=True))
-        return ModelProbe(self.path, inputs, of_name, size, metadata)
+        return ModelProbe(self.path, self._inputs, of_name, size, metadata)
 
     def _recognise(self, declared: str) -> tuple[Layout, tuple[str, ...]]:
         """Find the layout, and the names of its classes: by option, metadata, COCO, or numbers.
@@ -408,12 +407,11 @@ def open_detections(
         return as_source(detections, names)
     words = tuple(word.strip() for word in config.words.split(",") if word.strip())
     if library_of(config.model):
-        opened, version = library_detector(config.model, words, config.min_score, device)
+        batch = frames_at_once(config.batch, device)
+        opened, version = library_detector(config.model, words, config.min_score, device, batch)
         file = config.model.partition(":")[2] or config.model
         key = _cache_key(config, version, file, device)
-        source = _filtered(as_source(opened), config)
-        batch = frames_at_once(config.batch, device)
-        return dataclasses.replace(source, key=key, slow=True, always_looks=True, batch=batch)
+        return dataclasses.replace(_filtered(as_source(opened), config), key=key, slow=True)
     if words:
         raise fixed_classes(config.model)
     if is_function(config.model):
@@ -505,6 +503,7 @@ def as_source(detector: Any, class_names: Sequence[str] = ()) -> DetectionSource
         return detector
     if isinstance(detector, RecordedDetections):
         return _recorded_source(detector)
+    known = isinstance(detector, OnnxDetector | LibraryDetector)
     several = type(detector) in (OnnxDetector, LibraryDetector)  # a subclass may change a call
     if not several and not callable(detector):
         raise ReobjError(f"{detector!r:.80} is no detector: expected a function image -> detections"
@@ -531,13 +530,11 @@ def as_source(detector: Any, class_names: Sequence[str] = ()) -> DetectionSource
             warn = False  # one warning is enough
         return detections
 
-    source = DetectionSource(
-        lambda frames: map(checked, answer([frame.image for frame in frames])), names
-    )
-    if not isinstance(detector, OnnxDetector):
-        return source
-    batch = detector.batch if several else 1
-    return dataclasses.replace(source, batch=batch, messages=detector.messages, always_looks=True)
+    return DetectionSource(
+        lambda frames: map(checked, answer([frame.image for frame in frames])), names,
+        messages=detector.messages if known else (), always_looks=known,
+        batch=detector.batch if several else 1,
+    )  # fmt: skip
 
 
 def _recorded_source(recorded: RecordedDetections) -> DetectionSource:
@@ -545,8 +542,9 @@ def _recorded_source(recorded: RecordedDetections) -> DetectionSource:
     looked = None if recorded.looked is None else set(recorded.looked.tolist())
 
     def run(frames: Sequence[Frame]) -> Iterator[Detections | None]:
-        for index in (frame.index for frame in frames):
-            yield recorded.at(index) if looked is None or index in looked else None
+        for frame in frames:
+            ran = looked is None or frame.index in looked
+            yield recorded.at(frame.index) if ran else None
 
     return DetectionSource(
         run, recorded.class_names, "", recorded.messages, recorded=recorded, always_looks=True

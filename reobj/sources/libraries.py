@@ -29,13 +29,15 @@ class LibraryDetector:
     Attributes:
         run: RGB images (H, W, 3) uint8 (BGR of ultralytics) -> of each, detections as
             `reobj.types.as_detections` accepts them.
-        class_names: by class id. name: on the command line.
+        class_names: by class id. name: on the command line. batch: most images at once.
     """
 
     run: Callable[[list[Image]], Iterable[Any]]
     class_names: tuple[str, ...]
     is_rgb: bool = True
     name: str = ""
+    batch: int = 1
+    messages: tuple[str, ...] = ()
 
     def detect(self, images: list[Image]) -> Iterator[Any]:
         """Detect the objects in each of several images, all at once."""
@@ -209,13 +211,13 @@ def library_of(detector: str) -> tuple[str, str] | None:
 
 
 def library_detector(
-    detector: str, words: tuple[str, ...], min_score: float, device: str
+    detector: str, words: tuple[str, ...], min_score: float, device: str, batch: int
 ) -> tuple[LibraryDetector, str]:
     """Open a detector of another library.
 
     Args:
         detector: `library:model`, or a .pt file of ultralytics. words: to look for; (): the
-            model's classes. device: cpu, cuda, cuda:1 or mps.
+            model's classes. device: of PyTorch. batch: most images at once.
     Returns:
         the detector, and name and version of its library for cache keys.
     Raises:
@@ -238,7 +240,7 @@ def library_detector(
             raise ReobjError(f"--detector {detector}: {error}; {remedy}") from error
     package = library.install.partition(" ")[0]
     version = f"{package} {importlib.metadata.version(package)}"
-    return dataclasses.replace(found, name=detector), version
+    return dataclasses.replace(found, name=detector, batch=batch), version
 
 
 def is_function(detector: str) -> bool:

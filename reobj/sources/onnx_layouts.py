@@ -153,12 +153,11 @@ def fit_image(image: Image, size: tuple[int, int], fit: str) -> tuple[Image, Geo
 def _grid(size: tuple[int, int], levels: int) -> tuple[Array, Array]:
     """List the cells of all levels, of 8, 16, 32, ... px: x, y (A, 2) and stride (A, 1)."""
     cells = []
-    stride = []
     for s in (8 << k for k in range(levels)):
         y, x = np.mgrid[: math.ceil(size[1] / s), : math.ceil(size[0] / s)]
-        cells.append(np.stack([x.ravel(), y.ravel()], 1).astype(np.float64))
-        stride.append(np.full((x.size, 1), float(s)))
-    return np.concatenate(cells), np.concatenate(stride)
+        cells.append(np.stack([x.ravel(), y.ravel(), np.full(x.size, s)], 1).astype(np.float64))
+    rows = np.concatenate(cells)  # (A, 3)
+    return rows[:, :2], rows[:, 2:]
 
 
 def best_rows(score: Array, most: int = 1000) -> IntArray:
@@ -238,11 +237,10 @@ def _decode_yolo(outs: Sequence[Any], geometry: Geometry, model: ModelProbe) -> 
     if len(outs) == 1:
         return Decoded(boxes, score, label)
     proto = outs[1][0]  # (32, h, w)
-    ratio = np.divide(proto.shape[:0:-1], geometry.input_size)  # (2,) map / input
 
     def masks(chosen: IntArray) -> BoolArray:
         maps = np.tensordot(rows[chosen, end:], proto, 1)  # (K, h, w)
-        return _paste(maps, boxes[chosen], geometry, ratio)
+        return _paste(maps, boxes[chosen], geometry)
 
     return Decoded(boxes, score, label, masks)
 
@@ -289,31 +287,29 @@ def _decode_gfl(outs: Sequence[Any], geometry: Geometry, _: ModelProbe) -> Decod
     return Decoded(geometry.to_image(boxes), score[keep], label[keep])
 
 
-def _paste(maps: Any, boxes: Array, geometry: Geometry, ratio: Array) -> BoolArray:
+def _paste(maps: Any, boxes: Array, geometry: Geometry) -> BoolArray:
     """Resample the maps of masks inside their boxes.
 
     Args:
-        maps: (K, h, w), positive in the mask. boxes: (K, 4) in px of the image.
-        ratio: (2,) map / input of the network, x and y.
+        maps: (K, h, w) of the network's input, positive in the mask. boxes: (K, 4) px of the image.
     Returns:
         (K, H, W) masks, False outside the boxes.
     """
     size = geometry.image_size
     masks = np.zeros((len(maps), size[1], size[0]), bool)  # (K, H, W)
+    ratio = np.divide(maps.shape[:0:-1], geometry.input_size)  # (2,) map / input
     scale = ratio * geometry.scale  # map = image * scale + pad, from the corner
     pad = ratio * geometry.pad
     low = np.clip(np.floor(boxes[:, :2]), 0, size).astype(int)
     high = np.clip(np.ceil(boxes[:, 2:]), 0, size).astype(int)
     for k in np.flatnonzero((high > low).all(1)):
-        (x1, y1) = low[k].tolist()
-        (x2, y2) = high[k].tolist()
         shift = scale * (low[k] + 0.5) + pad - 0.5  # pixel centres on pixel centres
         affine = np.column_stack([np.diag(scale), shift])  # (2, 3)
         values = cv2.warpAffine(
-            np.ascontiguousarray(maps[k], np.float32), affine, (x2 - x1, y2 - y1),
+            np.ascontiguousarray(maps[k], np.float32), affine, (high[k] - low[k]).tolist(),
             flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE,
         )  # fmt: skip
-        masks[k, y1:y2, x1:x2] = values > 0
+        masks[k, low[k, 1] : high[k, 1], low[k, 0] : high[k, 0]] = values > 0
     return masks
 
 

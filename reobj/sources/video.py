@@ -16,11 +16,11 @@ import itertools
 import json
 import math
 import os
-import queue
 import re
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -84,7 +84,7 @@ class InputConfig:
         return within & ((frame - self.start) % self.every == 0)
 
 
-MAX_UNREADABLE = 64  # consecutive frames, 2 s at 30 Hz; lower: a damaged passage ends a video
+MAX_UNREADABLE = 64  # frames at the beginning, 2 s at 30 Hz, before a video is refused
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +166,7 @@ class Video:
             raise ReobjError("--every must be at least 1; --start, --stop, --max-size at least 0")
         self.skipped: list[int] = []
         self.messages: list[str] = []
-        self.read = self.dropped = self._seen = 0
+        self.read = self.dropped = self._seen = self._taken = 0
         self._declared_s = 0.0
         self._opened: Opened | None = None  # a live source, until it is iterated
         self._is_url = _is_stream_url(self._address)
@@ -213,11 +213,10 @@ class Video:
     @property
     def expected(self) -> int:
         """Approximate number of frames of an iteration; as announced until it is measured."""
-        clock = self._clock
-        count = self._announced
-        count = len(clock.times_s) if clock is not None and clock.complete else count
+        known = self._clock is not None and self._clock.complete
+        count = self.frame_count if known else self._announced
         stop = min(self.config.stop or count, count or self.config.stop)
-        return max(math.ceil((stop - self.config.start) / self.config.every), 0)
+        return len(range(self.config.start, stop, self.config.every))
 
     @functools.cached_property
     def copies(self) -> dict[int, int]:
@@ -259,27 +258,23 @@ class Video:
 
     def __iter__(self) -> Iterator[Frame]:
         self.skipped.clear()
-        decoded = self._from_images() if self.files else self._from_file()
-        unreadable = list[int]()
-        other_size = list[int]()
-        for index, time_s, image in self._from_live() if self.is_live else one_ahead(decoded):
-            if image is None or (image.shape[1], image.shape[0]) != self.size:
-                (unreadable if image is None else other_size).append(index)
-                self.skipped.append(index)
-            elif index > self._after:
-                yield Frame(index, time_s, self._scaled(image))
         others = "most" if self.files else "the first"
         size = f"not {self.size[0]}x{self.size[1]}, the size of {others}"
-        for skipped, why in ((unreadable, "unreadable"), (other_size, size)):
+        left_out: dict[str, list[int]] = {"unreadable": [], size: []}
+        decoded = self._from_images() if self.files else self._from_file()
+        for index, time_s, image in self._from_live() if self.is_live else one_ahead(decoded):
+            if image is None or image.shape[1::-1] != self.size:
+                left_out["unreadable" if image is None else size].append(index)
+                self.skipped.append(index)
+            elif index > self._after:
+                if self.working_size != self.size:
+                    small = cv2.resize(image, self.working_size, interpolation=cv2.INTER_AREA)
+                    image = np.asarray(small, np.uint8)
+                yield Frame(index, time_s, image)
+        for why, skipped in left_out.items():
             if skipped:
-                which = [self.name(index) or index for index in skipped]
-                self._warn(f"{len(skipped)} frames skipped ({why}): {shortened(which)}")
-
-    def _scaled(self, image: Image) -> Image:
-        if self.working_size == self.size:
-            return image
-        small = cv2.resize(image, self.working_size, interpolation=cv2.INTER_AREA)
-        return np.asarray(small, np.uint8)
+                which = shortened([self.name(index) or index for index in skipped])
+                self._warn(f"{len(skipped)} frames skipped ({why}): {which}")
 
     def _warn(self, text: str) -> None:
         if (text := f"{self.source}: {text}") not in self.messages:
@@ -305,24 +300,8 @@ class Video:
             self._keep(raw_s)
 
     def _decoded(self) -> Iterator[Decoded]:
-        """Decode the frames before `config.stop` one by one.
-
-        Undecodable frames count only if a later one can be decoded: at the end of the file they do
-        not exist.
-        """
-        index = 0
-        failed = list[Decoded]()
-        for item in self._open().frames:
-            failed.append(item)
-            if item.image is not None:
-                for each in failed:
-                    yield each
-                    index += 1
-                    if index == self.config.stop:
-                        return
-                failed.clear()
-            elif len(failed) == MAX_UNREADABLE:
-                return
+        """Decode the frames before `config.stop` one by one."""
+        return itertools.islice(self._open().frames, self.config.stop or None)
 
     def _measured(self) -> Clock:
         """Return the times of the frames; a file is decoded once."""
@@ -352,7 +331,7 @@ class Video:
         """
         opened: Opened | None = self._opened or self._open()
         self._opened = None
-        self.read = self.dropped = self._seen = attempts = 0
+        self.read = self.dropped = self._seen = self._taken = attempts = 0
         began_s = time.monotonic()
         while True:
             before = self._seen
@@ -382,45 +361,36 @@ class Video:
         A thread reads all frames, so that the driver's queue does not fill with old ones.
         """
         # Two frames wait: the next one for the tracker, and the newest one
-        frames: queue.Queue[tuple[int, float, Image]] = queue.Queue(2)
+        waiting: deque[tuple[int, int, float, Image]] = deque(maxlen=2)
         stopped = threading.Event()
-        thread = threading.Thread(
-            target=self._read_live, args=(opened, frames, stopped, began_s), daemon=True
-        )
+
+        def read() -> None:
+            with contextlib.closing(opened.frames):
+                for frame in opened.frames:
+                    if stopped.is_set() or self._at_stop:
+                        return
+                    if frame.image is None:
+                        continue
+                    if self.config.selects(self._seen):
+                        time_s = time.monotonic() - began_s
+                        waiting.append((self.read, self._seen, time_s, frame.image()))
+                        self.read += 1
+                    self._seen += 1
+
+        thread = threading.Thread(target=read, daemon=True)
         thread.start()
         try:
-            while thread.is_alive() or frames.qsize():
-                with contextlib.suppress(queue.Empty):
-                    yield frames.get(timeout=0.05)
+            while thread.is_alive() or waiting:
+                if not waiting:
+                    time.sleep(0.005)
+                    continue
+                number, at, time_s, image = waiting.popleft()
+                self.dropped = number - self._taken
+                self._taken += 1
+                yield at, time_s, image
         finally:
             stopped.set()
             thread.join(self._live.silent_s)
-
-    def _read_live(
-        self,
-        opened: Opened,
-        frames: queue.Queue[tuple[int, float, Image]],
-        stopped: threading.Event,
-        began_s: float,
-    ) -> None:
-        """Read a live source until it ends or `stopped`; drop the oldest frame of a full queue."""
-        with contextlib.closing(opened.frames):
-            for frame in opened.frames:
-                if stopped.is_set() or self._at_stop:
-                    return
-                if frame.image is None:
-                    continue
-                at = self._seen
-                self._seen += 1
-                if not self.config.selects(at):
-                    continue
-                self.read += 1
-                if frames.full():
-                    with contextlib.suppress(queue.Empty):  # the tracker took it first
-                        frames.get_nowait()
-                        self.dropped += 1
-                # No other thread puts: it does not block
-                frames.put((at, time.monotonic() - began_s, frame.image()))
 
     def _open(self) -> Opened:
         """Open the source.
