@@ -150,10 +150,10 @@ class OnnxDetector:
         """Decode and select the detections of one image."""
         assert self._layout.read is not None
         decoded = self._layout.read(outputs, geometry, self._model)
-        boxes = np.clip(decoded.xyxy, 0, np.tile(geometry.image_size, 2))
         label = decoded.class_id
         use = label >= 0 if self._allowed is None else np.isin(label, self._allowed)
-        keep = _best(boxes, decoded.score, use, self.config)
+        size = geometry.image_size
+        boxes, keep = _best(decoded.xyxy, decoded.score, use, size, self.config)
         if self._layout.nms_iou is not None:
             keep = keep[nms(boxes[keep], label[keep], self._layout.nms_iou)]
         keep = keep[: self.config.max_detections or 100]  # of a frame (COCO's maxDets)
@@ -243,11 +243,17 @@ def _check_names(class_id: IntArray, names: Sequence[str], where: str = "") -> N
         raise ReobjError(where + unnamed_class(int(class_id.max()), len(names)))
 
 
-def _best(xyxy: Array, score: Array, use: BoolArray, config: DetectConfig) -> IntArray:
-    """Select rows, among those to `use`, by score and area; best first."""
-    use = use & (score >= config.min_score) & (xyxy[:, 2:] > xyxy[:, :2]).all(1)
-    rows = np.flatnonzero(use)
-    return rows[best_rows(score[rows])]
+def _best(
+    xyxy: Array, score: Array, use: BoolArray, size: Sequence[int], config: DetectConfig
+) -> tuple[Array, IntArray]:
+    """Clip boxes to the image of (w, h); select rows, among those to `use`, by score and area.
+
+    Returns:
+        the boxes (N, 4) of all rows, and the selected rows, best first.
+    """
+    boxes = np.clip(xyxy, 0, np.tile(size, 2))
+    rows = np.flatnonzero(use & (score >= config.min_score) & (boxes[:, 2:] > boxes[:, :2]).all(1))
+    return boxes, rows[best_rows(score[rows])]
 
 
 class DetectionCache:
@@ -436,19 +442,17 @@ def _filtered(
     wanted = config.classes
     allowed = class_filter(wanted, source.class_names) if wanted and not is_open else None
 
-    def select(frame: Frame, found: Detections) -> Detections:
-        boxes = np.clip(found.xyxy, 0, np.tile(frame.image.shape[1::-1], 2))
-        use = np.ones(len(boxes), bool)
-        if allowed is not None:
-            use = np.isin(found.class_id, allowed)
-        elif wanted:
+    def select(frame: Frame, found: Detections | None) -> Detections | None:
+        if found is None:
+            return None
+        use = np.ones(len(found), bool) if allowed is None else np.isin(found.class_id, allowed)
+        if wanted and allowed is None:
             use = among(source.class_names, wanted.split(","))[found.class_id]
-        rows = _best(boxes, found.score, use, config)[: config.max_detections or None]
-        return dataclasses.replace(found, xyxy=boxes)[rows]
+        boxes, rows = _best(found.xyxy, found.score, use, frame.image.shape[1::-1], config)
+        return dataclasses.replace(found, xyxy=boxes)[rows[: config.max_detections or None]]
 
     def run(frames: Sequence[Frame]) -> Iterator[Detections | None]:
-        for frame, found in zip(frames, source.run(frames), strict=True):
-            yield None if found is None else select(frame, found)
+        return map(select, frames, source.run(frames))
 
     return dataclasses.replace(source, run=run)
 

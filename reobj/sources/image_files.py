@@ -12,7 +12,7 @@ import itertools
 import re
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -57,13 +57,13 @@ def list_images(source: str) -> ImageList:
             sizes.
     """
     path = Path(source)
+    suffix = path.suffix.lower()
     if path.is_file():
-        suffix = path.suffix.lower()
         if suffix in UNREAD_SUFFIXES:
             raise ReobjError(f"{source}: {path.suffix} files are not read; convert it to .jpg")
         head = header(path) if suffix in IMAGE_SUFFIXES else None
         is_video = suffix not in IMAGE_SUFFIXES or (head is not None and head.frames > 1)
-        return _sized(source, [] if is_video else [path], {path: head}, [])
+        return ImageList([], [], []) if is_video else ImageList([path], [path], [])
     if not path.is_dir() and not re.search(r"[*?\[]", source):
         return ImageList([], [], [])
     paths = [p for p in _paths(path) if not p.name.startswith(".")]
@@ -88,9 +88,8 @@ def _paths(path: Path) -> list[Path]:
     """List a folder, or the matches of a glob in a folder whose name may have glob characters."""
     if path.is_dir():
         return list(path.iterdir())
-    if path.parent.is_dir():
-        return [path.parent / name for name in glob.glob(path.name, root_dir=path.parent)]
-    return [Path(name) for name in glob.glob(str(path))]
+    root, pattern = (path.parent, path.name) if path.parent.is_dir() else (Path(), str(path))
+    return [root / name for name in glob.glob(pattern, root_dir=root)]
 
 
 def _sized(
@@ -134,9 +133,9 @@ class _Kind:
     numbers: set[tuple[int, ...]]
     color: bool
 
-    def shares(self, other: _Kind, least: Callable[[int, int], int]) -> bool:
-        """Test whether more than half of the smaller (min) or larger (max) kind shares numbers."""
-        count = least(len(self.numbers), len(other.numbers))
+    def shares(self, other: _Kind) -> bool:
+        """Test whether more than half of the smaller kind has numbers of the other one."""
+        count = min(len(self.numbers), len(other.numbers))
         return () not in self.numbers and 2 * len(self.numbers & other.numbers) > count
 
 
@@ -160,7 +159,7 @@ def _only_pictures(
         messages.append(_left_out(deep, "one channel with more than 8 bits, as depth maps have"))
     kinds = _kinds(files, headers)
     for kind in list(kinds):
-        beside = [k for k in kinds if k is not kind and kind.shares(k, min)]
+        beside = [k for k in kinds if k is not kind and kind.shares(k)]
         gray = not kind.color and any(k.color for k in beside)
         if gray or (kind.is_named_otherwise and not all(k.is_named_otherwise for k in beside)):
             why = "one channel, beside images in colour" if gray else "by their name"
@@ -168,7 +167,7 @@ def _only_pictures(
             kinds.remove(kind)
     least = 3  # images of each of two kinds: the numbers of fewer may agree by chance
     for pair in itertools.combinations(kinds if folder else (), 2):
-        if pair[0].shares(pair[1], max) and min(len(k.files) for k in pair) >= least:
+        if pair[0].shares(pair[1]) and min(len(k.files) for k in pair) >= least:
             names = [min((p.name for p in k.files), key=by_number) for k in pair]
             chosen = re.sub(r"\d+", "*", glob.escape(names[0]))
             raise ReobjError(
