@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import json
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -404,47 +403,6 @@ def test_class_names_come_from_the_user_first(
             rt.OnnxDetector(path, dataclasses.replace(config, layout=layout))
 
 
-def test_class_names_in_a_model_go_by_their_number(tmp_path: Path) -> None:
-    rows = np.zeros((1, 4 + 12, 84))  # 12 classes
-    for at in range(3):
-        rows[0, :4, 20 + at] = [20 * at + 10, 32, 10, 10]
-        rows[0, 4 + (1, 2, 10)[at], 20 + at] = 0.9
-    expected = tuple(f"name{i}" for i in range(12))
-    for names in (
-        json.dumps({str(i): name for i, name in enumerate(expected)}),  # as text 10 is before 2
-        str(dict(reversed(list(enumerate(expected))))),
-        str(list(expected)),
-    ):
-        detector = rt.OnnxDetector(model(tmp_path, {"o": rows}, names=names))
-        assert detector.class_names == expected
-        assert sorted(detector(IMAGE).class_id.tolist()) == [1, 2, 10]
-
-
-@pytest.mark.parametrize(
-    ("names", "found"),
-    [
-        ("{1: 'mug', 2: 'lamp', 3: 'box'}", "4 class names"),
-        ("{0: 'mug', 1: 'lamp'}", "2 class names"),
-        ("['mug', 'lamp', 'box', 'cup']", "4 class names"),
-        ("{'mug': 0, 'lamp': 1, 'box': 2}", "class number 'mug'"),
-        ("{'0': ['mug'], '1': 'lamp', '2': 'box'}", "expected class names"),
-        ("mug, lamp, box", "expected class names"),
-    ],
-)
-def test_class_names_that_do_not_fit_their_model_are_one_error(
-    clip: rt.Video, tmp_path: Path, names: str, found: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = model(tmp_path, yolov8(), names=names)
-    command = ["track", str(clip.source), "-o", str(tmp_path / "out"), "--detector", str(path)]
-    assert rt.main([*command, "--embed", "none"]) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1 and found in error
-    assert "detect.class_names" in error or "yolo with 3 classes" in error
-    (tmp_path / "names.txt").write_text("mug\nlamp\nbox\n")
-    config = rt.DetectConfig(class_names=str(tmp_path / "names.txt"))
-    assert rt.OnnxDetector(path, config).class_names == ("mug", "lamp", "box")
-
-
 @pytest.mark.parametrize(
     ("outputs", "shape", "expected"),
     [
@@ -491,12 +449,6 @@ def test_known_weights_have_the_layout_of_the_table(
     known(monkeypatch, model(tmp_path, yolov8()), "detr")
     with pytest.raises(rt.ReobjError, match=r"output0 .*: not the outputs of layout detr"):
         rt.OnnxDetector("toy")
-
-
-def test_no_onnx_file(tmp_path: Path) -> None:
-    (tmp_path / "a.onnx").write_bytes(b"no model")
-    with pytest.raises(rt.ReobjError, match=r"a.onnx: onnxruntime cannot load it"):
-        rt.OnnxDetector(tmp_path / "a.onnx")
 
 
 def reference_nms(xyxy: Any, label: Any, max_iou: float) -> list[int]:
