@@ -43,6 +43,7 @@ def arrays(video: rt.Video) -> Identities:
     identities = []
     for frame in video:
         (detections,) = source.detect([frame])
+        assert detections is not None  # the detector was run on all frames
         rows = np.column_stack([detections.xyxy, detections.score, detections.class_id])  # (N, 6)
         tracked = tracker.update(rows, frame.image).to_array()  # (M, 8)
         identities.append(tracked[:, 4].astype(np.int64))
@@ -58,6 +59,7 @@ def supervision(video: rt.Video) -> Identities:
     identities = []
     for frame in video:
         (detections,) = source.detect([frame])
+        assert detections is not None  # the detector was run on all frames
         given: Any = sv.Detections(
             xyxy=detections.xyxy,
             mask=detections.masks,
