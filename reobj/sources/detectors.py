@@ -220,10 +220,10 @@ class OnnxDetector:
         declared = self.config.layout or declared
         layout = find_layout(self._model, declared, names_of)
         count = layout.classes(self._model)
-        if names and count not in (None, len(names)):
-            raise ReobjError(f"{self.path}: {len(names)} class names ({names_of}), but layout "
-                             f"{layout.name} has {count} classes")  # fmt: skip
-        if not names and count not in (None, len(COCO_NAMES)):
+        if count not in (None, self._model.count):
+            if names:
+                raise ReobjError(f"{self.path}: {len(names)} class names ({names_of}), but layout "
+                                 f"{layout.name} has {count} classes")  # fmt: skip
             log.warning("%s: %d classes without names: %s", self.path, count, NAMES)
             names = tuple(f"class {i}" for i in range(count or 0))
         names = names or COCO_NAMES
