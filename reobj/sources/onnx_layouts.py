@@ -220,8 +220,7 @@ def _decode_yolox(outs: Sequence[Any], geometry: Geometry, model: ModelProbe) ->
         cells, stride = _grid(geometry.input_size, 3)
         rows[:, :2] = (rows[:, :2] + cells) * stride
         rows[:, 2:4] = np.exp(rows[:, 2:4]) * stride
-    score, label = _best_class(rows[:, 5:])
-    return Decoded(geometry.to_image(xyxy_from_cxcywh(rows)), score * rows[:, 4], label)
+    return _decode_yolov5([rows[None]], geometry, model)
 
 
 def _decode_yolo(outs: Sequence[Any], geometry: Geometry, model: ModelProbe) -> Decoded:
@@ -257,8 +256,8 @@ def _decode_rotated(outs: Sequence[Any], geometry: Geometry, model: ModelProbe) 
 def _decode_yolov5(outs: Sequence[Any], geometry: Geometry, model: ModelProbe) -> Decoded:
     """Decode rows of centre, size, objectness and class scores, in px."""
     rows = outs[0][0]  # (A, 5 + C)
-    rows = np.hstack([rows[:, :4], rows[:, 5:] * rows[:, 4:5]])
-    return _decode_yolo([rows.T[None]], geometry, model)
+    score, label = _best_class(rows[:, 5:])
+    return Decoded(geometry.to_image(xyxy_from_cxcywh(rows)), score * rows[:, 4], label)
 
 
 def _decode_gfl(outs: Sequence[Any], geometry: Geometry, _: ModelProbe) -> Decoded:
