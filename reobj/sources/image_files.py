@@ -347,9 +347,14 @@ def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> npt.NDArray[Any] | 
     """Read an image file with OpenCV's `flags`, faster than Pillow; None if it is no image."""
     try:
         data = np.fromfile(path, np.uint8)
-        return cv2.imdecode(data, flags) if len(data) else None
+        image = cv2.imdecode(data, flags) if len(data) else None
     except (OSError, cv2.error):
         return None
+    if image is None:  # OpenCV 4 reads no animated WebP
+        with contextlib.suppress(Exception), PillowImage.open(path) as opened:
+            if getattr(opened, "is_animated", False):
+                image = np.ascontiguousarray(np.asarray(opened.convert("RGB"))[..., ::-1])
+    return image
 
 
 def why_unreadable(path: Path) -> str:
