@@ -106,18 +106,6 @@ class LiveTimes:
     longest_wait_s: float = 30.0
 
 
-@dataclass(frozen=True, slots=True)
-class Clock:
-    """Times (F,) in s of a file's frames.
-
-    complete: of all frames, not only of those before `config.stop`. known: the file has times.
-    """
-
-    times_s: Array
-    complete: bool
-    known: bool
-
-
 class Video:
     """Iterate over the frames of a video file, image folder, glob, camera index or stream URL.
 
@@ -173,7 +161,7 @@ class Video:
         self.fingerprint = source_fingerprint(source)
         images = ImageList([], [], []) if self._is_url else list_images(self.source)
         self.files = images.files
-        self._clock: Clock | None = None
+        self._clock: tuple[Array, bool] | None = None  # times (F,) in s; the file has them
         for text in images.messages:
             self._warn(text)
         self.names = [path.name for path in self.files]
@@ -213,8 +201,8 @@ class Video:
     @property
     def expected(self) -> int:
         """Approximate number of frames of an iteration; as announced until it is measured."""
-        known = self._clock is not None and self._clock.complete
-        count = self.frame_count if known else self._announced
+        measured = self._clock is not None and not self.config.stop
+        count = self.frame_count if measured else self._announced
         stop = min(self.config.stop or count, count or self.config.stop)
         return len(range(self.config.start, stop, self.config.every))
 
@@ -233,16 +221,16 @@ class Video:
     def frame_count(self) -> int:
         if self.files or self.is_live:
             return len(self.files)
-        clock = self._measured()
-        count = len(clock.times_s)
-        return count if clock.complete or self._is_animation else packet_count(self._path)
+        if self.config.stop and not self._is_animation:
+            return packet_count(self._path)
+        return len(self._measured()[0])
 
     @functools.cached_property
     def fps(self) -> float:
         announced = self._announced_fps
         times_s = self.times_s
         if not self.files and not self.is_live and self.times_are_known:
-            times_s = self._measured().times_s
+            times_s = self._measured()[0]
         if times_s is None or len(times_s) < 2:
             return announced
         steps = len(times_s) - 1
@@ -254,7 +242,7 @@ class Video:
     def times_are_known(self) -> bool:
         if self.files or self.is_live:
             return self.is_live or self.times_s is not None
-        return self._measured().known
+        return self._measured()[1]
 
     def __iter__(self) -> Iterator[Frame]:
         self.skipped.clear()
@@ -294,7 +282,7 @@ class Video:
                 self._measured()  # correcting this time needs all later ones
             raw_s.append(seconds)
             if self.config.selects(index):
-                time_s = seconds if self._clock is None else float(self._clock.times_s[index])
+                time_s = seconds if self._clock is None else float(self._clock[0][index])
                 yield index, time_s, None if image is None else image()
         if self._clock is None:
             self._keep(raw_s)
@@ -303,13 +291,12 @@ class Video:
         """Decode the frames before `config.stop` one by one."""
         return itertools.islice(self._open().frames, self.config.stop or None)
 
-    def _measured(self) -> Clock:
-        """Return the times of the frames; a file is decoded once."""
+    def _measured(self) -> tuple[Array, bool]:
+        """Return the times of the frames before `config.stop`; a file is decoded once."""
         return self._clock or self._keep([frame.time_s for frame in self._decoded()])
 
-    def _keep(self, raw_s: Sequence[float]) -> Clock:
+    def _keep(self, raw_s: Sequence[float]) -> tuple[Array, bool]:
         """Correct the times of the container, with warnings, and store them."""
-        complete = not 0 < self.config.stop <= len(raw_s)
         fps = self._announced_fps
         times_s, restarts, known = settled_times(np.array(raw_s), 1 / fps)
         if restarts:
@@ -318,10 +305,11 @@ class Video:
             self._warn(f"it has no times: {fps:g} frames a second are assumed")
         last_s = times_s.max(initial=0.0)
         lost_s = self._declared_s - last_s
-        if complete and known and lost_s > max(2 / fps, 0.02 * self._declared_s):
+        stopped = 0 < self.config.stop <= len(raw_s)
+        if known and not stopped and lost_s > max(2 / fps, 0.02 * self._declared_s):
             read = f"{len(times_s)} frames up to {last_s:.2f} s can be read"
             self._warn(f"it ends early or is damaged: {read}, {self._declared_s:.2f} s declared")
-        self._clock = Clock(times_s, complete, known)
+        self._clock = (times_s, known)
         return self._clock
 
     def _from_live(self) -> Iterator[tuple[int, float, Image | None]]:
