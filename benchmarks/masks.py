@@ -43,7 +43,8 @@ def segment(images: Path, model: str, with_masks: Path, boxes_alone: Path) -> No
     """
     video = rt.Video(images)
     source = open_detections(video, dataclasses.replace(real_rooms.DETECTOR, model=model))
-    found = [(frame.index, source(frame)) for frame in video]
+    steps = ((frame.index, next(source.detect([frame]))) for frame in video)
+    found = [(index, d) for index, d in steps if d is not None]
     if not any(d.masks is not None for _, d in found):
         raise SystemExit(f"error: {model} found no masks in {images}; expected a segmenter")
     alone = [(index, dataclasses.replace(d, masks=None)) for index, d in found]

@@ -16,6 +16,7 @@ from reobj.poses.intrinsics import CAMERAS
 from reobj.poses.supplied.readers import POSES
 from reobj.results.truth import TRUTH
 from reobj.sources.detection_formats import DETECTIONS
+from reobj.sources.onnx_layouts import layouts_table
 
 PAGE = Path(__file__).parent / "input_formats.md"
 TABLES = {
@@ -23,6 +24,7 @@ TABLES = {
     "ground truth": dataclasses.replace(TRUTH, formats=TRUTH.readable).table(),
     "poses": POSES.table(),
     "cameras": CAMERAS.table(),
+    "layouts": layouts_table(),
 }
 
 

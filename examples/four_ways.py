@@ -38,11 +38,12 @@ def loop(video: rt.Video) -> Identities:
 
 def arrays(video: rt.Video) -> Identities:
     """2. Arrays, frame by frame: in (N, 6) x1 y1 x2 y2 score class, out (M, 8) with identities."""
-    detect = rt.open_detections(video, rt.DetectConfig(), DETECTIONS)
+    source = rt.open_detections(video, rt.DetectConfig(), DETECTIONS)
     tracker = rt.Tracker(embedder=rt.Embedder())
     identities = []
     for frame in video:
-        detections = detect(frame)
+        (detections,) = source.detect([frame])
+        assert detections is not None  # the detector was run on all frames
         rows = np.column_stack([detections.xyxy, detections.score, detections.class_id])  # (N, 6)
         tracked = tracker.update(rows, frame.image).to_array()  # (M, 8)
         identities.append(tracked[:, 4].astype(np.int64))
@@ -53,11 +54,12 @@ def supervision(video: rt.Video) -> Identities:
     """3. supervision's Detections in; out the tracked ones with `tracker_id`, masks and data."""
     import supervision as sv
 
-    detect = rt.open_detections(video, rt.DetectConfig(), DETECTIONS)
+    source = rt.open_detections(video, rt.DetectConfig(), DETECTIONS)
     tracker = rt.Tracker(embedder=rt.Embedder())
     identities = []
     for frame in video:
-        detections = detect(frame)
+        (detections,) = source.detect([frame])
+        assert detections is not None  # the detector was run on all frames
         given: Any = sv.Detections(
             xyxy=detections.xyxy,
             mask=detections.masks,

@@ -30,7 +30,7 @@ ROOM = Path(__file__).resolve().parent / "room"
 
 
 def live(
-    args: argparse.Namespace, video: rt.Video, detect: rt.DetectionSource
+    args: argparse.Namespace, video: rt.Video, source: rt.DetectionSource
 ) -> tuple[rt.Tracker, rt.Tracks, list[tuple[float, float]]]:
     """Track frame by frame; also return the seconds of each frame in detector and tracker."""
     poses = rt.read_poses(args.poses, video, camera=args.camera)
@@ -39,7 +39,7 @@ def live(
     resume = args.state is not None and args.state.exists()
     tracker = rt.Tracker.load(args.state, embedder) if resume else rt.Tracker(embedder=embedder)
     if args.map is not None and not resume:
-        tracker.start_from(rt.RoomMap.load(args.map), detect.class_names)
+        tracker.start_from(rt.RoomMap.load(args.map), source.class_names)
     frames: list[int] = []
     steps: list[rt.Tracks] = []
     seconds: list[tuple[float, float]] = []
@@ -47,7 +47,7 @@ def live(
         if args.frames and len(frames) == args.frames:
             break
         started = time.perf_counter()
-        detections = detect(frame)
+        (detections,) = source.detect([frame])
         detected = time.perf_counter()
         tracker.update(
             detections,
@@ -128,12 +128,12 @@ def main(argv: list[str] | None = None) -> int:
     try:
         video = rt.Video(args.video)
         recorded = None if args.detector else args.detections
-        detect = rt.open_detections(video, rt.DetectConfig(model=args.detector or ""), recorded)
-        tracker, tracks, seconds = live(args, video, detect)
+        source = rt.open_detections(video, rt.DetectConfig(model=args.detector or ""), recorded)
+        tracker, tracks, seconds = live(args, video, source)
     except rt.ReobjError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    objects = objects_of(tracker, tuple(detect.class_names))
+    objects = objects_of(tracker, tuple(source.class_names))
     args.out.mkdir(parents=True, exist_ok=True)
     write_mot(args.out / "tracks.txt", tracks)
     (args.out / "live_objects.json").write_text(json.dumps(objects, indent=1))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import json
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -17,6 +16,8 @@ import pytest
 
 import reobj_track as rt
 from reobj.options import read_config
+from reobj.results.stages import keep_detections
+from reobj.results.workspace import Workspace
 from reobj.sources import detectors, weights
 from reobj.sources.detectors import (
     DetectionCache,
@@ -155,6 +156,20 @@ def detr() -> dict[str, Any]:
     return {"labels": np.array([[LABEL, 1]]), "boxes": [[BOX, BOX]], "scores": [[SCORE, 0.01]]}
 
 
+def ssd() -> dict[str, Any]:
+    """ONNX' model zoo: boxes are fractions, label 0 is the background."""
+    boxes = np.divide([[STRETCHED, STRETCHED]], 64)
+    return {"bboxes": boxes, "labels": np.array([[LABEL + 1, 0]]), "scores": [[SCORE, 0.9]]}
+
+
+def mask_rcnn() -> dict[str, Any]:
+    """ONNX' model zoo: 28 x 28 probabilities of each box; its left half is the object."""
+    maps = np.zeros((2, 1, 28, 28))
+    maps[..., :14] = 1
+    return {"6568": [CORNER, CORNER], "6570": np.array([LABEL + 1, 0]), "6572": [SCORE, 0.9],
+            "6887": maps}  # fmt: skip
+
+
 def yolov5(boxes: int, name: str) -> dict[str, Any]:
     """Rows in px with an objectness, for one or three boxes a cell."""
     rows = np.tile([32.0, 32, 1, 1, 0.01, 0, 0, 0], (1, 84 * boxes, 1))
@@ -173,6 +188,9 @@ LAYOUT_ROWS = [
     ("nanodet", nanodet(), {}, 0),
     ("picodet", picodet(), {}, 0),
     ("detr", detr(), {"sizes": True}, 0),
+    ("ssd", ssd(), {}, 0),
+    ("r-cnn", mask_rcnn(), {"shape": (3, 64, 64)}, 120),
+    ("r-cnn", dict(list(mask_rcnn().items())[:3]), {"shape": (3, 64, 64)}, 0),  # Faster R-CNN
 ]
 
 
@@ -284,6 +302,9 @@ SEEN_ROWS = [
      [103.53, 116.28, 123.675], [57.375, 57.12, 58.395]),
     ("yolox", yolox(raw=False), ("output", (0, 7, 7)), {}, "BGR", 0, 1),
     ("yolo", yolov8(), ("output0", (0, 6, 50)), {}, "RGB", 0, 255),
+    ("ssd", ssd(), ("scores", (0, 0)), {}, "RGB", *TORCHVISION),
+    ("r-cnn", mask_rcnn(), ("6572", (0,)), {"shape": (3, 64, 64)}, "BGR",
+     [102.9801, 115.9465, 122.7717], 1),
 ]  # fmt: skip
 
 
@@ -382,47 +403,6 @@ def test_class_names_come_from_the_user_first(
             rt.OnnxDetector(path, dataclasses.replace(config, layout=layout))
 
 
-def test_class_names_in_a_model_go_by_their_number(tmp_path: Path) -> None:
-    rows = np.zeros((1, 4 + 12, 84))  # 12 classes
-    for at in range(3):
-        rows[0, :4, 20 + at] = [20 * at + 10, 32, 10, 10]
-        rows[0, 4 + (1, 2, 10)[at], 20 + at] = 0.9
-    expected = tuple(f"name{i}" for i in range(12))
-    for names in (
-        json.dumps({str(i): name for i, name in enumerate(expected)}),  # as text 10 is before 2
-        str(dict(reversed(list(enumerate(expected))))),
-        str(list(expected)),
-    ):
-        detector = rt.OnnxDetector(model(tmp_path, {"o": rows}, names=names))
-        assert detector.class_names == expected
-        assert sorted(detector(IMAGE).class_id.tolist()) == [1, 2, 10]
-
-
-@pytest.mark.parametrize(
-    ("names", "found"),
-    [
-        ("{1: 'mug', 2: 'lamp', 3: 'box'}", "4 class names"),
-        ("{0: 'mug', 1: 'lamp'}", "2 class names"),
-        ("['mug', 'lamp', 'box', 'cup']", "4 class names"),
-        ("{'mug': 0, 'lamp': 1, 'box': 2}", "class number 'mug'"),
-        ("{'0': ['mug'], '1': 'lamp', '2': 'box'}", "expected class names"),
-        ("mug, lamp, box", "expected class names"),
-    ],
-)
-def test_class_names_that_do_not_fit_their_model_are_one_error(
-    clip: rt.Video, tmp_path: Path, names: str, found: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = model(tmp_path, yolov8(), names=names)
-    command = ["track", str(clip.source), "-o", str(tmp_path / "out"), "--detector", str(path)]
-    assert rt.main([*command, "--embed", "none"]) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1 and found in error
-    assert "detect.class_names" in error or "yolo with 3 classes" in error
-    (tmp_path / "names.txt").write_text("mug\nlamp\nbox\n")
-    config = rt.DetectConfig(class_names=str(tmp_path / "names.txt"))
-    assert rt.OnnxDetector(path, config).class_names == ("mug", "lamp", "box")
-
-
 @pytest.mark.parametrize(
     ("outputs", "shape", "expected"),
     [
@@ -469,12 +449,6 @@ def test_known_weights_have_the_layout_of_the_table(
     known(monkeypatch, model(tmp_path, yolov8()), "detr")
     with pytest.raises(rt.ReobjError, match=r"output0 .*: not the outputs of layout detr"):
         rt.OnnxDetector("toy")
-
-
-def test_no_onnx_file(tmp_path: Path) -> None:
-    (tmp_path / "a.onnx").write_bytes(b"no model")
-    with pytest.raises(rt.ReobjError, match=r"a.onnx: onnxruntime cannot load it"):
-        rt.OnnxDetector(tmp_path / "a.onnx")
 
 
 def reference_nms(xyxy: Any, label: Any, max_iou: float) -> list[int]:
@@ -533,7 +507,7 @@ def assert_same(a: rt.Detections | None, b: rt.Detections) -> None:
 
 @pytest.mark.parametrize("masks", [False, True])
 def test_cache_survives_a_kill_between_flushes(tmp_path: Path, masks: bool) -> None:
-    cache = DetectionCache(tmp_path / "c", (32, 24), file_frames=64)
+    cache = DetectionCache(tmp_path / "c", (32, 24), file_frames=64, mask_frames=64)
     for index in range(0, 300, 2):
         cache.put(index, some(index, masks))
         assert_same(cache.get(index), some(index, masks))
@@ -550,7 +524,7 @@ def test_cache_survives_a_kill_between_flushes(tmp_path: Path, masks: bool) -> N
 
 
 def test_masks_are_written_before_they_fill_the_memory(tmp_path: Path) -> None:
-    cache = DetectionCache(tmp_path, (32, 24), mask_bytes=5 * 32 * 24)
+    cache = DetectionCache(tmp_path, (32, 24), mask_frames=3)
     files = []
     for index in (1, 2, 3):  # of as many masks each
         cache.put(index, some(index, masks=True))
@@ -625,6 +599,13 @@ def frame(index: int = 0, image: Image = IMAGE) -> rt.Frame:
     return rt.Frame(index, 0.0, image)
 
 
+def at(source: DetectionSource, frame: rt.Frame) -> rt.Detections:
+    """Detections of one frame."""
+    (found,) = source.detect([frame])
+    assert found is not None
+    return found
+
+
 @pytest.mark.parametrize(
     "found",
     [
@@ -641,12 +622,12 @@ def frame(index: int = 0, image: Image = IMAGE) -> rt.Frame:
 def test_a_function_is_a_source_of_detections(found: Any) -> None:
     images = []
     source = as_source(lambda image: images.append(image) or found)
-    made = source(frame(4))
+    made = at(source, frame(4))
     assert made.xyxy.tolist() == [BOX] and made.score.tolist() == [0.5]
     assert made.class_id.tolist() == [3] and images[0] is IMAGE
     assert source.key == "" and source.class_names == rt.COCO_NAMES and source.messages == ()
     assert as_source(source) is source
-    assert len(as_source(lambda image: [])(frame())) == 0
+    assert len(at(as_source(lambda image: []), frame())) == 0
 
 
 def test_class_names_of_a_function() -> None:
@@ -658,9 +639,9 @@ def test_class_names_of_a_function() -> None:
 
     assert as_source(Own()).class_names == ("cup", "wok")
     source = as_source(Own(), ["a", "b", "c"])
-    assert source.class_names == ("a", "b", "c") and source(frame()).class_id.tolist() == [2]
+    assert source.class_names == ("a", "b", "c") and at(source, frame()).class_id.tolist() == [2]
     with pytest.raises(rt.ReobjError, match="frame 9: class 2, but there are only 2 class names"):
-        as_source(Own())(frame(9))
+        at(as_source(Own()), frame(9))
 
 
 @pytest.mark.parametrize(
@@ -684,7 +665,7 @@ def test_a_model_states_its_class_names(stated: Any, names: tuple[str, ...]) -> 
 
 def test_a_wrong_answer_names_the_frame() -> None:
     with pytest.raises(rt.ReobjError, match=r"frame 7: detections are an array of shape \(1, 5\)"):
-        as_source(lambda image: [[*BOX, 0.5]])(frame(7))
+        at(as_source(lambda image: [[*BOX, 0.5]]), frame(7))
 
 
 def test_a_network_that_fails_names_the_frame(
@@ -698,7 +679,7 @@ def test_a_network_that_fails_names_the_frame(
 
     monkeypatch.setattr(detector, "_session", Full())
     with pytest.raises(rt.ReobjError) as caught:
-        as_source(detector)(frame(7))
+        at(as_source(detector), frame(7))
     assert str(caught.value) == f"frame 7: {detector.path} failed: CUDA failure 2: out of memory"
 
 
@@ -722,12 +703,11 @@ def test_a_file_is_indexed_by_frame_number(clip: rt.Video, tmp_path: Path) -> No
     path.write_text("".join(f"{i + 1},-1,{10 + i},20,30,10,.9\n" for i in range(7)))
     source = open_detections(clip, rt.DetectConfig(), path)
     assert [f.index for f in clip] == [0, 2, 4]
-    assert [source(f).xyxy[0, 0] for f in clip] == [5, 6, 7]  # half of 10, 12, 14
+    assert [at(source, f).xyxy[0, 0] for f in clip] == [5, 6, 7]  # half of 10, 12, 14
     assert source.class_names == ("object",)
     assert any("frames that the video lacks" in text for text in source.messages)
-    assert source.cached(tmp_path / "cache", clip.working_size) is source  # it is on disk
     recorded = as_source(rt.read_detections(path, clip))
-    assert recorded(frame(4)).xyxy[0, 0] == 7 and recorded.messages == source.messages
+    assert at(recorded, frame(4)).xyxy[0, 0] == 7 and recorded.messages == source.messages
     assert recorded.class_names == ("object",)
     path.write_text("1,-1,10,20,30,10,.9\n")
     assert source.key != open_detections(clip, rt.DetectConfig(), str(path)).key != ""
@@ -736,14 +716,14 @@ def test_a_file_is_indexed_by_frame_number(clip: rt.Video, tmp_path: Path) -> No
         ("cup",), (64, 48), (32, 24), np.empty(0, np.int64), "row",
     )  # fmt: skip
     for made in (as_source(empty), open_detections(clip, rt.DetectConfig(), empty)):
-        assert made.class_names == ("cup",) and len(made(frame())) == 0
+        assert made.class_names == ("cup",) and len(at(made, frame())) == 0
 
 
 def test_the_options_of_a_file_apply(clip: rt.Video, tmp_path: Path) -> None:
     path = tmp_path / "det.txt"
     path.write_text("1,-1,10,20,30,10,.9\n1,-1,12,20,30,10,.3\n")
-    assert len(open_detections(clip, rt.DetectConfig(), path)(frame())) == 2
-    assert len(open_detections(clip, rt.DetectConfig(min_score=0.5), path)(frame())) == 1
+    assert len(at(open_detections(clip, rt.DetectConfig(), path), frame())) == 2
+    assert len(at(open_detections(clip, rt.DetectConfig(min_score=0.5), path), frame())) == 1
 
 
 def test_a_changed_option_or_file_changes_the_key(clip: rt.Video, tmp_path: Path) -> None:
@@ -767,7 +747,7 @@ def test_a_function_gets_its_class_names_from_the_options(clip: rt.Video, tmp_pa
     config = rt.DetectConfig(class_names=str(tmp_path / "names.txt"))
     source = open_detections(clip, config, lambda image: [[*BOX, 0.5, 1]])
     assert source.class_names == ("cup", "wok") and source.key == ""
-    assert source(frame()).class_id.tolist() == [1]
+    assert at(source, frame()).class_id.tolist() == [1]
 
 
 def test_a_model_is_a_source_of_detections(
@@ -784,19 +764,15 @@ def test_a_model_is_a_source_of_detections(
     config = rt.DetectConfig(model=str(path))
     source = open_detections(clip, config, threads=1)
     assert source.class_names == ("cup", "bowl", "tv") and threads == [(1, "cpu")]
-    np.testing.assert_allclose(source(frame()).xyxy, [BOX], atol=1e-3)
+    np.testing.assert_allclose(at(source, frame()).xyxy, [BOX], atol=1e-3)
     direct = as_source(rt.OnnxDetector(path))
-    np.testing.assert_array_equal(direct(frame()).xyxy, source(frame()).xyxy)
+    np.testing.assert_array_equal(at(direct, frame()).xyxy, at(source, frame()).xyxy)
     assert direct.class_names == source.class_names
-    cached = source.cached(tmp_path / "cache", (320, 160))
-    assert len(cached(frame(5))) == 1
-    cached.flush()
-    assert len(list((tmp_path / "cache").iterdir())) == 1
     keys = {source.key, open_detections(clip, config).key}
     assert len(keys) == 1 and "" not in keys and str(tmp_path) in source.key
-    for change in ({"min_score": 0.2}, {"tiles": "2x2"}, {"classes": "tv"}):
+    for change in ({"min_score": 0.2}, {"classes": "tv"}):
         keys.add(open_detections(clip, rt.DetectConfig(model=str(path), **change)).key)
-    assert len(keys) == 4
+    assert len(keys) == 3
 
 
 def test_a_detector_is_named_where_detections_are_given(
@@ -892,40 +868,39 @@ class Counting:
 
 def test_a_slow_source_is_called_once_per_frame(tmp_path: Path) -> None:
     counting = Counting()
-    first = counting.source.cached(tmp_path, (32, 24))
+    first = dataclasses.replace(counting.source, cache=DetectionCache(tmp_path, (32, 24)))
     for index in (1, 2, 3, 2):
-        assert_same(first(frame(index)), some(index))
+        assert_same(at(first, frame(index)), some(index))
     assert counting.asked == [1, 2, 3]
     assert (first.class_names, first.key, first.messages) == (("cup",), "key", ["a message"])
-    first.flush()
-    second = counting.source.cached(tmp_path, (32, 24))  # the next run
+    assert first.cache is not None
+    first.cache.flush()
+    second = dataclasses.replace(first, cache=DetectionCache(tmp_path, (32, 24)))  # the next run
     for index in (3, 4):
-        assert_same(second(frame(index)), some(index))
+        assert_same(at(second, frame(index)), some(index))
     assert counting.asked == [1, 2, 3, 4]
 
 
 @pytest.mark.parametrize("options", [{"key": ""}, {"slow": False}])
-def test_sources_that_are_not_cached(tmp_path: Path, options: dict[str, Any]) -> None:
-    counting = Counting(**options)
-    source = counting.source.cached(tmp_path / "cache", (32, 24))
-    for _ in range(2):
-        source(frame(1))
-    source.flush()
-    assert counting.asked == [1, 1] and not (tmp_path / "cache").exists()
+def test_sources_that_are_not_cached(
+    clip: rt.Video, tmp_path: Path, options: dict[str, Any]
+) -> None:
+    source = Counting(**options).source
+    assert keep_detections(source, clip, Workspace(tmp_path / "out")) is source
 
 
 def test_flush_never_replaces_an_error(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """It is called in a `finally`: a failed write is a warning, and the first error is kept."""
     (tmp_path / "cache").write_text("a file where the folder should be")
-    source = Counting().source.cached(tmp_path / "cache", (32, 24))
+    cache = DetectionCache(tmp_path / "cache", (32, 24))
     with pytest.raises(KeyboardInterrupt):
         try:
-            source(frame(1))
+            cache.put(1, some(1))
             raise KeyboardInterrupt
         finally:
-            source.flush()
+            cache.flush()
     assert "cannot be written" in caplog.text and "detected again" in caplog.text
-    source.flush()  # as often as wanted
+    cache.flush()  # as often as wanted
 
 
 # ---- Real weights --------------------------------------------------------------------------------

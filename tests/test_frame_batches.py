@@ -119,10 +119,10 @@ def test_each_image_of_a_batch_gets_its_detections(tmp_path: Path, spied: type[S
     assert len({found.score[0] for found in alone}) == 6
     many = rt.OnnxDetector(path, rt.DetectConfig(batch=4))
     together = list(many.detect(images))
-    assert many.batch == 4 and spied.batches == [1, 4, 4, 2]
+    assert many.batch == 4 and spied.batches == [1, 4, 2]
     assert all(map(same, together, alone))
-    assert same(many(images[2]), alone[2]) and spied.batches[4:] == [1]
-    assert list(many.detect([])) == [] and len(spied.batches) == 5
+    assert same(many(images[2]), alone[2]) and spied.batches[3:] == [1]
+    assert list(many.detect([])) == [] and len(spied.batches) == 4
 
 
 def test_a_fixed_batch_is_filled_up(tmp_path: Path, spied: type[Spy], caplog: Any) -> None:
@@ -136,26 +136,22 @@ def test_a_fixed_batch_is_filled_up(tmp_path: Path, spied: type[Spy], caplog: An
     assert not caplog.text
 
 
-@pytest.mark.parametrize(
-    ("shape", "each", "reason"),
-    [
-        ((1, 3, 64, 64), True, "its batch axis is 1"),
-        (("n", 3, 64, 64), False, "its outputs have no batch axis"),
-    ],
-)
-def test_a_model_of_one_image_gets_one(
-    tmp_path: Path, spied: type[Spy], caplog: Any, shape: Any, each: bool, reason: str
-) -> None:
-    """The user is warned who asked for more, or whose model says that it takes more."""
-    detector = rt.OnnxDetector(grey_model(tmp_path, shape, each), rt.DetectConfig(batch=4))
+def test_a_model_of_one_image_gets_one(tmp_path: Path, spied: type[Spy], caplog: Any) -> None:
+    """The user is warned who asked for more."""
+    path = grey_model(tmp_path, (1, 3, 64, 64))
+    detector = rt.OnnxDetector(path, rt.DetectConfig(batch=4))
     found = list(detector.detect([plain(40), plain(200)]))
     assert detector.batch == 1 and spied.batches[-2:] == [1, 1]
     assert found[0].score < found[1].score
-    assert f"m.onnx: detect.batch=4 is not possible ({reason}): images are" in caplog.text
-    for device, warned in (("cpu", False), ("cuda", shape[0] == "n")):
-        caplog.clear()
-        assert rt.OnnxDetector(grey_model(tmp_path, shape, each), device=device).batch == 1
-        assert ("detect.batch=8 is not possible" in caplog.text) == bool(caplog.text) == warned
+    assert "m.onnx: takes 1 images at once, not detect.batch=4" in caplog.text
+    caplog.clear()
+    assert rt.OnnxDetector(path, device="cuda").batch == 1 and not caplog.text
+
+
+def test_a_model_whose_outputs_have_no_batch_axis_is_refused(tmp_path: Path) -> None:
+    detector = rt.OnnxDetector(grey_model(tmp_path, each=False), rt.DetectConfig(batch=4))
+    with pytest.raises(rt.ReobjError, match=r"2 images at once .detect.batch.: its outputs have"):
+        list(detector.detect([plain(40), plain(200)]))
 
 
 def test_images_of_different_input_sizes_are_not_joined(tmp_path: Path, spied: type[Spy]) -> None:
@@ -163,22 +159,13 @@ def test_images_of_different_input_sizes_are_not_joined(tmp_path: Path, spied: t
     wide = plain(80, (320, 160))
     high = plain(160, (160, 320))
     images = [wide, wide, high, wide]
-    for shape, batches in ((("n", 3, "h", "w"), [1, 4, 2, 1, 1]), (("n", 3, 64, 64), [1, 4, 4])):
+    for shape, batches in ((("n", 3, "h", "w"), [1, 2, 1, 1]), (("n", 3, 64, 64), [1, 4])):
         path = grey_model(tmp_path, shape)
         found = list(rt.OnnxDetector(path, rt.DetectConfig(batch=4)).detect(images))
         assert spied.batches == batches
         one = rt.OnnxDetector(path)
         assert all(map(same, found, map(one, images)))
         assert not np.array_equal(found[2].xyxy, found[3].xyxy)
-
-
-def test_the_tiles_of_an_image_are_a_batch(tmp_path: Path, spied: type[Spy]) -> None:
-    path = grey_model(tmp_path)
-    image = np.hstack([plain(40), plain(200)])
-    many = rt.OnnxDetector(path, rt.DetectConfig(batch=4, tiles="2x2"))
-    found = many(image)
-    assert spied.batches == [1, 4, 4, 1]
-    assert same(found, rt.OnnxDetector(path, rt.DetectConfig(tiles="2x2"))(image))
 
 
 def test_masks_of_a_batch_are_not_held_together(tmp_path: Path, monkeypatch: Any) -> None:
@@ -320,7 +307,7 @@ def test_a_subclass_decides_what_a_call_returns(tmp_path: Path) -> None:
             return super().__call__(image)[[0, 0]]
 
     source = as_source(Two(grey_model(tmp_path), rt.DetectConfig(batch=4)))
-    assert len(source(rt.Frame(0, 0.0, plain(40)))) == 2 and source.always_looks
+    assert len(next(source.detect([rt.Frame(0, 0.0, plain(40))]))) == 2 and source.always_looks
 
 
 def test_cached_frames_are_not_in_the_batch(tmp_path: Path) -> None:
@@ -328,7 +315,7 @@ def test_cached_frames_are_not_in_the_batch(tmp_path: Path) -> None:
     cache = DetectionCache(tmp_path, (96, 64))
     source = rt.DetectionSource(noted.several, batch=4, cache=cache)
     frames = [rt.Frame(i, 0.0, plain(40)) for i in range(4)]
-    assert source(frames[2]).xyxy[0, 3] == 42
+    assert next(source.detect(frames[2:3])).xyxy[0, 3] == 42
     steps = source.detect(frames)
     next(steps)
     assert noted.batches == [[2], [0, 1, 3]] and 0 in cache and 1 not in cache
@@ -345,13 +332,13 @@ def test_an_interrupted_run_continues_with_another_batch(
              "--set", "output.overlay=none", "--set", "output.scene=0"]  # fmt: skip
     assert rt.main([*words, "-o", str(tmp_path / "one")]) == 0
     assert spied.batches == [1] * 7
-    spied.stop_after = 3  # two trials, and a batch
+    spied.stop_after = 2  # a trial, and a batch
     several = [*words, "-o", str(tmp_path / "several")]
     assert rt.main([*several, "--set", "detect.batch=4"]) == 130
-    assert spied.batches == [1, 4, 4]
+    assert spied.batches == [1, 4]
     spied.stop_after = -1
     assert rt.main([*several, "--set", "detect.batch=2"]) == 0
-    assert spied.batches == [1, 2, 2]  # the last two frames
+    assert spied.batches == [1, 2]  # the last two frames
     written = [(tmp_path / out / "tracks.txt").read_text() for out in ("one", "several")]
     assert written[0] == written[1] and len(written[0].splitlines()) == 6
 

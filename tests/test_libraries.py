@@ -43,7 +43,8 @@ def detect(video: rt.Video, model: str, **config: Any) -> tuple[Detections, Dete
     """Detections of the photo, checked as those of any detector."""
     source = open_detections(video, rt.DetectConfig(model=model, **config))
     (frame,) = list(video)
-    found = source(frame)
+    (found,) = source.detect([frame])
+    assert found is not None
     assert np.isfinite(found.xyxy).all() and (found.xyxy >= 0).all()
     assert (found.xyxy <= (320, 240, 320, 240)).all()
     assert (found.xyxy[:, 2:] > found.xyxy[:, :2]).all()
@@ -194,12 +195,6 @@ def test_a_missing_package_of_one_model_is_not_taken_for_the_library(
     monkeypatch.setitem(libraries.LIBRARIES, "ultralytics", broken)
     with pytest.raises(rt.ReobjError, match="'clip'; ultralytics needs it for this model"):
         detect(video, "ultralytics:yolov8s-worldv2.pt", words="toolbox")
-
-
-@pytest.mark.parametrize("device", ["openvino", "coreml"])
-def test_a_device_of_onnxruntime_is_refused(video: rt.Video, device: str) -> None:
-    with pytest.raises(rt.ReobjError, match=f"--device {device}: detectors of hf run on cpu, cuda"):
-        open_detections(video, rt.DetectConfig(model="hf:some/model"), device=device)
 
 
 def test_words_need_a_detector_of_free_text(video: rt.Video) -> None:

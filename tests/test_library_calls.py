@@ -78,7 +78,7 @@ def check(
     video = rt.Video(folder / "photos")
     (frame,) = list(video)
     source = open_detections(video, rt.DetectConfig(model=detector, min_score=min_score))
-    found = source(frame)
+    (found,) = source.detect([frame])
     names = [source.class_names[k] for k in found.class_id]
     assert len(found) >= 5
     assert_same(found, names, documented(picture))

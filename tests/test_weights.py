@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import email.message
-import functools
 import hashlib
 import http.server
-import io
 import os
 import re
 import subprocess
@@ -27,7 +24,6 @@ import numpy as np
 import pytest
 
 import reobj_track as rt
-from reobj.files import locked
 from reobj.sources import weights
 from reobj.sources.onnx_layouts import LAYOUTS
 
@@ -86,7 +82,6 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     toy = weights.Weights("toy", "detector", "toy_416.onnx", url, SHA256, len(BLOB), "MIT")
     monkeypatch.setattr(weights, "WEIGHTS", (toy,))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.delenv("REOBJ_MODELS", raising=False)
     for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
         monkeypatch.delenv(name, raising=False)
@@ -119,38 +114,14 @@ def test_a_download_is_announced_verified_and_done_once(
 
 
 def test_an_unexpected_file_is_not_kept(server: Any) -> None:
-    for server.mode, body in (("wrong", BLOB[::-1]), ("long", BLOB + b"more" * 1)):
+    page = b"<html>Welcome to our hotel</html>"
+    for server.mode, body in (
+        ("wrong", BLOB[::-1]), ("long", BLOB + b"more"), ("portal", page)
+    ):  # fmt: skip
         found = hashlib.sha256(body).hexdigest()
-        with pytest.raises(rt.ReobjError, match=f"sha256 is {found}, expected {SHA256}: not kept"):
+        with pytest.raises(rt.ReobjError, match=f"sha256 is {found}, not kept.*{SHA256}"):
             rt.model_path("toy")
         assert here(server) == []
-
-
-def test_a_git_blob_id_verifies_a_file_of_unknown_size(
-    server: Any, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As a download, as an existing file, and in the table."""
-    toy = dataclasses.replace(weights.WEIGHTS[0], digest=GIT_BLOB, size=0)
-    monkeypatch.setattr(weights, "WEIGHTS", (toy,))
-    for server.mode in ("wrong", "long", "cut without a length"):
-        with pytest.raises(
-            rt.ReobjError, match=f"git blob id is .*, expected {GIT_BLOB}"
-        ) as caught:
-            rt.model_path("toy")
-        assert "\n" not in str(caught.value) and "not kept" in str(caught.value)
-        assert "--detector fast" in str(caught.value) and here(server) == []
-    server.mode = "cut"  # its length was announced
-    with pytest.raises(rt.ReobjError, match="cut after 100000 of 300000 bytes"):
-        rt.model_path("toy")
-    server.mode = "good"
-    caplog.set_level(rt.NOTE, "reobj_track")
-    assert rt.model_path("toy") == server.target and server.target.read_bytes() == BLOB
-    assert "size unknown" in caplog.text and f"git blob id {GIT_BLOB}" in caplog.text
-    assert [row.state for row in rt.list_models()] == ["verified"]
-    server.target.write_bytes(BLOB[:-1])
-    assert [row.state for row in rt.list_models()] == ["changed"]
-    with pytest.raises(rt.ReobjError, match=f"git blob id is .*, expected {GIT_BLOB}: delete the"):
-        rt.model_path("toy")
 
 
 def test_a_git_blob_id_equals_that_of_git(tmp_path: Path) -> None:
@@ -163,18 +134,13 @@ def test_a_git_blob_id_equals_that_of_git(tmp_path: Path) -> None:
     assert row.digest_of(tmp_path / "a") == GIT_BLOB
 
 
-def test_a_download_of_unknown_size_ends(server: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    toy = dataclasses.replace(weights.WEIGHTS[0], digest=GIT_BLOB, size=0)
-    monkeypatch.setattr(weights, "WEIGHTS", (toy,))
-    download = functools.partial(weights._download, most=100_000)
-    monkeypatch.setattr(weights, "_download", download)
+def test_a_download_ends_at_a_limit(server: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(weights, "FILE_MAX", 100_000)
     written: list[int] = []
     monkeypatch.setattr(weights.Progress, "step", lambda self, n: written.append(n))
-    for server.mode in ("good", "without a length"):
-        with pytest.raises(rt.ReobjError, match="not kept"):
-            rt.model_path("toy")
-        assert sum(written) < 200  # of 300 kB
-        written.clear()
+    with pytest.raises(rt.ReobjError, match="not kept"):
+        rt.model_path("toy")
+    assert sum(written) < 200  # of 300 kB
 
 
 def test_another_detector_is_suggested_but_not_used(
@@ -194,7 +160,7 @@ def test_another_detector_is_suggested_but_not_used(
     for offline, asked in (["--offline"], 0), ([], 1):
         assert rt.main([*command, *offline]) == 2
         error = capsys.readouterr().err.splitlines()[-1]
-        for part in ("deimv2-femto is not in", str(server.folder), default.url, "--detector fast"):
+        for part in ("model deimv2-femto", str(server.folder), default.url, "--detector fast"):
             assert part in error
         assert len(server.asked) == asked and not (tmp_path / "out/tracks.txt").exists()
     monkeypatch.setattr(weights, "WEIGHTS", (dataclasses.replace(default, alias="fast"),))
@@ -206,8 +172,7 @@ def test_another_detector_is_suggested_but_not_used(
 @pytest.mark.parametrize("mode", ["cut", "cut without a length"])
 def test_a_truncated_download_leaves_nothing_and_restarts(server: Any, mode: str) -> None:
     server.mode = mode
-    expected = r"cut after 100000 of 300000 bytes.: run again"
-    with pytest.raises(rt.ReobjError, match=expected) as caught:
+    with pytest.raises(rt.ReobjError, match=r"download failed .*: run again") as caught:
         rt.model_path("toy")
     assert "\n" not in str(caught.value) and here(server) == []
     server.mode = "good"
@@ -227,7 +192,7 @@ def test_ctrl_c_leaves_nothing(server: Any, monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_404_names_url_and_hash(server: Any) -> None:
     server.mode = "404"
-    expected = r"toy.onnx: download failed .HTTP Error 404.*sha256.*put it at"
+    expected = r"toy: download failed .HTTP Error 404.*sha256.*toy.onnx.*put it at"
     with pytest.raises(rt.ReobjError, match=expected):
         rt.model_path("toy")
     assert here(server) == []
@@ -265,39 +230,6 @@ def test_a_full_disk(server: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     assert here(server) == []
 
 
-def test_the_page_of_a_captive_portal_is_refused(server: Any) -> None:
-    """Also if neither size nor digest could detect it before the end of the download."""
-    server.mode = "portal"
-    with pytest.raises(rt.ReobjError, match=r"a web page came instead: must you log in") as caught:
-        rt.model_path("toy")
-    assert "put it at" in str(caught.value) and here(server) == []
-
-
-def test_redirects_are_followed_but_never_off_https(
-    server: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    server.mode = "moved"
-    assert rt.model_path("toy").read_bytes() == BLOB
-    assert [path for path, _ in server.asked] == ["/toy.onnx", "/there"]
-    server.target.unlink()
-    headers = email.message.Message()
-    plain = weights.WEIGHTS[0].url
-    headers["Location"] = plain  # where the file is served without encryption
-
-    def answers(_: Any, request: Any) -> Any:
-        made = urllib.response.addinfourl(io.BytesIO(), headers, request.full_url, 302)
-        made.msg = "Found"  # type: ignore[attr-defined]
-        return made
-
-    monkeypatch.setattr(urllib.request.HTTPSHandler, "https_open", answers)
-    row = dataclasses.replace(weights.WEIGHTS[0], url="https://example.org/toy.onnx")
-    monkeypatch.setattr(weights, "WEIGHTS", (row,))
-    server.asked.clear()
-    with pytest.raises(rt.ReobjError, match=f"redirected to {plain}, which is not encrypted"):
-        rt.model_path("toy")
-    assert server.asked == [] and here(server) == []  # not even requested
-
-
 FETCHES = """
 import dataclasses, logging, sys, reobj_track as rt
 logging.basicConfig(level=20)
@@ -323,27 +255,10 @@ def test_simultaneous_downloads_are_one(server: Any) -> None:
     assert here(server) == [server.target]
 
 
-def test_a_download_waits_for_another_but_not_for_ever(
-    server: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    waits: list[float] = []
-
-    def impatient(path: Path, wait_s: float = 0.0) -> Any:
-        waits.append(wait_s)
-        return locked(path, wait_s / 3000)  # .2 s
-
-    monkeypatch.setattr(weights, "locked", impatient)
-    with locked(server.folder / ".lock"):
-        with pytest.raises(rt.ReobjError, match=r"\.lock: locked by another process"):
-            rt.model_path("toy")
-    assert waits == [600.0]
-    assert server.asked == [] and rt.model_path("toy") == server.target
-
-
 # ---- Folders and states --------------------------------------------------------------------------
 
 
-def test_the_users_folder_comes_first_and_may_be_read_only(
+def test_the_users_folder_comes_first(
     server: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     own = tmp_path / "own"
@@ -355,35 +270,16 @@ def test_the_users_folder_comes_first_and_may_be_read_only(
     for name in ("mine", "mine.onnx"):  # unknown to the table: not verified
         assert rt.model_path(name) == own / "mine.onnx"
     assert server.asked == []
-    monkeypatch.setenv("REOBJ_MODELS", "/proc/none")  # nothing can be written there
-    assert rt.model_path("toy") == server.target
-    monkeypatch.setenv("REOBJ_MODELS", str(own))  # now in both
-    assert rt.model_path("toy") == own / "toy_416.onnx"
     (own / "toy_416.onnx").unlink()
-    server.target.unlink()
     assert rt.model_path("toy") == own / "toy_416.onnx"  # downloads go there too
 
 
-@pytest.mark.parametrize(
-    ("platform", "variable", "expected"),
-    [
-        ("linux", "", "home/.cache"),
-        ("darwin", "", "home/Library/Caches"),
-        ("win32", "", "home/AppData/Local"),
-        ("win32", "LOCALAPPDATA", "local"),
-        ("linux", "XDG_CACHE_HOME", "local"),
-    ],
-)
-def test_the_cache_of_each_platform(
-    server: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    platform: str, variable: str, expected: str,
-) -> None:  # fmt: skip
-    for name in ("XDG_CACHE_HOME", "LOCALAPPDATA"):
-        monkeypatch.delenv(name, raising=False)
-    if variable:
-        monkeypatch.setenv(variable, str(tmp_path / "local"))
+@pytest.mark.parametrize(("variable", "expected"), [("", "home/.cache"), ("local", "local")])
+def test_the_cache_of_the_user(
+    server: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variable: str, expected: str
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / variable) if variable else "")
     monkeypatch.setattr(Path, "home", lambda: tmp_path / "home")
-    monkeypatch.setattr(sys, "platform", platform)
     assert rt.model_path("toy") == tmp_path / expected / "reobj_track" / "toy_416.onnx"
 
 
@@ -416,13 +312,6 @@ def test_states_and_unknown_names(server: Any) -> None:
     expected = r"detector yolo99: no such file, nor one of the known names \(toy\)"
     with pytest.raises(rt.ReobjError, match=expected):
         rt.model_path("yolo99")
-
-
-def test_no_writable_folder(server: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", "/proc/none")
-    with pytest.raises(rt.ReobjError, match=r"cannot write to /proc/none.*: set REOBJ_MODELS"):
-        rt.model_path("toy")
-    assert server.asked == []
 
 
 # ---- The table -----------------------------------------------------------------------------------
@@ -490,37 +379,22 @@ def test_a_missing_onnxruntime_is_named(monkeypatch: pytest.MonkeyPatch) -> None
 REOBJ = weights.own_models() / "reobj.onnx"
 
 
-def test_unavailable_devices_are_named() -> None:
-    import onnxruntime
-
+def test_an_unknown_device_is_named() -> None:
     assert weights.onnx_session(REOBJ, 1, "cpu").get_providers() == ["CPUExecutionProvider"]
-    with pytest.raises(rt.ReobjError, match=r"--device gpu: unknown; known are cpu, cuda"):
+    with pytest.raises(rt.ReobjError, match=r"--device gpu: this onnxruntime has .*cpu.* only$"):
         weights.onnx_session(REOBJ, 1, "gpu")
-    if "CUDAExecutionProvider" in onnxruntime.get_available_providers():
-        pytest.skip("this onnxruntime has CUDA")
-    with pytest.raises(rt.ReobjError, match=r"--device cuda: .* has cpu only; .*onnxruntime-gpu"):
-        weights.onnx_session(REOBJ, 1, "cuda")
 
 
 @pytest.mark.parametrize(
-    ("device", "package"),
-    [
-        ("cuda", "onnxruntime-gpu"),
-        ("tensorrt", "onnxruntime-gpu"),
-        ("coreml", "onnxruntime, on a Mac"),
-        ("directml", "onnxruntime-directml"),
-        ("openvino", "onnxruntime-openvino"),
-        ("migraphx", "onnxruntime-migraphx"),
-    ],
-)
+    ("device", "provider"),
+    [("cuda", "CUDA"), ("tensorrt", "Tensorrt"), ("coreml", "CoreML"), ("directml", "Dml"),
+     ("openvino", "OpenVINO"), ("migraphx", "MIGraphX")],
+)  # fmt: skip
 def test_a_missing_device_is_one_line(
-    device: str,
-    package: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    device: str, provider: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-) -> None:
-    """From the command line: what this onnxruntime has, and the package to install."""
+) -> None:  # fmt: skip
+    """From the command line: what this onnxruntime has."""
     import onnxruntime
 
     monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: ["CPUExecutionProvider"])
@@ -529,7 +403,7 @@ def test_a_missing_device_is_one_line(
     assert rt.main([*words, "--detector", str(REOBJ)]) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert line.startswith(f"error: --device {device}: this onnxruntime has cpu only; ")
-    assert line.endswith(f"comes with {package} (in place of onnxruntime)")
+    assert f"{provider}ExecutionProvider needs another package" in line
     assert not (tmp_path / "out" / "tracks.txt").exists()
 
 

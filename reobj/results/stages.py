@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,10 +26,10 @@ def detections_key(source: DetectionSource, video: Video) -> tuple[Any, ...]:
 
 def keep_detections(source: DetectionSource, video: Video, workspace: Workspace) -> DetectionSource:
     """Return a source that caches the detections of a slow detector in the output folder."""
-    if video.is_live:
+    if video.is_live or not source.slow or not source.key:
         return source
     folder = workspace.path("detections", *detections_key(source, video)).with_suffix("")
-    return source.cached(folder, video.working_size)
+    return dataclasses.replace(source, cache=DetectionCache(folder, video.working_size))
 
 
 def detect_all(
@@ -55,10 +54,12 @@ def detect_all(
     if source.key and (cached := load_cached(path, lambda p: load_npz(p, sealed=True))):
         columns, _ = cached
         return source, _rows(*(columns[name] for name in names))
-    if source.cache is None:  # without a key it is not recognised in a later run
+    cache = source.cache
+    if cache is None:  # without a key it is not recognised in a later run
         folder = workspace.cache / "detections-once"
         shutil.rmtree(folder, ignore_errors=True)
-        source = dataclasses.replace(source, cache=DetectionCache(folder, video.working_size))
+        cache = DetectionCache(folder, video.working_size)
+        source = dataclasses.replace(source, cache=cache)
     frames: list[int] = []
     steps = []
     try:
@@ -70,7 +71,7 @@ def detect_all(
                     steps.append((detected.xyxy / video.scale, detected.score, detected.class_id))
                     line.step()
     finally:
-        source.flush()
+        cache.flush()
     rows = Tracks.empty()
     if steps:
         xyxy, score, class_id = (np.concatenate(column) for column in zip(*steps, strict=True))
@@ -78,6 +79,14 @@ def detect_all(
     if source.key:
         save_npz(path, {name: getattr(rows, name) for name in names})
     return source, rows
+
+
+def _finish_cache(source: DetectionSource) -> None:
+    """Write the pending detections; remove those that no later run can use."""
+    if source.cache is not None:
+        source.cache.flush()
+        if not source.key:
+            shutil.rmtree(source.cache.folder, ignore_errors=True)
 
 
 def _rows(frame: IntArray, xyxy: Array, score: Array, class_id: IntArray) -> Tracks:
@@ -159,9 +168,7 @@ def collect_tracks(
                 interruption.add_note(f"{checkpoint.kept} tracked frames")
             raise
     finally:
-        source.flush()
-        if source.cache is not None and not source.key:
-            shutil.rmtree(Path(source.cache.folder), ignore_errors=True)
+        _finish_cache(source)
     frames = collected.frames
     if not frames:
         why = "--start/--stop/--every leave none, or the file is damaged"

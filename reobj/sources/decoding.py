@@ -5,8 +5,9 @@ Start at `open_file`. PyAV reads everything but cameras (OpenCV) and animated im
 
 from __future__ import annotations
 
-import itertools
+import contextlib
 import math
+import time
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
@@ -17,6 +18,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 from PIL import Image as PillowImage
+from PIL import ImageSequence
 
 from reobj.runtime import quiet_opencv
 from reobj.types import Array, Image, ReobjError
@@ -38,33 +40,38 @@ class Opened:
     """An opened source.
 
     Attributes:
-        frames: in the order of their display. codec: name. pixels: of a frame.
-        fps, count: announced rate in Hz and number of frames; 0: unknown.
+        frames: in the order of their display. codec: name.
+        fps, count, duration_s: declared rate in Hz, number of frames and length in s; 0: unknown.
         pixel_aspect: width over height of a stored pixel.
     """
 
     frames: Generator[Decoded]
     codec: str = ""
-    pixels: int = 0
     fps: float = 0.0
     count: int = 0
+    duration_s: float = 0.0
     pixel_aspect: Fraction = Fraction(1)
 
 
-def open_camera(number: int) -> Opened:
-    """Open a camera."""
+def open_camera(number: int, silent_s: float) -> Opened:
+    """Open a camera, which ends after `silent_s` without a frame."""
     with quiet_opencv():
         capture = cv2.VideoCapture(number)
     if not capture.isOpened():
         raise ReobjError("cannot be opened as a camera (is it connected?)")
-    return Opened(_camera_frames(capture), fps=capture.get(cv2.CAP_PROP_FPS))
+    return Opened(_camera_frames(capture, silent_s), fps=capture.get(cv2.CAP_PROP_FPS))
 
 
-def _camera_frames(capture: Any) -> Generator[Decoded]:
+def _camera_frames(capture: Any, silent_s: float) -> Generator[Decoded]:
+    last_s = time.monotonic()
     try:
-        while True:
+        while time.monotonic() - last_s < silent_s:
             ok, image = capture.read()
-            yield Decoded(image=partial(np.asarray, image)) if ok else Decoded()
+            if not ok:
+                time.sleep(0.01)
+                continue
+            last_s = time.monotonic()
+            yield Decoded(image=partial(np.asarray, image))
     finally:
         capture.release()
 
@@ -77,82 +84,64 @@ def open_animation(path: Path) -> Opened:
 def _animation_frames(path: Path) -> Generator[Decoded]:
     milliseconds = 0.0
     with PillowImage.open(path) as image:
-        for k in range(getattr(image, "n_frames", 1)):
+        for frame in ImageSequence.Iterator(image):
             try:
-                image.seek(k)
-                bgr = np.asarray(image.convert("RGB"))[..., ::-1]
-            except (OSError, ValueError, EOFError):
+                bgr = np.asarray(frame.convert("RGB"))[..., ::-1]
+            except (OSError, ValueError):
                 yield Decoded()
                 continue
             yield Decoded(milliseconds / 1000, partial(np.ascontiguousarray, bgr))
-            milliseconds += image.info.get("duration", 0)
+            milliseconds += frame.info.get("duration", 0)
 
 
-def _open_container(address: str, timeout_s: float | None) -> tuple[Any, Any]:
-    """Open a container and its first video stream that is no cover picture.
+def open_file(address: str, open_s: float | None = None, read_s: float | None = None) -> Opened:
+    """Open a video file, or with time limits the URL of a stream or file.
 
     Raises:
-        ReobjError: no container, no such stream, or no decoder. The source is not named.
+        ReobjError: no container, no video stream in it, or no decoder. The source is not named.
     """
     import av
 
     try:  # tags in other encodings than UTF-8 are no error
         options = {"rtsp_flags": "prefer_tcp"}
-        file = av.open(address, options=options, timeout=timeout_s, metadata_errors="replace")
+        timeout = (open_s, read_s) if open_s else None
+        file = av.open(address, options=options, timeout=timeout, metadata_errors="replace")
     except (av.FFmpegError, OSError, ValueError) as error:
         late = isinstance(error, av.error.ExitError)
         reason = "no answer in time" if late else getattr(error, "strerror", "") or error
         raise ReobjError(f"cannot be opened as a video ({reason})") from None
     cover = av.stream.Disposition.attached_pic
-    streams = [stream for stream in file.streams.video if not stream.disposition & cover]
-    if streams and streams[0].codec_context is not None:
-        return file, streams[0]
-    fault = "no video in it" + "; its cover picture is none" * bool(file.streams.video)
-    file.close()
-    decoder = "its codec cannot be decoded here; convert it (ffmpeg -i IN OUT.mp4)"
-    raise ReobjError(decoder if streams else fault)
-
-
-def open_file(address: str, timeout_s: float | None = None) -> Opened:
-    """Open a video file, or with `timeout_s` the URL of a stream or file.
-
-    Raises:
-        ReobjError: as `_open_container` does.
-    """
-    file, stream = _open_container(address, timeout_s)
+    stream = next((s for s in file.streams.video if not s.disposition & cover), None)
+    if stream is None or stream.codec_context is None:
+        file.close()
+        codec = "its codec cannot be decoded here; convert it (ffmpeg -i IN OUT.mp4)"
+        raise ReobjError("no video in it" if stream is None else codec)
     fps = float(stream.guessed_rate or 0)
-    duration_s = float((stream.duration or 0) * stream.time_base) or (file.duration or 0) / 1e6
-    count = stream.frames or round(duration_s * fps)
+    duration_s = float((stream.duration or 0) * stream.time_base)
+    if not duration_s and len(file.streams) == 1:  # else it may be that of the sound
+        duration_s = (file.duration or 0) / 1e6 - (file.start_time or 0) / 1e6
+    count = stream.frames or round((duration_s or (file.duration or 0) / 1e6) * fps)
     # Several frames at a time delay those of a live stream
-    stream.thread_type = "AUTO" if count or timeout_s is None else "SLICE"
+    stream.thread_type = "AUTO" if count or not open_s else "SLICE"
     aspect = stream.sample_aspect_ratio or Fraction(1)
-    pixels = stream.width * stream.height
-    return Opened(_file_frames(file, stream), stream.name, pixels, fps, count, aspect)
+    return Opened(_file_frames(file, stream), stream.name, fps, count, duration_s, aspect)
 
 
-def _packets(file: Any, streams: Any) -> Iterator[Any]:
-    """Read the packets of a container, across damaged places."""
+def _packets(file: Any, stream: Any) -> Iterator[Any]:
+    """Read the packets of a stream up to its end, a time limit or a damaged place."""
     import av
 
-    for _ in range(64):  # places; each missing packet at the end of an MP4 file is one
-        try:
-            yield from file.demux(*streams)
-        except av.error.ExitError:  # timeout
-            return
-        except av.FFmpegError:
-            continue
-        return
+    with contextlib.suppress(av.FFmpegError):
+        yield from file.demux(stream)
+    yield None  # returns the frames that the decoder holds
 
 
-def _stamp_s(item: Any) -> float:
-    """Return the time of a packet or frame in s, NaN: none."""
-    at = item.dts if item.pts is None else item.pts
-    return math.nan if at is None else float(at * item.time_base)
+def packet_count(path: str) -> int:
+    """Count the packets of the video stream of a file: its frames."""
+    import av
 
-
-def _is_cut(packet: Any, file: Any) -> bool:
-    """Test whether the file ends within a packet."""
-    return bool(packet.is_corrupt and (packet.pos or 0) + packet.size == file.size)
+    with av.open(path, metadata_errors="replace") as file:
+        return sum(1 for packet in _packets(file, file.streams.video[0]) if packet and packet.size)
 
 
 def _file_frames(file: Any, stream: Any) -> Generator[Decoded]:
@@ -161,103 +150,53 @@ def _file_frames(file: Any, stream: Any) -> Generator[Decoded]:
     reformatter = av.video.reformatter.VideoReformatter()
     start_s = float((stream.start_time or 0) * stream.time_base)
     with file:
-        for packet in itertools.chain(_packets(file, [stream]), [None]):  # None: no more packets
-            if packet is not None and _is_cut(packet, file):
-                continue  # after an error PyAV returns no more frames of other threads
+        for packet in _packets(file, stream):
             try:
                 frames = stream.decode(packet)
+            except av.EOFError:  # the decoder has returned all frames
+                return
             except av.FFmpegError:
                 yield Decoded()
                 continue
             for frame in frames:
-                image = partial(_bgr, reformatter, frame)
-                yield Decoded(_stamp_s(frame) - start_s, image, frame.rotation)
+                at = frame.dts if frame.pts is None else frame.pts
+                time_s = math.nan if at is None else float(at * frame.time_base) - start_s
+                yield Decoded(time_s, partial(_bgr, reformatter, frame), frame.rotation)
 
 
 def _bgr(reformatter: Any, frame: Any) -> Image:
     """Convert a frame to BGR, upright by the rotation in its metadata."""
     # Bicubic: the pixels are those of OpenCV's VideoCapture
     image = reformatter.reformat(frame, format="bgr24", interpolation="BICUBIC").to_ndarray()
-    turns = {90: cv2.ROTATE_90_COUNTERCLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_CLOCKWISE}
-    turn = turns.get(frame.rotation % 360)
-    return np.asarray(image if turn is None else cv2.rotate(image, turn), np.uint8)
-
-
-@dataclass(frozen=True, slots=True)
-class Stored:
-    """What can be read of a file without decoding: number and last time of its frames; a fault."""
-
-    count: int = 0
-    last_s: float = 0.0
-    fault: str = ""
-
-
-def stored_in(path: str) -> Stored:
-    """Read the packets of a file."""
-    file, video = _open_container(path, None)
-    start_s = float((video.start_time or 0) * video.time_base)
-    count = size = 0
-    last_s = end_s = 0.0
-    is_cut = False
-    with file:
-        for packet in _packets(file, file.streams):
-            is_cut = is_cut or _is_cut(packet, file)
-            if not packet.size or is_cut:
-                continue
-            size += packet.size
-            at_s = _stamp_s(packet)
-            duration_s = float((packet.duration or 0) * packet.time_base)
-            end_s = max(end_s, at_s + duration_s)
-            if packet.stream.index == video.index:
-                count += 1
-                last_s = max(last_s, at_s - start_s)
-        announced_s = (file.duration or 0) / 1e6
-        unread = file.size - size  # Matroska holds little beside packets: an index, tags
-        if file.format.name.startswith("matroska") and unread > max(size, 1 << 14):
-            fault = f"is damaged, {size} of its {file.size} bytes are readable"
-            return Stored(count, last_s, fault)
-    # Containers announce the end of the last frame, or its time
-    if is_cut or announced_s - end_s > max(0.02 * end_s, 2 * end_s / max(count, 1)):
-        return Stored(count, last_s, "ends early")
-    return Stored(count, last_s)
+    quarters = round(frame.rotation / 90) % 4  # anticlockwise; OpenCV's codes count clockwise
+    return np.asarray(cv2.rotate(image, 3 - quarters) if quarters else image, np.uint8)
 
 
 def settled_times(raw_s: Array, step_s: float) -> tuple[Array, int, bool]:
     """Make the times of frames (F,) strictly increasing.
 
-    Single wrong or equal times are interpolated. Where the clock restarts (concatenated
-    recordings), times continue one step after the frame before. Times before the first one that
-    does not increase are unchanged.
+    Where the clock restarts (concatenated recordings), times continue one step after the frame
+    before. Other times that do not increase are interpolated. Times before the first one that does
+    not increase are unchanged.
 
     Args:
         raw_s: times in the container, NaN: none. step_s: interval of frames without times.
     Returns:
         times (F,) in s, number of restarts of the clock, and whether the container has times.
     """
-    # Time from a backward step of the clock until it passes its last value, over what these frames
-    # take at the usual rate: 1 after one wrong time stamp, less for repeated ones, near 0 where a
-    # second recording begins. Below it the clock has restarted. Chosen: reached by five frames
-    restart_share = 0.25
+    restart_steps = 3.0  # backward, in usual steps; less is a wrong or coarse time stamp
     count = len(raw_s)
     known = np.flatnonzero(np.isfinite(raw_s))
     if len(known) < 2 or np.ptp(raw_s[known]) == 0:
         return np.arange(0.0, count) * step_s, 0, count < 2 and len(known) == count
-    time_s: Array = np.interp(np.arange(count), known, raw_s[known])
-    steps = np.diff(raw_s[known]) / np.diff(known)
-    restarts = 0
-    at = 1
+    time_s: Array = np.interp(np.arange(count), known, raw_s[known])  # (F,)
+    steps = np.diff(time_s)  # (F - 1,)
     step = float(np.median(steps[steps > 0])) if (steps > 0).any() else step_s
-    while True:
-        highest = np.maximum.accumulate(time_s[at - 1 :])
-        back = np.flatnonzero(time_s[at:] <= highest[:-1])
-        if not len(back):
-            return time_s, restarts, True
-        at += int(back[0])
-        last = time_s[at - 1]
-        later = np.flatnonzero(time_s[at:] > last)
-        after = int(later[0]) if len(later) else 0  # number of frames that are not later
-        if after and time_s[at + after] - last > restart_share * (after + 1) * step:
-            time_s[at : at + after] = np.linspace(last, time_s[at + after], after + 2)[1:-1]
-        else:
-            time_s[at:] += last + step - time_s[at]
-            restarts += after != 0 or count - at > 1 / restart_share
+    restarts = steps < -restart_steps * step
+    time_s[1:] += np.cumsum(np.where(restarts, step - steps, 0))
+    highest = np.maximum.accumulate(time_s)
+    rising = np.flatnonzero(np.r_[True, time_s[1:] > highest[:-1]])
+    if len(rising) < count:
+        end_s = time_s[rising[-1]] + step * (count - rising[-1])
+        time_s = np.interp(np.arange(count), [*rising, count], [*time_s[rising], end_s])
+    return time_s, int(restarts.sum()), True

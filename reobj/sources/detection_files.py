@@ -62,12 +62,6 @@ class DetectConfig:
         "(ultralytics' YOLO-World and YOLOE, hf: Grounding DINO and OWLv2)",
         "--words",
     )
-    tiles: str = option(
-        "",
-        "also detect on a COLUMNSxROWS grid of overlapping tiles, e.g. 2x2: finds small objects, "
-        "costs 1 + COLUMNS*ROWS runs per frame",
-        "--detector-tiles",
-    )
     min_score: float = option(0.1, "drop detections of a lower score (ByteTrack: .1)")
     classes: str = option("", "comma-separated class names to keep (default: all)", "--classes")
     class_names: str = option(

@@ -53,7 +53,6 @@ from reobj.sources.onnx_layouts import (
     nms,
 )
 from reobj.sources.recorded import RecordedDetections, pack_detections, read_npz
-from reobj.sources.tiles import detect_in_tiles, parse_tiles
 from reobj.sources.video import Video, in_batches, source_fingerprint
 from reobj.sources.weights import (
     WEIGHTS,
@@ -110,24 +109,26 @@ class OnnxDetector:
     ) -> None:
         self.config = config or DetectConfig()
         name = path_or_name or self.config.model
-        self._most = self.config.max_detections or 100  # of a frame (COCO's maxDets)
-        self._grid = parse_tiles(self.config.tiles)
         weights = known_weights(name)
         self.path = model_path(name, offline)
         self._session = onnx_session(self.path, threads, device)
-        self._inputs = [(i.name, list(i.shape), i.type) for i in self._session.get_inputs()]
-        _, shape, kind = self._inputs[0]
+        self._inputs = {i.name: list(i.shape) for i in self._session.get_inputs()}
+        kind = self._session.get_inputs()[0].type
+        self._image_input, shape = next(iter(self._inputs.items()))
         if kind != "tensor(float)" or len(shape) not in (3, 4) or shape[-3] != 3:
             raise ReobjError(f"{self.path}: no known object detector: input is {kind} {shape}, "
                              "expected an image (1, 3, H, W)")  # fmt: skip
         axis = shape[0] if len(shape) == 4 else 1
         self._fixed = axis if isinstance(axis, int) else 0  # images of every run; 0: any number
+        self.batch = self._fixed or frames_at_once(self.config.batch, device)
+        if self._fixed and self.config.batch not in (0, self._fixed):
+            log.warning("%s: takes %d images at once, not detect.batch=%d", self.path, self._fixed,
+                        self.config.batch)  # fmt: skip
         self._model = self._trial_run()
         self._layout, self.class_names = self._recognise(weights.layout if weights else "")
         self.layout = self._layout.name
         wanted = self.config.classes
         self._allowed = class_filter(wanted, self.class_names) if wanted else None
-        self.batch = self._accepted(frames_at_once(self.config.batch, device))
 
     def __call__(self, image: Image) -> Detections:
         """Detect the objects in one BGR image (H, W, 3); best first, boxes clipped to the image."""
@@ -136,14 +137,7 @@ class OnnxDetector:
     def detect(self, images: Sequence[Image]) -> Iterator[Detections]:
         """Detect the objects in each of several images, as one call for each would."""
         images = [as_frame(image) for image in images]
-        if self._grid == (1, 1):
-            yield from self._detect(images)
-            return
-        for image in images:
-            yield detect_in_tiles(self._detect, image, self._grid)[: self._most]
-
-    def _detect(self, images: list[Image]) -> Iterator[Detections]:
-        """Run the network on whole images, together if they have the same input size."""
+        # Images of the same input size are given to the network together
         for size, group in itertools.groupby(images, lambda a: self._input_size(*a.shape[1::-1])):
             for batch in in_batches(group, self.batch):
                 fitted = [fit_image(image, size, self._layout.fit) for image in batch]
@@ -156,22 +150,20 @@ class OnnxDetector:
         """Decode and select the detections of one image."""
         assert self._layout.read is not None
         decoded = self._layout.read(outputs, geometry, self._model)
-        boxes = np.clip(decoded.xyxy, 0, np.tile(geometry.image_size, 2))
         label = decoded.class_id
         use = label >= 0 if self._allowed is None else np.isin(label, self._allowed)
-        keep = _best(boxes, decoded.score, use, self.config)
+        size = geometry.image_size
+        boxes, keep = _best(decoded.xyxy, decoded.score, use, size, self.config)
         if self._layout.nms_iou is not None:
             keep = keep[nms(boxes[keep], label[keep], self._layout.nms_iou)]
-        keep = keep[: self._most]
-        if len(keep) and label[keep].max() >= len(self.class_names):
-            text = unnamed_class(label[keep].max(), len(self.class_names))
-            raise ReobjError(f"{self.path}: {text}")
+        keep = keep[: self.config.max_detections or 100]  # of a frame (COCO's maxDets)
+        _check_names(label[keep], self.class_names, f"{self.path}: ")
         masks = decoded.masks(keep) if decoded.masks is not None else None
         return Detections(boxes[keep], decoded.score[keep], label[keep], masks)
 
     def _input_size(self, width: int, height: int) -> tuple[int, int]:
         """Return the input (w, h) for an image: the model's, or, if dynamic, the image's shape."""
-        fixed = self._inputs[0][1][:-3:-1]
+        fixed = self._inputs[self._image_input][:-3:-1]
         longer = 640  # px, longer side (YOLO11's training size)
         stride = 32  # px, largest cells of YOLO: sides are multiples of it
         ratio = longer / max(width, height) / stride
@@ -186,55 +178,30 @@ class OnnxDetector:
         """
         count = len(fitted)
         fitted = fitted + fitted[-1:] * (self._fixed - count)
-        name, shape, _ = self._inputs[0]
         mean, std = np.array([pixels.mean, pixels.std], np.float32)
         canvases = np.stack([canvas for canvas, _ in fitted])
         blob = (canvases[..., ::-1] if pixels.rgb else canvases).astype(np.float32)
         blob = np.ascontiguousarray(((blob - mean) / std).transpose(0, 3, 1, 2))  # (B, 3, H, W)
         sizes = np.array([geometry.image_size for _, geometry in fitted])
-        feeds = {name: blob if len(shape) == 4 else blob[0]}
-        feeds |= {other: sizes for other, _, _ in self._inputs[1:]}
+        image = blob if len(self._inputs[self._image_input]) == 4 else blob[0]
+        feeds = dict.fromkeys(self._inputs, sizes) | {self._image_input: image}
         outputs = [np.asarray(output) for output in self._session.run(None, feeds)]
         if len(fitted) == 1:
             return [outputs]  # some have no batch axis
+        if any(output.shape[:1] != (len(fitted),) for output in outputs):
+            raise RuntimeError("its outputs have no batch axis")
         return [[output[i : i + 1] for output in outputs] for i in range(count)]
 
-    def _run_grey(self, count: int) -> list[list[Any]]:
-        """Run the model on square images in the grey of the borders of fitted images."""
+    def _trial_run(self) -> ModelProbe:
+        """Run the model on a square grey image to get the shapes of its outputs."""
         size = self._input_size(1, 1)
         grey = np.full((size[1], size[0], 3), 114, np.uint8)
-        return self._run([(grey, Geometry(size, size, (1.0, 1.0), (0, 0)))] * count, UNIT_RGB)
-
-    def _trial_run(self) -> ModelProbe:
-        """Run the model to get the shapes of its outputs."""
         with failing(f"{self.path}: no known object detector: a trial run", 1):
-            (outputs,) = self._run_grey(1)
+            (outputs,) = self._run([(grey, Geometry(size, size, (1.0, 1.0), (0, 0)))], UNIT_RGB)
             names = [output.name for output in self._session.get_outputs()]
             metadata = self._session.get_modelmeta().custom_metadata_map
-        inputs = [name for name, _, _ in self._inputs]
         of_name = dict(zip(names, outputs, strict=True))
-        return ModelProbe(self.path, inputs, of_name, self._input_size(1, 1), metadata)
-
-    def _accepted(self, wanted: int) -> int:
-        """Return how many images the model takes at once: `wanted`, or its fixed number, or 1.
-
-        Exports exist whose batch axis is dynamic only by name.
-        """
-        if wanted == 1 or self._fixed > 1:
-            return max(self._fixed, 1)
-        reason = "its batch axis is 1"
-        if not self._fixed:
-            try:
-                *_, last = self._run_grey(wanted)
-                if [a.shape for a in last] == self._model.shapes:
-                    return wanted
-                reason = "its outputs have no batch axis"
-            except Exception as error:
-                reason = str(error).partition("\n")[0]
-        if self.config.batch or not self._fixed:
-            log.warning("%s: detect.batch=%d is not possible (%s): images are given one at a time",
-                        self.path, wanted, reason)  # fmt: skip
-        return 1
+        return ModelProbe(self.path, self._inputs, of_name, size, metadata)
 
     def _recognise(self, declared: str) -> tuple[Layout, tuple[str, ...]]:
         """Find the layout, and the names of its classes: by option, metadata, COCO, or numbers.
@@ -253,10 +220,10 @@ class OnnxDetector:
         declared = self.config.layout or declared
         layout = find_layout(self._model, declared, names_of)
         count = layout.classes(self._model)
-        if names and count not in (None, len(names)):
-            raise ReobjError(f"{self.path}: {len(names)} class names ({names_of}), but layout "
-                             f"{layout.name} has {count} classes")  # fmt: skip
-        if not names and count not in (None, len(COCO_NAMES)):
+        if count not in (None, self._model.count):
+            if names:
+                raise ReobjError(f"{self.path}: {len(names)} class names ({names_of}), but layout "
+                                 f"{layout.name} has {count} classes")  # fmt: skip
             log.warning("%s: %d classes without names: %s", self.path, count, NAMES)
             names = tuple(f"class {i}" for i in range(count or 0))
         names = names or COCO_NAMES
@@ -270,11 +237,23 @@ class OnnxDetector:
 NAMES = "give a file of names with --set detect.class_names=FILE"
 
 
-def _best(xyxy: Array, score: Array, use: BoolArray, config: DetectConfig) -> IntArray:
-    """Select rows, among those to `use`, by score and area; best first."""
-    use = use & (score >= config.min_score) & (xyxy[:, 2:] > xyxy[:, :2]).all(1)
-    rows = np.flatnonzero(use)
-    return rows[best_rows(score[rows])]
+def _check_names(class_id: IntArray, names: Sequence[str], where: str = "") -> None:
+    """Refuse class ids (D,) without a name."""
+    if len(class_id) and class_id.max() >= len(names):
+        raise ReobjError(where + unnamed_class(int(class_id.max()), len(names)))
+
+
+def _best(
+    xyxy: Array, score: Array, use: BoolArray, size: Sequence[int], config: DetectConfig
+) -> tuple[Array, IntArray]:
+    """Clip boxes to the image of (w, h); select rows, among those to `use`, by score and area.
+
+    Returns:
+        the boxes (N, 4) of all rows, and the selected rows, best first.
+    """
+    boxes = np.clip(xyxy, 0, np.tile(size, 2))
+    rows = np.flatnonzero(use & (score >= config.min_score) & (boxes[:, 2:] > boxes[:, :2]).all(1))
+    return boxes, rows[best_rows(score[rows])]
 
 
 class DetectionCache:
@@ -285,8 +264,8 @@ class DetectionCache:
 
     Args:
         folder: for the cache alone. image_size: (w, h) of the frames and of their masks.
-        file_frames: frames of a file; a kill loses a few seconds of work at most.
-        mask_bytes: of masks in memory, after which a file is written before it has its frames.
+        file_frames: frames of a file; a kill loses a few seconds of work at most. mask_frames: of
+            one with masks, which fill the memory.
     """
 
     def __init__(
@@ -294,15 +273,14 @@ class DetectionCache:
         folder: str | Path,
         image_size: tuple[int, int],
         file_frames: int = 64,
-        mask_bytes: int = 2**28,
+        mask_frames: int = 8,
     ) -> None:
         self.folder = Path(folder)
         self.image_size = image_size
-        self._file_frames = file_frames
-        self._mask_bytes = mask_bytes
+        self._frames = (file_frames, mask_frames)
         self._stored: dict[int, RecordedDetections | None] = {}  # by frame; None: skipped
         self._pending: dict[int, Detections] = {}  # by frame, not on disk yet
-        chunks = sorted(p for p in self.folder.glob("chunk_*.npz") if p.stem[6:].isdecimal())
+        chunks = sorted(self.folder.glob("chunk_*.npz"))
         self._next = 1 + max((int(path.stem[6:]) for path in chunks), default=-1)
         for path in chunks:
             try:
@@ -318,26 +296,23 @@ class DetectionCache:
 
     def __contains__(self, index: int) -> bool:
         """Test whether `put` was called for a frame."""
-        return index in self._pending or index in self._stored
+        return index in self._stored
 
     def get(self, index: int) -> Detections | None:
         """Return the detections of a frame; None if the detector was not run on it."""
-        if index in self._pending:
-            return self._pending[index]
         chunk = self._stored.get(index)
-        return None if chunk is None else chunk.at(index)
+        return self._pending.get(index) if chunk is None else chunk.at(index)
 
     def put(self, index: int, detections: Detections | None) -> None:
         """Store the detections of a frame; None: the detector was not run on it."""
+        self._stored[index] = None
         if detections is None:
-            self._stored[index] = None
             return
         self._pending[index] = detections
-        masks = (d.masks.nbytes for d in self._pending.values() if d.masks is not None)
-        if len(self._pending) >= self._file_frames or sum(masks) >= self._mask_bytes:
-            self.flush()
+        if len(self._pending) >= self._frames[detections.masks is not None]:
+            self._write()
 
-    def flush(self) -> None:
+    def _write(self) -> None:
         """Write the pending frames to disk."""
         if not self._pending:
             return
@@ -349,10 +324,17 @@ class DetectionCache:
         self._pending.clear()
         self._load(path)
 
+    def flush(self) -> None:
+        """Write the pending frames; a failure is a warning: safe in a `finally`."""
+        try:
+            self._write()
+        except ReobjError as error:
+            log.warning("%s: the last frames will be detected again", error)
+
 
 @dataclass(frozen=True, slots=True)
 class DetectionSource:
-    """Source of the detections of a video: `source.detect(frames)`, or `source(frame)`.
+    """Source of the detections of a video: `source.detect(frames)`.
 
     Attributes:
         run: several frames -> Detections of each in px of its image; None: the detector was not
@@ -383,10 +365,6 @@ class DetectionSource:
         if not isinstance(self.class_names, Vocabulary):
             object.__setattr__(self, "class_names", tuple(map(visible_name, self.class_names)))
 
-    def __call__(self, frame: Frame) -> Detections:
-        """Return the detections of a frame; zero if the detector was not run on it."""
-        return next(self.detect([frame])) or Detections.empty()
-
     def detect(self, frames: Sequence[Frame]) -> Iterator[Detections | None]:
         """Yield the detections of each frame, cached if possible; None: the detector was not run.
 
@@ -405,24 +383,6 @@ class DetectionSource:
             if cache is not None:
                 cache.put(frame.index, detections)
             yield detections
-
-    def cached(self, folder: str | Path, image_size: tuple[int, int]) -> DetectionSource:
-        """Return the source with a cache in `folder`, if it is slow and has a key.
-
-        The folder is that of the video and `key`. Call `flush` at the end, also after an error or
-        Ctrl-C.
-        """
-        if not self.slow or not self.key:
-            return self
-        return dataclasses.replace(self, cache=DetectionCache(folder, image_size))
-
-    def flush(self) -> None:
-        """Write the pending frames of the cache; a failure is a warning: safe in a `finally`."""
-        if self.cache is not None:
-            try:
-                self.cache.flush()
-            except ReobjError as error:
-                log.warning("%s: the last frames will be detected again", error)
 
 
 def open_detections(
@@ -453,12 +413,11 @@ def open_detections(
         return as_source(detections, names)
     words = tuple(word.strip() for word in config.words.split(",") if word.strip())
     if library_of(config.model):
-        opened, version = library_detector(config.model, words, config.min_score, device)
+        batch = frames_at_once(config.batch, device)
+        opened, version = library_detector(config.model, words, config.min_score, device, batch)
         file = config.model.partition(":")[2] or config.model
         key = _cache_key(config, version, file, device)
-        source = _filtered(as_source(opened), config)
-        batch = frames_at_once(config.batch, device)
-        return dataclasses.replace(source, key=key, slow=True, always_looks=True, batch=batch)
+        return dataclasses.replace(_filtered(as_source(opened), config), key=key, slow=True)
     if words:
         raise fixed_classes(config.model)
     if is_function(config.model):
@@ -483,19 +442,17 @@ def _filtered(
     wanted = config.classes
     allowed = class_filter(wanted, source.class_names) if wanted and not is_open else None
 
-    def select(frame: Frame, found: Detections) -> Detections:
-        boxes = np.clip(found.xyxy, 0, np.tile(frame.image.shape[1::-1], 2))
-        use = np.ones(len(boxes), bool)
-        if allowed is not None:
-            use = np.isin(found.class_id, allowed)
-        elif wanted:
+    def select(frame: Frame, found: Detections | None) -> Detections | None:
+        if found is None:
+            return None
+        use = np.ones(len(found), bool) if allowed is None else np.isin(found.class_id, allowed)
+        if wanted and allowed is None:
             use = among(source.class_names, wanted.split(","))[found.class_id]
-        rows = _best(boxes, found.score, use, config)[: config.max_detections or None]
-        return dataclasses.replace(found, xyxy=boxes)[rows]
+        boxes, rows = _best(found.xyxy, found.score, use, frame.image.shape[1::-1], config)
+        return dataclasses.replace(found, xyxy=boxes)[rows[: config.max_detections or None]]
 
     def run(frames: Sequence[Frame]) -> Iterator[Detections | None]:
-        for frame, found in zip(frames, source.run(frames), strict=True):
-            yield None if found is None else select(frame, found)
+        return map(select, frames, source.run(frames))
 
     return dataclasses.replace(source, run=run)
 
@@ -550,50 +507,38 @@ def as_source(detector: Any, class_names: Sequence[str] = ()) -> DetectionSource
         return detector
     if isinstance(detector, RecordedDetections):
         return _recorded_source(detector)
+    known = isinstance(detector, OnnxDetector | LibraryDetector)
     several = type(detector) in (OnnxDetector, LibraryDetector)  # a subclass may change a call
     if not several and not callable(detector):
         raise ReobjError(f"{detector!r:.80} is no detector: expected a function image -> detections"
                          "; a file is opened by read_detections(path, video)")  # fmt: skip
     answer = detector.detect if several else lambda images: map(detector, images)
-    names = tuple(class_names) or _stated_names(detector)
-    source = DetectionSource(*_checked(answer, names, bool(class_names)))
-    if not isinstance(detector, OnnxDetector):
-        return source
-    batch = detector.batch if several else 1
-    return dataclasses.replace(source, batch=batch, messages=detector.messages, always_looks=True)
-
-
-def _checked(
-    answer: Callable[[list[Image]], Iterator[Any]], class_names: Sequence[str], numbered: bool
-) -> tuple[Callable[[Sequence[Frame]], Iterator[Detections | None]], Vocabulary]:
-    """Check the answers of a detector; return `run` and `class_names` of its source.
-
-    Args:
-        answer: BGR images -> what the detector returns for each. class_names: () if it states none.
-        numbered: labels of the detector are ignored, as its class numbers have names.
-    """
-    names = Vocabulary(class_names or COCO_NAMES)
-    silent = bool(class_names)
+    stated = tuple(class_names) or _stated_names(detector)
+    names = Vocabulary(stated or COCO_NAMES)
+    warn = not stated
 
     def checked(found: Any) -> Detections | None:
-        nonlocal silent
+        nonlocal warn
         if found is None:
             return None
-        labels = None if numbered else text_labels(found)
+        labels = None if class_names else text_labels(found)  # else its numbers have names
         kinds = None if labels is None else np.array(names.numbers(labels), np.int64)
         detections = as_detections(found, kinds)
-        if len(detections) and detections.class_id.max() >= len(names):
-            raise ReobjError(unnamed_class(int(detections.class_id.max()), len(names)))
-        if isinstance(found, Mapping) and kinds is None and not silent and len(detections):
+        _check_names(detections.class_id, names)
+        if warn and isinstance(found, Mapping) and kinds is None and len(detections):
             log.warning(
                 "the detector has no class names: its numbers are read as COCO's 80 classes, from "
                 "0; torchvision and DETR count 91 from 1: give the names (detect.class_names, or "
                 "an attribute `names` of the function)"
             )
-            silent = True  # one warning is enough
+            warn = False  # one warning is enough
         return detections
 
-    return lambda frames: map(checked, answer([frame.image for frame in frames])), names
+    return DetectionSource(
+        lambda frames: map(checked, answer([frame.image for frame in frames])), names,
+        messages=detector.messages if known else (), always_looks=known,
+        batch=detector.batch if several else 1,
+    )  # fmt: skip
 
 
 def _recorded_source(recorded: RecordedDetections) -> DetectionSource:
@@ -601,8 +546,9 @@ def _recorded_source(recorded: RecordedDetections) -> DetectionSource:
     looked = None if recorded.looked is None else set(recorded.looked.tolist())
 
     def run(frames: Sequence[Frame]) -> Iterator[Detections | None]:
-        for index in (frame.index for frame in frames):
-            yield recorded.at(index) if looked is None or index in looked else None
+        for frame in frames:
+            ran = looked is None or frame.index in looked
+            yield recorded.at(frame.index) if ran else None
 
     return DetectionSource(
         run, recorded.class_names, "", recorded.messages, recorded=recorded, always_looks=True

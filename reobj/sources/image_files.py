@@ -9,12 +9,10 @@ import contextlib
 import enum
 import glob
 import itertools
-import math
 import re
-import threading
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,6 +27,7 @@ from reobj.types import Array, ReobjError
 
 IMAGE_FPS = 30.0  # Hz, rate of images without times; chosen: most phones record at 30 Hz
 IMAGE_SUFFIXES = tuple(".jpg .jpeg .jpe .jfif .mpo .png .bmp .webp .tif .tiff".split())
+UNREAD_SUFFIXES = tuple(".heic .heif .avif .jxl .jp2 .exr .hdr .dng .cr2 .cr3 .nef".split())
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +48,7 @@ def list_images(source: str) -> ImageList:
     """List the images of a folder, glob or single file in the order of their names.
 
     Left out are images of one channel with more than 8 bits (depth), and images of one channel or
-    with a name such as mask or depth beside colour images of the same numbers.
+    with a name such as mask or depth beside pictures of the same numbers.
 
     Returns:
         an empty list for videos and missing files.
@@ -57,29 +56,24 @@ def list_images(source: str) -> ImageList:
         ReobjError: no images; two kinds of images, either of which may be the frames; or too many
             sizes.
     """
-    unread = (  # of images that not every build of OpenCV reads
-        ".heic .heif .avif .gif .jxl .jp2 .exr .hdr .ppm .pgm .tga .dng .cr2 .cr3 .nef .arw .raf "
-        ".orf .rw2 .raw".split()
-    )
     path = Path(source)
+    suffix = path.suffix.lower()
     if path.is_file():
-        suffix = path.suffix.lower()
-        if suffix in unread and suffix != ".gif":  # .gif is read as a video
+        if suffix in UNREAD_SUFFIXES:
             raise ReobjError(f"{source}: {path.suffix} files are not read; convert it to .jpg")
         head = header(path) if suffix in IMAGE_SUFFIXES else None
         is_video = suffix not in IMAGE_SUFFIXES or (head is not None and head.frames > 1)
-        return _sized(source, [] if is_video else [path], {path: head}, [])
+        return ImageList([], [], []) if is_video else ImageList([path], [path], [])
     if not path.is_dir() and not re.search(r"[*?\[]", source):
         return ImageList([], [], [])
     paths = [p for p in _paths(path) if not p.name.startswith(".")]
     files = [p for p in paths if p.suffix.lower() in IMAGE_SUFFIXES]
-    others = Counter(p.suffix for p in paths if p.suffix.lower() in unread)
-    messages = [
-        f"{n} {suffix} files are not read; convert them to .jpg" for suffix, n in others.items()
-    ]
+    others = Counter(p.suffix for p in paths if p.suffix.lower() in (*UNREAD_SUFFIXES, ".gif"))
+    messages = [f"{n} {suffix} files are not read; convert them to .jpg"
+                for suffix, n in others.items()]  # fmt: skip
     if not files:
-        folders = sorted(p.name for p in paths if p.is_dir())[:9]
-        more = [f"its folders: {', '.join(folders)}"] if folders and path.is_dir() else []
+        folders = [p.name for p in paths if p.is_dir()]
+        more = [f"its folders: {shortened(sorted(folders))}"] if folders and path.is_dir() else []
         fault = f"no images there (looked for {' '.join(IMAGE_SUFFIXES)})"
         raise ReobjError("; ".join([f"{source}: {fault}", *messages, *more]))
     headers = {p: header(p) for p in files}
@@ -94,9 +88,8 @@ def _paths(path: Path) -> list[Path]:
     """List a folder, or the matches of a glob in a folder whose name may have glob characters."""
     if path.is_dir():
         return list(path.iterdir())
-    if path.parent.is_dir():
-        return [path.parent / name for name in glob.glob(path.name, root_dir=path.parent)]
-    return [Path(name) for name in glob.glob(str(path))]
+    root, pattern = (path.parent, path.name) if path.parent.is_dir() else (Path(), str(path))
+    return [root / name for name in glob.glob(pattern, root_dir=root)]
 
 
 def _sized(
@@ -105,21 +98,16 @@ def _sized(
     """Sort files, and select those of the most common size.
 
     Raises:
-        ReobjError: too many sizes; a header declares too many pixels (decompression bomb).
+        ReobjError: too many sizes.
     """
-    for path, head in headers.items():
-        if head is not None and (pixels := math.prod(head.size)) > PIXELS_MAX:
-            raise ReobjError(f"{path}: {pixels} pixels, at most {PIXELS_MAX} are allowed")
     sizes = Counter(head.size for p in files if (head := headers[p]) is not None)
-    size, most = max(sizes.items(), key=lambda item: (item[1], math.prod(item[0])),
-                     default=((0, 0), 0))  # fmt: skip
+    size, most = max(sizes.items(), key=lambda item: (item[1], item[0]), default=((0, 0), 0))
     if 2 * most < sizes.total():
         raise ReobjError(
             f"{source}: {sizes.total()} images of {len(sizes)} sizes, at most {most} of the same "
             f"({size[0]}x{size[1]}); expected one size: give a folder or a glob in quotes of those"
         )
-    by_name = dict(zip(files, (p.name for p in files), strict=True))
-    order = {name: k for k, name in enumerate(sorted_names(by_name.values()))}
+    order = {name: k for k, name in enumerate(sorted_names(p.name for p in files))}
     files = sorted(files, key=lambda p: (order[p.name], str(p)))
     usual = [p for p in files if (head := headers[p]) is not None and head.size == size]
     return ImageList(files, usual, messages)
@@ -127,12 +115,12 @@ def _sized(
 
 # ---- Which images are frames ---------------------------------------------------------------------
 
+
 # Of names of images that are no pictures: 7-Scenes, ScanNet, 3D Scanner App, NeRFCapture, DAVIS,
 # Replica, Hypersim, Record3D
 OTHER_WORDS = frozenset(
-    "depth depthmap disp disparity conf confidence mask masks matte alpha seg segm segmentation "
-    "semantic semantics label labels instance instances panoptic normal normals thumb thumbs "
-    "thumbnail preview ir infrared flow albedo uncertainty".split()
+    "depth disp disparity conf confidence mask masks matte alpha seg segmentation semantic label "
+    "labels instance normal normals thumb thumbnail preview infrared flow albedo".split()
 )
 
 
@@ -145,16 +133,16 @@ class _Kind:
     numbers: set[tuple[int, ...]]
     color: bool
 
-    def shares(self, other: _Kind, least: Callable[[int, int], int]) -> bool:
-        """Test whether more than half of the smaller (min) or larger (max) kind shares numbers."""
-        count = least(len(self.numbers), len(other.numbers))
+    def shares(self, other: _Kind) -> bool:
+        """Test whether more than half of the smaller kind has numbers of the other one."""
+        count = min(len(self.numbers), len(other.numbers))
         return () not in self.numbers and 2 * len(self.numbers & other.numbers) > count
 
 
 def _only_pictures(
     files: list[Path], headers: dict[Path, Header | None], folder: str
 ) -> tuple[list[Path], list[str]]:
-    """Separate pictures from depth maps, masks etc.
+    """Separate pictures from depth maps and masks.
 
     Args:
         folder: the source if it is a folder, "" for a glob, which selects a kind by itself.
@@ -171,23 +159,20 @@ def _only_pictures(
         messages.append(_left_out(deep, "one channel with more than 8 bits, as depth maps have"))
     kinds = _kinds(files, headers)
     for kind in list(kinds):
-        beside = [k for k in kinds if k is not kind and kind.shares(k, min)]
-        named = kind.is_named_otherwise
-        why = ""
-        if not kind.color and any(k.color for k in (kinds if named else beside)):
-            why = "one channel, beside images in colour"
-        elif named and not all(k.is_named_otherwise for k in beside):
-            why = "by its name; others have the same numbers"
-        if why:
+        beside = [k for k in kinds if k is not kind and kind.shares(k)]
+        gray = not kind.color and any(k.color for k in beside)
+        if gray or (kind.is_named_otherwise and not all(k.is_named_otherwise for k in beside)):
+            why = "one channel, beside images in colour" if gray else "by their name"
             messages.append(_left_out(kind.files, why))
             kinds.remove(kind)
     least = 3  # images of each of two kinds: the numbers of fewer may agree by chance
     for pair in itertools.combinations(kinds if folder else (), 2):
-        if pair[0].shares(pair[1], max) and min(len(k.files) for k in pair) >= least:
+        if pair[0].shares(pair[1]) and min(len(k.files) for k in pair) >= least:
             names = [min((p.name for p in k.files), key=by_number) for k in pair]
+            chosen = re.sub(r"\d+", "*", glob.escape(names[0]))
             raise ReobjError(
                 f"{folder}: two kinds of images, {' and '.join(names)}; which are the frames? "
-                f"Give a glob in quotes, such as '{Path(folder) / _glob_of(names[0])}'"
+                f"Give a glob in quotes, such as '{Path(folder) / chosen}'"
             )
     return [p for kind in kinds for p in kind.files], messages
 
@@ -213,11 +198,6 @@ def _kinds(files: Sequence[Path], headers: dict[Path, Header | None]) -> list[_K
         named = not OTHER_WORDS.isdisjoint(re.split(r"[^a-z]+", text.rpartition(".")[0]))
         kinds.append(_Kind([path for path, _ in members], named, numbers, color))
     return kinds
-
-
-def _glob_of(name: str) -> str:
-    """Return a glob of all names that differ from this one only in their numbers."""
-    return re.sub(r"\d+", "*", glob.escape(name))
 
 
 # ---- Order and times of names --------------------------------------------------------------------
@@ -278,39 +258,25 @@ def is_date(time_s: float) -> bool:
 def times_of_names(names: Sequence[str]) -> Array | None:
     """Read the times of images (F,) in s from names that are time stamps; None for other names.
 
-    Such as TUM's 1305031102.175304.png.
-
-    The time stamp is the last number of a name and has a decimal point or at least ten digits. Its
-    unit, s, ms, us or ns, is the one that gives a plausible frame rate, if possible with a
-    plausible date.
+    The time stamp is the last number of a name: with a decimal point in s (TUM's
+    1305031102.175304.png), else a date as s, ms, us or ns since 1970 (10, 13, 16, 19 digits).
     """
     words = [re.findall(r"\d+(?:\.\d+)?", Path(name).stem)[-1:] for name in names]
     if not words or not all(words):
         return None
     decimals = _decimals(names)
-    points = ["." in word for (word,) in words]
     numbers = np.array(decimals or [float(word) for (word,) in words])
-    if not (all(points) or (decimals and any(points)) or numbers.min() >= LEAST_STAMP):
-        return None
     steps = np.diff(numbers)
+    points = ["." in word for (word,) in words]
     if (steps <= 0).any():
         return None
-    units = []  # plausible ones: (no date, |log| of the rate over the usual one, units per s)
-    for unit in TimeUnit:
-        step_s = float(np.median(steps)) / unit.value if len(steps) else 1 / IMAGE_FPS
-        first_s = float(numbers[0]) / unit.value
-        dated = is_date(first_s)
-        clock = dated or (first_s < 1e9 and len(steps) > 0)  # or since power-on
-        if clock and 1 / 240 <= step_s <= 10:  # s: from the fastest phones to single photos
-            units.append((not dated, abs(math.log(step_s * IMAGE_FPS)), unit.value))
-    return numbers / min(units)[2] if units else None
+    if all(points) or (decimals and any(points)):  # in s, unless closer than on the fastest phones
+        return numbers if not len(steps) or np.median(steps) >= 1 / 240 else None
+    units = [unit.value for unit in TimeUnit if all(map(is_date, numbers / unit.value))]
+    return numbers / units[0] if units else None
 
 
 # ---- Reading -------------------------------------------------------------------------------------
-
-PIXELS_MAX = 1 << 28  # pixels of an image; chosen: above the 200 megapixels of phones; 800 MB (BGR)
-_open_lock = threading.Lock()  # of the settings of Pillow and of warnings
-# suppress(Exception) below: Pillow raises ten types of errors for damaged files
 
 
 @dataclass(frozen=True, slots=True)
@@ -320,27 +286,14 @@ class Header:
     Attributes:
         size: (w, h) in px, upright. frames: of an animated file, else 1.
         is_gray: one channel; also with a palette: masks use palettes, photos do not.
-        is_deep: one channel of more than 8 bits.
+        is_deep: one channel of more than 8 bits. orientation: EXIF's, 1 (upright) to 8.
     """
 
     size: tuple[int, int]
     is_gray: bool = False
     is_deep: bool = False
     frames: int = 1
-
-
-@contextlib.contextmanager
-def _opened(path: Path) -> Iterator[PillowImage.Image]:
-    """Open an image without Pillow's warnings, and its limit of pixels, below that of phones."""
-    with _open_lock, warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        limit = PillowImage.MAX_IMAGE_PIXELS
-        PillowImage.MAX_IMAGE_PIXELS = None
-        try:
-            with PillowImage.open(path) as image:
-                yield image
-        finally:
-            PillowImage.MAX_IMAGE_PIXELS = limit
+    orientation: int = 1
 
 
 def _orientation(image: PillowImage.Image) -> int:
@@ -360,23 +313,34 @@ def exif_orientation(path: Path) -> int:
     `read_image` returns images upright: 2 to 4 are mirrored or turned by 180 deg, 5 to 8 have width
     and height exchanged. 6 turns the stored pixels clockwise, 8 anticlockwise.
     """
-    with contextlib.suppress(Exception), _opened(path) as image:
-        return _orientation(image)
-    return 1
+    head = header(path)
+    return head.orientation if head is not None else 1
 
 
 def header(path: Path) -> Header | None:
-    """Read the header of an image file; None if Pillow cannot."""
-    with contextlib.suppress(Exception), _opened(path) as image:
-        turned = image.format != "TIFF" and _orientation(image) >= 5  # Pillow turns TIFF itself
-        return Header(
-            image.size[::-1] if turned else image.size,
-            image.mode[0] in "1LPIF" and image.mode != "LAB",
-            image.mode[0] in "IF",
-            # The second picture of a JPEG (MPO) is a preview or a gain map
-            1 if image.format == "MPO" else getattr(image, "n_frames", 1),
-        )
-    return None
+    """Read the header of an image file; None if Pillow cannot.
+
+    Raises:
+        ReobjError: more pixels than Pillow allows.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # half as many pixels, as photos of phones have
+            with PillowImage.open(path) as image:
+                turn = _orientation(image)
+                turned = image.format != "TIFF" and turn >= 5  # Pillow turns TIFF itself
+                return Header(
+                    image.size[::-1] if turned else image.size,
+                    image.mode[0] in "1LPIF" and image.mode != "LAB",
+                    image.mode[0] in "IF",
+                    # The second picture of a JPEG (MPO) is a preview or a gain map
+                    1 if image.format == "MPO" else getattr(image, "n_frames", 1),
+                    turn,
+                )
+    except PillowImage.DecompressionBombError as error:
+        raise ReobjError(f"{path}: {error}") from None
+    except Exception:  # Pillow raises ten types of errors for damaged files
+        return None
 
 
 def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> npt.NDArray[Any] | None:
@@ -389,8 +353,8 @@ def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> npt.NDArray[Any] | 
     if image is None:  # OpenCV 4 reads no animated WebP
         with contextlib.suppress(Exception), PillowImage.open(path) as opened:
             if getattr(opened, "is_animated", False):
-                image = np.asarray(opened.convert("RGB"))[..., ::-1]
-    return None if image is None else np.ascontiguousarray(image)
+                image = np.ascontiguousarray(np.asarray(opened.convert("RGB"))[..., ::-1])
+    return image
 
 
 def why_unreadable(path: Path) -> str:

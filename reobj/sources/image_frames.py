@@ -129,14 +129,16 @@ def _by_image_number(number: IntArray, source: Source, given: Sequence[str]) -> 
     unusable = not len(image) or video.times_s is not None or image.min() < 0
     if source.first or unusable or len(np.unique(image)) < len(image):
         return None
-    order = np.argsort(image)
-    at = order[np.searchsorted(image[order], number).clip(max=len(image) - 1)]
-    matched = image[at] == number
+    frame_of = {n: frame for frame, n in enumerate(image.tolist())}
+    frame = np.array([frame_of.get(n, -1) for n in number.tolist()])
+    matched = frame >= 0
     begin = first_number(number, video.frame_count)
     position = begin is not None and number.max() - begin < video.frame_count
     if not matched.any() or (position and not matched.all()):
         return None
     missing = [name for name, match in zip(given, matched.tolist(), strict=True) if not match]
-    text = f"the number in a name or id is that of an image ({given[0]}: {video.names[at[0]]})"
+    first = int(matched.argmax())
+    example = f"{given[first]}: {video.names[frame[first]]}"
+    text = f"the number in a name or id is that of an image ({example})"
     source.say(text + f"; {len(missing)} match none: {shortened(missing)}" * bool(missing))
-    return np.where(matched, at, -1)
+    return frame

@@ -27,19 +27,23 @@ class LibraryDetector:
     """Detector of another library.
 
     Attributes:
-        run: BGR images (H, W, 3) uint8 -> of each, detections as `reobj.types.as_detections`
-            accepts them.
-        class_names: by class id. name: on the command line.
+        run: RGB images (H, W, 3) uint8 (BGR of ultralytics) -> of each, detections as
+            `reobj.types.as_detections` accepts them.
+        class_names: by class id. name: on the command line. batch: most images at once.
     """
 
     run: Callable[[list[Image]], Iterable[Any]]
     class_names: tuple[str, ...]
+    is_rgb: bool = True
     name: str = ""
+    batch: int = 1
+    messages: tuple[str, ...] = ()
 
     def detect(self, images: list[Image]) -> Iterator[Any]:
         """Detect the objects in each of several images, all at once."""
         with failing(f"--detector {self.name}", len(images)):
-            yield from self.run(images)
+            rgb = [image[..., ::-1].copy() for image in images] if self.is_rgb else images
+            yield from self.run(rgb)
 
 
 @contextlib.contextmanager
@@ -92,7 +96,7 @@ def _ultralytics(name: str, words: list[str], min_score: float, device: str) -> 
             images, conf=min_score, device=device, retina_masks=True, verbose=False
         )
 
-    return LibraryDetector(run, names_by_number(model.names))
+    return LibraryDetector(run, names_by_number(model.names), is_rgb=False)
 
 
 def _rfdetr(name: str, _: list[str], min_score: float, device: str) -> LibraryDetector:
@@ -107,8 +111,7 @@ def _rfdetr(name: str, _: list[str], min_score: float, device: str) -> LibraryDe
     model = getattr(rfdetr, classes[wanted])(device=device, **options)
 
     def run(images: list[Image]) -> Iterator[Any]:
-        rgb = [image[..., ::-1].copy() for image in images]
-        answer = model.predict(rgb, threshold=min_score)
+        answer = model.predict(images, threshold=min_score)
         for found in answer if isinstance(answer, list) else [answer]:  # of one image: no list
             yield found[np.array([bool(name) for name in found.data["class_name"]], bool)]
 
@@ -133,9 +136,9 @@ def _torchvision(name: str, _: list[str], min_score: float, device: str) -> Libr
     model = model.to(device).eval()
 
     def run(images: list[Image]) -> Iterator[dict[str, Any]]:
-        rgb = torch.from_numpy(np.stack(images)[..., ::-1].copy()).to(device)
+        stack = torch.from_numpy(np.stack(images)).to(device)
         with torch.inference_mode():
-            answers = model(list(rgb.permute(0, 3, 1, 2).float() / 255))
+            answers = model(list(stack.permute(0, 3, 1, 2).float() / 255))
         for found in answers:
             keep = (found["scores"] >= min_score) & (found["labels"] > 0)  # 0: background
             yield {key: value[keep].cpu() for key, value in found.items()}
@@ -158,19 +161,19 @@ def _transformers(name: str, words: list[str], min_score: float, device: str) ->
     model = model.to(device).eval()
 
     def run(images: list[Image]) -> Any:
-        rgb = [image[..., ::-1].copy() for image in images]
-        text = {"text": [words] * len(rgb), "padding": True, "truncation": True} if words else {}
-        inputs = processor(images=rgb, return_tensors="pt", **text).to(device)
+        count = len(images)
+        text = {"text": [words] * count, "padding": True, "truncation": True} if words else {}
+        inputs = processor(images=images, return_tensors="pt", **text).to(device)
         with torch.inference_mode():
             outputs = model(**inputs)
         asked: dict[str, Any] = {"threshold": min_score}
-        asked["target_sizes"] = [image.shape[:2] for image in rgb]
+        asked["target_sizes"] = [image.shape[:2] for image in images]
         if not words:
             return processor.post_process_object_detection(outputs, **asked)
         if "input_ids" in inputs and type(processor).__name__.startswith("GroundingDino"):
             asked |= {"input_ids": inputs["input_ids"], "text_threshold": min_score}
         else:
-            asked["text_labels"] = [words] * len(rgb)
+            asked["text_labels"] = [words] * count
         answers = processor.post_process_grounded_object_detection(outputs, **asked)
         return (_with_words(found, words) for found in answers)
 
@@ -208,13 +211,13 @@ def library_of(detector: str) -> tuple[str, str] | None:
 
 
 def library_detector(
-    detector: str, words: tuple[str, ...], min_score: float, device: str
+    detector: str, words: tuple[str, ...], min_score: float, device: str, batch: int
 ) -> tuple[LibraryDetector, str]:
     """Open a detector of another library.
 
     Args:
         detector: `library:model`, or a .pt file of ultralytics. words: to look for; (): the
-            model's classes. device: cpu, cuda, cuda:1 or mps.
+            model's classes. device: of PyTorch. batch: most images at once.
     Returns:
         the detector, and name and version of its library for cache keys.
     Raises:
@@ -226,8 +229,6 @@ def library_detector(
     library = LIBRARIES[name]
     if words and not library.takes_words:
         raise fixed_classes(detector)
-    if device.partition(":")[0] not in ("cpu", "cuda", "mps"):
-        raise ReobjError(f"--device {device}: detectors of {name} run on cpu, cuda or mps")
     with failing(f"--detector {detector}"):
         try:
             found = library.open(model, list(words), min_score, device)
@@ -239,7 +240,7 @@ def library_detector(
             raise ReobjError(f"--detector {detector}: {error}; {remedy}") from error
     package = library.install.partition(" ")[0]
     version = f"{package} {importlib.metadata.version(package)}"
-    return dataclasses.replace(found, name=detector), version
+    return dataclasses.replace(found, name=detector, batch=batch), version
 
 
 def is_function(detector: str) -> bool:

@@ -86,13 +86,14 @@ def polygon_runs(rings: Sequence[Sequence[float]], size: tuple[int, int]) -> Cou
         raise ValueError("a polygon with corners that are not finite, or beyond 1e7 px")
     if not len(flat):
         return NO_RUNS
-    low = np.clip(np.floor(flat.min(0)) - 1, 0, size).astype(int)  # only the part with the polygon
-    high = np.clip(np.ceil(flat.max(0)) + 1, low, size).astype(int)
-    canvas = np.zeros((high - low)[::-1], np.uint8)
+    width, height = size
+    left = int(np.clip(np.floor(flat[:, 0].min()) - 1, 0, width))  # only the columns of the polygon
+    right = int(np.clip(np.ceil(flat[:, 0].max()) + 1, left, width))
+    canvas = np.zeros((height, right - left), np.uint8)
     if not canvas.size:
         return NO_RUNS
     bits = 4  # of fractions of a pixel, 1/16 px: finer than annotations
     for ring in corners:  # OpenCV's first pixel has its centre at (0, 0), ours at (0.5, 0.5)
-        fixed = np.round((ring - low - 0.5) * (1 << bits)).astype(np.int32)
+        fixed = np.round((ring - (left + 0.5, 0.5)) * (1 << bits)).astype(np.int32)
         cv2.fillPoly(canvas, [fixed], 1, shift=bits)
-    return crop_runs(canvas > 0, (int(low[0]), int(low[1])), size)
+    return _runs_of_columns(canvas > 0, left, width)

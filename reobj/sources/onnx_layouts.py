@@ -54,11 +54,11 @@ class ModelProbe(Probe):
     """What a layout is recognised by.
 
     Attributes:
-        inputs: their names. outputs: of a trial run, by name. size: (w, h) of the input.
+        inputs: their shapes by name. outputs: of a trial run, by name. size: (w, h) of the input.
         metadata: of the file. count: number of class names, then of classes of the layout.
     """
 
-    def __init__(self, path: Path, inputs: Sequence[str], outputs: Mapping[str, Any],
+    def __init__(self, path: Path, inputs: Mapping[str, Sequence[Any]], outputs: Mapping[str, Any],
                  size: tuple[int, int], metadata: Mapping[str, str]) -> None:  # fmt: skip
         super().__init__(path)
         self.inputs = inputs
@@ -153,12 +153,11 @@ def fit_image(image: Image, size: tuple[int, int], fit: str) -> tuple[Image, Geo
 def _grid(size: tuple[int, int], levels: int) -> tuple[Array, Array]:
     """List the cells of all levels, of 8, 16, 32, ... px: x, y (A, 2) and stride (A, 1)."""
     cells = []
-    stride = []
     for s in (8 << k for k in range(levels)):
         y, x = np.mgrid[: math.ceil(size[1] / s), : math.ceil(size[0] / s)]
-        cells.append(np.stack([x.ravel(), y.ravel()], 1).astype(np.float64))
-        stride.append(np.full((x.size, 1), float(s)))
-    return np.concatenate(cells), np.concatenate(stride)
+        cells.append(np.stack([x.ravel(), y.ravel(), np.full(x.size, s)], 1).astype(np.float64))
+    rows = np.concatenate(cells)  # (A, 3)
+    return rows[:, :2], rows[:, 2:]
 
 
 def best_rows(score: Array, most: int = 1000) -> IntArray:
@@ -192,6 +191,25 @@ def _decode_detr(outs: Sequence[Any], geometry: Geometry, model: ModelProbe) -> 
     return Decoded(boxes.reshape(-1, 4), score.ravel(), of["labels"].ravel().astype(np.int64))
 
 
+def _decode_zoo(outs: Sequence[Any], geometry: Geometry, model: ModelProbe) -> Decoded:
+    """Decode boxes, labels from 1 (0: background), scores[, masks of the boxes, 0..1]."""
+    unit = geometry.input_size if "bboxes" in model.outputs else (1, 1)  # SSD: in 0..1
+    boxes = geometry.to_image(outs[0].reshape(-1, 4) * np.tile(unit, 2))
+    label = outs[1].ravel().astype(np.int64) - 1
+
+    def masks(chosen: IntArray) -> BoolArray:
+        found = np.zeros((len(chosen), *geometry.image_size[::-1]), bool)  # (K, H, W)
+        corners = np.clip(np.round(boxes[chosen]), 0, np.tile(geometry.image_size, 2))
+        for mask, row, corner in zip(found, chosen, corners.astype(int).tolist(), strict=True):
+            x1, y1, x2, y2 = corner
+            if x2 > x1 and y2 > y1:
+                mask[y1:y2, x1:x2] = cv2.resize(outs[3][row, 0], (x2 - x1, y2 - y1)) > 0.5
+        return found
+
+    score = outs[2].ravel().astype(np.float64)
+    return Decoded(boxes, score, label, masks if len(outs) > 3 else None)
+
+
 def _decode_yolox(outs: Sequence[Any], geometry: Geometry, model: ModelProbe) -> Decoded:
     """Decode centre, log size, objectness and class scores of each cell, or of decoded boxes.
 
@@ -202,8 +220,7 @@ def _decode_yolox(outs: Sequence[Any], geometry: Geometry, model: ModelProbe) ->
         cells, stride = _grid(geometry.input_size, 3)
         rows[:, :2] = (rows[:, :2] + cells) * stride
         rows[:, 2:4] = np.exp(rows[:, 2:4]) * stride
-    score, label = _best_class(rows[:, 5:])
-    return Decoded(geometry.to_image(xyxy_from_cxcywh(rows)), score * rows[:, 4], label)
+    return _decode_yolov5([rows[None]], geometry, model)
 
 
 def _decode_yolo(outs: Sequence[Any], geometry: Geometry, model: ModelProbe) -> Decoded:
@@ -219,11 +236,10 @@ def _decode_yolo(outs: Sequence[Any], geometry: Geometry, model: ModelProbe) -> 
     if len(outs) == 1:
         return Decoded(boxes, score, label)
     proto = outs[1][0]  # (32, h, w)
-    ratio = np.divide(proto.shape[:0:-1], geometry.input_size)  # (2,) map / input
 
     def masks(chosen: IntArray) -> BoolArray:
         maps = np.tensordot(rows[chosen, end:], proto, 1)  # (K, h, w)
-        return _paste(maps, boxes[chosen], geometry, ratio)
+        return _paste(maps, boxes[chosen], geometry)
 
     return Decoded(boxes, score, label, masks)
 
@@ -240,8 +256,8 @@ def _decode_rotated(outs: Sequence[Any], geometry: Geometry, model: ModelProbe) 
 def _decode_yolov5(outs: Sequence[Any], geometry: Geometry, model: ModelProbe) -> Decoded:
     """Decode rows of centre, size, objectness and class scores, in px."""
     rows = outs[0][0]  # (A, 5 + C)
-    rows = np.hstack([rows[:, :4], rows[:, 5:] * rows[:, 4:5]])
-    return _decode_yolo([rows.T[None]], geometry, model)
+    score, label = _best_class(rows[:, 5:])
+    return Decoded(geometry.to_image(xyxy_from_cxcywh(rows)), score * rows[:, 4], label)
 
 
 def _decode_gfl(outs: Sequence[Any], geometry: Geometry, _: ModelProbe) -> Decoded:
@@ -270,31 +286,29 @@ def _decode_gfl(outs: Sequence[Any], geometry: Geometry, _: ModelProbe) -> Decod
     return Decoded(geometry.to_image(boxes), score[keep], label[keep])
 
 
-def _paste(maps: Any, boxes: Array, geometry: Geometry, ratio: Array) -> BoolArray:
+def _paste(maps: Any, boxes: Array, geometry: Geometry) -> BoolArray:
     """Resample the maps of masks inside their boxes.
 
     Args:
-        maps: (K, h, w), positive in the mask. boxes: (K, 4) in px of the image.
-        ratio: (2,) map / input of the network, x and y.
+        maps: (K, h, w) of the network's input, positive in the mask. boxes: (K, 4) px of the image.
     Returns:
         (K, H, W) masks, False outside the boxes.
     """
     size = geometry.image_size
     masks = np.zeros((len(maps), size[1], size[0]), bool)  # (K, H, W)
+    ratio = np.divide(maps.shape[:0:-1], geometry.input_size)  # (2,) map / input
     scale = ratio * geometry.scale  # map = image * scale + pad, from the corner
     pad = ratio * geometry.pad
     low = np.clip(np.floor(boxes[:, :2]), 0, size).astype(int)
     high = np.clip(np.ceil(boxes[:, 2:]), 0, size).astype(int)
     for k in np.flatnonzero((high > low).all(1)):
-        (x1, y1) = low[k].tolist()
-        (x2, y2) = high[k].tolist()
         shift = scale * (low[k] + 0.5) + pad - 0.5  # pixel centres on pixel centres
         affine = np.column_stack([np.diag(scale), shift])  # (2, 3)
         values = cv2.warpAffine(
-            np.ascontiguousarray(maps[k], np.float32), affine, (x2 - x1, y2 - y1),
+            np.ascontiguousarray(maps[k], np.float32), affine, (high[k] - low[k]).tolist(),
             flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE,
         )  # fmt: skip
-        masks[k, y1:y2, x1:x2] = values > 0
+        masks[k, low[k, 1] : high[k, 1], low[k, 0] : high[k, 0]] = values > 0
     return masks
 
 
@@ -324,13 +338,22 @@ def _layout(
 IMAGENET_RGB = Pixels("RGB, ImageNet", True, IMAGENET_MEAN, IMAGENET_STD)
 IMAGENET_BGR = Pixels("BGR, ImageNet", False, IMAGENET_MEAN[::-1], IMAGENET_STD[::-1])
 BYTES_BGR = Pixels("BGR, 0..255", False, std=(1.0, 1.0, 1.0))
+CAFFE_BGR = Pixels("BGR, less the mean", False, (102.9801, 115.9465, 122.7717), (1.0, 1.0, 1.0))
 YOLO = "YOLOv8, YOLO11"
 
-LAYOUTS: Registry[Decode] = Registry("object detectors", "--detector-layout", [
+ENTRIES: list[Layout] = [
     _layout("detr", "DEIM, D-FINE, RT-DETR", "labels, boxes, scores",
             lambda m: None if "orig_target_sizes" in m.inputs
             and {"labels", "boxes", "scores"} <= m.outputs.keys() else 0,
             _decode_detr, nms_iou=None),
+    _layout("ssd", "SSD of ONNX' model zoo", "bboxes, labels, scores",
+            lambda m: None if m.outputs.keys() == {"bboxes", "labels", "scores"} else 0,
+            _decode_zoo, pixels=IMAGENET_RGB, nms_iou=None),
+    _layout("r-cnn", "Mask R-CNN and Faster R-CNN of ONNX' model zoo",
+            "boxes, labels, scores[, (n, 1, 28, 28)]",
+            lambda m: None if [*map(len, m.inputs.values())] == [3]
+            and [*map(len, m.shapes)] in ([2, 1, 1], [2, 1, 1, 4]) else 0,
+            _decode_zoo, fit="corner", pixels=CAFFE_BGR, nms_iou=None),
     _layout("yolo", f"{YOLO}, also -seg", "(1, 4 + classes [+ 32], cells)[, (1, 32, h, w)]",
             lambda m: m.values(0) - 4 - sum(shape[1] for shape in m.shapes[1:] if len(shape) == 4),
             _decode_yolo, ("", "detect", "segment"), also=lambda m: not m.in_fractions,
@@ -358,7 +381,8 @@ LAYOUTS: Registry[Decode] = Registry("object detectors", "--detector-layout", [
             lambda m: m.shapes[0][2] if [*map(len, m.shapes)] in ([3] * 6, [3] * 8)
             and m.shapes[-1][2] == 4 * GFL_BINS else 0,
             _decode_gfl, pixels=IMAGENET_RGB),
-])  # fmt: skip
+]  # fmt: skip
+LAYOUTS: Registry[Decode] = Registry("object detectors", "--detector-layout", ENTRIES)
 
 
 def find_layout(model: ModelProbe, declared: str, names_of: str) -> Layout:
@@ -370,31 +394,27 @@ def find_layout(model: ModelProbe, declared: str, names_of: str) -> Layout:
         ReobjError: its outputs fit no layout, or several, or not the declared one.
     """
     shapes = ", ".join(f"{name} {output.shape}" for name, output in model.outputs.items())
-    near = []
-    for entry in LAYOUTS.formats:
-        assert isinstance(entry, Layout)
-        count = entry.classes(model)
-        if entry.name == declared and count is not None and count < 1:
-            raise ReobjError(f"{model.path}: {shapes}: not the outputs of layout {declared}, "
-                             f"{entry.shape}")  # fmt: skip
-        near += [f"{entry.name} with {count} classes"] if count and count > 0 else []
+    counts = {entry.name: entry.classes(model) for entry in ENTRIES}
+    near = [f"{name} with {count} classes" for name, count in counts.items() if count and count > 0]
     model.found = f": {shapes}"
     if near:
         task = f" and task {task}" if (task := model.metadata.get("task")) else ""
-        small = near[0].startswith("yolo ") and model.in_fractions
-        fractions = ", but its boxes are fractions: export them in px of the input" * bool(small)
+        small = "yolo with" in near[0] and model.in_fractions
+        fractions = ", but its boxes are fractions: export them in px of the input" * small
         model.found += (f" with {model.count} class names ({names_of}){task}; by its shape "
                         f"{' or '.join(near)}{fractions}")  # fmt: skip
-    layout = LAYOUTS.choose(model, declared)
-    assert isinstance(layout, Layout)
+    layout = ENTRIES[LAYOUTS.formats.index(LAYOUTS.choose(model, declared))]
+    count = counts[layout.name]
+    if count is not None and count < 1:
+        raise ReobjError(f"{model.path}: {shapes}: not the outputs of layout {declared}, "
+                         f"{layout.shape}")  # fmt: skip
     return layout
 
 
 def layouts_table() -> str:
     """Return the Markdown table of docs/input_formats.md."""
     rows = [("layout", "models", "outputs", "image", "not read"), ("---",) * 5]
-    for entry in LAYOUTS.formats:
-        assert isinstance(entry, Layout)
+    for entry in ENTRIES:
         image = f"{entry.fit}, {entry.pixels.title}"
         rows.append((f"`{entry.name}`", entry.title, entry.shape, image, entry.unread))
     return "".join(f"| {' | '.join(row)} |\n" for row in rows)

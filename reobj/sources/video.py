@@ -16,12 +16,11 @@ import itertools
 import json
 import math
 import os
-import queue
 import re
 import sys
 import threading
 import time
-from collections import Counter
+from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -37,17 +36,15 @@ from reobj.runtime import check_versions, guard_forks, quiet_opencv
 from reobj.sources.decoding import (
     Decoded,
     Opened,
-    Stored,
     open_animation,
     open_camera,
     open_file,
+    packet_count,
     settled_times,
-    stored_in,
 )
 from reobj.sources.image_files import (
     IMAGE_FPS,
     IMAGE_SUFFIXES,
-    PIXELS_MAX,
     ImageList,
     list_images,
     read_image,
@@ -87,7 +84,7 @@ class InputConfig:
         return within & ((frame - self.start) % self.every == 0)
 
 
-MAX_UNREADABLE = 64  # consecutive frames, 2 s at 30 Hz; lower: a damaged passage ends a video
+MAX_UNREADABLE = 64  # frames at the beginning, 2 s at 30 Hz, before a video is refused
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +94,7 @@ class LiveTimes:
     Attributes:
         silent_s: s without a frame after which it has ended. Lower: a short break of the network
             ends the run; higher: a run waits longer for a camera that was switched off.
-        open_s: s to open a stream, and to read from it. Cameras answer within 2 s.
+        open_s: s to open a stream. Cameras answer within 2 s.
         first_wait_s, longest_wait_s: s before the first attempt to reconnect, doubled for each next
             one, and its maximum. Lower: more load on a server that is down; higher: more frames are
             lost after a short break.
@@ -107,18 +104,6 @@ class LiveTimes:
     open_s: float = 5.0
     first_wait_s: float = 1.0
     longest_wait_s: float = 30.0
-
-
-@dataclass(frozen=True, slots=True)
-class Clock:
-    """Times (F,) in s of a file's frames.
-
-    complete: of all frames, not only of those before `config.stop`. known: the file has times.
-    """
-
-    times_s: Array
-    complete: bool
-    known: bool
 
 
 class Video:
@@ -169,13 +154,14 @@ class Video:
             raise ReobjError("--every must be at least 1; --start, --stop, --max-size at least 0")
         self.skipped: list[int] = []
         self.messages: list[str] = []
-        self.read = self.dropped = self._seen = 0
+        self.read = self.dropped = self._seen = self._taken = 0
+        self._declared_s = 0.0
         self._opened: Opened | None = None  # a live source, until it is iterated
         self._is_url = _is_stream_url(self._address)
         self.fingerprint = source_fingerprint(source)
         images = ImageList([], [], []) if self._is_url else list_images(self.source)
         self.files = images.files
-        self._clock: Clock | None = None
+        self._clock: tuple[Array, bool] | None = None  # times (F,) in s; the file has them
         for text in images.messages:
             self._warn(text)
         self.names = [path.name for path in self.files]
@@ -215,83 +201,68 @@ class Video:
     @property
     def expected(self) -> int:
         """Approximate number of frames of an iteration; as announced until it is measured."""
-        clock = self._clock
-        count = self._announced
-        count = len(clock.times_s) if clock is not None and clock.complete else count
+        measured = self._clock is not None and not self.config.stop
+        count = self.frame_count if measured else self._announced
         stop = min(self.config.stop or count, count or self.config.stop)
-        return max(math.ceil((stop - self.config.start) / self.config.every), 0)
+        return len(range(self.config.start, stop, self.config.every))
 
     @functools.cached_property
     def copies(self) -> dict[int, int]:
         """Frame numbers of images with the same bytes as an earlier one, and of that one."""
-        first = dict[tuple[int, str], int]()
+        first = dict[str, int]()
         copies = {}
-        sizes = [path.stat().st_size for path in self.files]
-        usual = Counter(sizes)
         for k, path in enumerate(self.files):
-            if usual[sizes[k]] > 1:
-                number = first.setdefault((sizes[k], content_fingerprint([path])), k)
-                if number != k and filecmp.cmp(path, self.files[number], shallow=False):
-                    copies[k] = number
+            number = first.setdefault(content_fingerprint([path]), k)
+            if number != k and filecmp.cmp(path, self.files[number], shallow=False):
+                copies[k] = number
         return copies
 
     @functools.cached_property
     def frame_count(self) -> int:
         if self.files or self.is_live:
             return len(self.files)
-        clock = self._measured()
-        return (
-            len(clock.times_s) if clock.complete else max(len(clock.times_s), self._stored().count)
-        )
+        if self.config.stop and not self._is_animation:
+            return packet_count(self._path)
+        return len(self._measured()[0])
 
     @functools.cached_property
     def fps(self) -> float:
         announced = self._announced_fps
         times_s = self.times_s
         if not self.files and not self.is_live and self.times_are_known:
-            times_s = self._measured().times_s
+            times_s = self._measured()[0]
         if times_s is None or len(times_s) < 2:
-            return self._assumed_fps
+            return announced
         steps = len(times_s) - 1
         seconds = float(np.ptp(times_s))
         same = abs(steps / announced - seconds) <= 1e-3  # s, resolution of times in containers
         return announced if same else steps / seconds
 
-    @property
-    def _assumed_fps(self) -> float:
-        """Frame rate without measured times: as announced, unless implausible."""
-        announced = self._announced_fps
-        return announced if announced <= 240 else IMAGE_FPS  # Hz, of the fastest phones
-
     @functools.cached_property
     def times_are_known(self) -> bool:
         if self.files or self.is_live:
             return self.is_live or self.times_s is not None
-        return self._measured().known
+        return self._measured()[1]
 
     def __iter__(self) -> Iterator[Frame]:
         self.skipped.clear()
-        decoded = self._from_images() if self.files else self._from_file()
-        unreadable = list[int]()
-        other_size = list[int]()
-        for index, time_s, image in self._from_live() if self.is_live else one_ahead(decoded):
-            if image is None or (image.shape[1], image.shape[0]) != self.size:
-                (unreadable if image is None else other_size).append(index)
-                self.skipped.append(index)
-            elif index > self._after:
-                yield Frame(index, time_s, self._scaled(image))
         others = "most" if self.files else "the first"
         size = f"not {self.size[0]}x{self.size[1]}, the size of {others}"
-        for skipped, why in ((unreadable, "unreadable"), (other_size, size)):
+        left_out: dict[str, list[int]] = {"unreadable": [], size: []}
+        decoded = self._from_images() if self.files else self._from_file()
+        for index, time_s, image in self._from_live() if self.is_live else one_ahead(decoded):
+            if image is None or image.shape[1::-1] != self.size:
+                left_out["unreadable" if image is None else size].append(index)
+                self.skipped.append(index)
+            elif index > self._after:
+                if self.working_size != self.size:
+                    small = cv2.resize(image, self.working_size, interpolation=cv2.INTER_AREA)
+                    image = np.asarray(small, np.uint8)
+                yield Frame(index, time_s, image)
+        for why, skipped in left_out.items():
             if skipped:
-                which = [self.name(index) or index for index in skipped]
-                self._warn(f"{len(skipped)} frames skipped ({why}): {shortened(which)}")
-
-    def _scaled(self, image: Image) -> Image:
-        if self.working_size == self.size:
-            return image
-        small = cv2.resize(image, self.working_size, interpolation=cv2.INTER_AREA)
-        return np.asarray(small, np.uint8)
+                which = shortened([self.name(index) or index for index in skipped])
+                self._warn(f"{len(skipped)} frames skipped ({why}): {which}")
 
     def _warn(self, text: str) -> None:
         if (text := f"{self.source}: {text}") not in self.messages:
@@ -311,61 +282,35 @@ class Video:
                 self._measured()  # correcting this time needs all later ones
             raw_s.append(seconds)
             if self.config.selects(index):
-                time_s = seconds if self._clock is None else float(self._clock.times_s[index])
+                time_s = seconds if self._clock is None else float(self._clock[0][index])
                 yield index, time_s, None if image is None else image()
         if self._clock is None:
             self._keep(raw_s)
 
     def _decoded(self) -> Iterator[Decoded]:
-        """Decode the frames before `config.stop` one by one.
+        """Decode the frames before `config.stop` one by one."""
+        return itertools.islice(self._open().frames, self.config.stop or None)
 
-        Undecodable frames count only if a later one can be decoded: at the end of the file they do
-        not exist.
-        """
-        index = 0
-        failed = list[Decoded]()
-        for item in self._open().frames:
-            failed.append(item)
-            if item.image is not None:
-                for each in failed:
-                    yield each
-                    index += 1
-                    if index == self.config.stop:
-                        return
-                failed.clear()
-            elif len(failed) == MAX_UNREADABLE:
-                return
-
-    def _measured(self) -> Clock:
-        """Return the times of the frames; a file is decoded once."""
+    def _measured(self) -> tuple[Array, bool]:
+        """Return the times of the frames before `config.stop`; a file is decoded once."""
         return self._clock or self._keep([frame.time_s for frame in self._decoded()])
 
-    def _keep(self, raw_s: Sequence[float]) -> Clock:
+    def _keep(self, raw_s: Sequence[float]) -> tuple[Array, bool]:
         """Correct the times of the container, with warnings, and store them."""
-        complete = not 0 < self.config.stop <= len(raw_s)
-        fps = self._assumed_fps
+        fps = self._announced_fps
         times_s, restarts, known = settled_times(np.array(raw_s), 1 / fps)
         if restarts:
             self._warn(f"its clock restarts {restarts} time(s): times are continued from there")
         if not known:
             self._warn(f"it has no times: {fps:g} frames a second are assumed")
-        if complete and not self._is_url and (text := self._missing_end(times_s)):
-            self._warn(text)
-        self._clock = Clock(times_s, complete, known)
-        return self._clock
-
-    def _missing_end(self, times_s: Array) -> str:
-        """Describe missing frames at the end of a file; "": none, or no evidence."""
-        stored = self._stored()
         last_s = times_s.max(initial=0.0)
-        fault = stored.fault
-        if stored.last_s - last_s > max(2 / self._announced_fps, 0.02 * stored.last_s):
-            fault = f"is damaged, frames up to {stored.last_s:.2f} s are stored"
-        readable = f"{len(times_s)} frames up to {last_s:.2f} s can be read"
-        return f"the file {fault}: {readable}" if fault else ""
-
-    def _stored(self) -> Stored:
-        return Stored() if self._is_animation else stored_in(self._path)
+        lost_s = self._declared_s - last_s
+        stopped = 0 < self.config.stop <= len(raw_s)
+        if known and not stopped and lost_s > max(2 / fps, 0.02 * self._declared_s):
+            read = f"{len(times_s)} frames up to {last_s:.2f} s can be read"
+            self._warn(f"it ends early or is damaged: {read}, {self._declared_s:.2f} s declared")
+        self._clock = (times_s, known)
+        return self._clock
 
     def _from_live(self) -> Iterator[tuple[int, float, Image | None]]:
         """Yield number, time in s since the start and image of the newest frames of a live source.
@@ -374,108 +319,86 @@ class Video:
         """
         opened: Opened | None = self._opened or self._open()
         self._opened = None
-        self.read = self.dropped = self._seen = attempts = 0
-        began = time.monotonic()
-        while opened is not None:
+        self.read = self.dropped = self._seen = self._taken = attempts = 0
+        began_s = time.monotonic()
+        while True:
             before = self._seen
-            yield from self._from_connection(opened, began)
-            attempts = attempts if self._seen == before else 0  # consecutive, without a frame
+            if opened is not None:
+                yield from self._from_connection(opened, began_s)
+            attempts = attempts + 1 if self._seen == before else 1  # consecutive, without a frame
+            if attempts > self.config.reconnect or self._at_stop:
+                return
+            wait_s = self._live.first_wait_s * 2.0 ** min(attempts - 1, 9)
+            wait_s = min(wait_s, self._live.longest_wait_s)
+            log.warning("%s: ended; reconnecting in %g s", self.source, wait_s)
+            time.sleep(wait_s)
             opened = None
-            while opened is None and attempts < self.config.reconnect:
-                if 0 < self.config.stop <= self._seen:
-                    break
-                wait_s = self._live.first_wait_s * 2.0 ** min(attempts, 9)
-                wait_s = min(wait_s, self._live.longest_wait_s)
-                attempts += 1
-                log.warning("%s: ended; reconnecting in %g s", self.source, wait_s)
-                time.sleep(wait_s)
-                with contextlib.suppress(ReobjError):
-                    opened = self._open()
+            with contextlib.suppress(ReobjError):
+                opened = self._open()
+
+    @property
+    def _at_stop(self) -> bool:
+        """Whether `config.stop` frames of a live source have come."""
+        return 0 < self.config.stop <= self._seen
 
     def _from_connection(
-        self, opened: Opened, began: float
+        self, opened: Opened, began_s: float
     ) -> Iterator[tuple[int, float, Image | None]]:
         """Yield the newest frames until a connection ends.
 
         A thread reads all frames, so that the driver's queue does not fill with old ones.
         """
         # Two frames wait: the next one for the tracker, and the newest one
-        frames: queue.Queue[tuple[int, float, Image]] = queue.Queue(2)
+        waiting: deque[tuple[int, int, float, Image]] = deque(maxlen=2)
         stopped = threading.Event()
-        self._last_frame_s = time.monotonic()
-        thread = threading.Thread(
-            target=self._read_live, args=(opened, frames, stopped, began), daemon=True
-        )
+
+        def read() -> None:
+            with contextlib.closing(opened.frames):
+                for frame in opened.frames:
+                    if stopped.is_set() or self._at_stop:
+                        return
+                    if frame.image is None:
+                        continue
+                    if self.config.selects(self._seen):
+                        time_s = time.monotonic() - began_s
+                        waiting.append((self.read, self._seen, time_s, frame.image()))
+                        self.read += 1
+                    self._seen += 1
+
+        thread = threading.Thread(target=read, daemon=True)
         thread.start()
-        poll_s = 0.5  # longer than the reading thread takes to end
         try:
-            while (reads := thread.is_alive() and self._silent_s < poll_s) or frames.qsize():
-                with contextlib.suppress(queue.Empty):
-                    yield frames.get(timeout=0.05)
-            if not reads and thread.is_alive():
-                self._warn(f"no frame came for {self._live.silent_s:g} s: taken as its end")
+            while thread.is_alive() or waiting:
+                if not waiting:
+                    time.sleep(0.005)
+                    continue
+                number, at, time_s, image = waiting.popleft()
+                self.dropped = number - self._taken
+                self._taken += 1
+                yield at, time_s, image
         finally:
             stopped.set()
-            # A thread that hangs in the driver is left
-            thread.join(0.0 if self._silent_s > 0 else self._live.silent_s / 2)
-
-    @property
-    def _silent_s(self) -> float:
-        """Time since a live source has ended for lack of frames, s; negative: it has not."""
-        return time.monotonic() - self._last_frame_s - self._live.silent_s
-
-    def _read_live(
-        self,
-        opened: Opened,
-        frames: queue.Queue[tuple[int, float, Image]],
-        stopped: threading.Event,
-        began: float,
-    ) -> None:
-        """Read a live source until it ends or `stopped`; drop the oldest frame of a full queue."""
-        with contextlib.closing(opened.frames):
-            for frame in opened.frames:
-                # Stopped also if the driver hung, and a new connection is in use
-                if stopped.is_set() or self._silent_s >= 0 or 0 < self.config.stop <= self._seen:
-                    return
-                if frame.image is None:
-                    time.sleep(0.01)
-                    continue
-                self._last_frame_s = time.monotonic()
-                at = self._seen
-                self._seen += 1
-                if not self.config.selects(at):
-                    continue
-                self.read += 1
-                if frames.full():
-                    with contextlib.suppress(queue.Empty):  # the tracker took it first
-                        frames.get_nowait()
-                        self.dropped += 1
-                # No other thread puts: it does not block
-                frames.put((at, self._last_frame_s - began, frame.image()))
+            thread.join(self._live.silent_s)
 
     def _open(self) -> Opened:
         """Open the source.
 
         Raises:
-            ReobjError: it is missing, unreadable, no video, or has too large frames.
+            ReobjError: it is missing, unreadable or no video.
         """
         path = Path(self.source)
-        is_camera = self.is_live and self._address.isdecimal()
+        is_camera = self.is_live and not self._is_url
         if not (is_camera or self._is_url or path.is_file()):
             raise ReobjError(f"{self.source}: no such file or folder")
         try:
             if is_camera:
-                return open_camera(int(self._address))
-            opened = (
-                open_animation(path) if self._is_animation
-                else open_file(self._path, self._live.open_s if self._is_url else None)
-            )  # fmt: skip
+                return open_camera(int(self._address), self._live.silent_s)
+            if self._is_animation:
+                return open_animation(path)
+            limits = (self._live.open_s, self._live.silent_s) if self._is_url else ()
+            return open_file(self._path, *limits)
         except ReobjError as error:
             raise ReobjError(f"{self.source}: {error}") from None
-        if opened.pixels > PIXELS_MAX:
-            raise ReobjError(f"{self.source}: frames of {opened.pixels} pixels, at most "
-                             f"{PIXELS_MAX} are allowed")  # fmt: skip
-        return opened
 
     @property
     def _path(self) -> str:
@@ -508,6 +431,7 @@ class Video:
         self.is_live = self.is_live and not opened.count  # the URL of a file is not live
         self._opened = opened if self.is_live else None
         if not self.is_live:
+            self._declared_s = opened.duration_s
             self._set_aspect(opened.pixel_aspect, frame.turned % 180 == 90)
         height, width = frame.image().shape[:2]
         fps = opened.fps if 0 < opened.fps < math.inf else IMAGE_FPS

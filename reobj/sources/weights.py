@@ -5,12 +5,10 @@ Start at `model_path`.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import http.client
 import json
 import os
-import sys
 import urllib.request
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +21,7 @@ from reobj.types import NOTE, ReobjError, log
 # and .229, .224, .225, times 255), as used to train most published networks
 IMAGENET_MEAN = (123.675, 116.28, 103.53)
 IMAGENET_STD = (58.395, 57.12, 57.375)
+FILE_MAX = 100_000_000  # bytes of a download; of DEIMv2's largest: a third
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,12 +61,6 @@ class Weights:
                 return hashlib.file_digest(file, "sha256").hexdigest()
             blob = hashlib.sha1(b"blob %d\0" % path.stat().st_size, usedforsecurity=False)
             return hashlib.file_digest(file, lambda: blob).hexdigest()
-
-    @property
-    def fallback(self) -> str:
-        """Suggest a smaller detector, as the end of an error message; "": none."""
-        other = self.role == "detector" and self.alias != "fast"
-        return "; or take the small detector: --detector fast" if other else ""
 
 
 def _deimv2(name: str, digest: str, size: int, note: str, alias: str = "") -> Weights:
@@ -115,16 +108,10 @@ class ModelRow:
 
 
 def _model_folders() -> list[Path]:
-    """List the folders for downloads: REOBJ_MODELS, if set, then the platform's cache."""
-    home = Path.home()
-    if sys.platform == "win32":
-        cache = os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local"
-    elif sys.platform == "darwin":
-        cache = home / "Library" / "Caches"
-    else:
-        cache = os.environ.get("XDG_CACHE_HOME") or home / ".cache"
+    """List the folders for downloads: REOBJ_MODELS, if set, then the cache of the user."""
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     chosen = os.environ.get("REOBJ_MODELS")
-    return [*([Path(chosen).expanduser()] if chosen else []), Path(cache) / "reobj_track"]
+    return [*([Path(chosen).expanduser()] if chosen else []), cache / "reobj_track"]
 
 
 def own_models() -> Path:
@@ -188,75 +175,44 @@ def model_path(name_or_path: str | Path, offline: bool = False, role: str = "det
 
 
 def _fetch(weights: Weights, offline: bool) -> Path:
-    """Download weights into the first writable folder; keep the file if its digest matches."""
-    folders = _model_folders()
-    missing = f"model {weights.name} is not in {' nor '.join(map(str, folders))},"
-    by_hand = f"put it at {folders[0] / weights.file}, or set REOBJ_MODELS to its folder"
-    if offline:
-        raise ReobjError(f"{missing} and --offline forbids the download: fetch {weights.url} "
-                         f"elsewhere and {by_hand}{weights.fallback}")  # fmt: skip
-    target = _writable_folder() / weights.file
+    """Download weights into the first folder; keep the file if its digest matches."""
+    folder = _model_folders()[0]
+    target = folder / weights.file
     expected = f"{weights.digest_kind} {weights.digest}"
+    smaller = "; or take the small detector: --detector fast" if weights.alias != "fast" else ""
+    by_hand = (f"get a file with {expected} from {weights.url}, put it at {target}, or set "
+               f"REOBJ_MODELS to its folder{smaller * (weights.role == 'detector')}")  # fmt: skip
+    if offline:
+        raise ReobjError(f"model {weights.name} is not in {folder}, and --offline forbids the "
+                         f"download: {by_hand}")  # fmt: skip
     size = f"{weights.size / 1e6:.1f} MB" if weights.size else "size unknown"
-    with locked(target.with_name(".lock"), wait_s=600.0):  # 100 MB at 1.3 Mbit/s
-        if target.is_file() and weights.digest_of(target) == weights.digest:
-            return target
-        log.log(NOTE, "fetching %s: %s, licence %s, from %s, %s", weights.name, size,
-                weights.licence, weights.url, expected)  # fmt: skip
-        try:
-            with atomic(target) as part:
-                _download(weights, part)
-                if (digest := weights.digest_of(part)) != weights.digest:
-                    raise ReobjError(
-                        f"{weights.url}: {weights.digest_kind} is {digest}, expected "
-                        f"{weights.digest}: not kept; run again; if it happens again the source "
-                        f"has changed: do not use it{weights.fallback}"
-                    )
-        except (OSError, http.client.HTTPException) as error:  # the server, the network or the disk
-            raise ReobjError(
-                f"{missing} and {weights.url}: download failed ({error}): run again, or get a file "
-                f"with {expected} on another machine and {by_hand}{weights.fallback}"
-            ) from error
+    with locked(folder / ".lock", wait_s=600.0):  # 100 MB at 1.3 Mbit/s
+        if not target.is_file() or weights.digest_of(target) != weights.digest:
+            log.log(NOTE, "fetching %s: %s, licence %s, from %s, %s", weights.name, size,
+                    weights.licence, weights.url, expected)  # fmt: skip
+            try:
+                _download(weights, target)
+            except (OSError, http.client.HTTPException, ReobjError) as error:
+                raise ReobjError(f"model {weights.name}: download failed ({error}): run again, or "
+                                 f"{by_hand}") from error  # fmt: skip
     return target
 
 
-def _writable_folder() -> Path:
-    """Return the first writable folder for downloads; make it if necessary."""
-    for folder in _model_folders():
-        with contextlib.suppress(OSError):
-            folder.mkdir(parents=True, exist_ok=True)
-        if os.access(folder, os.W_OK):
-            return folder
-    tried = " nor ".join(map(str, _model_folders()))
-    raise ReobjError(f"cannot write to {tried}: set REOBJ_MODELS to a writable folder")
-
-
-class StaysEncrypted(urllib.request.HTTPRedirectHandler):
-    """Follow redirects, but not from an encrypted to an unencrypted connection."""
-
-    def redirect_request(self, req: Any, *more: Any) -> Any:
-        """Return the request for a redirect."""
-        if req.full_url.startswith("https:") and not more[-1].startswith("https:"):
-            raise ConnectionError(f"redirected to {more[-1]}, which is not encrypted")
-        return super().redirect_request(req, *more)
-
-
-def _download(weights: Weights, part: Path, most: int = 100_000_000) -> None:
-    """Download the file to `part`, little more than its size, or `most` bytes if it is unknown."""
+def _download(weights: Weights, target: Path) -> None:
+    """Download a file, and keep it if its digest matches."""
     request = urllib.request.Request(weights.url, headers={"User-Agent": "reobj_track"})
-    with (
-        urllib.request.build_opener(StaysEncrypted).open(request, timeout=30) as response,  # s
-        part.open("wb") as file,
-        Progress("fetch kB", weights.size // 1000) as progress,
-    ):
-        if response.headers.get_content_type() == "text/html":
-            raise ConnectionError("a web page came instead: must you log in to this network first?")
-        size = weights.size or min(response.length or 0, most)
-        while file.tell() <= (weights.size or most) and (chunk := response.read(1 << 16)):
-            file.write(chunk)
-            progress.step(file.tell() // 1000 - progress.done)
-        if file.tell() < size:
-            raise ConnectionError(f"connection cut after {file.tell()} of {size} bytes")
+    with atomic(target) as part:
+        with (
+            urllib.request.urlopen(request, timeout=30) as response,  # s
+            part.open("wb") as file,
+            Progress("fetch kB", weights.size // 1000) as progress,
+        ):
+            while file.tell() < FILE_MAX and (chunk := response.read(1 << 16)):
+                file.write(chunk)
+                progress.step(file.tell() // 1000 - progress.done)
+        if (digest := weights.digest_of(part)) != weights.digest:
+            raise ReobjError(f"{weights.digest_kind} is {digest}, not kept: an incomplete download "
+                             "or another file")  # fmt: skip
 
 
 def frames_at_once(asked: int, device: str) -> int:
@@ -274,33 +230,28 @@ def onnx_session(path: Path, threads: int = 0, device: str = "cpu") -> Any:
     Raises:
         ReobjError: the device is unknown or not supported by this onnxruntime; or no ONNX model.
     """
-    devices = {  # onnxruntime's provider of each, and the package that has it
-        "cpu": ("CPUExecutionProvider", "onnxruntime"),
-        "cuda": ("CUDAExecutionProvider", "onnxruntime-gpu"),
-        "tensorrt": ("TensorrtExecutionProvider", "onnxruntime-gpu"),
-        "coreml": ("CoreMLExecutionProvider", "onnxruntime, on a Mac"),
-        "directml": ("DmlExecutionProvider", "onnxruntime-directml"),
-        "openvino": ("OpenVINOExecutionProvider", "onnxruntime-openvino"),
-        "migraphx": ("MIGraphXExecutionProvider", "onnxruntime-migraphx"),
-    }
-    if device not in devices:
-        raise ReobjError(f"--device {device}: unknown; known are {', '.join(devices)}")
     try:
         import onnxruntime
     except ImportError as error:
         raise ReobjError("ONNX models need onnxruntime: pip install onnxruntime") from error
-    provider, package = devices[device]
-    if provider not in (available := onnxruntime.get_available_providers()):
-        have = ", ".join(name for name, (known, _) in devices.items() if known in available)
-        raise ReobjError(f"--device {device}: this onnxruntime has {have} only; {provider} comes "
-                         f"with {package} (in place of onnxruntime)")  # fmt: skip
+    names = {"DmlExecutionProvider": "directml"}
+    providers = {
+        names.get(provider, provider.removesuffix("ExecutionProvider").lower()): provider
+        for provider in onnxruntime.get_all_providers()
+    }
+    available = onnxruntime.get_available_providers()
+    provider = providers.get(device)
+    if provider not in available:
+        have = ", ".join(name for name, known in providers.items() if known in available)
+        need = f"; {provider} needs another package in place of onnxruntime" * bool(provider)
+        raise ReobjError(f"--device {device}: this onnxruntime has {have} only{need}")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     options.log_severity_level = 3  # errors only: warnings concern the export of the model
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # no busy waiting
     try:
-        providers = list(dict.fromkeys([provider, devices["cpu"][0]]))  # CPU for missing operators
-        session = onnxruntime.InferenceSession(str(path), options, providers=providers)
+        order = list(dict.fromkeys([provider, providers["cpu"]]))  # CPU for missing operators
+        session = onnxruntime.InferenceSession(str(path), options, providers=order)
     except Exception as error:
         reason = str(error).partition("\n")[0]
         raise ReobjError(f"{path}: onnxruntime cannot load it: {reason}") from error

@@ -280,6 +280,11 @@ def test_names_in_a_locale_without_utf8(tmp_path: Path) -> None:
         cv2.imwrite(str(folder / f"{index}.png"), np.zeros((120, 160, 3), np.uint8))
         rows += [f"{index},20,30,60,70,.9,椅子", f"{index},90,30,130,70,.9,Stuhl grün"]
     (tmp_path / "det.csv").write_text("\n".join(rows), encoding="utf-8")
+    film = cv2.VideoWriter(str(tmp_path / "a.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 5, (160, 120))
+    for _ in range(6):
+        film.write(np.zeros((120, 160, 3), np.uint8))
+    film.release()
+    (tmp_path / "a.mp4").rename(tmp_path / "Küche.mp4")
     off = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
     program = [sys.executable, "-X", "warn_default_encoding", str(ROOT / "reobj_track.py")]
 
@@ -294,7 +299,8 @@ def test_names_in_a_locale_without_utf8(tmp_path: Path) -> None:
     track = ["track", "Stühle", "--detections", "det.csv", *QUICK]
     shown = run(*track, "-o", "out ü")
     assert "1 椅子" in shown and "1 Stuhl grün" in shown and "out ü" in shown
-    assert "1 object: 1 椅子" in run(*track, "-o", "one", "--classes", "椅子")
+    words = ["track", "Küche.mp4", *track[2:], "-o", "one", "--classes", "椅子"]
+    assert "1 object: 1 椅子" in run(*words)
     assert "out ü" in run("export", "out ü", "--to", "labelme")
     exported = (tmp_path / "out ü/labelme/labels.txt").read_text(encoding="utf-8")
     assert set(exported.split("\n")) >= {"Stuhl grün", "椅子"}

@@ -176,28 +176,16 @@ def test_the_overlay_lasts_as_long_as_the_video(tmp_path: Path) -> None:
     assert last_s == pytest.approx(UNEVEN[-1] / 1000, abs=0.2)
 
 
-@pytest.mark.parametrize("name", ["a.mp4", "a.mkv", "a.avi"])
+@pytest.mark.parametrize("name", ["a.mp4", "a.mkv"])
 def test_a_truncated_file_is_reported(name: str, tmp_path: Path) -> None:
-    codec = "mjpeg" if name == "a.avi" else "libx264"
-    data = write_video(tmp_path / name, EVEN, codec=codec, noise=True).read_bytes()
+    data = write_video(tmp_path / name, EVEN, noise=True).read_bytes()
     (tmp_path / name).write_bytes(data[: 2 * len(data) // 3])
     video = rt.Video(tmp_path / name)
     count = len(list(video))
     assert 5 < count < 38 and video.frame_count == count + len(video.skipped)
     message = next(text for text in video.messages if "ends early" in text)
-    assert f"{video.frame_count} frames up to" in message
+    assert f"{video.frame_count} frames up to" in message and "1.32 s declared" in message
     assert len(list(rt.Video(tmp_path / name, rt.InputConfig(stop=5)))) == 5
-
-
-def test_a_file_that_stops_decoding_is_reported(tmp_path: Path) -> None:
-    """The file has its full length, but a damaged section."""
-    path = write_video(tmp_path / "a.mkv", EVEN, codec="mjpeg", noise=True)
-    data = bytearray(path.read_bytes())
-    data[len(data) // 4 : 3 * len(data) // 4] = bytes(3 * len(data) // 4 - len(data) // 4)
-    path.write_bytes(data)
-    video = rt.Video(path)
-    assert len(list(video)) < 20 and "damaged" in str(video.messages)
-    assert "ends early" not in str(video.messages)
 
 
 @pytest.mark.parametrize(
@@ -391,7 +379,7 @@ def test_frames_that_cannot_be_decoded_to_the_end_are_reported(tmp_path: Path) -
     path.write_bytes(data)
     video = rt.Video(path)
     assert 20 < len(list(video)) < 30
-    assert "damaged, frames up to 1.29 s are stored" in str(video.messages)
+    assert "is damaged" in str(video.messages) and "1.32 s declared" in str(video.messages)
 
 
 @pytest.mark.parametrize("sizes", [[(64, 48), (128, 96), (64, 48)], [(64, 48), (48, 64)]])
@@ -430,7 +418,7 @@ def test_a_cover_picture_is_no_video(tmp_path: Path) -> None:
         heard = av.AudioFrame.from_ndarray(np.zeros((2, 1152), np.float32), "fltp", "stereo")
         heard.sample_rate = 44100
         file.mux([*sound.encode(heard), *sound.encode()])
-    with pytest.raises(rt.ReobjError, match="no video in it; its cover picture is none"):
+    with pytest.raises(rt.ReobjError, match="no video in it"):
         rt.Video(tmp_path / "a.mp3")
 
 
@@ -580,7 +568,7 @@ def test_depth_maps_and_masks_beside_images_are_no_frames(tmp_path: Path) -> Non
 
     few = write(tmp_path / "few", numbered("%04d.jpg", 20))
     write(few, ["0004_mask.png", "0010_mask.png"])  # in colour, of some
-    read(few, 20, "2 images are no frames (by its name; others have the same numbers): 0004_mask")
+    read(few, 20, "2 images are no frames (by their name): 0004_mask")
 
     named = write(tmp_path / "named", numbered("rgb_%d.png"))
     write(named, numbered("edges_%d.png"))
@@ -590,7 +578,7 @@ def test_depth_maps_and_masks_beside_images_are_no_frames(tmp_path: Path) -> Non
     nerf = write(tmp_path / "synthetic", numbered("r_%d.png"))
     for name in ("r_%d_depth_0000.png", "r_%d_normal_0000.png"):  # in colour
         write(nerf, numbered(name))
-    read(nerf, 6, "6 images are no frames (by its name", "6 images are no frames (by its name")
+    read(nerf, 6, "6 images are no frames (by their name", "6 images are no frames (by their name")
 
 
 def test_images_of_a_single_kind_are_frames(tmp_path: Path) -> None:
@@ -746,7 +734,7 @@ def test_an_image_of_gigabytes_is_refused_by_its_header(
 ) -> None:
     (tmp_path / f"a.{kind}").write_bytes(claiming(kind, 30_000, 30_000, tmp_path))
     monkeypatch.setattr(cv2, "imdecode", None)
-    with pytest.raises(rt.ReobjError, match=f"a.{kind}: 900000000 pixels, at most 268435456"):
+    with pytest.raises(rt.ReobjError, match=f"a.{kind}: .*900000000 pixels.* exceeds"):
         rt.Video(tmp_path / f"a.{kind}")
 
 
@@ -809,10 +797,7 @@ START = 1305031102.175304
          START + 0.033333 * np.arange(3)),
         ([f"{1305031102175304000 + 33333000 * i}.jpg" for i in range(3)],
          START + 0.033333 * np.arange(3)),  # EuRoC, ROS
-        ([f"video_{87551170813262 + 33333333 * i}.jpg" for i in range(3)],
-         87551.170813262 + 0.033333333 * np.arange(3)),  # since the device was switched on
-        ([f"{1500000000000000 + 33333333 * i}.jpg" for i in range(3)],
-         1500000 + 0.033333333 * np.arange(3)),  # ns, switched on 17 days ago
+        ([f"video_{87551170813262 + 33333333 * i}.jpg" for i in range(3)], None),  # not a date
         ([f"{i / 30:.6f}.png" for i in range(4)], np.arange(4) / 30),
         ([f"{1305031102 + 5 * i}.jpg" for i in range(3)], 1305031102 + 5.0 * np.arange(3)),
         (["1305031102.175304.png"], [START]),
@@ -1017,17 +1002,6 @@ def test_a_slow_consumer_sees_the_newest_frames(monkeypatch: pytest.MonkeyPatch)
     assert all(a.time_s <= b.time_s for a, b in itertools.pairwise(seen))
 
 
-def test_a_driver_that_hangs_ends_the_video(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A stalled stream blocks OpenCV for half a minute; earlier frames are used."""
-    gate = threading.Event()
-    opened(monkeypatch, FakeCamera(5, {3: gate}))
-    video = rt.Video(0, live=QUICK)
-    began = time.monotonic()
-    assert [f.index for f in video] == [0, 1]
-    assert time.monotonic() - began < 10 and "no frame came for 1 s" in video.messages[-1]
-    gate.set()
-
-
 class Flaky:
     """cv2.VideoCapture of a source available on some attempts only, with three frames each."""
 
@@ -1226,7 +1200,6 @@ def test_a_stream_that_stalls_ends_soon(stream: tuple[Stream, str]) -> None:
         last = time.monotonic()
     assert video.read == 9 and last - began < 5
     assert 0.9 < time.monotonic() - last < 2.0
-    assert "no frame came for 1 s: taken as its end" in video.messages[-1]
 
 
 @pytest.mark.parametrize("stream", [(6, 0.02)], indirect=True)
