@@ -225,7 +225,7 @@ def test_the_last_fit_uses_occluded_edges(monkeypatch: pytest.MonkeyPatch) -> No
         monkeypatch.setattr(
             reobj.objects.fit,
             "occluded_edges",
-            lambda v, e, f, own=occluded: np.broadcast_to(own, v.boxes.shape),
+            lambda v, *_, own=occluded: np.broadcast_to(own, v.boxes.shape),
         )
         found = finished(dataclasses.replace(given), link=False).objects
         heights.append([o.size[2] for o in found if o.size is not None])
@@ -259,7 +259,7 @@ def test_the_last_fit_starts_from_the_association(
         calls = Mock(wraps=quadrics.fit_objects)
         monkeypatch.setattr(quadrics, "fit_objects", calls)
         result = finished(unlinked(walk(), tracks_of(walk())), link=link)
-        (_, ellipsoids, _), _ = seen.call_args
+        (_, ellipsoids, *_), _ = seen.call_args
         center = [o.center for o in result.objects]
         np.testing.assert_allclose(ellipsoids.center_in_world, center, atol=0.05)
         occluded = [call.kwargs["hidden"] is not None for call in calls.call_args_list]
