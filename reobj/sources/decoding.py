@@ -5,7 +5,6 @@ Start at `open_file`. PyAV reads everything but cameras (OpenCV) and animated im
 
 from __future__ import annotations
 
-import contextlib
 import math
 import time
 from collections.abc import Callable, Generator, Iterator
@@ -128,11 +127,17 @@ def open_file(address: str, open_s: float | None = None, read_s: float | None = 
 
 
 def _packets(file: Any, stream: Any) -> Iterator[Any]:
-    """Read the packets of a stream up to its end, a time limit or a damaged place."""
+    """Read the packets of a stream up to its end or a time limit, across damaged places."""
     import av
 
-    with contextlib.suppress(av.FFmpegError):
-        yield from file.demux(stream)
+    for _ in range(64):  # places
+        try:
+            yield from file.demux(stream)
+        except av.error.ExitError:  # time limit
+            break
+        except av.FFmpegError:
+            continue
+        break
     yield None  # returns the frames that the decoder holds
 
 
@@ -160,7 +165,7 @@ def _file_frames(file: Any, stream: Any) -> Generator[Decoded]:
                 continue
             for frame in frames:
                 at = frame.dts if frame.pts is None else frame.pts
-                time_s = math.nan if at is None else float(at * frame.time_base) - start_s
+                time_s = math.nan if at is None else float(at * stream.time_base) - start_s
                 yield Decoded(time_s, partial(_bgr, reformatter, frame), frame.rotation)
 
 

@@ -382,6 +382,16 @@ def test_frames_that_cannot_be_decoded_to_the_end_are_reported(tmp_path: Path) -
     assert "is damaged" in str(video.messages) and "1.32 s declared" in str(video.messages)
 
 
+def test_a_recorded_stream_is_read_across_a_damaged_place(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "a.ts", EVEN, noise=True)
+    data = bytearray(path.read_bytes())
+    third = len(data) // 3
+    data[third : third + len(data) // 6] = bytes(len(data) // 6)
+    path.write_bytes(data)
+    frames = list(rt.Video(path))
+    assert 25 < len(frames) < 40 and frames[-1].time_s > 1.2
+
+
 @pytest.mark.parametrize("sizes", [[(64, 48), (128, 96), (64, 48)], [(64, 48), (48, 64)]])
 def test_frames_of_another_size_are_left_out_and_said(
     sizes: list[tuple[int, int]], tmp_path: Path
