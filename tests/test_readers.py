@@ -705,6 +705,11 @@ def test_stamps_of_another_clock_match_in_order(tmp_path, start, every, count, k
     assert "order, one row for each frame of the source" in poses.reading
 
 
+def test_a_camera_that_stays_at_the_identity_has_poses(tmp_path):
+    poses = read(as_scannet(tmp_path, np.tile(np.eye(3, 4), (6, 1, 1))), blank(FRAMES))
+    assert poses.known.all()
+
+
 def test_lost_scannet_frames_have_no_pose(tmp_path):
     path = as_scannet(tmp_path, some_cameras())
     text(tmp_path / "pose" / "3.txt", np.full((4, 4), -np.inf))

@@ -238,8 +238,8 @@ def read_pose_file(path: Path, fmt: str, size: tuple[int, int]) -> PoseFile:
 def _settled(found: PoseFile, entry: Format[ReadPoses], path: Path) -> PoseFile:
     """Sort poses by their time stamps, without repeated ones, and remove those of lost frames.
 
-    These are the identity in the axes of the file. It is a pose where it begins the path, and where
-    it is the only one of poses with names.
+    These are the identity in the axes of the file. It is a pose where it begins the path, where it
+    is the only one of poses with names, and where there is no other pose.
     """
     poses = found.cam_from_world
     stamps = found.stamps
@@ -257,6 +257,7 @@ def _settled(found: PoseFile, entry: Format[ReadPoses], path: Path) -> PoseFile:
     begins = same[:1].any() and not same[1:2].any()
     if begins or (found.names and same.sum() == 1):
         same[same.argmax()] = False
+    same &= not same.all()
     poses = np.where(same[:, None, None], np.nan, poses)
     lost = int((~np.isfinite(poses).all((1, 2))).sum())
     if lost == len(poses):
