@@ -231,7 +231,7 @@ BAD_TRACKS = {
     ),
     "detections": ("a.txt", "1,-1,10,10,20,20,.9,-1,-1,-1\n", "no box has an identity"),
     "twice": ("a.txt", "1,4,10,10,20,20\n1,4,99,10,20,20\n", "identity 4 has 2 boxes in frame 0"),
-    "missing": ("a.txt", None, "no such file"),
+    "missing": ("a.txt", None, "does not exist"),
 }
 
 

@@ -268,7 +268,7 @@ def forms(probe: Probe) -> frozenset[str]:
         return frozenset({"mot"})
     values = np.array([[_number(cell) for cell in cells] for cells in rows])  # (N, 9 or 10)
     flag, kind, last = values[:, 6], values[:, 7], values[:, 8:]
-    whole = (kind >= 0) & (kind % 1 == 0)
+    whole = (kind >= 0) & (kind == np.floor(kind))
     if count == 10:
         fits = whole & (kind <= 11) & np.isin(last, range(3)).all(1) & ((kind > 0) | (flag == 0))
         return frozenset({"visdrone" if fits.all() and kind.any() else "mot"})
