@@ -48,11 +48,13 @@ ALIASES: dict[str, str] = {  # names of columns; the first one with values is us
             "timestamp_ms",
     "id": "id track_id tracker_id trackid track object_id obj_id object_uid instance_id instance "
           "identity",
-    "x1": "x1 x_min xmin left bb_left bbox_left box_left x_left xtl bbox_x1 bbox_xmin x bbox_x "
-          "bb_x",
-    "y1": "y1 y_min ymin top bb_top bbox_top box_top y_top ytl bbox_y1 bbox_ymin y bbox_y bb_y",
-    "x2": "x2 x_max xmax right bb_right bbox_right box_right x_right xbr bbox_x2 bbox_xmax",
-    "y2": "y2 y_max ymax bottom bb_bottom bbox_bottom box_bottom y_bottom ybr bbox_y2 bbox_ymax",
+    "x1": "x1 x_min xmin left bb_left bbox_left box_left x_left xtl bbox_x1 box_x1 bbox_xmin "
+          "x bbox_x bb_x",
+    "y1": "y1 y_min ymin top bb_top bbox_top box_top y_top ytl bbox_y1 box_y1 bbox_ymin "
+          "y bbox_y bb_y",
+    "x2": "x2 x_max xmax right bb_right bbox_right box_right x_right xbr bbox_x2 box_x2 bbox_xmax",
+    "y2": "y2 y_max ymax bottom bb_bottom bbox_bottom box_bottom y_bottom ybr bbox_y2 box_y2 "
+          "bbox_ymax",
     "w": "w bb_width bbox_width box_width bbox_w bb_w width",
     "h": "h bb_height bbox_height box_height bbox_h bb_h height",
     "image w": "img_width image_width img_w image_w frame_width original_width imw im_w "
