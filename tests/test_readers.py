@@ -547,6 +547,15 @@ def transpose(path):
 
 NGP, COLOR = "transforms.json", "intrinsic/intrinsic_color.txt"
 ONLY, IMAGES, CAMERAS = as_colmap_poses_only, "images.txt", "cameras.txt"
+
+
+def put(path, offset, value):
+    """Overwrite a double of a binary file."""
+    data = bytearray(path.read_bytes())
+    data[offset : offset + 8] = np.float64(value).tobytes()
+    path.write_bytes(data)
+
+
 # writer, file, how it is damaged, what the message must hold
 DAMAGED = [
     (as_tum, "poses.txt", lambda p: edit(p, 2, drop_last), "line 3: 7 words"),
@@ -614,6 +623,7 @@ DAMAGED = [
     (ONLY, CAMERAS, lambda p: p.unlink(), "no cameras.txt beside it"),
     (ONLY, "points3D.txt", lambda p: edit(p, 0, drop_last), "not a COLMAP model"),
     (as_colmap_binary, "images.bin", lambda p: p.write_bytes(p.read_bytes()[:30]), "not a COLMAP"),
+    (as_colmap_binary, "cameras.bin", lambda p: put(p, 32, np.inf), "expected a size, finite numb"),
 ]
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from reobj.cameras import Camera, camera_parameters, checked_camera
+from reobj.cameras import Camera, camera_parameters, checked_camera, usable
 from reobj.files import load_json, load_npz, read_text, shortened
 from reobj.formats import AUTO, Format, Probe, Registry
 from reobj.types import COORDINATE_MAX, ReobjError
@@ -91,6 +91,7 @@ def fitted_camera(camera: Camera, size: tuple[int, int], where: str) -> Camera:
         camera_parameters(camera.model)  # refuses panoramas, which have no K
     except ReobjError as error:
         raise ReobjError(f"{where}: {error}") from None
+    refuse_unusable(camera, where)
     if abs(width * size[1] - height * size[0]) > max(width, height, *size):  # more than rounding
         raise ReobjError(
             f"{where}: a camera of {width}x{height} images, but the frames are {size[0]}x{size[1]};"
@@ -105,6 +106,13 @@ def fitted_camera(camera: Camera, size: tuple[int, int], where: str) -> Camera:
             f"{100 * ratio:.0f} % of the pixels; check the order of the distortion terms"
         )
     return camera
+
+
+def refuse_unusable(camera: Camera, where: str) -> None:
+    """Refuse a camera without a size, finite parameters and positive focal lengths."""
+    if not usable(camera):
+        text = "expected a size, finite numbers and focal lengths above 0"
+        raise ReobjError(f"{where}: {camera_line(camera)}: {text}")
 
 
 def pinhole_ratio(camera: Camera, count: int = 16) -> float:

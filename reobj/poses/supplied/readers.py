@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from reobj.cameras import WORLD_MAX, Camera, Poses, invert_rigid, usable
+from reobj.cameras import WORLD_MAX, Camera, Poses, invert_rigid
 from reobj.files import spans
 from reobj.formats import AUTO, Format, Probe, Registry
 from reobj.poses.estimate import PosesConfig
@@ -25,6 +25,7 @@ from reobj.poses.intrinsics import (
     is_dso_camera,
     is_kitti_calibration,
     parse_camera,
+    refuse_unusable,
 )
 from reobj.poses.supplied import pose_formats as formats
 from reobj.poses.supplied.check import Supplied
@@ -88,8 +89,6 @@ def read_supplied(video: Any, config: PosesConfig) -> Supplied:
     row = assignment.row
     turns = turns_of(source, size, pose_file.cameras, row) if pose_file.stored_pixels else {}
     camera = stated or one_camera(_cameras_of(pose_file, row, turns), path, size)
-    if not usable(camera):
-        raise ReobjError(f"{path}: {camera}: expected finite numbers, focal lengths above 0")
     cam_from_world = _of_frames(pose_file.cam_from_world, assignment, source, stamps_s)
     if (np.abs(cam_from_world) >= WORLD_MAX).any():
         raise ReobjError(f"{path}: a camera is more than {WORLD_MAX:g} units away from the origin")
@@ -177,6 +176,8 @@ def one_camera(cameras: Sequence[Camera | None], path: Path, size: tuple[int, in
     found = sorted((c for c in cameras if c is not None), key=lambda c: c.params[0])
     if not found:
         raise ReobjError(f"{path}: no intrinsics; add --camera {CAMERA_FORMS}")
+    for camera in found:
+        refuse_unusable(camera, str(path))
     kinds = sorted({f"{c.model} {c.width}x{c.height}" for c in found})
     K = np.array([camera.K for camera in found])  # (n, 3, 3)
     if len(kinds) > 1 or np.ptp(K, axis=0).max() > MAX_SPREAD * K[0, 0, 0]:
