@@ -148,7 +148,7 @@ def read_config(config: C, path: str | Path) -> C:
     try:
         # At most a thousand times the length of all options
         table = tomllib.loads(read_text(path, 1 << 20, "surrogateescape"))
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # also a number of 5,000 digits
         raise ReobjError(f"{path}: not valid TOML ({error})") from None
     for name, value in _settings(table).items():
         value = _with_bytes(value) if isinstance(value, str) else value

@@ -40,7 +40,10 @@ def meant(word: str, names: Sequence[str]) -> list[int]:
 
 def typed(word: str) -> str:
     """Decode a word of the command line in a locale without UTF-8 (LC_ALL=C)."""
-    return word.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+    try:
+        return word.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+    except UnicodeEncodeError:  # other surrogates, as in JSON
+        return word.encode("utf-8", "replace").decode()
 
 
 def among(names: Iterable[str], words: Iterable[str]) -> BoolArray:

@@ -200,6 +200,7 @@ def test_any_text_survives_a_file(tmp_path: Path, text: str) -> None:
         ("[tracker]\nn_init = true", r"tracker\.n_init: expected =INT, found True"),
         ("[tracker]\nremember = 'maybe'", "tracker.remember: expected =BOOL"),
         ("tracker = 3", "tracker: no such option"),
+        ("[tracker]\nmax_age = " + "9" * 5000, "not valid TOML"),
         ("[tracker", r"not valid TOML \(Expected"),
         ("[output]\noverlay = 'solid'", r"output\.overlay=solid: expected"),
     ],

@@ -155,7 +155,7 @@ def read_result(out: Path, notes: list[str] | None = None) -> LabelledBoxes:
         predicted = LabelledBoxes(frame, ids, tracks.xyxy, names[tracks.class_id], role)
     else:
         predicted = labelled(_checked(read_mot_rows(out), out, notes))
-    _check_identities(predicted, out)
+    _check_identities(predicted, out / "tracks.txt" if out.is_dir() else out)
     return predicted
 
 

@@ -167,3 +167,7 @@ def test_a_label_without_a_prior_keeps_the_category(tmp_path: Path, label: str, 
         sizes.append(np.array(found.size))
     assert found.class_name == label
     assert np.allclose(*sizes) == same
+
+
+def test_a_name_that_is_no_unicode_is_a_class_name() -> None:
+    assert len({canonical("\ud800"), canonical("chair")}) == 2
