@@ -60,6 +60,7 @@ def test_numbers_are_parsed():
         ("OPENCV 640 480 500 500 320 240", "4 parameters of a OPENCV camera; expected fx, fy"),
         ("PINHOLE 640 480 500 500 320 x", "neither a file nor a camera"),
         ("PINHOLE 640 480 500 500 320 nan", "not finite"),
+        ("PINHOLE 9" + "0" * 30 + " 480 500 500 320 240", "size not of 1 to"),
         ("EQUIRECTANGULAR 640 480 640 480", "has no focal length"),
         ("PINHOLE 480 640 500 500 240 320", "480x640 images, but the frames are 640x480"),
     ],

@@ -175,8 +175,10 @@ def colmap_camera(words: Sequence[str]) -> Camera:
     """
     model, width, height, *params = words
     camera = Camera(model, int(width), int(height), tuple(map(float, params)))
-    if not np.isfinite(camera.params).all() or min(camera.width, camera.height) < 1:
-        raise ReobjError(f"{' '.join(words)!r}: a number is not finite, or the size not positive")
+    sides = (camera.width, camera.height)
+    if not np.isfinite(camera.params).all() or not 1 <= min(sides) <= max(sides) <= COORDINATE_MAX:
+        text = f"a number is not finite, or the size not of 1 to {COORDINATE_MAX:g} pixels"
+        raise ReobjError(f"{' '.join(words)!r}: {text}")
     camera.to_pycolmap()  # refuses unknown models
     return camera
 
