@@ -84,6 +84,10 @@ def read_label_folder(source: Source, pose: int = 0) -> RecordedDetections:
         box[i] = cxcywh_from_xyxy(np.hstack([points.min(0), points.max(0)])[None])[0]
         if not source.describes:
             runs[i] = polygon_runs([(points * video.size).ravel().tolist()], video.size)
+    six = np.array([row[2:] for row in rows if len(row) == 6]).reshape(-1, 4)
+    if len(six) == len(box) and _leaving(box) > 0.1 and _leaving(six) < 0.02:
+        raise ReobjError(f"{path}: boxes that leave the image as class cx cy w h conf fit it as "
+                         "class conf cx cy w h: write the confidence after the box")  # fmt: skip
     score, identity = _tails([row[at:] for row, at in zip(rows, begin, strict=True)], path)
     stems = [str(file.relative_to(path)) for file in files]
     frame = frames_of_names(stems, source, 1 if video_files else None)
@@ -92,6 +96,12 @@ def read_label_folder(source: Source, pose: int = 0) -> RecordedDetections:
         frame[np.array(of_file, np.int64)], box, (class_id, _names(source)), score, runs,
         np.array(lines, object), "line", CENTRES, np.tile(video.size, 2), identity=identity,
     )  # fmt: skip
+
+
+def _leaving(box: Array) -> float:
+    """Return the fraction of boxes (N, 4), cx cy w h in image sizes, that leave the image."""
+    reach = np.abs(box[:, :2] - 0.5) + box[:, 2:] / 2
+    return float((reach > 0.502).any(1).mean()) if len(box) else 0.0  # rounded numbers
 
 
 def _names(source: Source) -> Sequence[str]:

@@ -68,8 +68,9 @@ def other_form(
     leave = ~_inside(xyxy, size)
     if not inverted.any() and leave.sum() <= max(2, 0.1 * len(xyxy)):
         return ""
-    why = (f"as {form}, {inverted.sum()} of {len(xyxy)} boxes have x2 < x1 or y2 < y1 and "
-           f"{leave.sum()} leave the image of {size[0]:g}x{size[1]:g}")  # fmt: skip
+    image = f"the image of {size[0]:g}x{size[1]:g}"
+    why = f"as {form}, {leave.sum()} of {len(xyxy)} boxes leave {image}"
+    why += f", and {inverted.sum()} have x2 < x1 or y2 < y1" * bool(inverted.any())
     others = [other for other in (CORNERS, SIZES, CENTRES) if other != form]
     fits = [other for other in others if _inside(corners(given, other), size).mean() > 0.98]
     if fits:

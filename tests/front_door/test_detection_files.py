@@ -1132,6 +1132,17 @@ def test_boxes_in_another_form(
         assert f"all fit it as {form}" in made.said, made.said
 
 
+def test_confidences_before_the_boxes_of_yolo_labels(
+    tmp_path: Path, tracked: Callable[..., Tracked]
+) -> None:
+    path = write_boxes(tmp_path, "yolo", DECLARED["yolo"])
+    for file in path.iterdir():
+        rows = [line.split() for line in file.read_text().splitlines()]
+        file.write_text("".join(f"{row[0]} {row[5]} {' '.join(row[1:5])}\n" for row in rows))
+    made = tracked(write_clip(tmp_path / "v.avi"), "--detections", path)
+    assert made.code == 2 and "fit it as class conf cx cy w h" in made.said, made.said
+
+
 @pytest.mark.parametrize("option", ["--detections", "--tracks"])
 def test_corners_that_stay_in_the_image(
     tmp_path: Path, tracked: Callable[..., Tracked], option: str
