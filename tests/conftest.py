@@ -29,6 +29,19 @@ else:  # the same cases each time, within a minute; `--hypothesis-profile long` 
 os.environ["REOBJ_RAISE"] = "1"  # an internal error while drawing fails the test
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add --slow: without it, tests marked `slow` (more than some seconds each) are skipped."""
+    parser.addoption("--slow", action="store_true", help="also run the tests marked slow")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Skip the slow tests without --slow."""
+    if not config.getoption("--slow"):
+        for item in items:
+            if item.get_closest_marker("slow"):
+                item.add_marker(pytest.mark.skip(reason="slow: run with --slow"))
+
+
 @pytest.fixture
 def no_points(monkeypatch: pytest.MonkeyPatch) -> None:
     """Supplied poses get no triangulated points, so that no child process is started."""
