@@ -3,7 +3,6 @@
 
     python benchmarks/benchmark.py                      # our tracker only
     python benchmarks/benchmark.py --peers build/peers  # also others, in venvs made there
-    python benchmarks/benchmark.py --embedding VIDEO... # cost of the embedding
 
 The streams are synthetic, seeded and the same for every tracker: 500 frames of 1920x1080 with boxes
 and precomputed embeddings. Camera motion compensation is off; only the tracker's update is timed.
@@ -54,7 +53,7 @@ PEERS = {
     "deepsort": "peers", "rf-sort": "peers", "rf-bytetrack": "peers", "rf-ocsort": "peers",
     "rf-botsort": "peers", "norfair-reid": "norfair",
 }  # fmt: skip
-# best settings of the sweep of `compare_deepsort.py --tune`, by peer
+# best settings of a sweep over the rooms for choosing, by peer
 TUNED: dict[str, Options] = json.loads((Path(__file__).resolve().parent / "tuned.json").read_text())
 ROWS: dict[str, tuple[str, Options]] = {  # of the tables: tracker and options
     "ours": ("ours", {}),
@@ -378,85 +377,6 @@ def python_of(venvs: Path, group: str) -> Path:
     return python
 
 
-# ---- What the embedding costs ------------------------------------------------------------------
-
-
-class Clock:
-    """CPU seconds and calls of the wrapped functions of the frame at hand, by name."""
-
-    def __init__(self) -> None:
-        self.spent: dict[str, float] = {}
-        self.calls: dict[str, int] = {}
-
-    def wrap(self, owner: Any, name: str, label: str, count: Callable[..., int]) -> None:
-        """Time a method or function of `owner`; `count`: of how many objects a call is."""
-        plain = getattr(owner, name)
-
-        def timed(*args: Any, **kwargs: Any) -> Any:
-            started = time.thread_time()
-            result = plain(*args, **kwargs)
-            self.spent[label] = self.spent.get(label, 0.0) + time.thread_time() - started
-            self.calls[label] = self.calls.get(label, 0) + count(*args, **kwargs)
-            return result
-
-        setattr(owner, name, timed)
-
-
-def embedding_rows(source: str, frames: int) -> tuple[Array, IntArray]:
-    """CPU ms (F, 5) of each frame: detector, tracker in all, its embedding, of that the map, the
-    head; and how many objects were embedded (F,).
-    """
-    sys.path.insert(0, os.environ.get("REOBJ_TRACK", str(ROOT)))
-    import cv2
-
-    import reobj_track as rt
-    from reobj.appearance.embedding import Backbone
-
-    cv2.setNumThreads(1)
-    detector = rt.OnnxDetector("deimv2-femto", threads=1)
-    embedder = rt.Embedder(threads=1)
-    tracker, clock = rt.Tracker(embedder=embedder), Clock()
-    clock.wrap(Backbone, "__call__", "map", lambda *_: 1)
-    clock.wrap(Backbone, "embed", "head", lambda *_: 1)
-    clock.wrap(rt.Embedder, "__call__", "all", lambda *args: len(args[3]))
-    rows, embedded = [], []
-    for frame in rt.Video(source, rt.InputConfig(stop=frames)):
-        clock.spent.clear()
-        clock.calls.clear()
-        started = time.thread_time()
-        found = detector(frame.image)
-        detected = time.thread_time()
-        tracker.update(found, frame.image)
-        done = time.thread_time()
-        parts = [clock.spent.get(name, 0.0) for name in ("all", "map", "head")]
-        rows.append((detected - started, done - detected, *parts))
-        embedded.append(clock.calls.get("all", 0))
-    return 1e3 * np.array(rows), np.array(embedded)
-
-
-def embedding_table(sources: list[str], frames: int) -> str:
-    """Format what the embedding adds to deimv2-femto in `run`, one thread each."""
-    cells = []
-    for source in sources:
-        ms, embedded = embedding_rows(source, frames)
-        detector, asked = float(np.median(ms[:, 0])), embedded > 0
-        once = np.median(ms[asked][:, 2:], 0)  # (3,) embedding, map, head where a pass was asked
-        mean = ms[:, 2].mean()  # over all frames
-        rest = float(np.median(ms[:, 1] - ms[:, 2]))
-        cells.append([
-            Path(source).name, f"{detector:.1f}", f"{100 * asked.mean():.0f} %",
-            f"{embedded[asked].mean():.1f}", f"{once[0]:.2f}", f"{once[1]:.2f}",
-            f"{once[0] - once[1] - once[2]:.2f}", f"{once[2]:.2f}",
-            f"{mean:.2f}, {100 * mean / ms[:, 0].mean():.1f} %",
-            f"{rest:.2f}, {100 * rest / detector:.1f} %",
-        ])  # fmt: skip
-    header = (
-        "video | detector, ms | frames that ask | objects then | embedding, ms | map | sampling | "
-        "head | embedding over all frames, of the detector | tracker without"
-    )
-    return table("Embedding in `run`, CPU time with one thread", header, cells)
-
-
 # ---- Scores and tables -------------------------------------------------------------------------
 
 
@@ -545,13 +465,8 @@ def main() -> int:
     parser.add_argument("--runs", type=int, default=2, help="timed runs; the fastest counts")
     parser.add_argument("--revisit", default="50", help="numbers of objects, e.g. 10,50,200, or ''")
     parser.add_argument("--seeds", type=int, default=1, help="random scenes for each number")
-    parser.add_argument("--embedding", nargs="+", metavar="VIDEO", help="time the embedding only")
-    parser.add_argument("--frames", type=int, default=0, help="frames of each video (0: all)")
     parser.add_argument("--worker", nargs=4, help=argparse.SUPPRESS)
     args = parser.parse_args()
-    if args.embedding:
-        print(embedding_table(args.embedding, args.frames))
-        return 0
     if args.worker:
         name, options, job, result = args.worker
         worker(name, json.loads(options), Path(job), Path(result))

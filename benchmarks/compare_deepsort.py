@@ -2,18 +2,16 @@
 """Compare the identities of our tracker, DeepSORT and current trackers on the same detections.
 
     python benchmarks/compare_deepsort.py --peers build/peers --rooms reporting --mot mot -o OUT
-    python benchmarks/compare_deepsort.py --peers build/peers --rooms choosing --tune -o OUT
 
-Prints Markdown tables; writes OUT/compare.html (all tables and plots), compare.csv, compare_*.png.
+Prints Markdown tables; writes OUT/compare.csv.
 All sequences use the same settings. A tracker's rows are the detections that it assigned an
 identity to, never predicted boxes. `whole chain` decides identities over the whole video, all
 others frame by frame. Results are kept in OUT/runs: an interrupted comparison resumes, and a change
-of reobj_track.py recomputes only our own rows. --fill FILE renews the tables of a Markdown file.
+of reobj_track.py recomputes only our own rows.
 
 splits.json lists the rooms, recordings and pedestrians for reporting. All others are left out;
---choosing includes them, marked. --tune uses only the others: it varies one option of every peer
-after the other (SWEEP) for the best HOTA over all and writes the best settings to tuned.json beside
-this file, for the rows `tuned`.
+--choosing includes them, marked. The rows `tuned` have the best settings of a sweep over one option
+of a peer after the other, on the rooms for choosing (tuned.json).
 
 Rank-1: fraction of the returns (a true object in view again after >= 30 frames) whose first
 detection is nearest, by the tracker's appearance alone, to an earlier view of the same object among
@@ -31,19 +29,14 @@ copies of the last view. Pedestrians without recorded detections get the truth w
 from __future__ import annotations
 
 import argparse
-import base64
 import csv
 import functools
 import hashlib
-import html
-import json
 import os
 import re
-import shutil
 import sys
 import time
 from collections.abc import Callable
-from collections.abc import Sequence as Rows
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -64,34 +57,6 @@ from reobj.sources.weights import IMAGENET_MEAN, IMAGENET_STD, onnx_session, own
 from reobj.types import Image
 
 Embedded = list[Array]  # embeddings of every frame's detections
-# What --tune tries, one option after the other, each with the best of those before it. The first
-# value is the default; frames are frames, since `frame_rate` stays 30.
-SWEEP: dict[str, dict[str, Rows[Any]]] = {
-    "deepsort": {
-        "max_age": (30, 100, 1000), "gating_only_position": (False, True), "n_init": (3, 1),
-        "max_cosine_distance": (0.2, 0.1, 0.35), "min_score": (0.3, 0.1, 0.5),
-    },
-    "rf-sort": {
-        "lost_track_buffer": (30, 90), "track_activation_threshold": (0.25, 0.4),
-        "minimum_consecutive_frames": (3, 1), "minimum_iou_threshold": (0.3, 0.1, 0.2),
-    },
-    "rf-bytetrack": {
-        "lost_track_buffer": (30, 90), "track_activation_threshold": (0.7, 0.5, 0.3),
-        "minimum_consecutive_frames": (2, 1), "minimum_iou_threshold": (0.1, 0.05, 0.2),
-        "high_conf_det_threshold": (0.6, 0.4),
-    },
-    "rf-ocsort": {
-        "lost_track_buffer": (30, 90), "minimum_consecutive_frames": (3, 1),
-        "minimum_iou_threshold": (0.3, 0.1, 0.2), "direction_consistency_weight": (0.2, 0.0),
-        "high_conf_det_threshold": (0.6, 0.4), "delta_t": (3, 1),
-    },
-    "rf-botsort": {
-        "lost_track_buffer": (30, 90), "track_activation_threshold": (0.7, 0.5, 0.3),
-        "minimum_consecutive_frames": (2, 1), "high_conf_det_threshold": (0.6, 0.4),
-        "minimum_iou_threshold_first_assoc": (0.2, 0.05, 0.1),
-        "minimum_iou_threshold_second_assoc": (0.5, 0.3),
-    },
-}  # fmt: skip
 KITCHEN = ("chair", "dining table", "cup")  # what redkitchen's truth knows
 
 
@@ -405,8 +370,8 @@ def jobs(seq: Sequence, args: Any) -> dict[str, tuple[str, Callable[[], IntArray
     result: dict[str, tuple[str, Callable[[], IntArray]]] = {
         "ours": (source, part(ours, seq, None))
     }
-    settings: dict[str, tuple[str, Options]] = {peer: (peer, {}) for peer in SWEEP}
-    settings |= {f"{peer} tuned": (peer, TUNED[peer]) for peer in SWEEP if TUNED.get(peer)}
+    settings: dict[str, tuple[str, Options]] = {peer: (peer, {}) for peer in TUNED}
+    settings |= {f"{peer} tuned": (peer, TUNED[peer]) for peer in TUNED if TUNED[peer]}
     settings = settings if args.peers else {}
     nets = networks(seq)
     for name, net in nets.items():
@@ -448,36 +413,6 @@ def variants(seq: Sequence, args: Any) -> dict[str, IntArray]:
 
 
 # ---- Tuning the peers --------------------------------------------------------------------------
-
-
-def tune(peer: str, seqs: list[Sequence], args: Any) -> tuple[Options, list[list[str]]]:
-    """The best options of a peer on these sequences, and a line for every setting that was tried.
-
-    DeepSORT has our embeddings.
-    """
-    net = functools.partial(own_embedding, embedder=rt.Embedder())
-    embedded = {s.name: embed_all(s, net) if peer == "deepsort" else None for s in seqs}
-    truth = joined([s.truth for s in seqs])
-
-    def hota(options: Options) -> float:
-        boxes = []
-        for s in seqs:
-            make = functools.partial(peer_run, peer, options, s, args.peers, embedded[s.name])
-            key = f"{options}{EMBEDDER if peer == 'deepsort' else ''}"
-            boxes.append(result_boxes(s, kept_run(s, f"{peer} {options}", key, make, args.out)))
-        score = score_tracks(truth, joined(boxes))
-        lines.append([peer, str(options), *(f"{100 * score[c]:.1f}" for c in ("HOTA", "IDF1"))])
-        return float(score["HOTA"])
-
-    lines: list[list[str]] = []
-    best: Options = {}
-    reached = hota(best)
-    for option, (_, *values) in SWEEP[peer].items():
-        found = {v: hota(best | {option: v}) for v in values}
-        value = max(found, key=found.__getitem__)
-        if found[value] > reached:
-            reached, best = found[value], best | {option: value}
-    return best, lines
 
 
 # ---- Output ------------------------------------------------------------------------------------
@@ -568,52 +503,6 @@ def verdicts(rows: list[dict[str, Any]]) -> list[str]:
     return lines
 
 
-def write_page(rows: list[dict[str, Any]], out: Path) -> None:
-    """compare.html: the plots and all tables on one self-contained page."""
-    parts = ["<!doctype html><meta charset=utf-8><title>Identities compared</title><style>"
-             "body{font:14px sans-serif;margin:2em}td,th{padding:2px 9px;text-align:right}"
-             "td:first-child{text-align:left}tr.ours{background:#e3f4e3}img{max-width:100%}"
-             "</style><h1>Identities on the same detections</h1><pre>",
-             html.escape(__doc__), "</pre><ul>", *(f"<li>{html.escape(v)}" for v in verdicts(rows)),
-             "</ul>"]  # fmt: skip
-    for name in list(dict.fromkeys(r["sequence"] for r in rows))[::-1]:
-        parts.append(f"<h2>{html.escape(name)}</h2>")
-        picture = out / f"compare_{name[4:].replace(' ', '_')}.png"
-        if name.startswith("all ") and picture.exists():
-            code = base64.b64encode(picture.read_bytes()).decode()
-            parts.append(f'<img src="data:image/png;base64,{code}">')
-        head = "".join(f"<th>{h.strip()}</th>" for h in HEADER.split("|"))
-        parts.append(f"<table><tr>{head}</tr>")
-        for row in (r for r in rows if r["sequence"] == name):
-            line = "".join(f"<td>{html.escape(c)}</td>" for c in cells(row))
-            parts.append(f"<tr class={row['tracker'][:4]}>{line}</tr>")
-        parts.append("</table>")
-    with atomic(out / "compare.html") as part:
-        part.write_text("\n".join(parts))
-
-
-def plots(rows: list[dict[str, Any]], out: Path) -> None:
-    """Bars of IDF1, AssA and identities per object for each group of sequences."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    for name in dict.fromkeys(r["sequence"] for r in rows if r["sequence"].startswith("all")):
-        part = [r for r in rows if r["sequence"] == name][::-1]
-        figure, axes = plt.subplots(1, 4, figsize=(13, 0.32 * len(part) + 1.2), sharey=True)
-        for ax, column in zip(axes, ("HOTA", "AssA", "IDF1", "ids_per_object"), strict=True):
-            colour = ["tab:green" if r["tracker"].startswith("ours") else "tab:gray" for r in part]
-            bars = ax.barh([r["tracker"] for r in part], [r[column] for r in part], color=colour)
-            ax.bar_label(bars, fmt="%.2f", fontsize=7)
-            ax.set_title(column.replace("_", " "), fontsize=9)
-            ax.margins(x=0.15)
-        figure.suptitle(name, fontsize=10)
-        figure.tight_layout()
-        figure.savefig(out / f"compare_{name[4:].replace(' ', '_')}.png", dpi=80)
-        plt.close(figure)
-
-
 def rendered(names: list[str], folder: Path) -> list[Path]:
     """Rooms of render_room.py by seed, made where missing; v7: of its own plan."""
     rooms = [folder / f"room_{name}" for name in names]
@@ -624,23 +513,11 @@ def rendered(names: list[str], folder: Path) -> list[Path]:
     return rooms
 
 
-def fill_in(document: Path, rows: list[dict[str, Any]], pictures: Path) -> None:
-    """Renew the tables of a Markdown file that follow <!-- compare: SEQUENCE -->, and its plots."""
-    for picture in pictures.glob("compare_*.png"):
-        if (document.parent / "img" / picture.name).exists():
-            shutil.copy(picture, document.parent / "img")
-    for name in dict.fromkeys(r["sequence"] for r in rows):
-        body = table("", HEADER, [cells(r) for r in rows if r["sequence"] == name]).strip()
-        mark = re.escape(f"<!-- compare: {name} -->") + r"\n+(\|.*\n)*\n*"
-        text = document.read_text()
-        document.write_text(re.sub(mark, f"<!-- compare: {name} -->\n\n{body}\n\n", text))
-
-
 def wanted(args: argparse.Namespace) -> list[Sequence]:
     """The sequences asked for that may be used, and a line for each of the others."""
 
     def allowed(kind: str, name: str) -> bool:
-        return usable(kind, name, args.choosing, args.tune)
+        return usable(kind, name, args.choosing)
 
     split = args.rooms in ("reporting", "choosing")
     names = SPLITS[args.rooms]["rooms"] if split else args.rooms.split(",")
@@ -670,8 +547,6 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--mot", type=Path, help="folder with MOT15-train, MOT17-train ...")
     parser.add_argument("--every", type=int, default=1, help="use every n-th frame")
     add_choosing(parser)
-    parser.add_argument("--tune", action="store_true", help="find the best settings of the peers")
-    parser.add_argument("--fill", type=Path, help="Markdown file whose marked tables to replace")
     parser.add_argument("-o", "--out", type=Path, required=True)
     return parser
 
@@ -684,17 +559,6 @@ def main() -> int:
     seqs = wanted(args)
     if not seqs:
         parser.error("no sequences: give --rooms, --recordings or --mot with some that may be used")
-    if args.tune and not args.peers:
-        parser.error("--tune needs --peers")
-    if args.tune:
-        best = {peer: tune(peer, seqs, args) for peer in SWEEP}
-        with atomic(Path(__file__).resolve().parent / "tuned.json") as part:
-            settings = {peer: options for peer, (options, _) in best.items()}
-            part.write_text(json.dumps(settings, indent=1) + "\n")
-        title = f"Tuned on {', '.join(s.name for s in seqs)}"
-        lines = [line for _, tried in best.values() for line in tried]
-        print(table(title, "peer | options | HOTA | IDF1", lines))
-        return 0
     seqs = [thinned(seq, args.every) for seq in seqs]
     found = {s.name: variants(s, args) for s in seqs}
     rows = report(found, seqs)
@@ -702,10 +566,6 @@ def main() -> int:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
-    plots(rows, args.out)
-    write_page(rows, args.out)
-    if args.fill:
-        fill_in(args.fill, rows, args.out)
     print(markdown(rows), *verdicts(rows), sep="\n- ")
     return 0
 

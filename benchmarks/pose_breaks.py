@@ -22,7 +22,6 @@ Kinds of corruption, in clips of 24 to 40 images:
     zoomed           a stretch is zoomed: another focal length
     thin             a stretch is blurred or dark: its two sides have few common points
 and besides
-    issue            the two failures that were reported first, in full length, with the defaults
     good             unchanged recordings, with the defaults: they must still be registered
 
 Verdict. Every frame has a true pose and a scene label. A component of the result is right if all
@@ -765,8 +764,6 @@ def prepare(job: Job, kind: str, tail: str, folder: Path) -> Case:
             video, truth, focal = rt.Video(folder / "images"), clip.truth, clip.focal
         world, config = np.zeros(len(truth), np.int64), rt.PosesConfig()
         return Case(video, truth, world, config, "as it is", focal, recording.noise)
-    if kind == "issue":
-        return issue_case(job.shelf, tail, folder)
     number = int(tail)
     rng = np.random.default_rng([job.seed, list(KINDS).index(kind), number])
     clip, what = KINDS[kind](job.shelf, job.names, rng)
@@ -780,36 +777,10 @@ def prepare(job: Job, kind: str, tail: str, folder: Path) -> Case:
     return Case(video, clip.truth, clip.world, config, what, clip.focal, clip.noise)
 
 
-ISSUES = ("room_mirrored", "bonsai_every_3rd", "hololens")
-
-
-def issue_case(shelf: Shelf, name: str, folder: Path) -> Case:
-    """Make a case that was reported first, at the defaults."""
-    config = rt.PosesConfig()
-    if name == "room_mirrored":
-        video = rt.Video(shelf.path("room"))
-        truth, focal = shelf.truth("room")
-        images = np.stack([frame.image for frame in video])
-        clip = Clip(images, truth, np.zeros(len(truth), np.int64), focal)
-        clip = mirrored(clip, np.arange(len(truth) // 2, len(truth)))
-        write_pictures(clip, folder / "images")
-        what = "the second half of 240 frames mirrored"
-        return Case(rt.Video(folder / "images"), clip.truth, clip.world, config, what, focal, 0.0)
-    source, every = ("bonsai", 3) if name == "bonsai_every_3rd" else ("hololens", 1)
-    truth, focal = shelf.truth(source)
-    kept = np.arange(len(truth)) % every == 0
-    truth = np.where(kept[:, None, None], truth, np.nan)
-    video = rt.Video(shelf.path(source), rt.InputConfig(every=every))
-    world = np.zeros(len(truth), np.int64)
-    return Case(video, truth, world, config, f"every {every}", focal, 0.0)
-
-
 def planned(args: argparse.Namespace, shelf: Shelf) -> list[str]:
     """Name the cases to run, good recordings first."""
     here = [name for name in RECORDINGS if shelf.has(name)]
     whole = [f"good-{name}" for name in GOOD if name in here]
-    needs = {"room_mirrored": "room", "bonsai_every_3rd": "bonsai", "hololens": "hololens"}
-    whole += [f"issue-{name}" for name in ISSUES if shelf.has(needs[name])]
     kinds = list(KINDS)
     short = [f"{kinds[i % len(kinds)]}-{i // len(kinds):03d}" for i in range(args.cases)]
     names = short if args.quick else whole + short
@@ -832,7 +803,7 @@ def main() -> int:
     parser.add_argument("--cache", type=Path, help="clips and references (default OUT/cache)")
     parser.add_argument("--cases", type=int, default=216, help="corrupted cases (default 216)")
     parser.add_argument("--jobs", type=int, default=2, help="processes at once (default 2)")
-    parser.add_argument("--only", nargs="*", default=[], choices=[*KINDS, "issue", "good"])
+    parser.add_argument("--only", nargs="*", default=[], choices=[*KINDS, "good"])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--quick", action="store_true", help=f"{QUICK_CASES} cases, own data only")
     args = parser.parse_args()

@@ -26,15 +26,15 @@ def held_out(kind: str, name: str) -> bool:
     return names == "all" or name in names
 
 
-def usable(kind: str, name: str, choosing: bool, tune: bool = False) -> bool:
+def usable(kind: str, name: str, choosing: bool) -> bool:
     """Return whether a sequence may be used; if not, print the reason on stderr.
 
     Args:
-        choosing: include sequences that are not held out. tune: only these, whatever `choosing`.
+        choosing: include sequences that are not held out.
     """
-    if held_out(kind, name) != tune or (choosing and not tune):
+    if held_out(kind, name) or choosing:
         return True
-    why = "is for reporting" if tune else "is not for reporting; --choosing includes it, marked"
+    why = "is not for reporting; --choosing includes it, marked"
     print(f"left out (benchmarks/splits.json): {name} {why}", file=sys.stderr)
     return False
 

@@ -16,7 +16,6 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -24,7 +23,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import quadrics
-from quadrics import Array, BoolArray, Ellipsoids, FitConfig, Priors
+from quadrics import Array, Ellipsoids, FitConfig, Priors
 
 IMAGE = (1280, 960)  # px
 FOCAL = 1000.0  # px
@@ -158,67 +157,6 @@ def box_overlap(a: Ellipsoids, b: Ellipsoids, nodes: int = 40) -> Array:
     return np.where(safe & np.isfinite(center).all(1), iou, np.nan)
 
 
-def plain_lfd(boxes: Array, cams: Array, passes: int = 2) -> Array:
-    """LfD as published, one object at a time: the stand-in for the official code.
-
-    boxes (V, 4), cams (V, 3, 4) -> dual quadric (4, 4). For each view beta C* = P Q* P' with P and
-    C* in the frame where the ellipse is centred and of unit size; null vector by SVD; each further
-    pass has its origin at the centre found before. Ref: Rubino et al., PAMI 2018.
-    """
-    i, j = np.triu_indices(4)
-    r, s = np.triu_indices(3)
-    expand = np.zeros((16, 10))  # vec Q = expand @ vech Q
-    for k, (a, b) in enumerate(zip(i, j, strict=True)):
-        expand[4 * a + b, k] = expand[4 * b + a, k] = 1.0
-    origin = np.zeros(3)
-    dual_q = np.zeros((4, 4))
-    for _ in range(passes):
-        shift = np.eye(4)
-        shift[:3, 3] = origin
-        rows = np.zeros((6 * len(boxes), 10 + len(boxes)))
-        for v, (x1, y1, x2, y2) in enumerate(boxes):
-            half = 0.5 * np.array([x2 - x1, y2 - y1])
-            scale = np.linalg.norm(half)
-            frame = np.array([[scale, 0, (x1 + x2) / 2], [0, scale, (y1 + y2) / 2], [0, 0, 1]])
-            cam = np.linalg.inv(frame) @ cams[v] @ shift
-            kron = (np.kron(cam, cam) @ expand).reshape(3, 3, 10)
-            rows[6 * v : 6 * v + 6, :10] = kron[r, s]
-            conic = np.diag([*(half / scale) ** 2, -1.0])
-            rows[6 * v : 6 * v + 6, 10 + v] = -conic[r, s]
-        null = np.linalg.svd(rows)[2][-1, :10]
-        local = (expand @ null).reshape(4, 4)
-        local = -local / local[3, 3]
-        dual_q = shift @ local @ shift.T
-        origin = -dual_q[:3, 3]
-    return dual_q
-
-
-def spoil(boxes: Array, kind: str, rng: np.random.Generator) -> tuple[Array, BoolArray]:
-    """Replace one box in five of each scene; boxes (T, V, 1, 4) -> changed boxes, mask (T, V).
-
-    far: anywhere in the image; near: a neighbour half a box to a box away, of another size;
-    hidden: an occluder covers 30 to 60 % from one side.
-    """
-    out, trials, views = boxes.copy(), *boxes.shape[:2]
-    wrong = np.zeros((trials, views), bool)
-    for t in range(trials):
-        for v in rng.choice(views, max(1, views // 5), replace=False):
-            wrong[t, v] = True
-            size = boxes[t, v, 0, 2:] - boxes[t, v, 0, :2]
-            middle = boxes[t, v, 0, :2] + 0.5 * size
-            if kind == "hidden":
-                side = rng.integers(4)
-                sign = 1.0 if side < 2 else -1.0
-                out[t, v, 0, side] += sign * rng.uniform(0.3, 0.6) * size[side % 2]
-                continue
-            turn = rng.uniform(0, 2 * np.pi)
-            near = middle + np.array([np.cos(turn), np.sin(turn)]) * size * rng.uniform(0.5, 1.2)
-            middle = near if kind == "near" else rng.uniform([0, 0], IMAGE)
-            size = size * np.exp(rng.normal(0, 0.3, 2))
-            out[t, v, 0] = [*(middle - 0.5 * size), *(middle + 0.5 * size)]
-    return out, wrong
-
-
 def align(found: Ellipsoids, truth: Ellipsoids) -> Ellipsoids:
     """Similarity (no reflection) of `found` onto `truth` by their centres. Ref: Umeyama 1991."""
     a = found.center_in_world - found.center_in_world.mean(0)
@@ -329,92 +267,6 @@ def coverage(
     return out
 
 
-def time_fit(n: int, views: int, support: str) -> float:
-    """CPU seconds an object: n objects seen by the same cameras (set OMP_NUM_THREADS=1)."""
-    rng = np.random.default_rng(0)
-    log_size = rng.uniform(np.log(0.2), np.log(0.8), (n, 3))
-    size = log_size + rng.normal(0, 0.25, (n, 3))
-    truth = Ellipsoids(rng.uniform(-0.5, 0.5, (n, 3)), 0.5 * np.exp(size), random_yaw(n, rng))
-    cams = arc_cameras(views, 90, rng, distance=4)
-    boxes = noisy(quadrics.solid_boxes(truth, support, cams), 0.02, rng)
-    priors, names = individual_priors(log_size, 0.25, support)
-    start = time.process_time()
-    quadrics.fit_objects(boxes, cams, (9000, 9000), names, priors, up=UP)
-    return (time.process_time() - start) / n
-
-
-def ugly_scene(f: int, o: int, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Boxes (F, O, 4) and cameras (F, 3, 4) with all kinds of defects."""
-    spread = rng.choice([0.0, 1e-6, 0.01, 1.0, 10.0, 1e4, 1e8])
-    center = rng.normal(0, spread, (f, 3))
-    rot = quadrics.rotations(rng.normal(0, rng.choice([0.0, 0.1, 0.3, 3.0]), (f, 3)))
-    calib = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
-    cams = calib @ np.concatenate([rot, -rot @ center[:, :, None]], 2)
-    with np.errstate(all="ignore"):
-        cams[rng.random(f) < 0.05] *= rng.choice([-1.0, 0.0, 1e-200, 1e200, np.inf, np.nan])
-        middle = rng.uniform(-200, [840, 680], (f, o, 2))
-        if rng.random() < 0.5:  # boxes consistent with one position
-            point = rng.normal(0, 1, (o, 3)) + np.array([0, 0, 3])
-            image = np.einsum("fij,oj->foi", cams[:, :, :3], point) + cams[:, None, :, 3]
-            middle = image[..., :2] / image[..., 2:]
-    size = np.exp(rng.normal(4, 1.0, (f, o, 2)) * rng.choice([0.3, 1.0]))
-    boxes = np.concatenate([middle - size / 2, middle + size / 2], -1)
-    fate = rng.random((f, o))
-    boxes[fate < 0.02] = 0.0  # zero area
-    boxes[(fate > 0.02) & (fate < 0.04)] *= 1e12
-    boxes[(fate > 0.04) & (fate < 0.05)] = np.inf
-    boxes[(fate > 0.05) & (fate < 0.07)] = [0, 0, 640, 480]  # fills the image
-    flipped = (fate > 0.07) & (fate < 0.09)
-    boxes[flipped] = boxes[flipped][:, [2, 3, 0, 1]]
-    boxes[rng.random((f, o)) < rng.choice([0.0, 0.3, 0.9])] = np.nan
-    return boxes, cams
-
-
-def is_honest(fits: quadrics.ObjectFits) -> BoolArray:
-    """(O,) True where a result that is not rejected is finite, positive and explained."""
-    live = fits.status != "rejected"
-    numbers = np.isfinite(fits.size).all(1) & (fits.size > 0).all(1) & np.isfinite(fits.rms_px)
-    numbers &= np.isfinite(fits.cov).all((1, 2)) & np.isfinite(fits.ellipsoids.center_in_world).all(
-        1
-    )
-    lowest = np.linalg.eigvalsh(np.where(np.isfinite(fits.cov), fits.cov, 0.0))
-    numbers &= lowest[:, 0] >= -1e-6 * np.maximum(lowest[:, -1], 1e-30)
-    explained = np.array(
-        [s == "ok" or bool(r) for s, r in zip(fits.status, fits.reason, strict=True)]
-    )
-    return np.asarray((numbers | ~live) & (explained if len(explained) else live))
-
-
-def fuzz(n: int, rng: np.random.Generator) -> dict[str, int]:
-    """Fit n random, mostly absurd objects; count the statuses and the dishonest results."""
-    counts = {"objects": 0, "bad": 0, "ok": 0, "prior_dominated": 0,
-              "implausible": 0, "rejected": 0}  # fmt: skip
-    priors = quadrics.load_priors()
-    while counts["objects"] < n:
-        f, o = int(rng.choice([1, 2, 3, 5, 8])), int(rng.choice([1, 10, 200]))
-        boxes, cams = ugly_scene(f, o, rng)
-        names = [str(x) for x in rng.choice(priors.names, o)] if rng.random() < 0.7 else None
-        up = (None, UP, (0.0, -1.0, 0.0))[rng.integers(3)]
-        support = (None, "evidence", *quadrics.SUPPORTS)[rng.integers(5)]
-        fits = quadrics.fit_objects(
-            boxes,
-            cams,
-            (640, 480),
-            names,
-            priors,
-            up=up,
-            support=support,
-            metric=bool(rng.integers(2)),
-        )
-        quadrics.fit_lfd(boxes, cams)
-        quadrics.reprojection_iou(fits, boxes, cams, (640, 480))
-        counts["objects"] += o
-        counts["bad"] += int((~is_honest(fits)).sum())
-        for status in ("ok", "prior_dominated", "implausible", "rejected"):
-            counts[status] += int((fits.status == status).sum())
-    return counts
-
-
 # ---- Tables --------------------------------------------------------------------------------
 
 
@@ -466,25 +318,6 @@ def cuboids_table(trials: int) -> str:
     return table(["size m", "ellipsoid", "box", "evidence"], rows)
 
 
-def wrong_table(trials: int) -> str:
-    """Fall of O3D when one box in five is wrong, and when an oracle removes it."""
-    rows = []
-    for support, measure in (("ellipsoid", quadrics.volume_overlap), ("box", box_overlap)):
-        for views, arc in ((5, 20), (5, 40), (5, 90), (10, 90)):
-            rng = np.random.default_rng(3)
-            boxes, cams, truth, priors, names = scenes(trials, views, arc, 0.02, support, rng)
-            clean = measure(solve(boxes, cams, priors, names).ellipsoids, truth).mean()
-            row: list[object] = [support, views, arc, f"{clean:.3f}"]
-            for kind in ("far", "near", "hidden"):
-                bad, wrong = spoil(boxes, kind, np.random.default_rng(4))
-                found = measure(solve(bad, cams, priors, names).ellipsoids, truth).mean()
-                bad[wrong] = np.nan
-                best = measure(solve(bad, cams, priors, names).ellipsoids, truth).mean()
-                row.append(f"{clean - found:+.3f} ({clean - best:+.3f})")
-            rows.append(row)
-    return table(["shape", "views", "arc deg", "clean", "far", "near", "hidden"], rows)
-
-
 def coverage_table(trials: int) -> str:
     """Fraction of truths inside the 95 % region."""
     rows = []
@@ -497,32 +330,6 @@ def coverage_table(trials: int) -> str:
     mean = [f"**{np.mean([float(str(r[k])) for r in rows]):.1f}**" for k in range(3, 7)]
     rows.append(["mean", "", "", *mean])
     return table(["shape", "views", "arc deg", "all 9", "center", "size", "rotation"], rows)
-
-
-def speed_table(trials: int) -> str:
-    """CPU milliseconds an object, and the ratio to the plain per-object LfD in the same run."""
-    rng = np.random.default_rng(7)
-    boxes, cams, *_ = scenes(min(trials, 100), 8, 90, 0.02, "ellipsoid", rng)
-    start = time.process_time()
-    for k in range(len(boxes)):
-        plain_lfd(boxes[k, :, 0], cams[k])
-    plain = (time.process_time() - start) / len(boxes)
-    truth = Ellipsoids(
-        rng.uniform(-0.5, 0.5, (1000, 3)), rng.uniform(0.1, 0.4, (1000, 3)), random_yaw(1000, rng)
-    )
-    shared = arc_cameras(8, 90, rng, distance=4)
-    many = noisy(quadrics.solid_boxes(truth, "ellipsoid", shared), 0.02, rng)
-    start = time.process_time()
-    quadrics.fit_lfd(many, shared)
-    batched = (time.process_time() - start) / 1000
-    rows = [["plain LfD, one object at a time", f"{1e3 * plain:.3f}", "1"]]
-    rows.append(["fit_lfd, 1,000 objects", f"{1e3 * batched:.3f}", f"{batched / plain:.2f}"])
-    for support in quadrics.SUPPORTS:
-        ours = min(time_fit(1000, 8, support) for _ in range(3))
-        rows.append(
-            [f"fit_objects ({support}), 1,000 objects", f"{1e3 * ours:.3f}", f"{ours / plain:.2f}"]
-        )
-    return table(["8 views", "CPU ms an object", "ratio"], rows)
 
 
 def room_table(trials: int) -> str:
@@ -547,14 +354,6 @@ def room_table(trials: int) -> str:
         rows.append([given, *medians, f"{np.median(tilts):.2f}", f"{100 * np.median(sizes):.1f} %"])
     head = ["given", "scale error", "within its 95 %", "up error deg", "median size error"]
     return table(head, rows)
-
-
-def fuzz_table(trials: int) -> str:
-    """Random, mostly absurd input: no exception, no warning, no nan without "rejected"."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        counts = fuzz(100_000 if trials > 100 else 5_000, np.random.default_rng(8))
-    return table(list(counts), [list(counts.values())])
 
 
 # ---- Figure 4.2 of the thesis --------------------------------------------------------------
@@ -621,7 +420,7 @@ def thesis_trial(rotation_deg: float, size: float, seed: int) -> list[float]:
     return scores + [float(np.nan_to_num(x)) for x in rest] + variance
 
 
-def thesis_figure(trials: int, image: Path | None = None) -> str:
+def thesis_table(trials: int) -> str:
     """O3D and PSfMO's noise variance (mean and sigma over scenes) against both ellipse errors."""
     methods = ["SfMO", "PSfMO", "PSfMO, cameras known", "fit_objects, cameras known"]
     columns = [*methods, *(f"noise variance, {m}" for m in methods[1:3])]
@@ -629,67 +428,26 @@ def thesis_figure(trials: int, image: Path | None = None) -> str:
         "ellipse rotation error, deg": [(x, 0.02) for x in (0, 5, 10, 20, 30, 45)],
         "size error, %": [(2, x / 100) for x in (0, 5, 10, 20, 30, 50)],
     }
-    rows, curves = [], {}
+    rows = []
     for label, settings in sweeps.items():
         for rotation, size in settings:
             seeds = range(max(6, trials // 10))
             scores = np.array([thesis_trial(rotation, size, seed) for seed in seeds])  # (S, 6)
             x = rotation if "rotation" in label else 100 * size
-            mean, sigma = scores.mean(0), scores.std(0)
+            mean = scores.mean(0)
+            sigma = scores.std(0)
             digits = [2] * len(methods) + [4] * 2
             cells = [f"{m:.{d}f} ± {s:.{d}f}" for m, s, d in zip(mean, sigma, digits, strict=True)]
             rows.append([label, f"{x:g}", *cells])
-            curves[label, x] = (mean, sigma)
-    if image is not None:
-        draw_figure(curves, list(sweeps), methods, image)
     return table(["disturbance", "value", *columns], rows)
-
-
-def draw_figure(
-    curves: dict[tuple[str, float], tuple[Array, Array]],
-    labels: list[str],
-    methods: list[str],
-    path: Path,
-) -> None:
-    """Panels as in the thesis's Fig. 4.2: O3D above, PSfMO's noise variance below."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, panels = plt.subplots(2, 2, figsize=(10, 7), sharex="col", sharey="row")
-    for column, label in zip(panels.T, labels, strict=True):
-        x = np.array([key[1] for key in curves if key[0] == label])
-        mean, sigma = (np.array([curves[label, v][k] for v in x]) for k in (0, 1))  # (X, 6)
-        shown = [(column[0], k, k) for k in range(len(methods))]
-        shown += [(column[1], len(methods) + i, 1 + i) for i in (0, 1)]
-        for panel, k, method in shown:
-            m, s = mean[:, k], sigma[:, k]
-            panel.plot(x, m, marker="o", label=methods[method], color=f"C{method}")
-            panel.fill_between(x, m - s, m + s, alpha=0.15, color=f"C{method}")
-            panel.grid(alpha=0.3)
-        column[1].set_xlabel(label)
-    panels[0, 0].set_ylabel("O3D (mean and sigma over scenes)")
-    panels[0, 0].set_ylim(0, 1)
-    panels[1, 0].set_ylabel("estimated noise variance")
-    panels[1, 0].set_yscale("log")
-    panels[0, 1].legend(fontsize=8)
-    panels[1, 1].legend(fontsize=8)
-    figure.tight_layout()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
 
 
 TABLES: dict[str, Callable[[int], str]] = {
     "ellipsoids": ellipsoids_table,
     "cuboids": cuboids_table,
-    "wrong": wrong_table,
     "coverage": coverage_table,
     "room": room_table,
-    "thesis": thesis_figure,
-    "speed": speed_table,
-    "fuzz": fuzz_table,
+    "thesis": thesis_table,
 }
 
 
@@ -714,10 +472,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name in args.only:
         start = time.perf_counter()
         trials = 40 if args.quick else 300
-        if name == "thesis" and args.o:
-            text = thesis_figure(trials, args.o / "img" / "synthetic_quadrics.png")
-        else:
-            text = TABLES[name](trials)
+        text = TABLES[name](trials)
         print(f"## {name} ({time.perf_counter() - start:.0f} s)\n\n{text}\n", flush=True)
         if args.o:
             write_table(args.o / "RESULTS.md", name, text)

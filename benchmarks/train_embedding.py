@@ -4,7 +4,7 @@
     python benchmarks/train_embedding.py -o OUT --rooms 1000:1150 --sparse IMAGES=SPARSE ...
 
 writes OUT/reobj.onnx and OUT/reobj_head.onnx (use: `--embed OUT/reobj.onnx`; the checkpoint of the
-best validation, OUT/best.pt), OUT/last.pt (go on with --resume), OUT/log.csv and OUT/curves.png.
+best validation, OUT/best.pt), OUT/last.pt (go on with --resume) and OUT/log.csv.
 Needs `pip install torch matplotlib onnx`; the GPU is used when there is one.
 
 Training data; every source may be given several times:
@@ -15,17 +15,14 @@ Training data; every source may be given several times:
                         the views that observe the point show it from different directions.
   --tracks IMAGES=FILE  `tracks.txt` of `run` (MOTChallenge): identity by 3D object. Masks
                         are those of the detector (OUT/cache, or a detections .npz beside FILE).
-  --scannet DIR         a scene in ScanNet's or Matterport3D's layout, as reid_scenes.py reads it.
 Validation: --val-rooms A:B, --val-sparse.
 
 Method: each step takes several scenes and several views of each, and augments every image
 (colour, gamma, white balance, blur, noise, JPEG, jittered boxes, ellipses instead of masks half of
 the time). Triplet loss on cosines of (foreground, background) together and of each alone. For every
 anchor and positive the negative is the soft maximum over all (mostly an identical instance
-elsewhere in the room); with --loss triplet it is semi-hard (the nearest of those further away than
-the positive), with --loss hardest the nearest of the batch. After the fraction --hard-after of the
-steps, negatives are from the same scene only, and semi-hard ones become the nearest.
-Ref: Bansal et al., re-OBJ, ICIAP 2019; Schroff et al., FaceNet, CVPR 2015 (semi-hard); Sandler et
+elsewhere in the room). After the fraction --hard-after of the steps, negatives are from the same
+scene only. Ref: Bansal et al., re-OBJ, ICIAP 2019; Sandler et
 al., MobileNetV2, CVPR 2018 (inverted residual); Izmailov et al., UAI 2018 (--average).
 
 Axes: B frames of a batch, D detections of a frame, N of a batch, C channels of the map.
@@ -278,28 +275,6 @@ def paint(label: Image, found: rt.Detections, xyxy: Array, identity: IntArray) -
     for row in np.flatnonzero(overlap.max(1) > 0.7):
         mask = found.masks[overlap[row].argmax()].astype(np.uint8)
         label[cv2.resize(mask, label.shape[::-1]) > 0] = identity[row] + 1
-
-
-def scannet_clip(folder: Path) -> Clip:
-    """Instances of a scene in ScanNet's layout (`reid_scenes.scannet_scene`), 120 views at most."""
-    import reid_scenes
-
-    scene = reid_scenes.scannet_scene(folder)
-    scene = scene.sampled(-(-len(scene.images) // 120))
-    names, identity = np.unique(scene.identity, return_inverse=True)
-    looks = np.unique(scene.name, return_inverse=True)[1]
-    labels: list[Image] | None = [] if len(names) < 255 else None
-    clip = Clip(folder.name, [], labels, [], [], [], True)
-    for f in range(len(scene.images)):
-        rows = np.flatnonzero((scene.row == f) & (scene.identity > 0))
-        image, found, scored = scene.at(f)
-        scale = min(1.0, 2.0 * SIZE_WH[0] / max(image.shape[:2]))
-        picture = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        corners = scene.xyxy[rows] * (picture.shape[1] / scene.size[0])
-        label = np.zeros(picture.shape[:2], np.uint8)
-        paint(label, found[scored], corners, identity[rows])
-        add_view(clip, np.asarray(picture, np.uint8), corners, identity[rows], looks[rows], label)
-    return clip
 
 
 def add_view(
@@ -738,59 +713,38 @@ def pooled(flat: Any, samples: Sequence[PartSamples], cells_a_map: int) -> list[
 # ---- Loss ----------------------------------------------------------------------------------------
 
 
-def triplet_loss(
-    rows: Any,
-    same: Any,
-    different: Any,
-    hard: bool,
-    soft: bool = False,
-    temperature: float = 0.1,
-) -> Any:
+def triplet_loss(rows: Any, same: Any, different: Any, temperature: float = 0.1) -> Any:
     """Soft-margin triplet loss log(1 + exp((s_an - s_ap) / T)) over all anchors and positives.
+
+    The negative s_an of an anchor is the soft maximum of all of them.
 
     Args:
         rows: (N, E) unit rows. same, different: (N, N) bool, positives and negatives of each row.
-        hard: the negative is the nearest one; else the nearest that is further than the positive
-            (if there is none, the nearest one counts a tenth).
-        soft: the negative is the soft maximum of all of them.
     """
     cosine = rows @ rows.T
     anchor, positive = torch.nonzero(same & different.any(1)[:, None], as_tuple=True)
     if not len(anchor):
         return rows.sum() * 0
-    near = cosine[anchor, positive]  # (P,)
     others = cosine[anchor].masked_fill(~different[anchor], -2.0)  # (P, N)
-    weight = torch.ones_like(near)
-    far = others.max(1).values
-    if soft:
-        far = temperature * torch.logsumexp(others / temperature, 1)
-    elif not hard:
-        semi = others.masked_fill(others > near[:, None].detach(), -2.0).max(1).values
-        weight = torch.where(semi > -1.5, 1.0, 0.1)
-        far = torch.where(semi > -1.5, semi, far)
-    loss = F.softplus((far - near) / temperature) * temperature
-    return (loss * weight).sum() / weight.sum()
+    far = temperature * torch.logsumexp(others / temperature, 1)
+    return (F.softplus((far - cosine[anchor, positive]) / temperature) * temperature).mean()
 
 
-def batch_loss(
-    foreground: Any, background: Any, scenes: list[list[View]], late: bool, kind: str = "triplet"
-) -> Any:
+def batch_loss(foreground: Any, background: Any, scenes: list[list[View]], late: bool) -> Any:
     """Triplet loss of both parts together, and a quarter as much of each alone."""
     views = [(s, f, v) for s, scene in enumerate(scenes) for f, v in enumerate(scene)]
     scene = np.concatenate([np.full(len(v.identity), s) for s, _, v in views])
     identity = np.concatenate([v.identity for _, _, v in views])
     frame = np.concatenate([np.full(len(v.identity), f) for _, f, v in views])
-    return parts_loss([foreground, background], (scene, identity, frame), late, kind)
+    return parts_loss([foreground, background], (scene, identity, frame), late)
 
 
-def parts_loss(
-    parts: Sequence[Any], of: tuple[IntArray, IntArray, IntArray], late: bool, kind: str
-) -> Any:
+def parts_loss(parts: Sequence[Any], of: tuple[IntArray, IntArray, IntArray], late: bool) -> Any:
     """Triplet loss of all parts (N, E) together, and a quarter as much of each, if there are two.
 
     Args:
         of: (N,) scene, identity within it and frame of each row.
-        late: negatives are of the same scene only. kind: one of LOSSES.
+        late: negatives are of the same scene only.
     """
     scene, frame, device = of[0], of[2], parts[0].device
     identity = of[1] + 10000 * scene
@@ -798,15 +752,12 @@ def parts_loss(
     apart = torch.from_numpy(frame[:, None] != frame).to(device)
     near = torch.from_numpy(scene[:, None] == scene).to(device)
     fused = torch.cat(list(parts), 1) * len(parts) ** -0.5
-    same, different = one & apart, ~one & (near if late else torch.ones_like(near))
-    how = {"hard": late or kind == "hardest", "soft": kind == "soft"}
-    loss = triplet_loss(fused, same, different, **how)
+    same = one & apart
+    different = ~one & (near if late else torch.ones_like(near))
+    loss = triplet_loss(fused, same, different)
     for alone in parts if len(parts) > 1 else ():
-        loss = loss + 0.25 * triplet_loss(alone, same, different, **how)
+        loss = loss + 0.25 * triplet_loss(alone, same, different)
     return loss
-
-
-LOSSES = ("soft", "triplet", "hardest")  # the negative: soft maximum, semi-hard, hardest
 
 
 # ---- Validation ----------------------------------------------------------------------------------
@@ -892,8 +843,7 @@ def real_clips(args: argparse.Namespace) -> list[Clip]:
         for images, model in args.sparse
         for draw in range(4)
     ]
-    clips += [tracks_clip(images, tracks) for images, tracks in args.tracks]
-    return clips + [scannet_clip(folder) for folder in args.scannet]
+    return clips + [tracks_clip(images, tracks) for images, tracks in args.tracks]
 
 
 class Pool:
@@ -907,9 +857,7 @@ class Pool:
         self.waiting = [(s, fine) for rooms, fine in wanted for s in parse_range(rooms or "0:0")]
         self.fill()
         if not self.real and not self.rooms:
-            raise SystemExit(
-                "error: nothing to train on: give --rooms, --sparse, --tracks or --scannet"
-            )
+            raise SystemExit("error: nothing to train on: give --rooms, --sparse or --tracks")
 
     def fill(self) -> None:
         """Take in rooms: those of the cache, or render one if there is nothing at all yet."""
@@ -1060,7 +1008,7 @@ class Trainer:
     def loss(self, scenes: Any, late: bool) -> Any:
         """Loss of one batch; late: as in `parts_loss`."""
         parts = self.net([view for scene in scenes for view in scene], self.device)
-        return batch_loss(parts[0], parts[1], scenes, late, self.args.loss)
+        return batch_loss(parts[0], parts[1], scenes, late)
 
     def score(self, clips: Any) -> dict[str, float]:
         """Rank-1 on validation clips."""
@@ -1126,29 +1074,6 @@ class Trainer:
         if self.mean is not None:
             self.mean.load_state_dict(state["mean"])
         self.step = state["step"]
-
-
-def draw_curves(log: Path, picture: Path) -> None:
-    """Loss and Rank-1 over the steps as a PNG."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    with log.open() as file:
-        rows = list(csv.DictReader(file))
-    step = [float(row["step"]) for row in rows]
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
-    left.plot(step, [float(row["loss"]) for row in rows])
-    left.set(xlabel="step", ylabel="triplet loss")
-    for name in rows[0]:
-        rank = [float(row[name]) for row in rows if name.startswith(("room", "real"))]
-        if name.endswith("_single" if "room" in name else "_all") and np.isfinite(rank).all():
-            right.plot(step, rank, label=name.replace("_", " "))
-    right.set(xlabel="step", ylabel="Rank-1, validation")
-    right.legend(fontsize="small", loc="center left", bbox_to_anchor=(1, 0.5))
-    figure.savefig(picture, dpi=90)
-    plt.close(figure)
 
 
 # ---- Export --------------------------------------------------------------------------------------
@@ -1222,7 +1147,6 @@ def common_options(description: str | None) -> argparse.ArgumentParser:
     add("--no-render", action="store_true", help="only use the cache; another process fills it")
     for name in ("--sparse", "--val-sparse", "--tracks"):
         add(name, type=pair, action="append", default=[], metavar="IMAGES=PATH")
-    add("--scannet", type=Path, action="append", default=[], metavar="DIR")
     add("--scenes", type=int, default=3, help="scenes a step")
     add("--views", type=int, default=8, help="views of each scene")
     add("--steps", type=int, default=3000)
@@ -1247,7 +1171,6 @@ def common_options(description: str | None) -> argparse.ArgumentParser:
     add("--seed", type=int, default=0)
     add("--threads", type=int, default=1)
     add("--ahead", type=int, default=0, help="batches that a second process prepares (0: none)")
-    add("--loss", choices=LOSSES, default="soft", help="the negative (default %(default)s)")
     add("--resume", action="store_true", help="resume from OUT/last.pt")
     return parser
 
@@ -1263,7 +1186,7 @@ def parsed(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> argpa
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Train, draw the curves, export."""
+    """Train and export."""
     parser = common_options(__doc__)
     parser.add_argument("--start", type=Path, help="initial weights: a checkpoint (.pt)")
     args = parsed(parser, argv)
@@ -1271,7 +1194,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     trainer.run()
     trainer.take_best()
     out: Path = args.out
-    draw_curves(out / "log.csv", out / "curves.png")
     export(trainer.taken(), out, trainer.summary())
     print(f"{out / 'reobj.onnx'}: use it with --embed {out / 'reobj.onnx'}")
     return 0

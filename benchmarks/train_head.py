@@ -5,7 +5,7 @@
 
 writes OUT/mobilenetv2_feat_head.onnx (two vectors an object from the cells of one pass over the
 frame) or, with --crops, OUT/SETUP/crops_mobilenetv2_feat_head.onnx (re-OBJ's ConvBlock on two
-masked crops an object), with checkpoints, log and curves. Use them with `--embed mobilenetv2_feat`
+masked crops an object), with checkpoints and log. Use them with `--embed mobilenetv2_feat`
 or `--embed crops`, and `--set embed.head=FILE`. Sources, augmentation, loss and validation are
 those of `train_embedding.py`. The backbone's features of every scene are computed once and cached.
 As published, the maps of foreground and background are concatenated and merged by one ConvBlock;
@@ -257,8 +257,7 @@ def sources(args: argparse.Namespace) -> list[Source]:
     found = room_sources(args, args.rooms) + room_sources(args, args.fine_rooms, True)
     for kind, given in ((te.sparse_clip, args.sparse), (te.tracks_clip, args.tracks)):
         found += [(f"{a.parent.name}/{a.name}", functools.partial(kind, a, b)) for a, b in given]
-    return found + [(folder.name, functools.partial(te.scannet_clip, folder))
-                    for folder in args.scannet]  # fmt: skip
+    return found
 
 
 class SeenPool:
@@ -341,7 +340,7 @@ class HeadTrainer(te.Trainer):
         scene = np.repeat(np.arange(len(scenes)), [len(s.identity) for s in scenes])
         identity = np.concatenate([s.identity for s in scenes])
         frame = np.concatenate([s.frame for s in scenes])
-        return te.parts_loss(parts, (scene, identity, frame), late, self.args.loss)
+        return te.parts_loss(parts, (scene, identity, frame), late)
 
     def score(self, clips: Sequence[Seen]) -> dict[str, float]:
         net = self.taken().eval()
@@ -361,7 +360,6 @@ def train_heads(args: argparse.Namespace) -> None:
         trainer = HeadTrainer(args, frozen, setups[setup])
         trainer.run()
         trainer.take_best()
-        te.draw_curves(args.out / "log.csv", args.out / "curves.png")
         export_head(trainer, args.out)
 
 
@@ -435,7 +433,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Train, draw the curves, export."""
+    """Train and export."""
     train_heads(te.parsed(build_parser(), argv))
     return 0
 
