@@ -2,14 +2,15 @@
 """Run the command line on every recording with images and check the scores against thresholds.
 
     python benchmarks/recordings.py DATA [-o OUT] [--only NAME...] [--long] [--jobs 2]
-        [--write-floors]
+        [--write-floors] [--rooms SEED...] [--without MECHANISM]
 
 Every row is one command, as a user types it, in a process of its own: with the small detector
 (--detector deimv2-femto, weights in REOBJ_MODELS) or recorded boxes, and with reconstructed or
 supplied cameras. benchmarks/truth.py compares the output files with the ground truth. The exit code
 is 1 if a command fails or a score misses its threshold in recordings.json beside this file;
 run times are only printed. --write-floors derives new thresholds from this run with the margins of
-`floors_of`.
+`floors_of`. --rooms adds rendered rooms (render_room.py --plan varied, kept in OUT) with their
+recorded boxes and our cameras. --without NAME runs all of it without a mechanism (without.py).
 
     IDF1     boxes of tracks.txt; overlap .5 (.4 on office_loop, livingroom13 and studio_room, .3 on
              hololens_kitchen, whose truth is of whole objects)
@@ -40,6 +41,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import render_room
 from truth import (
     Array,
     Output,
@@ -51,6 +53,7 @@ from truth import (
     score_cameras,
     score_solids,
 )
+from without import WITHOUT
 
 ROOT = Path(__file__).resolve().parent.parent
 FLOORS = Path(__file__).resolve().with_suffix(".json")
@@ -121,7 +124,7 @@ CASES = [
 # is found, and the cameras are those of its case with yolov8s. cubeslam: no cameras and no truth of
 # objects, as TUD-Campus. sun3d s2: supplied cameras alone, as s1.
 LONG = [
-    Case("room", "", FAST, every=3),
+    Case("room", str(ROOT / "examples/room/room.mp4"), FAST, every=3),
     kitchen(YOLO, "", 1, 120),
     red(YOLO, "", 5),
     Case("office_loop", "office_loop/images", FAST, every=2, stop=120),
@@ -139,16 +142,21 @@ CAMERAS = {  # where the file of poses has none
 
 def home(case: Case, data: Path) -> Path:
     """Return the folder of a recording's truth."""
-    if not case.source:
-        return ROOT / "examples" / "room"
     return (data / case.source).parent
+
+
+def rendered(seed: int, out: Path) -> Case:
+    """Return the case of a rendered room; render it if it is not there."""
+    folder = out / f"room_{seed}"
+    if not (folder / "gt_objects.json").exists():  # written after the video
+        render_room.main(["--seed", str(seed), "--plan", "varied", "-o", str(folder)])
+    return Case(f"rendered {seed}", str(folder / "room.mp4"), RECORDED)
 
 
 def command(case: Case, data: Path, work: Path) -> list[str]:
     """Return the words of a command; writes what it needs into `work`."""
     folder = home(case, data)
-    source = data / case.source if case.source else folder / "room.mp4"
-    words = ["run", str(source), "-o", str(work / "out"), "--every", str(case.every)]
+    words = ["run", str(data / case.source), "-o", str(work / "out"), "--every", str(case.every)]
     if case.stop:
         words += ["--stop", str(case.stop)]
     if case.boxes == FAST:
@@ -191,11 +199,16 @@ def write_seven_scenes(folder: Path, out: Path) -> None:
         np.savetxt(out / f"{name}.pose.txt", pose)
 
 
-def run(case: Case, data: Path, out: Path) -> Figures:
+def run(case: Case, data: Path, out: Path, without: str = "") -> Figures:
     """Run a case; returns its exit code, seconds, memory and figures."""
     work = out / case.name.replace(" ", "_")
     work.mkdir(parents=True)
-    words = [sys.executable, str(ROOT / "reobj_track.py"), *command(case, data, work)]
+    tool = (
+        [str(ROOT / "benchmarks/without.py"), without]
+        if without
+        else [str(ROOT / "reobj_track.py")]
+    )
+    words = [sys.executable, *tool, *command(case, data, work)]
     began = time.monotonic()
     with open(work / "log.txt", "w") as log:
         process = subprocess.Popen(words, stdout=log, stderr=subprocess.STDOUT, cwd=work)
@@ -229,7 +242,7 @@ def wait(process: subprocess.Popen[bytes]) -> tuple[int, int]:
 def truth_2d(case: Case, data: Path) -> tuple[Truth, float, float] | None:
     """Return true boxes, and the overlaps at which boxes and lists are compared."""
     folder = home(case, data)
-    if not case.source:
+    if (folder / "gt_objects.json").exists():
         objects = json.loads((folder / "gt_objects.json").read_text())["objects"]
         names = {o["class_id"]: o["class"] for o in objects}
         return read_mot_truth(folder / "gt_mot.txt", names), 0.5, 0.4
@@ -272,11 +285,11 @@ def true_cameras(case: Case, data: Path) -> dict[int, Array]:
     """Return the true centres by frame of the source; empty where none are known."""
     folder = home(case, data)
     files = {
-        "room": "poses.txt",
         "cubeslam_cabinet": "truth_cam_poses.txt",
         "tum_fr3": "poses17_c2w.txt",
     }
-    path = folder / files.get(case.recording, C2W)
+    rendered = (folder / "gt_objects.json").exists()
+    path = folder / files.get(case.recording, "poses.txt" if rendered else C2W)
     return dict(enumerate(read_centres(path))) if path.exists() else {}
 
 
@@ -290,7 +303,7 @@ def times_of(case: Case, data: Path) -> list[float]:
 def true_solids(case: Case, data: Path) -> list[dict[str, Any]]:
     """Return true objects in 3D, of the classes that are annotated completely."""
     folder = home(case, data)
-    if not case.source:
+    if (folder / "gt_objects.json").exists():
         return list(json.loads((folder / "gt_objects.json").read_text())["objects"])
     if not (folder / "objects_gt.json").exists():
         return []
@@ -342,7 +355,7 @@ def floors_of(figures: Figures) -> Figures:
     """Return the bounds that figures like these must keep.
 
     Half a pixel of box noise, or another order of sums on another processor, changes one or two
-    objects (benchmarks/real_rooms.py --noises). The margins: one object in ten and at least one,
+    objects (benchmarks/shape_checks.py). The margins: one object in ten and at least one,
     IDF1 .03, one camera in twenty, half of an error and a constant, half of the memory.
     """
     if figures["exit"]:
@@ -365,7 +378,7 @@ def missed(figures: Figures, floors: Mapping[str, float] | None) -> list[str]:
     if figures["exit"]:
         return [f"exit code {figures['exit']}: {' '.join(figures.get('said', []))[:200]}"]
     if floors is None:
-        return ["no floors: run with --write-floors"]
+        return ["no thresholds: run with --write-floors"]
     short = [f"{k} {figures.get(k)} < {floors[k]}" for k in LEAST
              if k in floors and not figures.get(k, -1) >= floors[k]]  # fmt: skip
     return short + [f"{k} {figures.get(k)} > {floors[k]}" for k in MOST
@@ -407,6 +420,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     add("-o", "--out", type=Path, help="keep the output folders here (default: delete them)")
     add("--only", nargs="+", default=[], metavar="NAME", help="prefixes of names")
     add("--long", action="store_true", help="also the runs that CI leaves out")
+    add("--rooms", nargs="+", type=int, default=[], metavar="SEED", help="also rendered rooms")
+    add("--without", default="", choices=list(WITHOUT), help="a mechanism to turn off")
     add("--jobs", type=int, default=2, help="commands at once")
     add(
         "--write-floors",
@@ -417,10 +432,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     floors = json.loads(FLOORS.read_text()) if FLOORS.exists() else {}
     every = CASES + LONG if args.long else CASES
     cases = [c for c in every if not args.only or c.name.startswith(tuple(args.only))]
+    cases += [rendered(seed, (args.out or Path("build")).resolve()) for seed in args.rooms]
     order = sorted(cases, key=lambda c: -floors.get(c.name, {}).get("seconds", math.inf))
     with tempfile.TemporaryDirectory() as temporary, ThreadPoolExecutor(args.jobs) as pool:
         out = (args.out or Path(temporary)).resolve()
-        tasks = {c.name: pool.submit(run, c, args.data.resolve(), out) for c in order}
+        tasks = {c.name: pool.submit(run, c, args.data.resolve(), out, args.without) for c in order}
         made = {c.name: tasks[c.name].result() for c in cases}
     print(table(made))
     if args.out:
@@ -429,7 +445,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         floors |= {n: floors_of(f) | {"seconds": round(f["seconds"])} for n, f in made.items()}
         FLOORS.write_text(json.dumps(floors, indent=1) + "\n")
         return 0
-    faults = [f"{n}: {text}" for n, f in made.items() for text in missed(f, floors.get(n))]
+    checked = {n: f for n, f in made.items() if not n.startswith("rendered ")}
+    faults = [f"{n}: {text}" for n, f in checked.items() for text in missed(f, floors.get(n))]
     print(*faults, sep="\n")
     return 1 if faults else 0
 

@@ -1,7 +1,7 @@
 """Compare an output folder with ground truth. It reads OUT's public files and nothing of the tool.
 
-Boxes are xyxy in pixels, frames are 0-based. `eval` and benchmarks/real_rooms.py compute the same
-figures with the tool's own code; a fault in that code does not affect these.
+Boxes are xyxy in pixels, frames are 0-based. `eval` computes the same figures with the tool's own
+code; a fault in that code does not affect these.
 """
 
 from __future__ import annotations
