@@ -5,7 +5,7 @@
 
 writes OUT/reobj.onnx and OUT/reobj_head.onnx (use: `--embed OUT/reobj.onnx`; the checkpoint of the
 best validation, OUT/best.pt), OUT/last.pt (go on with --resume) and OUT/log.csv.
-Needs `pip install torch matplotlib onnx`; the GPU is used when there is one.
+Needs `pip install torch onnx`; the GPU is used when there is one.
 
 Training data; every source may be given several times:
   --rooms A:B           seeds of rendered rooms with sets of identical instances (render_room.py
@@ -65,7 +65,7 @@ try:
     from torch.nn import functional as F
     from torch.optim import swa_utils
 except ImportError:
-    sys.exit("train_embedding.py needs PyTorch: pip install torch matplotlib onnx")
+    sys.exit("train_embedding.py needs PyTorch: pip install torch onnx")
 
 SIZE_WH = (320, 240)  # of a training picture; in use the longer side is 320, any shape
 STRIDE = 16  # sides of the network's input are multiples of it
