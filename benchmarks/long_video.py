@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Time and peak memory of `run` over the length of a video, and ratios between two lengths.
 
-    python benchmarks/long_video.py -o OUT [--frames 600 2400 4800] [--plot]
+    python benchmarks/long_video.py -o OUT [--frames 600 2400 4800]
 
 The clip of examples/room (240 frames, about 10 boxes in each) is played forwards and backwards
 until it has the wanted number of frames; the boxes are given, the cameras are reconstructed. Each
@@ -11,8 +11,7 @@ length is one command in a process of its own. A clip keeps its file names and i
     poses, track, objects, write     wall times that it reports, s
     MB       largest resident size of one process, and of all together at one time
 
-OUT/long_video.json has all figures, also the largest resident size in each stage; --plot draws them
-(OUT/long_video.png, needs matplotlib).
+OUT/long_video.json has all figures, also the largest resident size in each stage.
 """
 
 from __future__ import annotations
@@ -126,29 +125,6 @@ def measure(out: Path, count: int, options: Sequence[str]) -> dict[str, Any]:
     return result
 
 
-def plot(results: dict[int, dict[str, Any]], path: Path) -> None:
-    """Draw time and memory of each stage over the number of frames."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    frames = sorted(results)
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
-    for stage in STAGES:
-        left.plot(frames, [results[n][stage] for n in frames], marker="o", label=stage)
-        memory = [results[n]["stage_MB"][stage] / 1000 for n in frames]
-        right.plot(frames, memory, marker="o", label=stage)
-    left.plot(frames, [n / 30 for n in frames], "k:", label="duration of the video (30 fps)")
-    left.set(xlabel="frames", ylabel="seconds", title="Time of each stage")
-    right.set(xlabel="frames", ylabel="GB, all processes", title="Peak memory in each stage")
-    for axis in (left, right):
-        axis.set_ylim(bottom=0)
-        axis.grid(alpha=0.3)
-        axis.legend()
-    figure.savefig(path, dpi=110)
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure all lengths and print the table."""
     parser = argparse.ArgumentParser(
@@ -156,7 +132,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("-o", "--out", type=Path, required=True)
     parser.add_argument("--frames", type=int, nargs="+", default=[600, 2400, 4800])
-    parser.add_argument("--plot", action="store_true", help="draw OUT/long_video.png (matplotlib)")
     parser.add_argument("options", nargs="*", help="further options of `run`, after --")
     args = parser.parse_args(argv)
     names = ("whole", *STAGES, "MB", "MB_all")
@@ -171,8 +146,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     if {600, 2400} <= found.keys():
         ratios = [found[2400][n] / max(found[600][n], 1e-9) for n in names]
         print("| 2400 / 600 | " + " | ".join(f"{r:.1f}" for r in ratios) + " |")
-    if args.plot:
-        plot(found, args.out / "long_video.png")
     return 0
 
 

@@ -33,12 +33,7 @@ from __future__ import annotations
 import argparse
 import csv
 import functools
-import itertools
 import json
-import multiprocessing
-import os
-import queue
-import signal
 import sys
 import time
 import warnings
@@ -882,48 +877,6 @@ class Pool:
         return scenes
 
 
-class Loader:
-    """Batches made ahead by a second process; where it lags behind, this one makes them."""
-
-    def __init__(self, pool: Pool, first: int) -> None:
-        self.pool, fork = pool, multiprocessing.get_context("fork")
-        self.ready: Any = None
-        self.rooms = len(pool.rooms)
-        if pool.args.ahead:
-            self.ready = fork.Queue(pool.args.ahead)
-            fork.Process(target=self.work, args=(first, os.getpid()), daemon=True).start()
-
-    def work(self, first: int, parent: int) -> None:
-        """Fill the queue until the parent is gone."""
-        os.setsid()  # a scheduling group of its own
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        for number in itertools.count(first):
-            if number % self.pool.args.every == 0:
-                self.pool.fill()
-            rng = np.random.default_rng([self.pool.args.seed, number, 1])
-            batch = self.pool.draw(rng), len(self.pool.rooms)
-            while os.getppid() == parent:
-                try:
-                    self.ready.put(batch, timeout=5)
-                    break
-                except queue.Full:
-                    continue
-            else:
-                return
-
-    def __call__(self, step: int) -> list[list[View]]:
-        """The scenes of the next step."""
-        if self.ready is not None:
-            try:
-                scenes, self.rooms = self.ready.get_nowait()
-                return list(scenes)
-            except queue.Empty:
-                pass
-        else:
-            self.rooms = len(self.pool.rooms)
-        return self.pool.draw(np.random.default_rng([self.pool.args.seed, step]))
-
-
 class Trainer:
     """Network, optimiser and where training stands."""
 
@@ -995,7 +948,7 @@ class Trainer:
         rate = min((self.step + 1) / 40, max(0.02, 0.5 + 0.5 * float(np.cos(np.pi * done))))
         for group in self.optimizer.param_groups:
             group["lr"] = self.args.rate * rate
-        loss = self.loss(self.loader(self.step), done > self.args.hard_after)
+        loss = self.loss(self.batch(), done > self.args.hard_after)
         self.optimizer.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(self.net.parameters(), 5.0)
@@ -1004,6 +957,10 @@ class Trainer:
             self.mean.update_parameters(self.net)
         self.step += 1
         return float(np.asarray(loss.detach().cpu()))
+
+    def batch(self) -> Any:
+        """Scenes of this step, drawn by the seed and the number of the step."""
+        return self.pool.draw(np.random.default_rng([self.args.seed, self.step]))
 
     def loss(self, scenes: Any, late: bool) -> Any:
         """Loss of one batch; late: as in `parts_loss`."""
@@ -1022,13 +979,12 @@ class Trainer:
         """How it was trained, for the files."""
         return {
             "steps": self.step, "seed": self.args.seed, "minutes": round(self.seconds / 60, 1),
-            "rooms": self.loader.rooms, "torch": torch.__version__,
+            "rooms": len(self.pool.rooms), "torch": torch.__version__,
         }  # fmt: skip
 
     def run(self) -> None:
         """Train to the end; log, validate and save every so many steps."""
         losses: list[float] = []
-        self.loader = Loader(self.pool, self.step)
         while self.progress() < 1:
             began = time.monotonic()
             losses.append(self.learn())
@@ -1036,13 +992,12 @@ class Trainer:
             if self.step % self.args.every == 0 or self.progress() >= 1:
                 self.report(float(np.mean(losses)))
                 losses.clear()
-                if not self.args.ahead:
-                    self.pool.fill()
+                self.pool.fill()
 
     def report(self, loss: float) -> None:
         """A row of the log and a checkpoint."""
         row: dict[str, float] = {"step": self.step, "minutes": round(self.seconds / 60, 2)}
-        row |= {"rooms": self.loader.rooms, "loss": round(loss, 5)}
+        row |= {"rooms": len(self.pool.rooms), "loss": round(loss, 5)}
         for name, clips in self.val.items():
             found = self.score(clips)
             row |= {f"{name}_{k}": round(v, 4) for k, v in found.items()}
@@ -1170,7 +1125,6 @@ def common_options(description: str | None) -> argparse.ArgumentParser:
     add("--every", type=int, default=100, help="steps between two rows of the log")
     add("--seed", type=int, default=0)
     add("--threads", type=int, default=1)
-    add("--ahead", type=int, default=0, help="batches that a second process prepares (0: none)")
     add("--resume", action="store_true", help="resume from OUT/last.pt")
     return parser
 
