@@ -80,7 +80,7 @@ import reobj_track as rt
 from reobj.appearance.crops import flat_maps
 from reobj.appearance.reid import RETURN_ODDS, SimilarityCalibration, match_probability
 from reobj.files import atomic
-from reobj.sources.masks import NO_RUNS
+from reobj.sources.recorded import NO_RUNS
 from reobj.sources.weights import IMAGENET_MEAN, IMAGENET_STD, onnx_session
 from reobj.types import Array, BoolArray, Image, IntArray
 

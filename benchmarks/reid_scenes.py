@@ -27,7 +27,7 @@ import reobj_track as rt
 from reobj.cameras import viewing_rays
 from reobj.files import atomic
 from reobj.results.truth import Role, read_truth
-from reobj.sources.masks import NO_RUNS, rle_decode, rle_encode
+from reobj.sources.recorded import NO_RUNS, rle_decode, rle_encode
 from reobj.types import Array, Image, IntArray
 
 # ---- Scenes --------------------------------------------------------------------------------------

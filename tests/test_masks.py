@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reobj.sources import masks
+from reobj.sources import recorded as masks
 from reobj.types import BoolArray
 
 

@@ -44,8 +44,7 @@ from reobj.options import (
     write_config,
 )
 from reobj.results.workspace import Workspace
-from reobj.sources.imageless import ImagelessVideo
-from reobj.sources.video import LiveTimes
+from reobj.sources.video import ImagelessVideo, LiveTimes
 from reobj.sources.weights import frames_at_once, own_models
 
 CHAIR = 56

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -39,10 +38,7 @@ def load_class_names(path: str | Path) -> tuple[str, ...]:
     if isinstance(entries := data.get("categories"), list):
         named = [entry for entry in entries if isinstance(entry, dict)]
         data = {"names": {entry.get("id"): entry.get("name") for entry in named}}
-    names = names_by_number(given := data.get("names", data), where)
-    if "nc" in data and str(data["nc"]) not in (str(len(names)), str(len(given))):
-        raise ReobjError(f"{path}: nc is {data['nc']}, but there are {len(names)} names")
-    return names
+    return names_by_number(data.get("names", data), where)
 
 
 def _of_lines(path: Path) -> list[str] | dict[str, str]:
@@ -73,15 +69,6 @@ def parse_yaml(text: str, where: str) -> Any:
         line = f", line {mark.line + 1}" if mark else ""
         reason = getattr(error, "problem", None) or error
         raise ReobjError(f"{where}{line}: invalid YAML ({reason})") from error
-
-
-def parse_class_names(text: str, where: str) -> tuple[str, ...]:
-    """Read class names of a model's metadata, as Python, JSON or YAML write lists and maps."""
-    try:
-        names = ast.literal_eval(text.strip())
-    except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
-        names = parse_yaml(text, where)
-    return names_by_number(names, where)
 
 
 def names_by_number(names: Any, where: str = "class names of the detector") -> tuple[str, ...]:
@@ -141,9 +128,7 @@ class Vocabulary(Sequence[str]):
         return len(self._names)
 
     def __getitem__(self, index):  # type: ignore[no-untyped-def]
-        return tuple(self._names)[index]
+        return self._names[index]
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Sequence) and tuple(self) == tuple(other)
-
-    __hash__ = None  # type: ignore[assignment]

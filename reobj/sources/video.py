@@ -1,6 +1,7 @@
-"""Frames of a video file, an image folder, a camera or a stream, and checks of the source.
+"""Frames of a video file, an image folder, a camera or a stream; or frames without images.
 
-Start at `Video`; `resized` and `shrunk` scale images.
+Start at `Video`; `ImagelessVideo` replaces it where only detections and poses are given. `resized`
+and `shrunk` scale images.
 """
 
 from __future__ import annotations
@@ -30,37 +31,26 @@ from typing import Any, TypeVar
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from reobj.files import shortened
-from reobj.runtime import check_versions, guard_forks, quiet_opencv
-from reobj.sources.decoding import (
+from reobj.runtime import quiet_opencv
+from reobj.sources.image_files import (
+    IMAGE_FPS,
+    IMAGE_SUFFIXES,
     Decoded,
+    ImageList,
     Opened,
+    list_images,
     open_animation,
     open_camera,
     open_file,
     packet_count,
-    settled_times,
-)
-from reobj.sources.image_files import (
-    IMAGE_FPS,
-    IMAGE_SUFFIXES,
-    ImageList,
-    list_images,
     read_image,
+    settled_times,
     times_of_names,
-    why_unreadable,
 )
-from reobj.types import (
-    Array,
-    Frame,
-    Image,
-    ReobjError,
-    counted,
-    log,
-    option,
-    without_secrets,
-)
+from reobj.types import Array, Frame, Image, ReobjError, log, option, without_secrets
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,8 +134,6 @@ class Video:
         config: InputConfig | None = None,
         live: LiveTimes | None = None,
     ) -> None:
-        check_versions()
-        guard_forks()
         self._address = str(source)
         self.config = config or InputConfig()
         self._live = live or LiveTimes()
@@ -177,12 +165,6 @@ class Video:
         width, height = (max(round(side * ratio), 1) for side in self.size)
         self.working_size = (width, height)
         self.scale = width / self.size[0]
-
-    def __repr__(self) -> str:
-        """Describe the video in one line; a file is not decoded for it."""
-        width, height = self.size
-        frames = "live" if self.is_live else f"{counted(self.expected, 'frame', 'frames')} to read"
-        return f"{type(self).__name__}({self.source!r}, {width}x{height}, {frames})"
 
     def after(self, index: int) -> Video:
         """Return this video without the frames up to `index`, to continue with the next one.
@@ -420,8 +402,8 @@ class Video:
             with quiet_opencv():
                 image = next((image for image in images if image is not None), None)
             if image is None:
-                why = why_unreadable(self.files[0])
-                raise ReobjError(f"{self.source}: no frame can be decoded ({why})")
+                raise ReobjError(f"{self.source}: no frame can be decoded: damaged, or not images "
+                                 "of 8 or 16 bits a channel")  # fmt: skip
             return (image.shape[1], image.shape[0]), IMAGE_FPS, len(self.files)
         opened = self._open()
         first = itertools.islice(opened.frames, MAX_UNREADABLE)
@@ -446,6 +428,75 @@ class Video:
             self._warn(f"its pixels are {wide}:{high}, not square, by its metadata: boxes are in "
                        "stored pixels, cameras have two focal lengths; if that is wrong, correct "
                        "its sample aspect ratio (ffmpeg -i IN -vf setsar=1 OUT)")  # fmt: skip
+
+
+class ImagelessVideo(Video):
+    """Iterate over frames with a number, a time and perhaps a name, but without an image.
+
+    Supports tracking by motion and given cameras, 3D objects and all files; not detectors,
+    appearance, reconstruction, overlay video and pictures in the viewer.
+
+    Args:
+        source: file or folder of poses that defines the frames.
+        size: (w, h) of the images of the detections, px.
+        times_s: (F,) of the frames by number. None: from their names, else 30 Hz.
+        names: (F,) of the images by number, "" where unknown, or [].
+        count: F, if there are neither times nor names.
+    """
+
+    has_images = False
+
+    def __init__(
+        self,
+        source: str | Path,
+        size: Sequence[int],
+        config: InputConfig | None = None,
+        *,
+        times_s: npt.ArrayLike | None = None,
+        names: Sequence[str] = (),
+        count: int = 0,
+    ) -> None:
+        self.source = str(source)
+        self.config = config or InputConfig()
+        self.fingerprint = source_fingerprint(source)
+        if self.config.every < 1 or min(dataclasses.astuple(self.config)) < 0:
+            raise ReobjError("--every must be at least 1; --start, --stop, --max-size at least 0")
+        self.size = self.working_size = (int(size[0]), int(size[1]))
+        self.scale = self.pixel_aspect = 1.0
+        self.names = list(names)
+        self.files = []
+        given = times_of_names(self.names) if times_s is None else np.asarray(times_s, np.float64)
+        self.times_s = given
+        self.times_are_known = given is not None
+        self.frame_count = max(len(self.names), count, 0 if given is None else len(given))
+        if given is not None and len(given) < self.frame_count:
+            counts = f"{len(given)} times of {self.frame_count} frames"
+            raise ReobjError(f"{self.source}: {counts}; expected one each")
+        self._clock = None
+        self._announced = self.frame_count
+        self.fps = IMAGE_FPS
+        if given is not None and len(given) > 1:
+            self.fps = 1 / max(float(np.median(np.diff(given))), 1e-3)
+        self.is_live = False
+        self.read = 0
+        self.dropped = 0
+        self.skipped = []
+        self.messages = []
+
+    def facts(self) -> dict[str, Any]:
+        """Return the arguments to make the same frames again, as JSON values."""
+        times_s = None if self.times_s is None else self.times_s.tolist()
+        return {"size": self.size, "times_s": times_s, "names": self.names,
+                "count": self.frame_count}  # fmt: skip
+
+    def __iter__(self) -> Iterator[Frame]:
+        stop = min(self.config.stop or self.frame_count, self.frame_count)
+        times_s = self.times_s
+        no_image: Any = None
+        for index in range(self.config.start, stop, self.config.every):
+            time_s = index / IMAGE_FPS if times_s is None else float(times_s[index])
+            if index > self._after:
+                yield Frame(index, time_s, no_image)
 
 
 def resized(image: Image, size: Sequence[int]) -> Image:
@@ -487,19 +538,21 @@ def source_fingerprint(source: Any) -> str:
     return hashlib.sha256(json.dumps(facts).encode()).hexdigest()[:16]
 
 
-def content_fingerprint(files: Sequence[Path], most: int = 16, piece: int = 4096) -> str:
+def content_fingerprint(files: Sequence[Path]) -> str:
     """Hash sizes and some content of files.
 
     Copies have the same one, whatever their names, folders and times.
 
-    Args:
-        most: pieces of `piece` bytes that are read, spread over at most most / 2 files, with the
-            first and the last bytes of each.
+    At most 16 pieces are read, spread over at most 8 files, with the first and the last bytes of
+    each.
+
     Returns:
         16 hex digits; "" without files.
     """
     if not files:
         return ""
+    most = 16  # pieces
+    piece = 4096  # bytes
     digest = hashlib.sha256(json.dumps([p.stat().st_size for p in files]).encode())
     read = files[:: -(-len(files) // (most // 2))]
     for path in read:

@@ -5,11 +5,13 @@ Start at `model_path`.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import http.client
 import json
 import os
 import urllib.request
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -213,6 +215,26 @@ def _download(weights: Weights, target: Path) -> None:
         if (digest := weights.digest_of(part)) != weights.digest:
             raise ReobjError(f"{weights.digest_kind} is {digest}, not kept: an incomplete download "
                              "or another file")  # fmt: skip
+
+
+@contextlib.contextmanager
+def failing(name: str, count: int = 0) -> Iterator[None]:
+    """Convert any error of a network's library to one line.
+
+    Args:
+        count: images that it gets at once; 0: it is being opened.
+    """
+    try:
+        yield
+    except ReobjError:
+        raise
+    except Exception as error:  # no memory on the device, no such file, no download, ...
+        at_once = f" on {count} images at once (detect.batch)" if count > 1 else ""
+        text = next((line.strip() for line in str(error).splitlines() if line.strip()), "")
+        if not text or not isinstance(error, OSError | RuntimeError):
+            text = f"{type(error).__name__}: {text}"
+        failed = f" failed{at_once}" if count else ""
+        raise ReobjError(f"{name}{failed}: {text}") from error
 
 
 def frames_at_once(asked: int, device: str) -> int:

@@ -40,8 +40,13 @@ from reobj.poses.sfm import rescale
 from reobj.results.names import recording_name
 from reobj.results.workspace import Workspace
 from reobj.sources import video as sources
-from reobj.sources.decoding import settled_times
-from reobj.sources.image_files import exif_orientation, header, sorted_names, times_of_names
+from reobj.sources.image_files import (
+    exif_orientation,
+    header,
+    settled_times,
+    sorted_names,
+    times_of_names,
+)
 from reobj.types import Array
 from reobj.types import Image as Pixels
 
