@@ -42,17 +42,10 @@ def load_class_names(path: str | Path) -> tuple[str, ...]:
 
 
 def _of_lines(path: Path) -> list[str] | dict[str, str]:
-    """Read a name a line, or a number and a name: all lines have one, or none has."""
+    """Read a name a line, or a number and a name in all lines."""
     lines = [line.strip() for line in read_lines(path) if line.strip()]
     numbered = [match for line in lines if (match := re.fullmatch(r"(\d+)[\s:,]+(\S.*)", line))]
-    if not numbered:
-        return lines
-    named = {match[1]: match[2] for match in numbered}
-    if len(named) < len(lines):
-        raise ReobjError(f"{path}: {len(numbered)} of {len(lines)} lines are a number and a name "
-                         f"({numbered[0][0]!r:.40}); expected different numbers in all, or in none"
-                         )  # fmt: skip
-    return named
+    return {m[1]: m[2] for m in numbered} if len(numbered) == len(lines) else lines
 
 
 def is_yaml(path: Path) -> bool:

@@ -131,21 +131,6 @@ OTHER_WORDS = frozenset(
 )
 
 
-@dataclass(slots=True)
-class _Kind:
-    """Images whose names differ only in their numbers."""
-
-    files: list[Path]
-    is_named_otherwise: bool
-    numbers: set[tuple[int, ...]]
-    color: bool
-
-    def shares(self, other: _Kind) -> bool:
-        """Test whether more than half of the smaller kind has numbers of the other one."""
-        count = min(len(self.numbers), len(other.numbers))
-        return () not in self.numbers and 2 * len(self.numbers & other.numbers) > count
-
-
 def _only_pictures(
     files: list[Path], headers: dict[Path, Header | None], folder: str
 ) -> tuple[list[Path], list[str]]:
@@ -164,24 +149,26 @@ def _only_pictures(
     elif deep:
         files = [p for p in files if p not in set(deep)]
         messages.append(_left_out(deep, "one channel with more than 8 bits, as depth maps have"))
-    kinds = _kinds(files, headers)
-    for kind in list(kinds):
-        beside = [k for k in kinds if k is not kind and kind.shares(k)]
-        gray = not kind.color and any(k.color for k in beside)
-        if gray or (kind.is_named_otherwise and not all(k.is_named_otherwise for k in beside)):
-            why = "one channel, beside images in colour" if gray else "by their name"
-            messages.append(_left_out(kind.files, why))
-            kinds.remove(kind)
+    kinds = _kinds(files)
+    grays = {p for p in files if (h := headers[p]) is not None and h.is_gray}
+    gray = {name: grays >= kinds[name].keys() for name in kinds}
+    other = {name: not OTHER_WORDS.isdisjoint(re.split(r"[^a-z]+", name)) for name in kinds}
+    for name in list(kinds):
+        beside = [k for k in kinds if k != name and _share_numbers(kinds[k], kinds[name])]
+        masks = gray[name] and not all(gray[k] for k in beside)
+        if masks or (other[name] and not all(other[k] for k in beside)):
+            why = "one channel, beside images in colour" if masks else "by their name"
+            messages.append(_left_out(list(kinds.pop(name)), why))
     least = 3  # images of each of two kinds: the numbers of fewer may agree by chance
-    for pair in itertools.combinations(kinds if folder else (), 2):
-        if pair[0].shares(pair[1]) and min(len(k.files) for k in pair) >= least:
-            names = [min((p.name for p in k.files), key=by_number) for k in pair]
+    for pair in itertools.combinations(kinds.values() if folder else (), 2):
+        if _share_numbers(*pair) and min(map(len, pair)) >= least:
+            names = [min((p.name for p in kind), key=by_number) for kind in pair]
             chosen = re.sub(r"\d+", "*", glob.escape(names[0]))
             raise ReobjError(
                 f"{folder}: two kinds of images, {' and '.join(names)}; which are the frames? "
                 f"Give a glob in quotes, such as '{Path(folder) / chosen}'"
             )
-    return [p for kind in kinds for p in kind.files], messages
+    return [p for kind in kinds.values() for p in kind], messages
 
 
 def _left_out(files: Sequence[Path], why: str) -> str:
@@ -189,22 +176,29 @@ def _left_out(files: Sequence[Path], why: str) -> str:
     return f"{len(files)} images are no frames ({why}): {first}" + " ..." * (len(files) > 1)
 
 
-def _kinds(files: Sequence[Path], headers: dict[Path, Header | None]) -> list[_Kind]:
-    """Group images by their names without numbers; copies, a(1).jpg, belong to the original."""
-    groups: dict[str, list[tuple[Path, str]]] = {}
+def _kinds(files: Sequence[Path]) -> dict[str, dict[Path, tuple[int, ...]]]:
+    """Group images by their names without numbers, in lower case; with the numbers that differ.
+
+    Copies, a(1).jpg, belong to the original.
+    """
+    groups: dict[str, dict[Path, list[str]]] = {}
     for path in files:
         stem = re.sub(r"\s*\(\d+\)$", "", path.stem.casefold())
-        groups.setdefault(re.sub(r"\d+", "#", stem) + path.suffix.lower(), []).append((path, stem))
-    kinds = []
-    for text, members in groups.items():
-        rows = np.array([re.findall(r"\d+", stem) for _, stem in members], object)
-        varied = [len(set(column)) > 1 for column in rows.T.tolist()] if len(rows) > 1 else ...
-        numbers = {tuple(map(int, row)) for row in rows[:, varied].tolist()}
-        known = [h for path, _ in members if (h := headers[path]) is not None]
-        color = 2 * sum(h.is_gray for h in known) <= len(known)
-        named = not OTHER_WORDS.isdisjoint(re.split(r"[^a-z]+", text.rpartition(".")[0]))
-        kinds.append(_Kind([path for path, _ in members], named, numbers, color))
+        name = re.sub(r"\d+", "#", stem) + path.suffix.lower()
+        groups.setdefault(name, {})[path] = re.findall(r"\d+", stem)
+    kinds = {}
+    for name, members in groups.items():
+        columns = list(zip(*members.values(), strict=True))
+        varied = [k for k, column in enumerate(columns) if len({*column}) > 1 or len(members) == 1]
+        kinds[name] = {path: tuple(int(row[k]) for k in varied) for path, row in members.items()}
     return kinds
+
+
+def _share_numbers(kind: dict[Path, tuple[int, ...]], other: dict[Path, tuple[int, ...]]) -> bool:
+    """Test whether more than half of the smaller kind of images has numbers of the other one."""
+    one = {*kind.values()}
+    two = {*other.values()}
+    return () not in one and 2 * len(one & two) > min(len(one), len(two))
 
 
 # ---- Order and times of names --------------------------------------------------------------------
@@ -223,26 +217,8 @@ def by_number(name: str) -> tuple[Any, ...]:
 
 
 def sorted_names(names: Iterable[str]) -> list[str]:
-    """Sort names by the numbers in them, decimal numbers by their value."""
-    names = list(names)
-    if (values := _decimals(names)) is None:
-        return sorted(names, key=by_number)
-    order = sorted(range(len(names)), key=lambda k: (values[k], by_number(names[k])))
-    return [names[k] for k in order]
-
-
-def _decimals(names: Sequence[str]) -> list[float] | None:
-    """Read the numbers at the end of otherwise equal names; None if the names differ elsewhere."""
-    decimal = re.compile(r"(.*?)((?:(?<![^_= ])-)?\d+(?:\.(\d+))?)")  # no hyphen after a word
-    matches = [decimal.fullmatch(Path(name).stem.casefold()) for name in names]
-    known = [match for match in matches if match is not None]
-    if not known or len(known) < len(names) or len({match[1] for match in known}) > 1:
-        return None
-    digits = [match[3] for match in known if match[3]]
-    # 1.8, 1.9, 1.10 are two counters: decimals of unequal length do not end in 0 (except 10.0)
-    if len(set(map(len, digits))) > 1 and any(len(d) > 1 and d.endswith("0") for d in digits):
-        return None
-    return [float(match[2]) for match in known]
+    """Sort names by the numbers in them."""
+    return sorted(names, key=by_number)
 
 
 class TimeUnit(enum.Enum):
@@ -271,13 +247,11 @@ def times_of_names(names: Sequence[str]) -> Array | None:
     words = [re.findall(r"\d+(?:\.\d+)?", Path(name).stem)[-1:] for name in names]
     if not words or not all(words):
         return None
-    decimals = _decimals(names)
-    numbers = np.array(decimals or [float(word) for (word,) in words])
+    numbers = np.array([float(word) for (word,) in words])
     steps = np.diff(numbers)
-    points = ["." in word for (word,) in words]
     if (steps <= 0).any():
         return None
-    if all(points) or (decimals and any(points)):  # in s, unless closer than on the fastest phones
+    if all("." in word for (word,) in words):  # in s, unless closer than on the fastest phones
         return numbers if not len(steps) or np.median(steps) >= 1 / 240 else None
     units = [unit.value for unit in TimeUnit if all(map(is_date, numbers / unit.value))]
     return numbers / units[0] if units else None
@@ -351,10 +325,6 @@ def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> npt.NDArray[Any] | 
         image = cv2.imdecode(data, flags) if len(data) else None
     except (OSError, cv2.error):
         return None
-    if image is None:  # OpenCV 4 reads no animated WebP
-        with contextlib.suppress(Exception), PillowImage.open(path) as opened:
-            if getattr(opened, "is_animated", False):
-                image = np.ascontiguousarray(np.asarray(opened.convert("RGB"))[..., ::-1])
     return image
 
 

@@ -68,6 +68,10 @@ class InputConfig:
         0, "reconnection attempts after a live source ends, after 1, 2, 4, ... 30 s"
     )
 
+    def __post_init__(self) -> None:
+        if self.every < 1 or min(dataclasses.astuple(self)) < 0:
+            raise ReobjError("--every must be at least 1; --start, --stop, --max-size at least 0")
+
     def selects(self, frame: Any) -> Any:
         """Test whether frame numbers of the source, one or (N,), are to be read."""
         within = (frame >= self.start) & (frame < (self.stop or sys.maxsize))
@@ -126,7 +130,13 @@ class Video:
     """
 
     has_images = True
+    is_live = False
+    pixel_aspect = scale = 1.0
+    read = dropped = _seen = _taken = 0
     _after = -1  # frames up to this one are decoded and checked, but not yielded
+    _declared_s = 0.0
+    _opened: Opened | None = None  # a live source, until it is iterated
+    _clock: tuple[Array, bool] | None = None  # times (F,) in s; the file has them
 
     def __init__(
         self,
@@ -138,24 +148,17 @@ class Video:
         self.config = config or InputConfig()
         self._live = live or LiveTimes()
         self.source = without_secrets(self._address)
-        if self.config.every < 1 or min(dataclasses.astuple(self.config)) < 0:
-            raise ReobjError("--every must be at least 1; --start, --stop, --max-size at least 0")
         self.skipped: list[int] = []
         self.messages: list[str] = []
-        self.read = self.dropped = self._seen = self._taken = 0
-        self._declared_s = 0.0
-        self._opened: Opened | None = None  # a live source, until it is iterated
         self._is_url = _is_stream_url(self._address)
         self.fingerprint = source_fingerprint(source)
         images = ImageList([], [], []) if self._is_url else list_images(self.source)
         self.files = images.files
-        self._clock: tuple[Array, bool] | None = None  # times (F,) in s; the file has them
         for text in images.messages:
             self._warn(text)
         self.names = [path.name for path in self.files]
         self.times_s = times_of_names(self.names)
         self.is_live = self._is_url or (self.source.isdecimal() and not Path(self.source).exists())
-        self.pixel_aspect = 1.0
         self.size, self._announced_fps, self._announced = self._probe(images.usual)
         start = self.config.start
         if start and not self.is_live and not start < self.frame_count:
@@ -411,8 +414,9 @@ class Video:
         if frame.image is None:
             raise ReobjError(f"{self.source}: no frame can be decoded (codec {opened.codec})")
         self.is_live = self.is_live and not opened.count  # the URL of a file is not live
-        self._opened = opened if self.is_live else None
-        if not self.is_live:
+        if self.is_live:
+            self._opened = opened
+        else:
             self._declared_s = opened.duration_s
             self._set_aspect(opened.pixel_aspect, frame.turned % 180 == 90)
         height, width = frame.image().shape[:2]
@@ -459,10 +463,7 @@ class ImagelessVideo(Video):
         self.source = str(source)
         self.config = config or InputConfig()
         self.fingerprint = source_fingerprint(source)
-        if self.config.every < 1 or min(dataclasses.astuple(self.config)) < 0:
-            raise ReobjError("--every must be at least 1; --start, --stop, --max-size at least 0")
         self.size = self.working_size = (int(size[0]), int(size[1]))
-        self.scale = self.pixel_aspect = 1.0
         self.names = list(names)
         self.files = []
         given = times_of_names(self.names) if times_s is None else np.asarray(times_s, np.float64)
@@ -472,14 +473,10 @@ class ImagelessVideo(Video):
         if given is not None and len(given) < self.frame_count:
             counts = f"{len(given)} times of {self.frame_count} frames"
             raise ReobjError(f"{self.source}: {counts}; expected one each")
-        self._clock = None
         self._announced = self.frame_count
         self.fps = IMAGE_FPS
         if given is not None and len(given) > 1:
             self.fps = 1 / max(float(np.median(np.diff(given))), 1e-3)
-        self.is_live = False
-        self.read = 0
-        self.dropped = 0
         self.skipped = []
         self.messages = []
 

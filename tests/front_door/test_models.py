@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -267,8 +270,8 @@ def test_names_in_a_locale_without_utf8(tmp_path: Path) -> None:
     (tmp_path / "det.csv").write_text("\n".join(rows), encoding="utf-8")
     off = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
     words = ["track", "Stühle", "--detections", "det.csv", *QUICK, "-o", "out ü"]
-    shown = subprocess.run([sys.executable, str(ROOT / "reobj_track.py"), *words], cwd=tmp_path,
-                           env=os.environ | off, check=True, capture_output=True).stdout  # fmt: skip
+    command = [sys.executable, str(ROOT / "reobj_track.py"), *words]
+    shown = subprocess.check_output(command, cwd=tmp_path, env=os.environ | off)
     assert "1 椅子" in shown.decode() and "out ü" in shown.decode()
     data = json.loads((tmp_path / "out ü/objects.json").read_text(encoding="utf-8"))
     assert {entry["class"] for entry in data["objects"]} == {"椅子"}
