@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,7 +14,6 @@ import pytest
 
 import reobj_track as rt
 from reobj.options import read_config
-from reobj.sources import onnx_layouts
 from reobj.sources.detectors import (
     DetectionCache,
     DetectionSource,
@@ -253,16 +251,13 @@ def test_channels_and_scaling(
         (yolox(raw=False), ("output", (0, 7, 7)), 1, slice(0, 32)),  # in the corner
     ],
 )
-@pytest.mark.parametrize("portrait", [False, True])
 def test_the_letterbox_border_is_grey(
-    tmp_path: Path, outputs: dict[str, Any], at: Any, unit: float, where: slice, portrait: bool
+    tmp_path: Path, outputs: dict[str, Any], at: Any, unit: float, where: slice
 ) -> None:
     """The position of the image matches the mapping of boxes; the border is grey, 114."""
     inside = np.zeros((3, 64, 64))
     inside[:, where] = 1
     image = np.full_like(IMAGE, 200)
-    if portrait:
-        inside, image = inside.transpose(0, 2, 1), image.transpose(1, 0, 2)
     for fraction, value in ((inside, 200), (1 - inside, 114)):
         path = model(tmp_path, outputs, seen=(*at, fraction))
         expected = SCORE + value * unit / 2  # half of the input
@@ -300,26 +295,6 @@ def test_detections_are_selected(tmp_path: Path) -> None:
         rt.OnnxDetector(path, rt.DetectConfig(classes="sofa"))
 
 
-def test_class_names_come_from_the_user_first(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    path = model(tmp_path, yolov8(), names="")
-    with pytest.raises(
-        rt.ReobjError, match=r"80 class names .of COCO.*yolo with 3 classes or yolo"
-    ):
-        rt.OnnxDetector(path)
-    declared = rt.OnnxDetector(path, rt.DetectConfig(layout="yolo"))
-    assert declared.class_names == ("class 0", "class 1", "class 2")
-    assert "3 classes without names" in caplog.text
-    (tmp_path / "names.txt").write_text("a\nb\nc\n")
-    config = rt.DetectConfig(class_names=str(tmp_path / "names.txt"))
-    assert rt.OnnxDetector(path, config).class_names == ("a", "b", "c")
-    (tmp_path / "names.txt").write_text("a\n\nb\n")
-    for layout in ("", "yolo"):
-        with pytest.raises(rt.ReobjError, match=r"2 class names .*names\.txt.* 3 classes"):
-            rt.OnnxDetector(path, dataclasses.replace(config, layout=layout))
-
-
 @pytest.mark.parametrize(
     ("outputs", "shape", "expected"),
     [
@@ -345,32 +320,6 @@ def test_other_networks_are_refused(
     with pytest.raises(rt.ReobjError, match=expected) as caught:
         rt.OnnxDetector(model(tmp_path, outputs, shape))
     assert "m.onnx" in str(caught.value) and "\n" not in str(caught.value)
-
-
-def reference_nms(xyxy: Any, label: Any, max_iou: float) -> list[int]:
-    kept: list[int] = []
-    for i in range(len(xyxy)):
-        ok = True
-        for j in kept:
-            low, high = np.maximum(xyxy[i, :2], xyxy[j, :2]), np.minimum(xyxy[i, 2:], xyxy[j, 2:])
-            inter = np.clip(high - low, 0, None).prod()
-            area = (xyxy[i, 2:] - xyxy[i, :2]).prod() + (xyxy[j, 2:] - xyxy[j, :2]).prod() - inter
-            ok &= label[i] != label[j] or inter <= max_iou * area
-        if ok:
-            kept.append(i)
-    return kept
-
-
-def test_nms_equals_the_loop() -> None:
-    rng = np.random.default_rng(3)
-    corner = rng.random((200, 2)) * 60
-    xyxy, label = (
-        np.hstack([corner, corner + 10 + rng.random((200, 2)) * 30]),
-        rng.integers(0, 3, 200),
-    )
-    for limit in (0.3, 0.6):
-        assert onnx_layouts.nms(xyxy, label, limit).tolist() == reference_nms(xyxy, label, limit)
-    assert onnx_layouts.nms(np.empty((0, 4)), np.empty(0, np.int64), 0.5).tolist() == []
 
 
 # ---- Cache ---------------------------------------------------------------------------------------
@@ -578,34 +527,6 @@ def test_run_and_track_accept_a_model_a_video_and_a_dict(
         rt.run(video, detector="fast", detections="det.txt")
     with pytest.raises(rt.ReobjError, match="give these options to the Video only"):
         rt.run(video, config={"input": {"every": 2}})
-
-
-class Counting:
-    """A slow detector that counts its calls."""
-
-    def __init__(self, key: str = "key", slow: bool = True) -> None:
-        self.asked: list[int] = []
-        self.source = DetectionSource(self.run, ("cup",), key, ["a message"], slow)
-
-    def run(self, frames: Sequence[rt.Frame]) -> Iterator[rt.Detections]:
-        for frame in frames:
-            self.asked.append(frame.index)
-            yield some(frame.index)
-
-
-def test_a_slow_source_is_called_once_per_frame(tmp_path: Path) -> None:
-    counting = Counting()
-    first = dataclasses.replace(counting.source, cache=DetectionCache(tmp_path, (32, 24)))
-    for index in (1, 2, 3, 2):
-        assert_same(at(first, frame(index)), some(index))
-    assert counting.asked == [1, 2, 3]
-    assert (first.class_names, first.key, first.messages) == (("cup",), "key", ["a message"])
-    assert first.cache is not None
-    first.cache.flush()
-    second = dataclasses.replace(first, cache=DetectionCache(tmp_path, (32, 24)))  # the next run
-    for index in (3, 4):
-        assert_same(at(second, frame(index)), some(index))
-    assert counting.asked == [1, 2, 3, 4]
 
 
 # ---- Real weights --------------------------------------------------------------------------------

@@ -13,7 +13,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from small_models import small_rt_detr
 from torchvision_operators import REASON, declare_nms
 
 import reobj_track as rt
@@ -88,18 +87,6 @@ def opened(video: rt.Video, config: rt.DetectConfig) -> DetectionSource:
 # ---- Each library ------------------------------------------------------------------------------
 
 
-def test_ultralytics(video: rt.Video, tmp_path: Path) -> None:
-    pytest.importorskip("ultralytics", reason=INSTALL)
-    found, source = detect(video, "ultralytics:yolo11n-seg.yaml", min_score=1e-6)
-    assert len(found) > 0 and found.masks is not None
-    assert found.masks.shape == (len(found), 240, 320)
-    assert len(source.class_names) == 80 and source.key
-    model = "ultralytics:yolo11n-seg.yaml"
-    batches_are_like_single_frames(tmp_path / "three", model, min_score=1e-6)
-    with pytest.raises(rt.ReobjError, match=r"--words: ultralytics:yolo11n.yaml has fixed classes"):
-        detect(video, "ultralytics:yolo11n.yaml", words="toolbox")
-
-
 def test_rfdetr(video: rt.Video, tmp_path: Path) -> None:
     pytest.importorskip("rfdetr", reason=INSTALL)
     found, source = detect(video, "rfdetr:nano=", min_score=0.01)
@@ -119,20 +106,6 @@ def test_torchvision(video: rt.Video, tmp_path: Path, operators_are_missing: boo
     assert source.class_names[1] == "person" and found.class_id.min() > 0  # 0: background
     model = "torchvision:fasterrcnn_resnet50_fpn="
     batches_are_like_single_frames(tmp_path / "three", model, min_score=0.001)
-
-
-def test_transformers(video: rt.Video, tmp_path: Path) -> None:
-    tf = pytest.importorskip("transformers", reason=INSTALL)
-    pytest.importorskip("torch", reason=INSTALL)
-    folder = str(tmp_path / "model")
-    small_rt_detr().save_pretrained(folder)
-    tf.RTDetrImageProcessor().save_pretrained(folder)
-    found, source = detect(video, f"hf:{folder}", min_score=0.001)
-    assert len(found) > 5 and tuple(source.class_names) == ("lamp", "plant")
-    assert np.ptp(found.xyxy[:, ::2]) > 50  # px of the photo, not of the network or 0..1
-    plants, _ = detect(video, f"hf:{folder}", min_score=0.001, classes="plant")
-    assert set(plants.class_id) <= {1}
-    batches_are_like_single_frames(tmp_path / "three", f"hf:{folder}", min_score=0.001)
 
 
 def test_transformers_with_words(video: rt.Video, tmp_path: Path) -> None:

@@ -470,9 +470,6 @@ class ImagelessVideo(Video):
         self.times_s = given
         self.times_are_known = given is not None
         self.frame_count = max(len(self.names), count, 0 if given is None else len(given))
-        if given is not None and len(given) < self.frame_count:
-            counts = f"{len(given)} times of {self.frame_count} frames"
-            raise ReobjError(f"{self.source}: {counts}; expected one each")
         self._announced = self.frame_count
         self.fps = IMAGE_FPS
         if given is not None and len(given) > 1:
