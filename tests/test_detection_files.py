@@ -202,7 +202,7 @@ LINE = "1,-1,10,20,30,40,.9\n"
          r"missing required field `category_id` - at `\$\[0\]`"),
         ("d.json", json.dumps(coco_entries(category_id=500)), "category_id 500 is unknown"),
         ("d.json", json.dumps(coco_entries(segmentation={"size": [48, 64], "counts": [48 * 64]})),
-         r"entry 0: .*mask of .h, w. \(48, 64\) in a video of \(480, 640\)"),
+         r"mask of .h, w. \(48, 64\) in a video of \(480, 640\)"),
         ("d.json", json.dumps(coco_entries(segmentation={"size": [480, 640], "counts": [8, 9]})),
          r"entry 0: mask of 17 pixels in a video of \(640, 480\)"),
         ("d.json", json.dumps(coco_entries(score=float("nan"))), "entry 0: .*NaN, infinite"),
@@ -229,7 +229,7 @@ def test_a_damaged_zip_gives_one_line(tmp_path: Path, video: rt.Video) -> None:
     data = bytearray((tmp_path / "a.zip").read_bytes())
     data[50] ^= 255  # zlib.error
     (tmp_path / "a.zip").write_bytes(data)
-    with pytest.raises(rt.ReobjError, match=r"a\.zip: no annotations of CVAT") as caught:
+    with pytest.raises(rt.ReobjError, match=r"a\.zip: damaged") as caught:
         rt.read_tracks(tmp_path / "a.zip", video)
     assert "\n" not in str(caught.value)
 

@@ -44,7 +44,7 @@ Id = Whole | str
 
 
 class Image(msgspec.Struct):
-    """An image of a dataset; `extra` holds its name before an export by Roboflow."""
+    """An image of a dataset."""
 
     id: Id
     file_name: str | None = None
@@ -53,13 +53,6 @@ class Image(msgspec.Struct):
     frame_id: Whole | None = None  # COCO-VID
     frame_index: Whole | None = None  # TAO
     video_id: Id | None = None
-    extra: Any = None
-
-    @property
-    def name(self) -> str | None:
-        """Name of the image before its export."""
-        extra = self.extra.get("name") if isinstance(self.extra, dict) else None
-        return extra if isinstance(extra, str) else self.file_name
 
     @property
     def number(self) -> int | None:
@@ -199,22 +192,14 @@ def _read(source: Source, entries: list[Annotation], dataset: Dataset | None) ->
     classes = _categories(source, entries, dataset)
     frame, size, looked = _images(source, entries, dataset)
     scale = source.scale(size, frame >= 0)
-    masks = []
-    identity = []
-    for at, (entry, ratio) in enumerate(zip(entries, scale[:, :2], strict=True)):
-        try:
-            masks.append(_mask(entry.segmentation, source.video.size, ratio))
-            identity.append(entry.identity)
-        except (OverflowError, ValueError) as error:
-            raise ReobjError(f"{source.path}, entry {at}: {error}") from error
     modes = {entry.bbox_mode for entry in entries}
-    if len(modes) > 1:
-        raise ReobjError(f"{source.path}: entries of several bbox_mode; expected one")
+    masks = [_mask(entry.segmentation, source.video.size, ratio)
+             for entry, ratio in zip(entries, scale[:, :2], strict=True)]  # fmt: skip
     return source.recorded(
         frame, np.array([entry.bbox for entry in entries]), classes,
         np.array([entry.score for entry in entries], np.float64), masks,
         form=CORNERS if 0 in modes else SIZES, scale=scale, looked=looked,
-        identity=np.array(identity, np.int64),
+        identity=np.array([entry.identity for entry in entries], np.int64),
         ignored=np.array([bool(entry.iscrowd or entry.ignore) for entry in entries], bool),
     )  # fmt: skip
 
@@ -288,7 +273,7 @@ def _dataset_frames(dataset: Dataset, source: Source) -> dict[Id, int]:
     """
     video = source.video
     images = _of_one_video(dataset, source)
-    names = [original_name(image.name or "") for image in images]
+    names = [original_name(image.file_name or "") for image in images]
     named = bool(images) and all(names)
     numbers = [image.number for image in images]
     rule = named and frames_by_name(list(dict.fromkeys(names)), video.files or video.names)[1]
@@ -366,37 +351,31 @@ def read_cvat(source: Source) -> RecordedDetections:
     bounded = Counter[str]()  # number of shapes of each kind that became bounding boxes
     identity = np.empty(0, np.int64)
     looked = None
-    try:
-        root = _cvat_root(source.path)
-        tracks = list(root.iter("track"))
-        parents = tracks or list(root.iter("image"))
-        left = Counter(child.tag for parent in parents for child in parent)
-        shapes = [(parent, shape) for parent in parents for shape in parent
-                  if shape.tag in KINDS and shape.get("outside") != "1"]  # fmt: skip
-        boxes = np.array([_bounds(shape, bounded) for _, shape in shapes]).reshape(-1, 4)
-        size = [float(root.findtext(f".//meta//original_size/{side}", "0"))
-                for side in ("width", "height")]  # fmt: skip
-        scale = source.scale(np.tile(size, (len(shapes), 1)))
-        runs = [_cvat_runs(shape, ratio, source.video.size)
-                for (_, shape), ratio in zip(shapes, scale[:, :2], strict=True)]  # fmt: skip
-        if tracks:
-            begin = int(source.first == "1")
-            numbers = [int(shape.attrib["frame"]) for _, shape in shapes]
-            frame = np.array(numbers, np.int64) - begin
-            looked = _listed_frames(root, numbers, begin)
-            identity = np.array([int(track.attrib["id"]) + 1 for track, _ in shapes], np.int64)
-            labels = [track.attrib["label"] for track, _ in shapes]
-        else:
-            frame = frames_of_names([image.attrib["name"] for image, _ in shapes], source)
-            labels = [shape.attrib["label"] for _, shape in shapes]
-    except ReobjError:
-        raise
-    except Exception as error:  # zip, zlib and expat have their own exceptions for damaged files
-        raise ReobjError(f"{source.path}: no annotations of CVAT 1.1 for video or images "
-                         f"({error!r:.200})") from None  # fmt: skip
+    root = _cvat_root(source.path)
+    tracks = list(root.iter("track"))
+    parents = tracks or list(root.iter("image"))
+    left = Counter(child.tag for parent in parents for child in parent)
+    shapes = [(parent, shape) for parent in parents for shape in parent
+              if shape.tag in KINDS and shape.get("outside") != "1"]  # fmt: skip
     if not shapes:
         raise ReobjError(f"{source.path}: no track with a box; export the task as 'CVAT for video "
                          "1.1'")  # fmt: skip
+    boxes = np.array([_bounds(shape, bounded) for _, shape in shapes])
+    size = [float(root.findtext(f".//meta//original_size/{side}", "0"))
+            for side in ("width", "height")]  # fmt: skip
+    scale = source.scale(np.tile(size, (len(shapes), 1)))
+    runs = [_cvat_runs(shape, ratio, source.video.size)
+            for (_, shape), ratio in zip(shapes, scale[:, :2], strict=True)]  # fmt: skip
+    if tracks:
+        begin = int(source.first == "1")
+        numbers = [int(shape.attrib["frame"]) for _, shape in shapes]
+        frame = np.array(numbers, np.int64) - begin
+        looked = _listed_frames(root, numbers, begin)
+        identity = np.array([int(track.attrib["id"]) + 1 for track, _ in shapes], np.int64)
+        labels = [track.attrib["label"] for track, _ in shapes]
+    else:
+        frame = frames_of_names([image.attrib["name"] for image, _ in shapes], source)
+        labels = [shape.attrib["label"] for _, shape in shapes]
     for kind, count in sorted(bounded.items()):
         source.say(f"{count} {kind} taken as their bounding boxes")
     for kind in sorted(left.keys() - {*KINDS, "tag"}):

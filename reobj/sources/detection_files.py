@@ -265,8 +265,9 @@ def read_source(source: Source, read: Reader) -> RecordedDetections:
         return read(source)
     except ReobjError:
         raise
-    except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
-        raise ReobjError(f"{source.path}: an entry cannot be read: {error!r}") from error
+    except Exception as error:  # zip, zlib and expat have their own exceptions for damaged files
+        text = f"damaged, or not as its format says ({error!r:.200})"
+        raise ReobjError(f"{source.path}: {text}") from error
 
 
 def described_images(

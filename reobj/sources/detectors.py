@@ -283,7 +283,7 @@ def as_source(detector: Any, class_names: Sequence[str] = ()) -> DetectionSource
         return detector
     if isinstance(detector, RecordedDetections):
         return _recorded_source(detector)
-    several = type(detector) is OnnxDetector  # a subclass may change a call
+    several = isinstance(detector, OnnxDetector)
     if not callable(detector):
         raise ReobjError(f"{detector!r:.80} is no detector: expected a function image -> detections"
                          "; a file is opened by read_detections(path, video)")  # fmt: skip
@@ -292,10 +292,11 @@ def as_source(detector: Any, class_names: Sequence[str] = ()) -> DetectionSource
         tuple(class_names) or _stated_names(detector),
         has_numbers=bool(class_names),
     )
-    if not isinstance(detector, OnnxDetector):
+    if not several:
         return source
-    batch = detector.batch if several else 1
-    return dataclasses.replace(source, messages=detector.messages, always_looks=True, batch=batch)
+    return dataclasses.replace(
+        source, messages=detector.messages, always_looks=True, batch=detector.batch
+    )
 
 
 def _source_of(

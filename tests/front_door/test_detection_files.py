@@ -484,14 +484,6 @@ def test_boxes_of_frames_before_rotation(tmp_path: Path, tracked: Callable[..., 
     (tmp_path / "det.txt").write_text("".join(rows))
     made = tracked(folder, "--detections", tmp_path / "det.txt")
     assert made.code == 2 and "turned by 90 deg" in made.said
-    data = {
-        "images": [{"id": 0, "file_name": "0.png", "width": 320, "height": 240}],
-        "categories": [{"id": 1, "name": "chair"}],
-        "annotations": [{"image_id": 0, "category_id": 1, "bbox": [1, 2, 30, 40]}],
-    }
-    (tmp_path / "coco.json").write_text(json.dumps(data))
-    made = tracked(folder, "--detections", tmp_path / "coco.json")
-    assert made.code == 2 and "turned upright" in made.said
     (tmp_path / "det.txt").write_text("1,-1,200,50,60,80,.9\n1,-1,20,250,60,69,.9\n")
     assert tracked(folder, "--detections", tmp_path / "det.txt").code == 0  # over the edge only
 
@@ -754,38 +746,29 @@ def test_scores_that_are_percent(tmp_path: Path, tracked: Callable[..., Tracked]
 # ---- Names of images decide, never the order of a list -------------------------------------------
 
 
-def in_list_order(name: str, extra: bool, frames: Sequence[int]) -> dict[str, Any]:
+def in_list_order(name: str, frames: Sequence[int]) -> dict[str, Any]:
     """A dataset whose list has another order than the names; images without boxes too."""
-    images = [
-        {"id": i, "file_name": name.format(f)}
-        | ({"extra": {"name": f"desk_{f:04d}.png"}} if extra else {})
-        for i, f in enumerate(frames)
-    ]
+    images = [{"id": i, "file_name": name.format(f)} for i, f in enumerate(frames)]
     boxes = [{"image_id": i, "category_id": 1, "bbox": coco_box(f)} for i, f in enumerate(frames)]
     return {"images": images, "categories": [{"id": 1, "name": "chair"}], "annotations": boxes}
 
 
-@pytest.mark.parametrize("frames", [[3, 1, 0, 5]])
 @pytest.mark.parametrize(
-    ("name", "extra"),
-    [
-        ("desk_{:04d}_png.rf.5b3c8f01d97e42a6f8c5b09e1d74a3f6.jpg", False),
-        ("upload.rf.5b3c8f01d97e42a6{:04d}f8c5b09e1d74a3f6.jpg", True),
-        ("desk_{:04d}.png", False),
-    ],
+    "name", ["desk_{:04d}_png.rf.5b3c8f01d97e42a6f8c5b09e1d74a3f6.jpg", "desk_{:04d}.png"]
 )
 def test_datasets_in_another_order_than_the_frames(
-    tmp_path: Path, tracked: Callable[..., Tracked], frames: list[int], name: str, extra: bool
+    tmp_path: Path, tracked: Callable[..., Tracked], name: str
 ) -> None:
+    frames = [3, 1, 0, 5]
     source = images(tmp_path / "im", [f"desk_{f:04d}.png" for f in range(FRAMES)])
-    (tmp_path / "d.json").write_text(json.dumps(in_list_order(name, extra, frames)))
+    (tmp_path / "d.json").write_text(json.dumps(in_list_order(name, frames)))
     made = tracked(source, "--detections", tmp_path / "d.json")
     assert is_truth(made, frames=sorted(frames)), made
 
 
 def test_names_that_fit_no_image(tmp_path: Path, tracked: Callable[..., Tracked]) -> None:
     """As many images as frames: still refused, unless the user says that the order counts."""
-    data = in_list_order("desk_{:04d}.png", False, range(4))
+    data = in_list_order("desk_{:04d}.png", range(4))
     for image, name in zip(data["images"], ("hall", "door", "sofa", "left"), strict=True):
         image["file_name"] = f"{name}.jpg"
     (tmp_path / "d.json").write_text(json.dumps(data))
