@@ -360,6 +360,10 @@ def _layout(
     return Layout(name, title, recognise, decode, shape=shape, classes=classes, **fields)
 
 
+def _in_px(model: ModelProbe) -> bool:
+    return not model.in_fractions
+
+
 IMAGENET_RGB = Pixels("RGB, ImageNet", True, IMAGENET_MEAN, IMAGENET_STD)
 IMAGENET_BGR = Pixels("BGR, ImageNet", False, IMAGENET_MEAN[::-1], IMAGENET_STD[::-1])
 BYTES_BGR = Pixels("BGR, 0..255", False, std=(1.0, 1.0, 1.0))
@@ -381,18 +385,18 @@ ENTRIES: list[Layout] = [
             _decode_zoo, fit="corner", pixels=CAFFE_BGR, nms_iou=None),
     _layout("yolo", f"{YOLO}, also -seg", "(1, 4 + classes [+ 32], cells)[, (1, 32, h, w)]",
             lambda m: m.values(0) - 4 - sum(shape[1] for shape in m.shapes[1:] if len(shape) == 4),
-            _decode_yolo, ("", "detect", "segment"), also=lambda m: not m.in_fractions,
+            _decode_yolo, ("", "detect", "segment"), also=_in_px,
             fit="centre"),
     _layout("yolo-rows", f"{YOLO}, transposed", "(1, cells, 4 + classes)",
             lambda m: m.values(1) - 4,
             lambda outs, *more: _decode_yolo([outs[0].swapaxes(1, 2)], *more),
-            also=lambda m: not m.in_fractions, fit="centre"),
+            also=_in_px, fit="centre"),
     _layout("yolo-obb", f"{YOLO}, rotated boxes: the upright one around each",
             "(1, 4 + classes + 1, cells)", lambda m: m.values(0) - 5, _decode_rotated, ("obb",),
-            also=lambda m: not m.in_fractions, fit="centre"),
+            also=_in_px, fit="centre"),
     _layout("yolo-pose", f"{YOLO}, key points", "(1, 4 + classes + key points, cells)",
             lambda m: m.values(0) - 4 - _keypoint_values(m), _decode_yolo, ("pose",),
-            also=lambda m: not m.in_fractions, fit="centre", unread="the key points"),
+            also=_in_px, fit="centre", unread="the key points"),
     _layout("yolov5", "YOLOv5, YOLOv7, YOLOv6", "(1, cells or 3 * cells, 5 + classes)",
             lambda m: max(m.values(1), m.values(1, boxes=3)) - 5, _decode_yolov5,
             also=lambda m: m.in_px and ("output" not in m.outputs or not m.values(1)),

@@ -43,7 +43,6 @@ from reobj.types import (
     CLASS_MAX,
     COCO_NAMES,
     Array,
-    BoolArray,
     IntArray,
     ReobjError,
     Tracks,
@@ -265,26 +264,27 @@ def forms(probe: Probe) -> frozenset[str]:
     them; if all identities are below 0, they are detections, which ground truth is not.
     """
     rows = _head(probe)
+    mot = frozenset({"mot"})
     if not rows:
         empty = not probe.is_dir and not probe.path.read_bytes()[:4096].strip()
-        return frozenset({"mot"} if empty else ())
+        return mot if empty else frozenset()
+    count = len(rows[0])
     if not are_numbers(rows[0][:1]):
         return frozenset({"boxer-3d" if "tx_world_object" in rows[0] else "csv"})
-    if len(rows[0]) in (17, 18) and not are_numbers(rows[0][2:3]):
+    if count in (17, 18) and not are_numbers(rows[0][2:3]):
         return frozenset({"kitti"})
-    count = len(rows[0])
     if count not in (9, 10) or any(len(cells) != count for cells in rows):
-        return frozenset({"mot"})
+        return mot
     values = np.array([[_number(cell) for cell in cells] for cells in rows])  # (N, 9 or 10)
-    flag, kind, last = values[:, 6], values[:, 7], values[:, 8:]
+    flag, kind, *last = values[:, 6:].T
     whole = (kind >= 0) & (kind == np.floor(kind))
     if count == 10:
-        fits = whole & (kind <= 11) & np.isin(last, range(3)).all(1) & ((kind > 0) | (flag == 0))
-        return frozenset({"visdrone" if fits.all() and kind.any() else "mot"})
+        fits = whole & (kind <= 11) & np.isin(last, range(3)).all(0) & ((kind > 0) | (flag == 0))
+        return frozenset({"visdrone"}) if fits.all() and kind.any() else mot
     named = (probe.path.parent / "labels.txt").exists()
-    if named or not (whole & (flag == 1) & (last[:, 0] <= 1)).all():
-        return frozenset({"mot"})
-    return frozenset({"boxmot"} if (values[:, 1] < 0).all() else {"boxmot", "mot"})
+    if named or not (whole & (flag == 1) & (last[0] <= 1)).all():
+        return mot
+    return frozenset({"boxmot"}) | (mot if (values[:, 1] >= 0).any() else set())
 
 
 # ---- Readers -------------------------------------------------------------------------------------
@@ -335,14 +335,14 @@ def read_visdrone(source: Source) -> RecordedDetections:
     table = read_columns(source.path, MOT, 6)
     number = table.whole("class")
     classes = _numbered(np.maximum(number, 1) - 1, 1, source, VISDRONE.split())
-    return _recorded(table, source, 1, classes, number == 0)
+    return _recorded(table, source, 1, classes, ignored=number == 0)
 
 
 def read_kitti(source: Source) -> RecordedDetections:
     """Read KITTI's tracking labels or results; DontCare is an ignored region."""
     table = read_columns(source.path, KITTI, 17)
     care = np.array(table.cells["class"]) == "DontCare"
-    return _recorded(table, source, 0, _text_classes(table, source, ()), care)
+    return _recorded(table, source, 0, _text_classes(table, source, ()), ignored=care)
 
 
 def read_csv(source: Source) -> RecordedDetections:
@@ -391,7 +391,7 @@ def _recorded(
     source: Source,
     usual: int,
     classes: tuple[IntArray, Sequence[str]],
-    ignored: BoolArray | None = None,
+    **columns: Any,
 ) -> RecordedDetections:
     """Convert a table to detections; usual: number of the first frame."""
     roles = _box_roles(table.cells)
@@ -405,8 +405,7 @@ def _recorded(
     return source.recorded(
         frame, box, classes, table.numbers("score") if "score" in table.cells else None,
         line=table.line, unit=table.unit, form=BOX_FORMS[roles], scale=scale,
-        ignored=np.zeros(len(box), bool) if ignored is None else ignored,
-        identity=table.whole("id") if "id" in table.cells else np.empty(0, np.int64),
+        identity=table.whole("id") if "id" in table.cells else np.empty(0, np.int64), **columns,
     )  # fmt: skip
 
 
