@@ -306,24 +306,6 @@ def test_a_column_of_times_matches_images_named_by_time(tmp_path: Path) -> None:
         rt.read_detections(path, rt.Video(counted))
 
 
-def test_classes_take_synonyms_that_occur(tmp_path: Path, video: rt.Video) -> None:
-    """COCO has "couch", the file "sofa"; a class of the file goes before its synonyms."""
-    text = CSV.replace("56", "sofa").replace("41", "Espresso_Machine")
-    (tmp_path / "d.csv").write_text(text)
-    for wanted, names in (("couch", ["sofa"]), ("espresso machine", ["Espresso_Machine"]),
-                          ("settee,tv", None), ("couch,tv", ["sofa"])):  # fmt: skip
-        config = rt.DetectConfig(classes=wanted)
-        if names is None:
-            with pytest.raises(rt.ReobjError, match="--classes: no class settee"):
-                rt.read_detections(tmp_path / "d.csv", video, config)
-            continue
-        found = rt.read_detections(tmp_path / "d.csv", video, config)
-        assert [found.class_names[k] for k in found.class_id] == names
-    (tmp_path / "d.csv").write_text(text + CSV.splitlines()[1].replace("56", "couch") + "\n")
-    found = rt.read_detections(tmp_path / "d.csv", video, rt.DetectConfig(classes="sofa"))
-    assert {found.class_names[k] for k in found.class_id} == {"sofa"}
-
-
 # ---- Boxes in 3D ----
 
 

@@ -1,4 +1,4 @@
-"""Frames without images (`sources.imageless`), numbered as in the files of poses and detections.
+"""Frames without images (`sources.video`), numbered as in the files of poses and detections.
 
 Start at `open_video`.
 """
