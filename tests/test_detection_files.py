@@ -287,25 +287,6 @@ def test_single_bad_rows_are_counted(
 # ---- Times instead of frame numbers --------------------------------------------------------------
 
 
-def test_a_column_of_times_matches_images_named_by_time(tmp_path: Path) -> None:
-    """TUM's own header; the nearest within half a frame, others are dropped and counted."""
-    start = 1341847980.722988
-    names = [f"{start + i / 30:.6f}.png" for i in range(4)]
-    for name in names:
-        cv2.imwrite(str(tmp_path / name), np.zeros((48, 64, 3), np.uint8))
-    path = tmp_path / "det.csv"
-    rows = [f"{start + s / 30:.6f},73,5,6,20,10,.9" for s in (0, 1.2, 2.9, 4.5)]
-    path.write_text("timestamp,coco80_class,x,y,w,h,score\n" + "\n".join(rows) + "\n")
-    found = rt.read_detections(path, rt.Video(tmp_path))
-    assert found.frame.tolist() == [0, 1, 3] and set(found.class_id.tolist()) == {73}
-    assert any("1 boxes of frames that the video lacks" in text for text in found.messages)
-    counted = tmp_path / "counted"
-    counted.mkdir()
-    cv2.imwrite(str(counted / "0001.png"), np.zeros((48, 64, 3), np.uint8))
-    with pytest.raises(rt.ReobjError, match=r"det\.csv, line 1: no column frame; time stamps"):
-        rt.read_detections(path, rt.Video(counted))
-
-
 # ---- Boxes in 3D ----
 
 
