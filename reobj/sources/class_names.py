@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -94,34 +94,23 @@ def check_length(name: str, where: str) -> None:
         raise ReobjError(f"{where}: {text} ({name[:20]}...)")
 
 
-class Vocabulary(Sequence[str]):
+class Vocabulary(list[str]):
     """Class names by number; new labels get the next numbers.
 
-    Shared by all users of the class names of a detector with text labels.
+    Shared by all users of the class names of a detector with text labels. Equal to a tuple of the
+    same names.
     """
-
-    def __init__(self, names: Iterable[str]) -> None:
-        self._names = [visible_name(name) for name in names]
-        self._number = {name: i for i, name in reversed(list(enumerate(self._names)))}
 
     def numbers(self, labels: Sequence[str]) -> list[int]:
         """Return the numbers of labels; new labels are added."""
-        return [self._number_of(visible_name(label)) for label in labels]
-
-    def _number_of(self, label: str) -> int:
-        if label not in self._number:
-            check_length(label, "labels of the detector")
-            if len(self._names) > CLASS_MAX:
-                raise ReobjError(f"more than {CLASS_MAX} different labels; expected fewer classes")
-            self._number[label] = len(self._names)
-            self._names.append(label)
-        return self._number[label]
-
-    def __len__(self) -> int:
-        return len(self._names)
-
-    def __getitem__(self, index):  # type: ignore[no-untyped-def]
-        return self._names[index]
+        names = [visible_name(label) for label in labels]
+        for name in names:
+            if name not in self:
+                check_length(name, "labels of the detector")
+                self.append(name)
+        if len(self) > CLASS_MAX:
+            raise ReobjError(f"more than {CLASS_MAX} different labels; expected fewer classes")
+        return [self.index(name) for name in names]
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Sequence) and tuple(self) == tuple(other)

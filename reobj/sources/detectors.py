@@ -308,7 +308,7 @@ def _source_of(
         stated: class names by number, (): COCO's. has_numbers: they name the numbers, so that text
             labels are not read.
     """
-    names = Vocabulary(stated or COCO_NAMES)
+    names = Vocabulary(map(visible_name, stated or COCO_NAMES))
     warn = not stated
 
     def checked(found: Any) -> Detections | None:
