@@ -424,7 +424,8 @@ def _bounds(shape: ET.Element, bounded: Counter[str]) -> Array:
         if not angle:
             return box
         bounded["turned boxes"] += 1
-        centre, reach = (box[:2] + box[2:]) / 2, turn @ (box[2:] - box[:2]) / 2
+        centre = (box[:2] + box[2:]) / 2
+        reach = turn @ (box[2:] - box[:2]) / 2
         return np.hstack([centre - reach, centre + reach])
     if shape.tag not in ("polygon", "mask"):
         bounded[shape.tag + "s" * (shape.tag != "points")] += 1
