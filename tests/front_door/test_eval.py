@@ -528,4 +528,3 @@ def test_corners_in_a_sequence_of_known_size(
         entry["bbox_mode"] = 0
     (tmp_path / "gt.json").write_text(json.dumps(data))
     assert score(result, tmp_path / "gt.json")[0]["gt_objects"] == 5
-
