@@ -164,16 +164,11 @@ from reobj.results.scene import write_pictures
 from reobj.results.serve import Server
 from reobj.results.stages import collect_tracks, detect_all, detections_key, keep_detections
 from reobj.results.workspace import Workspace
-from reobj.sources.boxes_3d import boxes_3d_of
 from reobj.sources.detection_files import DetectConfig, read_detections, read_tracks
-from reobj.sources.detectors import (
-    DetectionSource,
-    OnnxDetector,
-    open_detections,
-    with_detector,
-)
-from reobj.sources.looked import Intervals
-from reobj.sources.recorded import write_detections_npz
+from reobj.sources.detectors import DetectionSource, open_detections, with_detector
+from reobj.sources.onnx_layouts import OnnxDetector
+from reobj.sources.recorded import Intervals, write_detections_npz
+from reobj.sources.tables import boxes_3d_of
 from reobj.sources.video import InputConfig, Video, in_batches
 from reobj.sources.weights import list_models, model_path
 from reobj.state import restore_state, state_arrays

@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 from reobj.poses.intrinsics import CAMERAS
 from reobj.poses.supplied.readers import POSES
 from reobj.results.truth import TRUTH
-from reobj.sources.detection_formats import DETECTIONS
+from reobj.sources.detection_files import DETECTIONS
 from reobj.sources.onnx_layouts import layouts_table
 
 PAGE = Path(__file__).parent / "input_formats.md"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import zipfile
 from collections.abc import Callable
@@ -15,17 +14,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from simulated import chair_solids, walk
+from test_recorded import coco_string
 
 import reobj_track as rt
 from reobj.results.export_labels import BOXER_HEADER
-from reobj.results.truth import read_truth
-from reobj.sources import cvat, recorded, tables
 from reobj.sources.recorded import RecordedDetections
-
-SHARED = Path(os.environ.get("REOBJ_SHARED", Path(__file__).resolve().parents[2] / "shared"))
-needs_shared = pytest.mark.skipif(
-    not (SHARED / "data").is_dir(), reason="no real recordings: set REOBJ_SHARED"
-)
 
 
 @pytest.fixture(scope="module")
@@ -49,91 +42,6 @@ MOT = "1,-1,10,20,30,40,.9,-1,-1,-1\n3,-1,50,60,30,40,.5,-1,-1,-1\n1,-1,100,20,3
 CSV = "frame,x1,y1,x2,y2,score,class\n0,10,20,40,60,.9,56\n2,50,60,80,100,.5,41\n"
 
 
-@pytest.mark.parametrize("classes", [("56", "-1", ""), ("sofa", "-1", ""), ("-1", "nan", "")])
-def test_csv_rows_without_a_class_are_counted(
-    tmp_path: Path, video: rt.Video, classes: tuple[str, ...]
-) -> None:
-    """Empty cells and -1 are no class, beside numbers, beside names, and alone."""
-    rows = "".join(f"{k},10,20,40,60,.9,{name}\n" for k, name in enumerate(classes))
-    found = read(tmp_path, "det.csv", CSV.splitlines()[0] + "\n" + rows, video)
-    first = {"56": "chair", "sofa": "sofa"}.get(classes[0], "object")
-    assert [found.class_names[c] for c in found.class_id] == [first, "object", "object"]
-    counted = any("2 boxes without a class" in text for text in found.messages)
-    assert counted == (first != "object")
-
-
-def test_mot(tmp_path: Path, video: rt.Video) -> None:
-    found = read(tmp_path, "det.txt", MOT, video)
-    assert found.frame.tolist() == [0, 0, 2] and found.class_names == ("object",)
-    assert len(found) == 3
-    first = found.at(0)
-    assert first.xyxy.tolist() == [[100, 20, 130, 60], [10, 20, 40, 60]]  # best first, corners
-    assert (
-        first.score.tolist() == [0.95, 0.9]
-        and first.class_id.tolist() == [0, 0]
-        and first.masks is None
-    )
-    assert len(found.at(1)) == 0 and found.at(1).xyxy.shape == (0, 4)
-    assert found.messages == []
-
-
-@pytest.mark.parametrize(
-    ("text", "names"),
-    [
-        ("1,-1,10,20,30,40,.9\n", ("object",)),  # 7 columns (MOT17)
-        ("1,-1,10,20,30,40\n", ("object",)),  # no score
-        # ground truth: class from 1, and visibility
-        ("\n1,7,10,20,30,40,1,2,.7\n", ("class 1", "class 2")),
-        ("0,-1,10,20,30,40,.9\n", ("object",)),  # 0-based frames
-    ],
-)
-def test_mot_variants(tmp_path: Path, video: rt.Video, text: str, names: tuple[str, ...]) -> None:
-    found = read(tmp_path, "det.txt", text, video, format="mot")
-    assert found.at(0).xyxy.tolist() == [[10, 20, 40, 60]] and found.class_names == names
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("", []),
-        ("\n\n", []),
-        ("1,2,3,4,5,6\n", [[1, 2, 3, 4, 5, 6]]),
-        ("1,-1,1.5,2e1,30,40,.9,-1,-1,-1\n", [[1, -1, 1.5, 20, 30, 40, 0.9, -1, -1, -1]]),
-        ("1, 2, 3, 4, 5, 6, 1\n\n2, 2, 3, 4, 5, 6, 0\n",
-         [[1, 2, 3, 4, 5, 6, 1], [2, 2, 3, 4, 5, 6, 0]]),
-    ],
-)  # fmt: skip
-def test_unusual_mot_rows(tmp_path: Path, text: str, expected: list[list[float]]) -> None:
-    (tmp_path / "a.txt").write_text(text)
-    rows = tables.read_mot_rows(tmp_path / "a.txt")
-    assert rows.tolist() == expected and rows.shape[1] == (len(expected[0]) if expected else 10)
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("1,2,3,4,5\n", "line 1: 5 columns, expected 6 to 10"),
-        ("1,2,3,4,5,6,7,8,9,10,11\n", "line 1: 11 columns, expected 6 to 10"),
-        ("1,2,3,4,5,6\n\n1,2,3,4,5,6,7\n", "line 3: 7 columns, expected 6"),
-        ("1,2,3,4,5,6\n\n1,2,3,4,5,six\n", "line 3: 'six' is no finite number"),
-        ("1,2,3,4,5,6\n1,2,3,4,5,\n", "line 2: '' is no finite number"),
-        ("1,2,3,4,5,nan\n", "line 1: 'nan' is no finite number"),
-        ("1,2,3,4,5,6,1,1,1,x\n", "line 1: 'x' is no finite number"),  # the last column too
-        ("frame,x1,y1,x2,y2\n0,1,2,3,4\n", "line 1: 5 columns, expected 6 to 10"),
-        ("1," + "2" * 200_000, "no table"),
-        ('1,2,3,4,5,"6"7\n', "no table"),
-        ("1,2,3,4,5,6\n1.5,2,3,4,5,6\n", "line 2: frame 1.5, expected a whole number"),
-        ("1,1e30,3,4,5,6\n", "line 1: id 1e30, expected a whole number"),
-        ("1,2,3,4,5,6\n1,2,3,-1e9,5,6\n", "line 2: box .*, expected at most 1e.07 px"),
-    ],
-)  # fmt: skip
-def test_damaged_mot_rows(tmp_path: Path, text: str, expected: str) -> None:
-    (tmp_path / "a.txt").write_text(text)
-    with pytest.raises(rt.ReobjError, match=rf"a\.txt[,:] {expected}") as caught:
-        tables.read_mot_rows(tmp_path / "a.txt")
-    assert "\n" not in str(caught.value)
-
-
 def test_options_apply_to_recorded_detections(tmp_path: Path, video: rt.Video) -> None:
     for min_score, kept in ((0.4, [0, 2]), (0.5, [0, 2]), (0.51, [0]), (0.9, [0]), (0.91, [])):
         assert read(tmp_path, "a.csv", CSV, video, min_score=min_score).frame.tolist() == kept
@@ -151,26 +59,6 @@ def test_options_apply_to_recorded_detections(tmp_path: Path, video: rt.Video) -
 
 def coco_entries(**changes: Any) -> list[dict[str, Any]]:
     return [{"image_id": 4, "category_id": 62, "bbox": [10, 20, 30, 40], "score": 0.9} | changes]
-
-
-def test_categories_are_positions_in_the_names_of_the_user(tmp_path: Path, video: rt.Video) -> None:
-    (tmp_path / "names.txt").write_text("sofa\nlamp\n")
-    named = read(tmp_path, "res.json", json.dumps(coco_entries(category_id=1)), video,
-                 class_names=str(tmp_path / "names.txt"))  # fmt: skip
-    assert named.class_names == ("sofa", "lamp") and named.class_id.tolist() == [1]
-
-
-def test_coco_ids_are_those_of_the_dataset_beside(tmp_path: Path, video: rt.Video) -> None:
-    """An image_id is no frame number: the dataset JSON maps it to a file name."""
-    images = [{"id": 900 + i, "file_name": f"some/im{19 - i}.png"} for i in range(20)]
-    dataset = {"images": images, "categories": [{"id": 7, "name": "wok"}, {"id": 9, "name": "cup"}]}
-    (tmp_path / "instances.json").write_text(json.dumps(dataset))
-    (tmp_path / "broken.json").write_text("{")
-    found = read(tmp_path, "res.json", json.dumps(coco_entries(image_id=903, category_id=9)), video)
-    assert found.frame.tolist() == [16] and "instances.json" in found.messages[0]
-    assert found.class_names[found.class_id[0]] == "cup"
-    with pytest.raises(rt.ReobjError, match=r"id 4 is not in the dataset JSON instances\.json"):
-        read(tmp_path, "res.json", json.dumps(coco_entries(category_id=9)), video)
 
 
 def test_datasets_with_their_own_annotations(tmp_path: Path) -> None:
@@ -201,29 +89,11 @@ def test_datasets_with_their_own_annotations(tmp_path: Path) -> None:
     assert read(tmp_path, "vid.json", json.dumps(data), video).frame.tolist() == [2]
 
 
-@pytest.mark.parametrize(
-    ("category", "name"), [(1, "person"), (13, "stop sign"), (90, "toothbrush")]
-)
-def test_category_ids_of_coco(tmp_path: Path, video: rt.Video, category: int, name: str) -> None:
-    """As published: 91 ids, 80 of them used."""
-    found = read(tmp_path, "a.json", json.dumps(coco_entries(category_id=category)), video)
-    assert found.class_names[found.class_id[0]] == name
-    with pytest.raises(rt.ReobjError, match="category_id 12 is unknown"):
-        read(tmp_path, "a.json", json.dumps(coco_entries(category_id=12)), video)
-
-
-def coco_number(value: int) -> str:
-    """Write a number as in COCO's compressed run lengths: 5 bits a character, low ones first."""
-    low, rest = value & 31, value >> 5
-    last = rest == (-1 if low & 16 else 0)
-    return chr(48 + low) if last else chr(48 + low + 32) + coco_number(rest)
-
-
 def test_coco_masks(tmp_path: Path, video: rt.Video) -> None:
     mask = np.zeros((480, 640), bool)
     mask[20:60, 10:40] = True
     runs = [10 * 480 + 20, *[40, 440] * 29, 40, 600 * 480 + 420]  # down the columns
-    text = "".join(map(coco_number, [*runs[:3], *np.subtract(runs[3:], runs[1:-2])]))
+    text = coco_string(runs)
     kinds = [
         {"size": [480, 640], "counts": runs},
         {"size": [480, 640], "counts": text},
@@ -306,47 +176,6 @@ def test_outlines_of_label_tools_are_masks(
     assert not found.masks[1 - row].any()  # a plain box has none
 
 
-def test_masks_of_cvat_are_ground_truth_of_an_unknown_image(tmp_path: Path) -> None:
-    truth = read_truth(cvat_triangle(tmp_path, cvat_runs(1)), (), 0.0)
-    assert truth.xyxy.tolist() == [[100, 60, 180, 100], [32, 24, 64, 48]]
-
-
-@pytest.mark.parametrize(
-    ("rle", "said"),
-    [
-        ("0,1600", "run lengths of 1600 pixels for 30x40"),
-        ("0,x", "x"),
-        ("-1,1201", "run lengths of 1200 pixels"),
-        ("9223372036854775807,9223372036854775807,1202", "run lengths"),  # 1200 modulo 2^64
-        ('0,1200" left="620', "30x40 pixels from 620, 20 on, beyond the image"),
-    ],
-)
-def test_broken_masks_of_cvat_are_refused(
-    tmp_path: Path, video: rt.Video, rle: str, said: str
-) -> None:
-    left = "" if "left" in rle else 'left="10"'
-    sides = f'{left} top="20" width="30" height="40"'
-    path = cvat_triangle(tmp_path, f'<mask frame="0" outside="0" rle="{rle}" {sides}/>')
-    with pytest.raises(rt.ReobjError, match=f"task.xml, box 0: mask cannot be read .*{said}"):
-        rt.read_detections(path, video)
-
-
-def test_npz(tmp_path: Path, video: rt.Video) -> None:
-    """Frames in any order; at half the size boxes and masks are half as large."""
-    made = np.zeros((2, 480, 640), bool)
-    made[0, 20:60, 10:40] = True
-    xyxy = np.array([[10.0, 20, 40, 60], [100, 20, 140, 60]])
-    two = rt.Detections(xyxy, np.array([0.8, 0.9]), np.array([1, 0]), made)
-    path = tmp_path / "d.npz"
-    rt.write_detections_npz(path, [(5, two), (2, two[[1]])], ("cup", "box"), (640, 480))
-    found = rt.read_detections(path, video)
-    assert found.frame.tolist() == [2, 5, 5] and found.class_names == ("cup", "box")
-    half = rt.read_detections(path, rt.Video(video.source, rt.InputConfig(max_size=320))).at(5)
-    assert half.xyxy.tolist() == [[50, 10, 70, 30], [5, 10, 20, 30]]  # best first
-    assert half.masks is not None
-    np.testing.assert_array_equal(half.masks, made[::-1, ::2, ::2])
-
-
 LINE = "1,-1,10,20,30,40,.9\n"
 
 
@@ -354,20 +183,14 @@ LINE = "1,-1,10,20,30,40,.9\n"
     ("name", "text", "expected"),
     [
         ("d.txt", LINE + "2,-1,10,20\n", "line 2: 4 columns, expected 7"),  # one line differs
-        ("d.txt", "1,10,20\n", "line 1: 3 columns, expected 6 to 10"),
-        ("d.txt", LINE + "2,-1,10,nan,30,40,.9\n", "line 2: 'nan' is no finite number"),
-        ("d.txt", LINE + "2,-1,10,inf,30,40,.9\n", "line 2: 'inf' is no finite"),
-        ("d.txt", LINE + "2,-1,10,2O,30,40,.9\n", "line 2: '2O' is no finite number"),
-        ("d.txt", "1,-1,10,ten,30,40,.9\n", "line 1: 'ten' is no finite number"),
-        ("d.txt", "0,10.5,20.5,40,60,.9,56\n", "needs a header"),  # CSV without a header is no MOT
+        ("d.txt", LINE + "2,-1,10,2O,30,40,.9\n", "line 2: y1 '2O', expected a finite number"),
+        ("d.txt", "0,10.5,20.5,40,60,.9,56\n", "line 1: id '10.5', expected a whole"),
         ("d.txt", "99,-1,10,20,30,40,.9\n",
          "frames that the video lacks .0-based: 98; it has 20.: detections of another video"),
         ("d.txt", "1,-1,.1,.2,.3,.4,.9\n", "no coordinate above 1.5: normalised"),
         ("d.txt", LINE + "1,-1,9000,20,30,40,.9\n" * 2,
          r"0 of 3 boxes have no area and 2 lie outside the image of \(640, 480\)"),
         ("d.txt", "1,-1,9000,20,30,40,.9\n", "another video"),  # all outside
-        ("d.csv", CSV + "3,1,2\n", "line 4: 3 columns, expected 7"),
-        ("d.csv", CSV + "3,1,2,nan,5,.9,56\n", "line 4: 'nan'"),
         ("d.csv", CSV + "3,1,2,4,5,.9,80\n", "line 4: class 80, but there are only 80 class names"),
         ("d.csv", "frame,x1,y1,score\n0,1,2,.9\n", "line 1: no column x2, y2 in the header"),
         ("d.csv", "x1,y1,x2,y2\n1,2,3,4\n", "no column frame"),
@@ -377,18 +200,16 @@ LINE = "1,-1,10,20,30,40,.9\n"
         ("d.json", '{"images": []}', "a dataset without annotations"),
         ("d.json", json.dumps([{"image_id": 1, "bbox": [1, 2, 3, 4]}]),
          r"missing required field `category_id` - at `\$\[0\]`"),
-        ("d.json", json.dumps(coco_entries(bbox=[1, 2, 3])),
-         r"length 4, got 3 - at `\$\[0\]\.bbox`"),
         ("d.json", json.dumps(coco_entries(category_id=500)), "category_id 500 is unknown"),
         ("d.json", json.dumps(coco_entries(segmentation={"size": [48, 64], "counts": [48 * 64]})),
-         r"entry 0: .*mask of .h, w. \(48, 64\) in a video of \(480, 640\)"),
+         r"mask of .h, w. \(48, 64\) in a video of \(480, 640\)"),
         ("d.json", json.dumps(coco_entries(segmentation={"size": [480, 640], "counts": [8, 9]})),
          r"entry 0: mask of 17 pixels in a video of \(640, 480\)"),
-        ("d.json", json.dumps(coco_entries(segmentation={"size": [480, 640], "counts": [0, 0]})),
-         r"entry 0: mask of 0 pixels in a video of \(640, 480\)"),
-        ("d.json", json.dumps(coco_entries(segmentation={"size": [480, 640], "counts": 9})),
-         r"`\$\[0\]\.segmentation\.counts`"),
         ("d.json", json.dumps(coco_entries(score=float("nan"))), "entry 0: .*NaN, infinite"),
+        ("d.json", json.dumps(coco_entries(attributes={"track_id": 1.5})), "track_id 1.5"),
+        ("d.txt", LINE + "1,-1,10,20,1e8,40,.9\n", "line 2: .*beyond 1e7 pixels"),
+        ("d.txt", LINE + "3.7,-1,10,20,30,40,.9\n", "line 2: frame '3.7', expected a whole number"),
+        ("d.txt", LINE.strip() + "," + "9" * 30, r"d\.txt[:,] "),
         ("d.json", json.dumps(coco_entries(image_id="x")), "names such as 'x' match no frame"),
         ("d.json", "[1, 2]", "no known format of detections"),
         ("d.npz", "no zip", "d.npz: damaged"),
@@ -402,103 +223,15 @@ def test_bad_files_give_one_clear_line(
     assert name in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_classes_without_names_get_default_names(tmp_path: Path, video: rt.Video) -> None:
-    """One name is made for each number up to the largest."""
-    line = LINE.strip() + ",{}\n"
-    assert len(read(tmp_path, "a.txt", line.format(32767), video).class_names) == 32767
-    for number in ("2000000000", "9" * 30, "9" * 5000):
-        with pytest.raises(rt.ReobjError, match=r"a\.txt[:,] "):
-            read(tmp_path, "a.txt", line.format(number), video)
-
-
-def test_coordinates_beyond_any_image(tmp_path: Path, video: rt.Video) -> None:
-    with pytest.raises(rt.ReobjError, match=r"line 2: .*beyond 1e7 pixels"):
-        read(tmp_path, "a.txt", LINE + "1,-1,10,20,1e8,40,.9\n", video)
-
-
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
-        ({"xyxy": np.array([["1", "2", "30", "40"]])}, "array xyxy is of <U2, expected fiu"),
-        ({"frame": np.array([0.5])}, "array frame is of float64, expected iu"),
-        ({"class_names": np.array([1])}, "array class_names is of int64, expected U"),
-        ({"class_names": np.array("x")}, "array class_names is"),
-        ({"mask_offsets": np.array([0, 9])}, "mask_counts and mask_offsets are inconsistent"),
-        ({"mask_offsets": np.array([5, 0])}, "mask_counts and mask_offsets are inconsistent"),
-    ],
-)
-def test_npz_of_other_kinds(
-    tmp_path: Path, video: rt.Video, change: dict[str, Any], expected: str
-) -> None:
-    one = rt.Detections(np.array([[1.0, 2, 30, 40]]), np.array([0.9]), np.array([0]))
-    rt.write_detections_npz(tmp_path / "a.npz", [(0, one)], ["x"], (640, 480))
-    np.savez(tmp_path / "a.npz", **(dict(np.load(tmp_path / "a.npz")) | change))
-    with pytest.raises(rt.ReobjError, match=rf"a\.npz: {expected}"):
-        rt.read_detections(tmp_path / "a.npz", video)
-
-
-@pytest.mark.parametrize("frame", ["3.7", "1e30", "-1e300"])
-def test_frames_are_whole_numbers(tmp_path: Path, video: rt.Video, frame: str) -> None:
-    with pytest.raises(rt.ReobjError, match=r"line 2: frame .*, expected a whole number"):
-        read(tmp_path, "a.txt", LINE + f"{frame},-1,10,20,30,40,.9\n", video)
-
-
-@pytest.mark.parametrize(
-    ("key", "limit", "size"),
-    [("frame", "LINES_MAX", 1), ("class_names", "CLASS_MAX", 1), ("mask_counts", "MEMORY_MAX", 8)],
-)
-def test_an_oversized_npz_is_refused(
-    tmp_path: Path,
-    video: rt.Video,
-    monkeypatch: pytest.MonkeyPatch,
-    key: str,
-    limit: str,
-    size: int,
-) -> None:
-    """Small numbers of bytes become ints and objects: a GB of them would be tens."""
-    path = tmp_path / "a.npz"
-    mask = np.zeros((1, 480, 640), bool)
-    mask[0, 10:20, 10:20] = True
-    found = rt.Detections(np.array([[1.0, 2, 30, 40]]), np.ones(1), np.zeros(1, np.int64), mask)
-    rt.write_detections_npz(path, [(0, found), (1, found)], ["a", "b"], video.size)
-    count = dict(np.load(path))[key].size
-    monkeypatch.setattr(recorded, limit, size * count)
-    assert len(rt.read_detections(path, video)) == 2
-    monkeypatch.setattr(recorded, limit, size * (count - 1))
-    with pytest.raises(
-        rt.ReobjError, match=f"a.npz: {count} {key}, at most {count - 1} are allowed"
-    ):
-        rt.read_detections(path, video)
-
-
-def test_a_zip_bomb_is_refused(
-    tmp_path: Path, video: rt.Video, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(cvat, "MEMORY_MAX", 16 << 20)
-    with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as packed:
-        packed.writestr("annotations.xml", b" " * (3 << 20))
-    (tmp_path / "a.xml").write_bytes(b"<annotations>\n" + b" " * (3 << 20))
-    for name in ("a.zip", "a.xml"):
-        with pytest.raises(rt.ReobjError, match=f"{name}: unpacks to 3 MB, at most 1 MB"):
-            rt.read_tracks(tmp_path / name, video)
-
-
 def test_a_damaged_zip_gives_one_line(tmp_path: Path, video: rt.Video) -> None:
     with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as packed:
         packed.writestr("annotations.xml", "<annotations/>" * 99)
     data = bytearray((tmp_path / "a.zip").read_bytes())
     data[50] ^= 255  # zlib.error
     (tmp_path / "a.zip").write_bytes(data)
-    with pytest.raises(rt.ReobjError, match=r"a\.zip: no annotations of CVAT") as caught:
+    with pytest.raises(rt.ReobjError, match=r"a\.zip: damaged") as caught:
         rt.read_tracks(tmp_path / "a.zip", video)
     assert "\n" not in str(caught.value)
-
-
-def test_missing_file_and_unknown_class(tmp_path: Path, video: rt.Video) -> None:
-    with pytest.raises(rt.ReobjError, match=r"none\.txt does not exist"):
-        rt.read_detections(tmp_path / "none.txt", video)
-    with pytest.raises(rt.ReobjError, match=r"--classes: no class chaise; did you mean chair\?"):
-        read(tmp_path, "a.csv", CSV, video, classes="chaise")
 
 
 @pytest.mark.parametrize(
@@ -551,66 +284,7 @@ def test_single_bad_rows_are_counted(
     assert ((found.score >= 0) & (found.score <= 1)).all()
 
 
-@needs_shared
-@pytest.mark.parametrize(
-    "name", ["redkitchen_7scenes", "office_loop", "studio_room", "livingroom13"]
-)
-def test_real_detections(name: str) -> None:
-    video = rt.Video(SHARED / "data" / name / "images")
-    found = rt.read_detections(SHARED / "data" / name / "detections_yolov8s.csv", video)
-    assert found.messages == [] and len(found) > 200 and found.class_names == rt.COCO_NAMES
-    assert found.frame.max() < video.frame_count
-
-
 # ---- Times instead of frame numbers --------------------------------------------------------------
-
-
-def test_a_column_of_times_matches_images_named_by_time(tmp_path: Path) -> None:
-    """TUM's own header; the nearest within half a frame, others are dropped and counted."""
-    start = 1341847980.722988
-    names = [f"{start + i / 30:.6f}.png" for i in range(4)]
-    for name in names:
-        cv2.imwrite(str(tmp_path / name), np.zeros((48, 64, 3), np.uint8))
-    path = tmp_path / "det.csv"
-    rows = [f"{start + s / 30:.6f},73,5,6,20,10,.9" for s in (0, 1.2, 2.9, 4.5)]
-    path.write_text("timestamp,coco80_class,x,y,w,h,score\n" + "\n".join(rows) + "\n")
-    found = rt.read_detections(path, rt.Video(tmp_path))
-    assert found.frame.tolist() == [0, 1, 3] and set(found.class_id.tolist()) == {73}
-    assert any("1 boxes of frames that the video lacks" in text for text in found.messages)
-    counted = tmp_path / "counted"
-    counted.mkdir()
-    cv2.imwrite(str(counted / "0001.png"), np.zeros((48, 64, 3), np.uint8))
-    with pytest.raises(rt.ReobjError, match=r"det\.csv, line 1: no column frame; time stamps"):
-        rt.read_detections(path, rt.Video(counted))
-
-
-@pytest.mark.parametrize("value", [True, "7", 1.5, 1 << 53, -(1 << 53)])
-@pytest.mark.parametrize("inside", [False, True])
-def test_identities_of_coco_are_whole_numbers(
-    tmp_path: Path, video: rt.Video, value: object, inside: bool
-) -> None:
-    """Also those in CVAT's attributes."""
-    identity = {"attributes": {"track_id": value}} if inside else {"track_id": value}
-    with pytest.raises(rt.ReobjError, match=r"track_id"):
-        read(tmp_path, "d.json", json.dumps(coco_entries(**identity)), video)
-
-
-def test_classes_take_synonyms_that_occur(tmp_path: Path, video: rt.Video) -> None:
-    """COCO has "couch", the file "sofa"; a class of the file goes before its synonyms."""
-    text = CSV.replace("56", "sofa").replace("41", "Espresso_Machine")
-    (tmp_path / "d.csv").write_text(text)
-    for wanted, names in (("couch", ["sofa"]), ("espresso machine", ["Espresso_Machine"]),
-                          ("settee,tv", None), ("couch,tv", ["sofa"])):  # fmt: skip
-        config = rt.DetectConfig(classes=wanted)
-        if names is None:
-            with pytest.raises(rt.ReobjError, match="--classes: no class settee"):
-                rt.read_detections(tmp_path / "d.csv", video, config)
-            continue
-        found = rt.read_detections(tmp_path / "d.csv", video, config)
-        assert [found.class_names[k] for k in found.class_id] == names
-    (tmp_path / "d.csv").write_text(text + CSV.splitlines()[1].replace("56", "couch") + "\n")
-    found = rt.read_detections(tmp_path / "d.csv", video, rt.DetectConfig(classes="sofa"))
-    assert {found.class_names[k] for k in found.class_id} == {"sofa"}
 
 
 # ---- Boxes in 3D ----

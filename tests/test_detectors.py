@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import os
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,9 +14,6 @@ import pytest
 
 import reobj_track as rt
 from reobj.options import read_config
-from reobj.results.stages import keep_detections
-from reobj.results.workspace import Workspace
-from reobj.sources import detectors, weights
 from reobj.sources.detectors import (
     DetectionCache,
     DetectionSource,
@@ -26,8 +21,7 @@ from reobj.sources.detectors import (
     open_detections,
     with_detector,
 )
-from reobj.sources.recorded import RecordedDetections
-from reobj.types import Image
+from reobj.types import Image, box_iou
 
 SHARED = Path(os.environ.get("REOBJ_SHARED", Path(__file__).resolve().parents[2] / "shared"))
 needs_shared = pytest.mark.skipif(
@@ -214,85 +208,6 @@ def test_layouts(
         assert (found.masks[0] != expected).sum() <= 80  # a column at most
 
 
-@pytest.mark.parametrize(
-    ("image_size", "fed"),
-    [
-        ((1920, 1080), (640, 384)),  # 360 is no multiple of 32
-        ((960, 1280), (480, 640)),
-        ((1000, 300), (640, 192)),
-        ((1000, 301), (640, 224)),
-    ],
-)
-def test_dynamic_input_takes_the_image_shape(
-    tmp_path: Path, image_size: tuple[int, int], fed: tuple[int, int]
-) -> None:
-    """A model that returns the shape of its input: 1, 3, width, height."""
-    helper = onnx.helper
-    tensors = {"labels": np.int64([[LABEL]]), "scores": np.float32([[SCORE]]),
-               "order": np.int64([0, 1, 3, 2]), "box shape": np.int64([1, 1, 4])}  # fmt: skip
-    nodes = [
-        helper.make_node("Identity", ["constant labels"], ["labels"]),
-        helper.make_node("Identity", ["constant scores"], ["scores"]),
-        helper.make_node("Shape", ["images"], ["shape"]),
-        helper.make_node("Gather", ["shape", "constant order"], ["whole"]),
-        helper.make_node("Cast", ["whole"], ["float"], to=1),
-        helper.make_node("Reshape", ["float", "constant box shape"], ["boxes"]),
-    ]
-    inputs = [helper.make_tensor_value_info("images", 1, [1, 3, "h", "w"]),
-              helper.make_tensor_value_info("orig_target_sizes", 7, [1, 2])]  # fmt: skip
-    outputs = [helper.make_tensor_value_info("labels", 7, [1, 1]),
-               helper.make_tensor_value_info("boxes", 1, [1, 1, 4]),
-               helper.make_tensor_value_info("scores", 1, [1, 1])]  # fmt: skip
-    constants = [onnx.numpy_helper.from_array(v, f"constant {k}") for k, v in tensors.items()]
-    detector = rt.OnnxDetector(
-        save_model(helper.make_graph(nodes, "g", inputs, outputs, constants), tmp_path)
-    )
-    image = np.zeros((image_size[1], image_size[0], 3), np.uint8)
-    assert detector(image).xyxy.tolist() == [[1, 3, *fed]]
-    assert detector.class_names == rt.COCO_NAMES
-
-
-def test_prototypes_are_aligned_with_the_image(tmp_path: Path) -> None:
-    """The upper half of the box: input rows up to 32, image rows up to (32 - 16) * 5."""
-    outputs = yolo_seg()
-    outputs["output1"][0, 1] = np.where(np.arange(16) < 8, 1, -1)[:, None]
-    found = rt.OnnxDetector(model(tmp_path, outputs))(IMAGE)
-    expected = np.zeros((160, 320), bool)
-    expected[40:80, 80:160] = True
-    assert found.masks is not None
-    assert (found.masks[0] != expected).sum() <= 80  # a row at most
-
-
-def test_an_input_need_not_be_square(tmp_path: Path) -> None:
-    """64 x 32, a fifth of the image: 8 x 4 + 4 x 2 + 2 x 1 cells."""
-    rows = np.zeros((1, 7, 42))
-    rows[0, :, 20] = [*center([16, 8, 32, 24]), 0, 0, SCORE]
-    found = rt.OnnxDetector(model(tmp_path, {"o": rows}, shape=(1, 3, 32, 64)))(IMAGE)
-    np.testing.assert_allclose(found.xyxy, [BOX], atol=1e-3)
-
-
-def test_the_size_of_the_image_is_width_and_height(tmp_path: Path) -> None:
-    """DEIM takes it as a second input; the model returns a box of that size."""
-    helper = onnx.helper
-    tensors = {"labels": np.int64([[LABEL]]), "scores": np.float32([[SCORE]]),
-               "zeros": np.float32([[0, 0]]), "box shape": np.int64([1, 1, 4])}  # fmt: skip
-    nodes = [
-        helper.make_node("Identity", ["constant labels"], ["labels"]),
-        helper.make_node("Identity", ["constant scores"], ["scores"]),
-        helper.make_node("Cast", ["orig_target_sizes"], ["size"], to=1),
-        helper.make_node("Concat", ["constant zeros", "size"], ["whole"], axis=1),
-        helper.make_node("Reshape", ["whole", "constant box shape"], ["boxes"]),
-    ]
-    inputs = [helper.make_tensor_value_info("images", 1, [1, 3, 64, 64]),
-              helper.make_tensor_value_info("orig_target_sizes", 7, [1, 2])]  # fmt: skip
-    outputs = [helper.make_tensor_value_info("labels", 7, [1, 1]),
-               helper.make_tensor_value_info("boxes", 1, [1, 1, 4]),
-               helper.make_tensor_value_info("scores", 1, [1, 1])]  # fmt: skip
-    constants = [onnx.numpy_helper.from_array(v, f"constant {k}") for k, v in tensors.items()]
-    graph = helper.make_graph(nodes, "g", inputs, outputs, constants)
-    assert rt.OnnxDetector(save_model(graph, tmp_path))(IMAGE).xyxy.tolist() == [[0, 0, 320, 160]]
-
-
 # What the projects' own inference code feeds: order of the channels, mean and deviation of 0..255.
 TORCHVISION = (np.multiply([0.485, 0.456, 0.406], 255), np.multiply([0.229, 0.224, 0.225], 255))
 SEEN_ROWS = [
@@ -336,16 +251,13 @@ def test_channels_and_scaling(
         (yolox(raw=False), ("output", (0, 7, 7)), 1, slice(0, 32)),  # in the corner
     ],
 )
-@pytest.mark.parametrize("portrait", [False, True])
 def test_the_letterbox_border_is_grey(
-    tmp_path: Path, outputs: dict[str, Any], at: Any, unit: float, where: slice, portrait: bool
+    tmp_path: Path, outputs: dict[str, Any], at: Any, unit: float, where: slice
 ) -> None:
     """The position of the image matches the mapping of boxes; the border is grey, 114."""
     inside = np.zeros((3, 64, 64))
     inside[:, where] = 1
     image = np.full_like(IMAGE, 200)
-    if portrait:
-        inside, image = inside.transpose(0, 2, 1), image.transpose(1, 0, 2)
     for fraction, value in ((inside, 200), (1 - inside, 114)):
         path = model(tmp_path, outputs, seen=(*at, fraction))
         expected = SCORE + value * unit / 2  # half of the input
@@ -377,47 +289,16 @@ def test_detections_are_selected(tmp_path: Path) -> None:
     assert only.class_names == ("cup", "bowl", "tv") and only(IMAGE).class_id.tolist() == [1, 2]
     two = rt.OnnxDetector(path, rt.DetectConfig(max_detections=2))(IMAGE)
     assert two.score.tolist() == pytest.approx([0.9, 0.7])
-    for min_score, count in ((0.5, 4), (0.51, 3), (0.0625, 5), (0.063, 4)):  # at least, not above
+    for min_score, count in ((0.0625, 5), (0.063, 4)):  # at least, not above
         assert len(rt.OnnxDetector(path, rt.DetectConfig(min_score=min_score))(IMAGE)) == count
     with pytest.raises(rt.ReobjError, match="no class sofa among cup, bowl, tv"):
         rt.OnnxDetector(path, rt.DetectConfig(classes="sofa"))
-
-
-def test_class_names_come_from_the_user_first(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    path = model(tmp_path, yolov8(), names="")
-    with pytest.raises(
-        rt.ReobjError, match=r"80 class names .of COCO.*yolo with 3 classes or yolo"
-    ):
-        rt.OnnxDetector(path)
-    declared = rt.OnnxDetector(path, rt.DetectConfig(layout="yolo"))
-    assert declared.class_names == ("class 0", "class 1", "class 2")
-    assert "3 classes without names" in caplog.text
-    (tmp_path / "names.txt").write_text("a\nb\nc\n")
-    config = rt.DetectConfig(class_names=str(tmp_path / "names.txt"))
-    assert rt.OnnxDetector(path, config).class_names == ("a", "b", "c")
-    (tmp_path / "names.txt").write_text("a\n\nb\n")
-    for layout in ("", "yolo"):
-        with pytest.raises(rt.ReobjError, match=r"2 class names .*names\.txt.* 3 classes"):
-            rt.OnnxDetector(path, dataclasses.replace(config, layout=layout))
 
 
 @pytest.mark.parametrize(
     ("outputs", "shape", "expected"),
     [
         ({"logits": np.zeros((1, 1000))}, (1, 3, 64, 64), r"logits \(1, 1000\); .* yolox.*layout"),
-        (
-            {"features": np.zeros((1, 320, 7, 7))},
-            (1, 3, 224, 224),
-            r"features \(1, 320, 7, 7\); expected",
-        ),
-        ({"a": np.zeros(()), "b": np.zeros(3)}, (1, 3, 64, 64), "no known format"),
-        (
-            {"boxes": [[0, 0, 9, 9]], "labels": [1], "scores": [0.9]},
-            (1, 3, 64, 64),
-            "no known format",
-        ),  # torchvision's
         ({"o": np.zeros((1, 5))}, (1, 10), r"input is tensor.float. \[1, 10\]"),
         ({"o": np.zeros((1, 84, 8))}, (1, 1, 64, 64), "expected an image .1, 3, H, W."),  # grey
     ],
@@ -428,60 +309,6 @@ def test_other_networks_are_refused(
     with pytest.raises(rt.ReobjError, match=expected) as caught:
         rt.OnnxDetector(model(tmp_path, outputs, shape))
     assert "m.onnx" in str(caught.value) and "\n" not in str(caught.value)
-
-
-def known(
-    monkeypatch: pytest.MonkeyPatch, path: Path, layout: str, alias: str = ""
-) -> weights.Weights:
-    """Put a model into the table of weights, as the only one."""
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    row = weights.Weights("toy", "detector", path.name, "", digest, 0, "MIT", "", layout, alias)
-    monkeypatch.setattr(weights, "WEIGHTS", (row,))
-    monkeypatch.setenv("REOBJ_MODELS", str(path.parent))
-    return row
-
-
-def test_known_weights_have_the_layout_of_the_table(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    known(monkeypatch, model(tmp_path, detr(), sizes=True), "detr")
-    np.testing.assert_allclose(rt.OnnxDetector("toy")(IMAGE).xyxy, [BOX])
-    known(monkeypatch, model(tmp_path, yolov8()), "detr")
-    with pytest.raises(rt.ReobjError, match=r"output0 .*: not the outputs of layout detr"):
-        rt.OnnxDetector("toy")
-
-
-def reference_nms(xyxy: Any, label: Any, max_iou: float) -> list[int]:
-    kept: list[int] = []
-    for i in range(len(xyxy)):
-        ok = True
-        for j in kept:
-            low, high = np.maximum(xyxy[i, :2], xyxy[j, :2]), np.minimum(xyxy[i, 2:], xyxy[j, 2:])
-            inter = np.clip(high - low, 0, None).prod()
-            area = (xyxy[i, 2:] - xyxy[i, :2]).prod() + (xyxy[j, 2:] - xyxy[j, :2]).prod() - inter
-            ok &= label[i] != label[j] or inter <= max_iou * area
-        if ok:
-            kept.append(i)
-    return kept
-
-
-def test_nms_equals_the_loop() -> None:
-    rng = np.random.default_rng(3)
-    corner = rng.random((200, 2)) * 60
-    xyxy, label = (
-        np.hstack([corner, corner + 10 + rng.random((200, 2)) * 30]),
-        rng.integers(0, 3, 200),
-    )
-    for limit in (0.3, 0.6):
-        assert detectors.nms(xyxy, label, limit).tolist() == reference_nms(xyxy, label, limit)
-    assert detectors.nms(np.empty((0, 4)), np.empty(0, np.int64), 0.5).tolist() == []
-
-
-@pytest.mark.parametrize(("limit", "kept"), [(0.49, [0]), (0.5, [0, 1]), (0.51, [0, 1])])
-def test_nms_keeps_boxes_at_the_overlap_limit(limit: float, kept: list[int]) -> None:
-    xyxy = np.array([[0.0, 0, 10, 10], [0, 0, 10, 5]])  # overlap 1/2
-    assert detectors.nms(xyxy, np.zeros(2, np.int64), limit).tolist() == kept
-    assert detectors.nms(xyxy, np.array([0, 1]), limit).tolist() == [0, 1]  # of two classes
 
 
 # ---- Cache ---------------------------------------------------------------------------------------
@@ -507,11 +334,12 @@ def assert_same(a: rt.Detections | None, b: rt.Detections) -> None:
 
 @pytest.mark.parametrize("masks", [False, True])
 def test_cache_survives_a_kill_between_flushes(tmp_path: Path, masks: bool) -> None:
-    cache = DetectionCache(tmp_path / "c", (32, 24), file_frames=64, mask_frames=64)
+    """Frames without detections are kept too."""
+    cache = DetectionCache(tmp_path / "c", (32, 24))
     for index in range(0, 300, 2):
         cache.put(index, some(index, masks))
         assert_same(cache.get(index), some(index, masks))
-    stored = 150 // 64 * 64
+    stored = 128 if not masks else 144  # files of 64 frames, of 8 with masks
     (tmp_path / "c" / ".part-chunk_000009.npz").write_bytes(b"half")  # a kill while writing
     reopened = DetectionCache(tmp_path / "c", (32, 24))
     assert reopened.get(2 * stored - 2) is not None and reopened.get(2 * stored) is None
@@ -521,17 +349,6 @@ def test_cache_survives_a_kill_between_flushes(tmp_path: Path, masks: bool) -> N
     reopened.put(298, some(298, masks))
     reopened.flush()
     assert_same(DetectionCache(tmp_path / "c", (32, 24)).get(298), some(298, masks))
-
-
-def test_masks_are_written_before_they_fill_the_memory(tmp_path: Path) -> None:
-    cache = DetectionCache(tmp_path, (32, 24), mask_frames=3)
-    files = []
-    for index in (1, 2, 3):  # of as many masks each
-        cache.put(index, some(index, masks=True))
-        files.append(len(list(tmp_path.glob("chunk_*.npz"))))
-    assert files == [0, 0, 1]
-    for index in (1, 2, 3):
-        assert_same(DetectionCache(tmp_path, (32, 24)).get(index), some(index, masks=True))
 
 
 def test_damaged_cache_files_are_detected_again(tmp_path: Path, caplog: Any) -> None:
@@ -552,44 +369,6 @@ def test_damaged_cache_files_are_detected_again(tmp_path: Path, caplog: Any) -> 
     for index in (1, 2, 3):
         assert_same(again.get(index), some(index))
     assert len(caplog.records) == 1  # said once, not in every later run
-
-
-def test_the_last_entry_of_a_frame_is_used(tmp_path: Path) -> None:
-    cache = DetectionCache(tmp_path, (32, 24))
-    cache.put(1, some(2))
-    cache.flush()
-    cache.put(1, some(3))
-    assert_same(cache.get(1), some(3))
-    cache.flush()
-    assert_same(DetectionCache(tmp_path, (32, 24)).get(1), some(3))
-
-
-def test_modified_cached_detections_are_rejected(tmp_path: Path, caplog: Any) -> None:
-    """A whole npz file of the right shapes, with other scores than were written."""
-    cache = DetectionCache(tmp_path, (32, 24))
-    cache.put(1, some(1))
-    cache.flush()
-    (chunk,) = tmp_path.glob("chunk_*.npz")
-    arrays = dict(np.load(chunk))
-    assert len(arrays["score"])
-    np.savez(chunk, **arrays | {"score": arrays["score"] * 0.5})
-    assert DetectionCache(tmp_path, (32, 24)).get(1) is None
-    assert "its frames are detected again" in caplog.text
-
-
-def test_a_cache_of_another_working_size_is_ignored(tmp_path: Path) -> None:
-    cache = DetectionCache(tmp_path, (32, 24))
-    cache.put(2, some(2))
-    cache.flush()
-    assert DetectionCache(tmp_path, (64, 48)).get(2) is None
-
-
-def test_frames_without_detections_are_cached(tmp_path: Path) -> None:
-    cache = DetectionCache(tmp_path, (32, 24))
-    cache.put(7, rt.Detections.empty())
-    cache.flush()
-    found = DetectionCache(tmp_path, (32, 24)).get(7)
-    assert found is not None and len(found) == 0
 
 
 # ---- Sources of detections -----------------------------------------------------------------------
@@ -628,59 +407,11 @@ def test_a_function_is_a_source_of_detections(found: Any) -> None:
     assert source.key == "" and source.class_names == rt.COCO_NAMES and source.messages == ()
     assert as_source(source) is source
     assert len(at(as_source(lambda image: []), frame())) == 0
-
-
-def test_class_names_of_a_function() -> None:
-    class Own:
-        class_names = ("cup", "wok")
-
-        def __call__(self, image: Image) -> Any:
-            return [[*BOX, 0.5, 2]]
-
-    assert as_source(Own()).class_names == ("cup", "wok")
-    source = as_source(Own(), ["a", "b", "c"])
-    assert source.class_names == ("a", "b", "c") and at(source, frame()).class_id.tolist() == [2]
-    with pytest.raises(rt.ReobjError, match="frame 9: class 2, but there are only 2 class names"):
-        at(as_source(Own()), frame(9))
-
-
-@pytest.mark.parametrize(
-    ("stated", "names"),
-    [
-        ({0: "cup", 1: "wok"}, ("cup", "wok")),  # ultralytics
-        ({0: "cup", 2: "wok"}, ("cup", "class 1", "wok")),
-        (["cup", "wok"], ("cup", "wok")),
-        (None, rt.COCO_NAMES),
-        (lambda: 1, rt.COCO_NAMES),  # a method of that name
-    ],
-)
-def test_a_model_states_its_class_names(stated: Any, names: tuple[str, ...]) -> None:
-    class Model:
-        def __call__(self, image: Image) -> Any:
-            return []
-
-    Model.names = stated  # type: ignore[attr-defined]
-    assert as_source(Model()).class_names == names
-
-
-def test_a_wrong_answer_names_the_frame() -> None:
+    named = as_source(lambda image: found, ["a", "b", "c"])
+    with pytest.raises(rt.ReobjError, match="frame 9: class 3, but there are only 3 class names"):
+        at(named, frame(9))
     with pytest.raises(rt.ReobjError, match=r"frame 7: detections are an array of shape \(1, 5\)"):
         at(as_source(lambda image: [[*BOX, 0.5]]), frame(7))
-
-
-def test_a_network_that_fails_names_the_frame(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    detector = rt.OnnxDetector(model(tmp_path, {"o": np.zeros((1, 7, 42))}, shape=(1, 3, 32, 64)))
-
-    class Full:
-        def run(self, *_: Any) -> None:
-            raise RuntimeError("CUDA failure 2: out of memory\nat line 3")
-
-    monkeypatch.setattr(detector, "_session", Full())
-    with pytest.raises(rt.ReobjError) as caught:
-        at(as_source(detector), frame(7))
-    assert str(caught.value) == f"frame 7: {detector.path} failed: CUDA failure 2: out of memory"
 
 
 @pytest.mark.parametrize("other", ["det.txt", None, 3])
@@ -711,19 +442,6 @@ def test_a_file_is_indexed_by_frame_number(clip: rt.Video, tmp_path: Path) -> No
     assert recorded.class_names == ("object",)
     path.write_text("1,-1,10,20,30,10,.9\n")
     assert source.key != open_detections(clip, rt.DetectConfig(), str(path)).key != ""
-    empty = RecordedDetections(
-        np.empty(0, np.int64), np.empty((0, 4)), np.empty(0), np.empty(0, np.int64), [],
-        ("cup",), (64, 48), (32, 24), np.empty(0, np.int64), "row",
-    )  # fmt: skip
-    for made in (as_source(empty), open_detections(clip, rt.DetectConfig(), empty)):
-        assert made.class_names == ("cup",) and len(at(made, frame())) == 0
-
-
-def test_the_options_of_a_file_apply(clip: rt.Video, tmp_path: Path) -> None:
-    path = tmp_path / "det.txt"
-    path.write_text("1,-1,10,20,30,10,.9\n1,-1,12,20,30,10,.3\n")
-    assert len(at(open_detections(clip, rt.DetectConfig(), path), frame())) == 2
-    assert len(at(open_detections(clip, rt.DetectConfig(min_score=0.5), path), frame())) == 1
 
 
 def test_a_changed_option_or_file_changes_the_key(clip: rt.Video, tmp_path: Path) -> None:
@@ -742,28 +460,12 @@ def test_a_changed_option_or_file_changes_the_key(clip: rt.Video, tmp_path: Path
     assert len(keys) == 5
 
 
-def test_a_function_gets_its_class_names_from_the_options(clip: rt.Video, tmp_path: Path) -> None:
-    (tmp_path / "names.txt").write_text("cup\nwok\n")
-    config = rt.DetectConfig(class_names=str(tmp_path / "names.txt"))
-    source = open_detections(clip, config, lambda image: [[*BOX, 0.5, 1]])
-    assert source.class_names == ("cup", "wok") and source.key == ""
-    assert at(source, frame()).class_id.tolist() == [1]
-
-
-def test_a_model_is_a_source_of_detections(
-    clip: rt.Video, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Named by the options, run with the configured threads, cached on disk under a key."""
-    threads, make = [], detectors.onnx_session
-    monkeypatch.setattr(
-        detectors,
-        "onnx_session",
-        lambda path, n, on: threads.append((n, on)) or make(path, n),
-    )
+def test_a_model_is_a_source_of_detections(clip: rt.Video, tmp_path: Path) -> None:
+    """Named by the options, cached on disk under a key."""
     path = model(tmp_path, yolov8(), names="{0: 'cup', 1: 'bowl', 2: 'tv'}")
     config = rt.DetectConfig(model=str(path))
     source = open_detections(clip, config, threads=1)
-    assert source.class_names == ("cup", "bowl", "tv") and threads == [(1, "cpu")]
+    assert source.class_names == ("cup", "bowl", "tv")
     np.testing.assert_allclose(at(source, frame()).xyxy, [BOX], atol=1e-3)
     direct = as_source(rt.OnnxDetector(path))
     np.testing.assert_array_equal(at(direct, frame()).xyxy, at(source, frame()).xyxy)
@@ -816,93 +518,6 @@ def test_run_and_track_accept_a_model_a_video_and_a_dict(
         rt.run(video, config={"input": {"every": 2}})
 
 
-def test_masks_of_a_model_reach_the_tracker_and_the_cache(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """In `run` with a -seg model: in the first run, and in the second from the disk."""
-    (tmp_path / "im").mkdir()
-    for index in range(4):
-        cv2.imwrite(str(tmp_path / f"im/{index}.png"), IMAGE)
-    path, given = model(tmp_path, yolo_seg(), names="{0: 'cup', 1: 'bowl', 2: 'tv'}"), []
-    update = rt.Tracker.update
-
-    def noted(self: Any, detections: rt.Detections, *args: Any, **more: Any) -> Any:
-        given.append(detections.masks)
-        return update(self, detections, *args, **more)
-
-    monkeypatch.setattr(rt.Tracker, "update", noted)
-    for coast in (30, 31):  # another option: tracked again
-        config = rt.Config(
-            detect=rt.DetectConfig(model=str(path)), tracker=rt.TrackerConfig(coast_frames=coast)
-        )
-        rt.run(tmp_path / "im", tmp_path / "out", config, in_3d=False)
-    expected = np.zeros((160, 320), bool)
-    expected[40:120, 80:120] = True
-    assert len(given) == 8
-    for masks in given:
-        assert masks.shape == (1, 160, 320) and (masks[0] != expected).sum() <= 80
-
-
-def test_no_detections_named_and_no_network(
-    clip: rt.Video, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.delenv("REOBJ_MODELS", raising=False)
-    expected = "deimv2-femto is not in .*, and --offline .*; or take .* --detector fast$"
-    with pytest.raises(rt.ReobjError, match=expected):
-        open_detections(clip, rt.DetectConfig(), offline=True)
-
-
-class Counting:
-    """A slow detector that counts its calls."""
-
-    def __init__(self, key: str = "key", slow: bool = True) -> None:
-        self.asked: list[int] = []
-        self.source = DetectionSource(self.run, ("cup",), key, ["a message"], slow)
-
-    def run(self, frames: Sequence[rt.Frame]) -> Iterator[rt.Detections]:
-        for frame in frames:
-            self.asked.append(frame.index)
-            yield some(frame.index)
-
-
-def test_a_slow_source_is_called_once_per_frame(tmp_path: Path) -> None:
-    counting = Counting()
-    first = dataclasses.replace(counting.source, cache=DetectionCache(tmp_path, (32, 24)))
-    for index in (1, 2, 3, 2):
-        assert_same(at(first, frame(index)), some(index))
-    assert counting.asked == [1, 2, 3]
-    assert (first.class_names, first.key, first.messages) == (("cup",), "key", ["a message"])
-    assert first.cache is not None
-    first.cache.flush()
-    second = dataclasses.replace(first, cache=DetectionCache(tmp_path, (32, 24)))  # the next run
-    for index in (3, 4):
-        assert_same(at(second, frame(index)), some(index))
-    assert counting.asked == [1, 2, 3, 4]
-
-
-@pytest.mark.parametrize("options", [{"key": ""}, {"slow": False}])
-def test_sources_that_are_not_cached(
-    clip: rt.Video, tmp_path: Path, options: dict[str, Any]
-) -> None:
-    source = Counting(**options).source
-    assert keep_detections(source, clip, Workspace(tmp_path / "out")) is source
-
-
-def test_flush_never_replaces_an_error(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """It is called in a `finally`: a failed write is a warning, and the first error is kept."""
-    (tmp_path / "cache").write_text("a file where the folder should be")
-    cache = DetectionCache(tmp_path / "cache", (32, 24))
-    with pytest.raises(KeyboardInterrupt):
-        try:
-            cache.put(1, some(1))
-            raise KeyboardInterrupt
-        finally:
-            cache.flush()
-    assert "cannot be written" in caplog.text and "detected again" in caplog.text
-    cache.flush()  # as often as wanted
-
-
 # ---- Real weights --------------------------------------------------------------------------------
 
 
@@ -913,10 +528,7 @@ def test_flush_never_replaces_an_error(tmp_path: Path, caplog: pytest.LogCapture
     # channel order, a wrong mean or half a cell of shift lose more than the margin.
     [
         ("deimv2-femto", 0.85, 0.9),
-        ("deimv2-atto", 0.75, 0.88),
-        ("yolox-nano", 0.6, 0.88),
         ("picodet-s-416", 0.85, 0.89),
-        ("nanodet-plus-m_512", 0.88, 0.87),
         ("yolo11n-seg_dyn", 0.8, 0.92),
     ],
 )
@@ -933,29 +545,9 @@ def test_real_weights_agree_with_yolov8s(
     best = []
     for frame in video:
         a, b = reference.at(frame.index), detector(frame.image)
-        low = np.maximum(a.xyxy[:, None, :2], b.xyxy[None, :, :2])
-        high = np.minimum(a.xyxy[:, None, 2:], b.xyxy[None, :, 2:])
-        inter = np.clip(high - low, 0, None).prod(2)
-        areas = [(d.xyxy[:, 2:] - d.xyxy[:, :2]).prod(1) for d in (a, b)]
-        overlap = (
-            inter
-            / (areas[0][:, None] + areas[1][None] - inter)
-            * (a.class_id[:, None] == b.class_id[None])
-        )
+        overlap = box_iou(a.xyxy, b.xyxy) * (a.class_id[:, None] == b.class_id)
         best += overlap.max(1, initial=0).tolist()
         assert (b.masks is not None) == ("seg" in name)
-        for mask, box in zip(b.masks if b.masks is not None else (), b.xyxy, strict=False):
-            (x1, y1), (x2, y2) = np.floor(box[:2]).astype(int), np.ceil(box[2:]).astype(int)
-            own = mask[y1:y2, x1:x2]
-            assert mask.shape == (480, 640) and own.mean() > 0.4 and own.sum() == mask.sum()
     hit = [value for value in best if value > 0.5]
     assert len(best) > 30 and len(hit) / len(best) >= recall, (len(hit), len(best))
     assert np.mean(hit) >= iou
-
-
-@needs_shared
-@pytest.mark.parametrize("name", ["mobilenetv2_feat", "squeezenet1.1", "osnet_x0_25_msmt17"])
-def test_real_networks_that_are_not_detectors(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("REOBJ_MODELS", str(SHARED / "models"))
-    with pytest.raises(rt.ReobjError, match=r"no known format of object detectors: \w+ \("):
-        rt.OnnxDetector(name)

@@ -20,7 +20,7 @@ import reobj_track as rt
 from reobj.cameras import invert_rigid
 from reobj.results.export import EXPORTS
 from reobj.results.workspace import Workspace
-from reobj.sources.imageless import ImagelessVideo
+from reobj.sources.video import ImagelessVideo
 from reobj.types import object_color
 
 TILT = Rotation.from_euler("xyz", [40, 70, -20], degrees=True).as_matrix()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-import pytest
 from simulated import CAMERA, chair_solids, looking_at, tracks_of, unlinked
 
 import reobj_track as rt
@@ -37,41 +36,11 @@ def chosen(
     return informative_frames(tracks, poses, poses.frame, options)
 
 
-def test_a_video_of_few_frames_is_used_whole() -> None:
-    poses = circle(np.zeros(600))
-    tracks = tracks_of(poses)
-    frames, new = informative_frames(tracks, poses, poses.frame)
-    assert frames.tolist() == list(range(600)) and new.all()
-    frames, new = informative_frames(tracks, poses, poses.frame[::2])
-    assert frames.tolist() == list(range(0, 600, 2))
-    assert (new == (tracks.frame % 2 == 0)).all()
-
-
-def test_of_a_long_video_as_many_frames_are_used_at_least() -> None:
-    frames, new = chosen(np.zeros(1200), FrameOptions(), chairs=(1, 2, 3))
-    assert len(frames) == 600 and np.diff(frames).max() <= 3
-    assert new.sum() == 3 * FrameOptions().identity_frames  # filled up with nothing new
-
-
-def test_a_camera_that_stands_still_adds_frames_at_the_longest_step_only() -> None:
-    frames, new = chosen(np.zeros(900))
-    first = FEW.identity_frames
-    assert frames[:first].tolist() == list(range(first))
-    assert set(np.diff(frames[first - 1 :])) == {STEP}
-    assert np.flatnonzero(new).tolist() == list(range(first))
-
-
 def test_a_camera_that_circles_adds_a_frame_per_degree() -> None:
     frames, new = chosen(np.arange(0, 90, 0.1))
     assert 80 <= len(frames) <= 100
     assert set(np.diff(frames[FEW.identity_frames :]).tolist()) <= {8, 9, 10, 11, 12}
     assert new.sum() == len(frames)
-
-
-def test_the_frame_rate_has_little_influence() -> None:
-    slow = chosen(np.arange(0, 90, 0.2), chairs=(1, 2, 3))[0]
-    fast = chosen(np.arange(0, 90, 0.1), chairs=(1, 2, 3))[0]
-    assert len(fast) == pytest.approx(len(slow), rel=0.15)
 
 
 def test_the_way_back_adds_nothing_but_the_longest_step() -> None:
@@ -136,23 +105,6 @@ def test_a_long_video_gives_the_objects_of_a_short_one() -> None:
         of_row = result.tracks.track_id.reshape(-1, 3)
         assert (of_row == of_row[0]).all() and len(set(of_row[0])) == 3
     assert long.fits is not None and long.fits.inlier.shape == (1800, 3)
-
-
-def test_outliers_of_the_frames_that_were_not_fitted_are_extrapolated() -> None:
-    """One box in ten is beside the chair."""
-    result = there_and_back(6)
-    wrong = (result.tracks.frame % 10 == 3) & (result.tracks.detection_index == 1)
-    box = result.tracks.xyxy
-    box[wrong] += np.tile(box[wrong, 2:] - box[wrong, :2], 2)
-    given = dataclasses.replace(
-        result,
-        tracks=result.tracks.with_identities(result.tracks.detection_index),
-        identities_given=True,
-    )
-    found = link_and_fit(given, rt.ObjectsConfig()).objects
-    assert [o.views for o in found] == [1800] * 3
-    assert found[1].dropped_boxes == pytest.approx(180, rel=0.3)
-    assert max(found[0].dropped_boxes, found[2].dropped_boxes) < 90
 
 
 def test_gaps_of_a_long_video_are_filled_by_projection() -> None:

@@ -13,12 +13,11 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from small_models import small_rt_detr
 from torchvision_operators import REASON, declare_nms
 
 import reobj_track as rt
-from reobj.sources import libraries
-from reobj.sources.detectors import DetectionSource, open_detections, with_detector
+from reobj.sources import detectors
+from reobj.sources.detectors import DetectionSource, open_detections
 from reobj.types import Detections
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*pretrain_weights=None")  # of rfdetr
@@ -88,18 +87,6 @@ def opened(video: rt.Video, config: rt.DetectConfig) -> DetectionSource:
 # ---- Each library ------------------------------------------------------------------------------
 
 
-def test_ultralytics(video: rt.Video, tmp_path: Path) -> None:
-    pytest.importorskip("ultralytics", reason=INSTALL)
-    found, source = detect(video, "ultralytics:yolo11n-seg.yaml", min_score=1e-6)
-    assert len(found) > 0 and found.masks is not None
-    assert found.masks.shape == (len(found), 240, 320)
-    assert len(source.class_names) == 80 and source.key
-    model = "ultralytics:yolo11n-seg.yaml"
-    batches_are_like_single_frames(tmp_path / "three", model, min_score=1e-6)
-    with pytest.raises(rt.ReobjError, match=r"--words: ultralytics:yolo11n.yaml has fixed classes"):
-        detect(video, "ultralytics:yolo11n.yaml", words="toolbox")
-
-
 def test_rfdetr(video: rt.Video, tmp_path: Path) -> None:
     pytest.importorskip("rfdetr", reason=INSTALL)
     found, source = detect(video, "rfdetr:nano=", min_score=0.01)
@@ -119,20 +106,6 @@ def test_torchvision(video: rt.Video, tmp_path: Path, operators_are_missing: boo
     assert source.class_names[1] == "person" and found.class_id.min() > 0  # 0: background
     model = "torchvision:fasterrcnn_resnet50_fpn="
     batches_are_like_single_frames(tmp_path / "three", model, min_score=0.001)
-
-
-def test_transformers(video: rt.Video, tmp_path: Path) -> None:
-    tf = pytest.importorskip("transformers", reason=INSTALL)
-    pytest.importorskip("torch", reason=INSTALL)
-    folder = str(tmp_path / "model")
-    small_rt_detr().save_pretrained(folder)
-    tf.RTDetrImageProcessor().save_pretrained(folder)
-    found, source = detect(video, f"hf:{folder}", min_score=0.001)
-    assert len(found) > 5 and tuple(source.class_names) == ("lamp", "plant")
-    assert np.ptp(found.xyxy[:, ::2]) > 50  # px of the photo, not of the network or 0..1
-    plants, _ = detect(video, f"hf:{folder}", min_score=0.001, classes="plant")
-    assert set(plants.class_id) <= {1}
-    batches_are_like_single_frames(tmp_path / "three", f"hf:{folder}", min_score=0.001)
 
 
 def test_transformers_with_words(video: rt.Video, tmp_path: Path) -> None:
@@ -169,10 +142,10 @@ def test_phrases_get_the_word_that_shares_most_tokens() -> None:
     phrases = ["machine", "red espresso machine", "toolbox red", "", "lamp"]
     image = {"boxes": np.arange(20.0).reshape(5, 4), "scores": np.arange(5.0),
              "text_labels": phrases}  # fmt: skip
-    found = libraries._with_words(image, list(WORDS))
+    found = detectors._with_words(image, list(WORDS))
     assert found["labels"].tolist() == [0, 0, 1]
     np.testing.assert_array_equal(found["scores"], [0, 1, 2])
-    none = libraries._with_words(image | {"boxes": np.empty((0, 4)), "scores": np.empty(0),
+    none = detectors._with_words(image | {"boxes": np.empty((0, 4)), "scores": np.empty(0),
                                           "text_labels": []}, list(WORDS))  # fmt: skip
     assert len(none["labels"]) == 0
 
@@ -181,20 +154,8 @@ def test_a_missing_library_is_one_line_with_the_command(
     video: rt.Video, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "ultralytics", None)
-    with pytest.raises(rt.ReobjError, match=r"--detector mine\.pt: .* pip install ultralytics$"):
+    with pytest.raises(rt.ReobjError, match=r"--detector mine\.pt: .* pip install ultralytics"):
         detect(video, "mine.pt")
-
-
-def test_a_missing_package_of_one_model_is_not_taken_for_the_library(
-    video: rt.Video, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def without_clip(*_: Any) -> libraries.LibraryDetector:
-        raise ModuleNotFoundError("No module named 'clip'", name="clip")
-
-    broken = libraries.Library(without_clip, "ultralytics", "yolov8s-worldv2.pt")
-    monkeypatch.setitem(libraries.LIBRARIES, "ultralytics", broken)
-    with pytest.raises(rt.ReobjError, match="'clip'; ultralytics needs it for this model"):
-        detect(video, "ultralytics:yolov8s-worldv2.pt", words="toolbox")
 
 
 def test_words_need_a_detector_of_free_text(video: rt.Video) -> None:
@@ -226,29 +187,6 @@ def test_a_function_of_the_users_module(
             detect(video, wrong)
 
 
-def test_names_of_libraries() -> None:
-    assert libraries.library_of("yolo11n.pt") == ("ultralytics", "yolo11n.pt")
-    assert libraries.library_of("hf:IDEA/dino") == ("hf", "IDEA/dino")
-    assert libraries.library_of("fast") is None and libraries.library_of("my:find") is None
-    for name in ("yolo11n.pt", "hf:IDEA/dino", "my.module:find"):
-        config, given = with_detector(rt.DetectConfig(), name)
-        assert config.model == name and given is None
-    assert with_detector(rt.DetectConfig(), "boxes.csv") == (rt.DetectConfig(), "boxes.csv")
-
-
-def test_a_library_without_a_file_is_one_line(
-    video: rt.Video, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def missing(name: str, *_: Any) -> libraries.LibraryDetector:
-        raise FileNotFoundError(f"no such file: {name}")
-
-    stub = libraries.Library(missing, "ultralytics")
-    monkeypatch.setitem(libraries.LIBRARIES, "ultralytics", stub)
-    monkeypatch.setattr(libraries.importlib.metadata, "version", lambda name: "1")
-    with pytest.raises(rt.ReobjError, match=r"^--detector no\.pt: no such file: no\.pt$"):
-        detect(video, "no.pt")
-
-
 def test_a_library_gets_batches(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -261,9 +199,9 @@ def test_a_library_gets_batches(
             raise RuntimeError("CUDA out of memory.")
         return [[[-5, 5, 20 + image[0, 0, 0], 40, 0.9, 0]] for image in images]
 
-    stub = libraries.Library(lambda *_: libraries.LibraryDetector(run, ("cup",)), "")
-    monkeypatch.setitem(libraries.LIBRARIES, "ultralytics", stub)
-    monkeypatch.setattr(libraries.importlib.metadata, "version", lambda name: "1")
+    stub = detectors.Library(lambda *_: (run, ("cup",)), "")
+    monkeypatch.setitem(detectors.LIBRARIES, "ultralytics", stub)
+    monkeypatch.setattr(detectors.importlib.metadata, "version", lambda name: "1")
     images = tmp_path / "five"
     images.mkdir()
     for i in range(5):
@@ -280,48 +218,3 @@ def test_a_library_gets_batches(
     assert calls == [2, 2, 2, 1]  # the first two frames are in the cache
     rows = (tmp_path / "out/tracks.txt").read_text().splitlines()
     assert len(rows) == 5 and all(row.split(",")[2] == "0.00" for row in rows)
-
-
-@pytest.mark.parametrize(
-    ("error", "said"),
-    [
-        (RuntimeError("CUDA out of memory.\nTried to allocate 2 GiB"), "CUDA out of memory."),
-        (KeyError("pred_boxes"), "KeyError: 'pred_boxes'"),
-        (MemoryError(), "MemoryError: "),
-    ],
-)
-def test_a_failure_of_a_library_is_one_line(
-    video: rt.Video,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    error: Exception,
-    said: str,
-) -> None:
-    """While it detects: the detector, the frame and the library's message; also while it opens."""
-    calls = []
-
-    def detect(images: list[Any]) -> Any:
-        calls.append(images)
-        if len(calls) > 1:
-            raise error
-        return [np.empty((0, 6))]
-
-    def opens(name: str, *_: Any) -> libraries.LibraryDetector:
-        if name == "broken":
-            raise error
-        return libraries.LibraryDetector(detect, ("cup",))
-
-    stub = libraries.Library(opens, "ultralytics")
-    monkeypatch.setitem(libraries.LIBRARIES, "ultralytics", stub)
-    monkeypatch.setattr(libraries.importlib.metadata, "version", lambda name: "1")
-    images = tmp_path / "two"
-    images.mkdir()
-    for i in range(2):
-        cv2.imwrite(str(images / f"{i}.png"), np.full((48, 64, 3), 90 + i, np.uint8))
-    for model, text in (("m", f"frame 1: --detector ultralytics:m failed: {said}"),
-                        ("broken", f"--detector ultralytics:broken: {said}")):  # fmt: skip
-        words = ["track", str(images), "-o", str(tmp_path / model), "--embed", "none"]
-        assert rt.main([*words, "--detector", f"ultralytics:{model}"]) == 2
-        line = capsys.readouterr().err.strip().splitlines()[-1]
-        assert line == f"error: {text}".strip()

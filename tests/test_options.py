@@ -30,7 +30,7 @@ import reobj.poses.estimate as estimate
 import reobj.poses.sfm as sfm
 import reobj.poses.stage as stage
 import reobj.results.scene as scene
-import reobj.sources.detectors as detectors
+import reobj.sources.onnx_layouts as detectors
 import reobj_track as rt
 from reobj.cameras import load_poses, save_poses, write_colmap
 from reobj.maps.stage import opened_map
@@ -44,8 +44,7 @@ from reobj.options import (
     write_config,
 )
 from reobj.results.workspace import Workspace
-from reobj.sources.imageless import ImagelessVideo
-from reobj.sources.video import LiveTimes
+from reobj.sources.video import ImagelessVideo, LiveTimes
 from reobj.sources.weights import frames_at_once, own_models
 
 CHAIR = 56

@@ -28,8 +28,8 @@ from reobj.results.edits import apply_edits, read_edits
 from reobj.results.evaluation_3d import read_true_objects
 from reobj.results.truth import read_truth
 from reobj.results.workspace import Workspace
-from reobj.sources.imageless import ImagelessVideo
 from reobj.sources.recorded import read_npz
+from reobj.sources.video import ImagelessVideo
 
 hypothesis = pytest.importorskip("hypothesis", reason="pip install hypothesis (dev extra)")
 from hypothesis import example, given  # noqa: E402

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 
 import quadrics
-from reobj.sources.boxes_3d import Boxes3D
+from reobj.sources.tables import Boxes3D
 from reobj.types import Array, IntArray, Tracks, rows_by
 
 OUTLIER = 3.0  # robust sigmas; a box beyond is not used

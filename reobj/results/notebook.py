@@ -13,7 +13,7 @@ from reobj.files import cut
 from reobj.results.entries import Object
 from reobj.results.report import sides
 from reobj.results.scene import Pictures, write_scene
-from reobj.sources.imageless import ImagelessVideo
+from reobj.sources.video import ImagelessVideo
 
 if TYPE_CHECKING:
     from reobj.results.result import Result

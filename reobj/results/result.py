@@ -21,7 +21,7 @@ from reobj.results.changes import Changes, EarlierSession
 from reobj.results.edits import Edits
 from reobj.results.entries import Object, Part, VideoInfo, World, found_text
 from reobj.results.links import Links
-from reobj.sources.boxes_3d import Boxes3D
+from reobj.sources.tables import Boxes3D
 from reobj.types import Embeddings, IntArray, ReobjError, Tracks, counted
 
 __all__ = ["Object", "Part", "Result", "VideoInfo", "World"]

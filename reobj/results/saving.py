@@ -47,8 +47,7 @@ from reobj.results.links import save_links
 from reobj.results.names import OutputFile
 from reobj.results.ply import write_ply
 from reobj.results.upright import component_of, upright_pose
-from reobj.sources.boxes_3d import Boxes3D
-from reobj.sources.tables import read_mot_rows
+from reobj.sources.tables import Boxes3D, read_mot_rows
 from reobj.types import Embeddings, ReobjError, Tracks, log, printable, without_secrets
 
 if TYPE_CHECKING:

@@ -22,8 +22,7 @@ import numpy.typing as npt
 from reobj.files import load_json, read_lines, shortened
 from reobj.formats import AUTO, Format, Registry
 from reobj.results.result import Result
-from reobj.sources.detection_files import check_rows, read_source
-from reobj.sources.detection_formats import DETECTIONS, FROM_1, Reader
+from reobj.sources.detection_files import DETECTIONS, FROM_1, Reader, check_rows, read_source
 from reobj.sources.recorded import SIZES, NoVideo, Source, corners, other_form
 from reobj.sources.tables import forms, read_mot_rows
 from reobj.types import CLASS_MAX, Array, BoolArray, IntArray, ReobjError, counted
@@ -117,7 +116,9 @@ def _with_roles(entry: Format[Reader]) -> Format[TruthReader]:
         check_rows(recorded, path)
         sizes = {size, *source.image_sizes} - {(0, 0)}
         image = min(sizes) if len(sizes) == 1 else (0, 0)
-        if fault := recorded.other_form(image):
+        if fault := other_form(
+            recorded.xyxy, recorded.form, image, recorded.frame, recorded.identity
+        ):
             raise ReobjError(f"{path}: {fault}")
         if not len(recorded.identity):
             raise ReobjError(f"{path}: boxes without identities; expected tracks")

@@ -35,8 +35,7 @@ from reobj.results.saving import (
     load_last_poses,
     remove_stale,
 )
-from reobj.sources.imageless import ImagelessVideo
-from reobj.sources.video import InputConfig, Video
+from reobj.sources.video import ImagelessVideo, InputConfig, Video
 from reobj.types import COORDINATE_MAX, FiniteFloat, Int32, ReobjError
 
 Side = Annotated[int, msgspec.Meta(ge=1, le=int(COORDINATE_MAX))]

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import ast
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,24 +38,14 @@ def load_class_names(path: str | Path) -> tuple[str, ...]:
     if isinstance(entries := data.get("categories"), list):
         named = [entry for entry in entries if isinstance(entry, dict)]
         data = {"names": {entry.get("id"): entry.get("name") for entry in named}}
-    names = names_by_number(given := data.get("names", data), where)
-    if "nc" in data and str(data["nc"]) not in (str(len(names)), str(len(given))):
-        raise ReobjError(f"{path}: nc is {data['nc']}, but there are {len(names)} names")
-    return names
+    return names_by_number(data.get("names", data), where)
 
 
 def _of_lines(path: Path) -> list[str] | dict[str, str]:
-    """Read a name a line, or a number and a name: all lines have one, or none has."""
+    """Read a name a line, or a number and a name in all lines."""
     lines = [line.strip() for line in read_lines(path) if line.strip()]
     numbered = [match for line in lines if (match := re.fullmatch(r"(\d+)[\s:,]+(\S.*)", line))]
-    if not numbered:
-        return lines
-    named = {match[1]: match[2] for match in numbered}
-    if len(named) < len(lines):
-        raise ReobjError(f"{path}: {len(numbered)} of {len(lines)} lines are a number and a name "
-                         f"({numbered[0][0]!r:.40}); expected different numbers in all, or in none"
-                         )  # fmt: skip
-    return named
+    return {m[1]: m[2] for m in numbered} if len(numbered) == len(lines) else lines
 
 
 def is_yaml(path: Path) -> bool:
@@ -73,15 +62,6 @@ def parse_yaml(text: str, where: str) -> Any:
         line = f", line {mark.line + 1}" if mark else ""
         reason = getattr(error, "problem", None) or error
         raise ReobjError(f"{where}{line}: invalid YAML ({reason})") from error
-
-
-def parse_class_names(text: str, where: str) -> tuple[str, ...]:
-    """Read class names of a model's metadata, as Python, JSON or YAML write lists and maps."""
-    try:
-        names = ast.literal_eval(text.strip())
-    except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
-        names = parse_yaml(text, where)
-    return names_by_number(names, where)
 
 
 def names_by_number(names: Any, where: str = "class names of the detector") -> tuple[str, ...]:
@@ -114,36 +94,23 @@ def check_length(name: str, where: str) -> None:
         raise ReobjError(f"{where}: {text} ({name[:20]}...)")
 
 
-class Vocabulary(Sequence[str]):
+class Vocabulary(list[str]):
     """Class names by number; new labels get the next numbers.
 
-    Shared by all users of the class names of a detector with text labels.
+    Shared by all users of the class names of a detector with text labels. Equal to a tuple of the
+    same names.
     """
-
-    def __init__(self, names: Iterable[str]) -> None:
-        self._names = [visible_name(name) for name in names]
-        self._number = {name: i for i, name in reversed(list(enumerate(self._names)))}
 
     def numbers(self, labels: Sequence[str]) -> list[int]:
         """Return the numbers of labels; new labels are added."""
-        return [self._number_of(visible_name(label)) for label in labels]
-
-    def _number_of(self, label: str) -> int:
-        if label not in self._number:
-            check_length(label, "labels of the detector")
-            if len(self._names) > CLASS_MAX:
-                raise ReobjError(f"more than {CLASS_MAX} different labels; expected fewer classes")
-            self._number[label] = len(self._names)
-            self._names.append(label)
-        return self._number[label]
-
-    def __len__(self) -> int:
-        return len(self._names)
-
-    def __getitem__(self, index):  # type: ignore[no-untyped-def]
-        return tuple(self._names)[index]
+        names = [visible_name(label) for label in labels]
+        for name in names:
+            if name not in self:
+                check_length(name, "labels of the detector")
+                self.append(name)
+        if len(self) > CLASS_MAX:
+            raise ReobjError(f"more than {CLASS_MAX} different labels; expected fewer classes")
+        return [self.index(name) for name in names]
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Sequence) and tuple(self) == tuple(other)
-
-    __hash__ = None  # type: ignore[assignment]

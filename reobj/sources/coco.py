@@ -1,24 +1,40 @@
-"""Detections and tracks in JSON: COCO results and datasets (COCO-VID, TAO), OA-SLAM.
+"""Files of annotation tools: COCO results and datasets (COCO-VID, TAO), OA-SLAM, and CVAT's XML.
 
-Image and category ids are resolved by the file itself, by a dataset JSON beside it, or as numbers
-and names of images.
+Image and category ids of COCO are resolved by the file itself, by a dataset JSON beside it, or as
+numbers and names of images. Of CVAT 1.1 (for video, for images) boxes, masks, and bounding boxes of
+other shapes are read.
 """
 
 from __future__ import annotations
 
 import contextlib
+import zipfile
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
+from xml.etree import ElementTree as ET
 
+import cv2
 import msgspec
 import numpy as np
 
 from reobj.files import load_json, shortened
 from reobj.frame_lookup import frames_by_name
-from reobj.sources.image_frames import frames_of_names, frames_of_numbers, original_name
-from reobj.sources.masks import NO_RUNS, Counts, coco_runs, polygon_runs
-from reobj.sources.recorded import CORNERS, SIZES, RecordedDetections, Source
+from reobj.sources.recorded import (
+    CORNERS,
+    NO_RUNS,
+    SIZES,
+    Counts,
+    RecordedDetections,
+    Source,
+    coco_runs,
+    crop_runs,
+    frames_of_names,
+    frames_of_numbers,
+    original_name,
+    polygon_runs,
+)
 from reobj.types import COCO_NAMES, Array, IntArray, ReobjError
 
 T = TypeVar("T")
@@ -28,7 +44,7 @@ Id = Whole | str
 
 
 class Image(msgspec.Struct):
-    """An image of a dataset; `extra` holds its name before an export by Roboflow."""
+    """An image of a dataset."""
 
     id: Id
     file_name: str | None = None
@@ -37,13 +53,6 @@ class Image(msgspec.Struct):
     frame_id: Whole | None = None  # COCO-VID
     frame_index: Whole | None = None  # TAO
     video_id: Id | None = None
-    extra: Any = None
-
-    @property
-    def name(self) -> str | None:
-        """Name of the image before its export."""
-        extra = self.extra.get("name") if isinstance(self.extra, dict) else None
-        return extra if isinstance(extra, str) else self.file_name
 
     @property
     def number(self) -> int | None:
@@ -183,22 +192,14 @@ def _read(source: Source, entries: list[Annotation], dataset: Dataset | None) ->
     classes = _categories(source, entries, dataset)
     frame, size, looked = _images(source, entries, dataset)
     scale = source.scale(size, frame >= 0)
-    masks = []
-    identity = []
-    for at, (entry, ratio) in enumerate(zip(entries, scale[:, :2], strict=True)):
-        try:
-            masks.append(_mask(entry.segmentation, source.video.size, ratio))
-            identity.append(entry.identity)
-        except (OverflowError, ValueError) as error:
-            raise ReobjError(f"{source.path}, entry {at}: {error}") from error
     modes = {entry.bbox_mode for entry in entries}
-    if len(modes) > 1:
-        raise ReobjError(f"{source.path}: entries of several bbox_mode; expected one")
+    masks = [_mask(entry.segmentation, source.video.size, ratio)
+             for entry, ratio in zip(entries, scale[:, :2], strict=True)]  # fmt: skip
     return source.recorded(
         frame, np.array([entry.bbox for entry in entries]), classes,
         np.array([entry.score for entry in entries], np.float64), masks,
         form=CORNERS if 0 in modes else SIZES, scale=scale, looked=looked,
-        identity=np.array(identity, np.int64),
+        identity=np.array([entry.identity for entry in entries], np.int64),
         ignored=np.array([bool(entry.iscrowd or entry.ignore) for entry in entries], bool),
     )  # fmt: skip
 
@@ -272,7 +273,7 @@ def _dataset_frames(dataset: Dataset, source: Source) -> dict[Id, int]:
     """
     video = source.video
     images = _of_one_video(dataset, source)
-    names = [original_name(image.name or "") for image in images]
+    names = [original_name(image.file_name or "") for image in images]
     named = bool(images) and all(names)
     numbers = [image.number for image in images]
     rule = named and frames_by_name(list(dict.fromkeys(names)), video.files or video.names)[1]
@@ -315,7 +316,7 @@ def _mask(mask: Rle | list[list[float]] | None, size: tuple[int, int], scale: Ar
         return NO_RUNS
     if not isinstance(mask, Rle):
         rings = [np.reshape(ring, (-1, 2)) * scale for ring in mask]
-        return polygon_runs([ring.ravel().tolist() for ring in rings], size)
+        return polygon_runs(rings, size)
     if mask.size != size[::-1]:
         raise ValueError(f"mask of (h, w) {mask.size} in a video of {size[::-1]}")
     counts = mask.counts
@@ -333,3 +334,140 @@ def read_oa_slam(source: Source) -> RecordedDetections:
         (np.array([row.category_id for row in rows], np.int64), source.names or COCO_NAMES),
         np.array([row.detection_score for row in rows], np.float64), unit="detection",
     )  # fmt: skip
+
+
+# ---- CVAT ---------------------------------------------------------------------------------------
+
+
+KINDS = ("box", "polygon", "polyline", "points", "ellipse", "mask")
+
+
+def read_cvat(source: Source) -> RecordedDetections:
+    """Read all shapes of an XML file or CVAT's zip that are not "outside".
+
+    The identity is the track id + 1. Polygons and masks have a mask. Other shapes than these and
+    upright boxes become their bounding boxes, and are counted in a message.
+    """
+    bounded = Counter[str]()  # number of shapes of each kind that became bounding boxes
+    identity = np.empty(0, np.int64)
+    looked = None
+    root = _cvat_root(source.path)
+    tracks = list(root.iter("track"))
+    parents = tracks or list(root.iter("image"))
+    left = Counter(child.tag for parent in parents for child in parent)
+    shapes = [(parent, shape) for parent in parents for shape in parent
+              if shape.tag in KINDS and shape.get("outside") != "1"]  # fmt: skip
+    if not shapes:
+        raise ReobjError(f"{source.path}: no track with a box; export the task as 'CVAT for video "
+                         "1.1'")  # fmt: skip
+    boxes = np.array([_bounds(shape, bounded) for _, shape in shapes])
+    size = [float(root.findtext(f".//meta//original_size/{side}", "0"))
+            for side in ("width", "height")]  # fmt: skip
+    scale = source.scale(np.tile(size, (len(shapes), 1)))
+    runs = [_cvat_runs(shape, ratio, source.video.size)
+            for (_, shape), ratio in zip(shapes, scale[:, :2], strict=True)]  # fmt: skip
+    if tracks:
+        begin = int(source.first == "1")
+        numbers = [int(shape.attrib["frame"]) for _, shape in shapes]
+        frame = np.array(numbers, np.int64) - begin
+        looked = _listed_frames(root, numbers, begin)
+        identity = np.array([int(track.attrib["id"]) + 1 for track, _ in shapes], np.int64)
+        labels = [track.attrib["label"] for track, _ in shapes]
+    else:
+        frame = frames_of_names([image.attrib["name"] for image, _ in shapes], source)
+        labels = [shape.attrib["label"] for _, shape in shapes]
+    for kind, count in sorted(bounded.items()):
+        source.say(f"{count} {kind} taken as their bounding boxes")
+    for kind in sorted(left.keys() - {*KINDS, "tag"}):
+        source.say(f"{left[kind]} shapes {kind} left out")
+    names, class_id = np.unique(labels, return_inverse=True)
+    return source.recorded(
+        frame, boxes, (class_id.astype(np.int64), names.tolist()), runs=runs, unit="box",
+        scale=scale, identity=identity, looked=looked,
+    )  # fmt: skip
+
+
+def _cvat_root(path: Path) -> ET.Element:
+    """Parse the annotations in an XML file or a zip archive."""
+    if not zipfile.is_zipfile(path):
+        return ET.fromstring(path.read_bytes())
+    with zipfile.ZipFile(path) as packed:
+        return ET.fromstring(packed.read("annotations.xml"))
+
+
+def _listed_frames(root: ET.Element, frames: Sequence[int], begin: int) -> IntArray | None:
+    """Return the frames (F,) of a task that skips some; None: all, or `frames` are not in them.
+
+    Our exports begin at 0 and have no step, whatever frames were read.
+    """
+    start, stop, step = (
+        root.findtext(f"meta/task/{key}", "").removeprefix("step=").strip() or default
+        for key, default in (("start_frame", "0"), ("stop_frame", "-1"), ("frame_filter", "1"))
+    )
+    listed = range(int(start), int(stop) + 1, max(int(step), 1))
+    if (listed.start == 0 and listed.step == 1) or not all(f in listed for f in frames):
+        return None
+    return np.array(listed, np.int64) - begin
+
+
+def _floats(shape: ET.Element, names: str) -> Array:
+    """Return attributes of a shape as numbers."""
+    return np.array([float(shape.attrib[name]) for name in names.split()])
+
+
+def _bounds(shape: ET.Element, bounded: Counter[str]) -> Array:
+    """Return the bounding box (4,) of a shape; count shapes that have no mask and are no box."""
+    angle = np.radians(float(shape.get("rotation") or 0) % 180)
+    turn = np.abs([[np.cos(angle), np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    if shape.tag == "box":
+        box = _floats(shape, "xtl ytl xbr ybr")
+        if not angle:
+            return box
+        bounded["turned boxes"] += 1
+        centre = (box[:2] + box[2:]) / 2
+        reach = turn @ (box[2:] - box[:2]) / 2
+        return np.hstack([centre - reach, centre + reach])
+    if shape.tag not in ("polygon", "mask"):
+        bounded[shape.tag + "s" * (shape.tag != "points")] += 1
+    if shape.tag == "ellipse":
+        centre = _floats(shape, "cx cy")
+        reach = np.sqrt(turn**2 @ _floats(shape, "rx ry") ** 2)
+        return np.hstack([centre - reach, centre + reach])
+    if shape.tag == "mask":
+        low = _floats(shape, "left top")
+        return np.hstack([low, low + _floats(shape, "width height")])
+    corners = _corners(shape)
+    return np.hstack([corners.min(0), corners.max(0)])
+
+
+def _corners(shape: ET.Element) -> Array:
+    """Return the points (K, 2) of a polygon, a polyline or points."""
+    pairs = [pair.split(",") for pair in shape.attrib["points"].split(";") if pair]
+    return np.array(pairs, np.float64)
+
+
+def _cvat_runs(shape: ET.Element, scale: Array, size: tuple[int, int]) -> Counts:
+    """Return the mask of a polygon or a mask as run lengths; of other shapes none.
+
+    The file's run lengths of a mask follow its rows.
+
+    Args:
+        scale: (2,) pixels of the video for each of the annotation. size: (w, h) of the video,
+            (0, 0): unknown, no mask.
+    """
+    if size == (0, 0) or shape.tag not in ("polygon", "mask"):
+        return NO_RUNS
+    if shape.tag == "polygon":
+        return polygon_runs([_corners(shape) * scale], size)
+    left, top, width, height = _floats(shape, "left top width height").astype(int).tolist()
+    box = np.array([[left, top], [left + width, top + height]]) * scale  # (2, 2) corners
+    if (box[0] < -scale).any() or (box[1] > size + scale).any():
+        raise ValueError(f"mask of {width}x{height} from {left}, {top} on, beyond the image")
+    counts = np.array(shape.attrib["rle"].split(","), np.int64)
+    if counts.min() < 0 or counts.sum() != width * height:
+        raise ValueError(f"mask of {counts.sum()} pixels, expected {width}x{height}")
+    mask = np.repeat(np.arange(len(counts)) % 2, counts).reshape(height, width)  # (H, W) 0, 1
+    (x1, y1), (x2, y2) = box.round().astype(int).tolist()
+    scaled = (max(x2 - x1, 1), max(y2 - y1, 1))
+    crop = cv2.resize(mask.astype(np.uint8), scaled, interpolation=cv2.INTER_NEAREST)
+    return crop_runs(crop > 0, (x1, y1), size)

@@ -1,17 +1,18 @@
 """Recorded detections and tracks of other tools: one registry of readers, one validation.
 
-Start at `read_detections` and `read_tracks`. Every reader (`detection_formats`) returns a
+Start at `read_detections` and `read_tracks`. Every reader of DETECTIONS returns a
 `RecordedDetections`, which is then validated: invalid content raises an error with the line number;
 unusable rows are dropped and counted in a message.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,15 +20,18 @@ import numpy as np
 
 from reobj.cameras import Poses
 from reobj.files import did_you_mean, last_name, shortened
-from reobj.formats import AUTO
+from reobj.formats import AUTO, Format, Probe, Registry
+from reobj.sources import coco, label_folders, tables
 from reobj.sources.class_names import check_length, load_class_names
-from reobj.sources.detection_formats import DETECTIONS, Reader
-from reobj.sources.looked import frames_looked_at, looked_message
 from reobj.sources.recorded import (
     NORMALISED_MAX,
     NoVideo,
     RecordedDetections,
     Source,
+    frames_looked_at,
+    looked_message,
+    other_form,
+    read_npz,
 )
 from reobj.sources.video import Video
 from reobj.types import (
@@ -43,6 +47,91 @@ from reobj.types import (
     rows_by,
 )
 from reobj.words import meant
+
+# ---- Formats -------------------------------------------------------------------------------------
+
+Reader = Callable[[Source], RecordedDetections]
+
+
+def _read_npz(source: Source) -> RecordedDetections:
+    return read_npz(source.path, source.video.size, source.video.working_size)[0]
+
+
+def _has(keys: str, listed: bool) -> Callable[[Probe], bool]:
+    """Test for keys in a JSON object, or, if it is `listed`, in the first object of a list."""
+    return lambda probe: listed == isinstance(probe.json, list) and probe.keys() >= {*keys.split()}
+
+
+def _table(name: str) -> Callable[[Probe], bool]:
+    return lambda probe: name in tables.forms(probe)
+
+
+def _is_cvat(probe: Probe) -> bool:
+    return "annotations.xml" in probe.names or getattr(probe.root, "tag", "") == "annotations"
+
+
+def _labels(numbers: int) -> Callable[[Probe], bool]:
+    """Test for a folder of labels that may have a form of `label_folders.forms`."""
+
+    def recognise(probe: Probe) -> bool:
+        with contextlib.suppress(ReobjError):
+            return probe.is_dir and numbers in label_folders.forms(probe.path)
+        return not numbers
+
+    return recognise
+
+
+def _label_reader(numbers: int) -> Reader:
+    return lambda source: label_folders.read_label_folder(source, numbers)
+
+
+FROM_1 = "from 1; from 0 if there is a 0"
+NAMED = "by image name, else by the number in it"
+
+DETECTIONS: Registry[Reader] = Registry("detections", "--detections-format", [
+    Format("mot", "MOTChallenge, CVAT's MOT 1.1, trackers: rows of 6 to 10 numbers",
+           _table("mot"), tables.read_mot, FROM_1, "px", "column 9; x, y, z in ten columns",
+           kind="text"),
+    Format("boxmot", "boxmot: nine columns that end in 1, class from 0, score", _table("boxmot"),
+           tables.read_boxmot, FROM_1, "px", kind="text"),
+    Format("visdrone", "VisDrone: ten columns that end in class, truncation, occlusion",
+           _table("visdrone"), tables.read_visdrone, FROM_1, "px", "truncation, occlusion",
+           kind="text"),
+    Format("kitti", "KITTI tracking: 17 or 18 columns", _table("kitti"), tables.read_kitti,
+           "from 0", "px", "everything in 3D", kind="text"),
+    Format("csv", "tables with a header: supervision's CSVSink, pandas, Boxer's 2D boxes, "
+           "Roboflow's CSV", _table("csv"), tables.read_csv,
+           "from 0 (bb_left: from 1), image names, or times", "px", "other columns", kind="text"),
+    Format("boxer-3d", "Boxer, WildDet3D: boxes in the world of --poses", _table("boxer-3d"),
+           tables.read_source_3d, "by time", "world", "instance, sem_id", kind="text"),
+    Format("records", "supervision's JSONSink: a JSON list of flat objects",
+           lambda probe: isinstance(probe.json, list)
+           and not probe.keys().isdisjoint(tables.ALIASES["x1"].split()),
+           tables.read_records, "from 0", "px", "other keys", kind="JSON"),
+    Format("coco-results", "COCO results, ultralytics' predictions.json",
+           lambda probe: probe.json == [] or _has("image_id bbox", listed=True)(probe),
+           coco.read_coco_results, f"{NAMED}, else image_id from 0", "px", kind="JSON"),
+    Format("coco", "COCO, COCO-VID and TAO datasets, CVAT's and Roboflow's COCO",
+           _has("images", listed=False), coco.read_coco, f"frame_id from 0; else {NAMED}", "px",
+           "keypoints", kind="JSON"),
+    Format("oa-slam", "OA-SLAM, VOOM", _has("file_name detections", listed=True),
+           coco.read_oa_slam, NAMED, "px", kind="JSON"),
+    *(Format(name, f"a folder of YOLO labels, boxes {title}", _labels(numbers),
+             _label_reader(numbers),
+             f"{NAMED}; VIDEO_N.txt from 1", "fractions", "keypoints" * (numbers > 0),
+             kind="folder")
+      for name, title, numbers in (
+        ("yolo", "or polygons", 0), ("yolo-pose", "with keypoints", 3),
+        ("yolo-pose-2d", "with keypoints without visibility", 2),
+      )),
+    Format("cvat", "CVAT for video 1.1 and for images 1.1, XML or zip", _is_cvat, coco.read_cvat,
+           f"from 0; images {NAMED}", "px", "skeletons, cuboids", kind="XML"),
+    Format("npz", "`rt.write_detections_npz`", lambda probe: probe.suffix == ".npz", _read_npz,
+           "from 0", "px"),
+])  # fmt: skip
+
+
+# ---- Options -------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +211,9 @@ def class_filter(wanted: str, names: Sequence[str], present: IntArray | None = N
     return np.array([i for ids in chosen.values() for i in ids], np.int64)
 
 
+# ---- Reading -------------------------------------------------------------------------------------
+
+
 def read_detections(
     path: str | Path,
     video: Video,
@@ -173,8 +265,9 @@ def read_source(source: Source, read: Reader) -> RecordedDetections:
         return read(source)
     except ReobjError:
         raise
-    except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
-        raise ReobjError(f"{source.path}: an entry cannot be read: {error!r}") from error
+    except Exception as error:  # zip, zlib and expat have their own exceptions for damaged files
+        text = f"damaged, or not as its format says ({error!r:.200})"
+        raise ReobjError(f"{source.path}: {text}") from error
 
 
 def described_images(
@@ -308,7 +401,8 @@ def _usable(
     if count and xyxy.max() <= NORMALISED_MAX:
         fault = f"no coordinate above {NORMALISED_MAX}: normalised to 0..1? "
         fault += "Multiply them by the image size"
-    elif count and (other := recorded.other_form(size)):
+    elif count and (other := other_form(xyxy, recorded.form, size, recorded.frame,
+                                        recorded.identity)):  # fmt: skip
         fault = other
     elif checks_size and (other := _other_size(xyxy[~empty], size)):
         fault = other
@@ -316,19 +410,12 @@ def _usable(
         fault = (
             f"{empty.sum()} of {count} boxes have no area and {outside.sum()} lie outside "
             f"the image of {size}: frames of another size (--set detect.image_size=WIDTHxHEIGHT), "
-            "or another video?"
+            "not turned upright, or another video?"
         )
     elif count and missing.all():
         fault = f"all detections are {text}: detections of another video?"
     if fault:
         raise ReobjError(f"{path}: {fault}")
-    reach = high.max(0, initial=0)
-    begins = bool(count) and (low.min(0) <= 0.02 * reach).any()
-    if checks_size and count >= 50 and begins and (reach < np.multiply(0.9, size)).all():
-        recorded.messages.append(
-            f"no box of {count} ends beyond x = {reach[0]:.0f} or y = {reach[1]:.0f} in images of "
-            f"{size}: boxes of frames of another size (detect.image_size)?"
-        )
     for bad, fault in ((empty, "without area"), (outside, "wholly outside the image"),
                        (missing, text)):  # fmt: skip
         if bad.any():

@@ -1,17 +1,19 @@
-"""Detectors: ONNX models, a cache, and one interface to all sources of detections.
+"""Detectors: one interface to all sources of detections, a cache, and other libraries' detectors.
 
 Start at `open_detections` (from a configuration) or `as_source` (from a detector): both return a
-`DetectionSource`, which maps frames to detections. Output layouts of ONNX models: `onnx_layouts`;
-files of detections: `detection_files`.
+`DetectionSource`, which maps frames to detections. ONNX models: `onnx_layouts`; files of
+detections: `detection_files`. The libraries are no requirement of this package: each adapter
+imports its own.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import itertools
+import importlib
+import importlib.metadata
 import json
-import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,240 +22,24 @@ import numpy as np
 
 from reobj.cameras import Poses
 from reobj.files import did_you_mean, save_npz
-from reobj.sources.class_names import (
-    Vocabulary,
-    load_class_names,
-    names_by_number,
-    parse_class_names,
-)
-from reobj.sources.detection_files import (
-    DetectConfig,
-    class_filter,
-    read_detections,
-    unnamed_class,
-)
-from reobj.sources.libraries import (
-    LibraryDetector,
-    failing,
-    fixed_classes,
-    is_function,
-    library_detector,
-    library_of,
-    user_function,
-)
-from reobj.sources.onnx_layouts import (
-    UNIT_RGB,
-    Geometry,
-    Layout,
-    ModelProbe,
-    Pixels,
-    best_rows,
-    find_layout,
-    fit_image,
-    nms,
-)
+from reobj.sources.class_names import Vocabulary, names_by_number
+from reobj.sources.detection_files import DetectConfig, class_filter, class_names, read_detections
+from reobj.sources.onnx_layouts import OnnxDetector, best_boxes, check_names
 from reobj.sources.recorded import RecordedDetections, pack_detections, read_npz
-from reobj.sources.video import Video, in_batches, source_fingerprint
-from reobj.sources.weights import (
-    WEIGHTS,
-    frames_at_once,
-    known_weights,
-    model_path,
-    onnx_session,
-)
+from reobj.sources.video import Video, source_fingerprint
+from reobj.sources.weights import WEIGHTS, failing, frames_at_once
 from reobj.types import (
     COCO_NAMES,
-    NOTE_START,
-    Array,
-    BoolArray,
     Detections,
     Frame,
     Image,
-    IntArray,
     ReobjError,
     as_detections,
-    as_frame,
     log,
     text_labels,
     visible_name,
 )
 from reobj.words import among
-
-
-class OnnxDetector:
-    """Detect objects with an ONNX model of one of the `onnx_layouts`.
-
-        detector = OnnxDetector("fast")
-        detections = detector(image)  # BGR; boxes in its pixels
-
-    Args:
-        path_or_name: file or name of a model ("": `config.model`).
-        threads: of onnxruntime (0: all cores). offline: never download.
-        device: cpu, cuda, coreml, ... (`onnx_session`).
-    Attributes:
-        class_names: names by class id. layout: name of the layout. path: of the file.
-        batch: most images that `detect` gives the network at once. messages: which layout was
-            recognised; (): it is declared.
-    Raises:
-        ReobjError: no such file; outputs of no layout, or of several; or names of the classes that
-            are not as many as the layout has.
-    """
-
-    def __init__(
-        self,
-        path_or_name: str | Path = "",
-        config: DetectConfig | None = None,
-        threads: int = 0,
-        offline: bool = False,
-        device: str = "cpu",
-    ) -> None:
-        self.config = config or DetectConfig()
-        name = path_or_name or self.config.model
-        weights = known_weights(name)
-        self.path = model_path(name, offline)
-        self._session = onnx_session(self.path, threads, device)
-        self._inputs = {i.name: list(i.shape) for i in self._session.get_inputs()}
-        kind = self._session.get_inputs()[0].type
-        self._image_input, shape = next(iter(self._inputs.items()))
-        if kind != "tensor(float)" or len(shape) not in (3, 4) or shape[-3] != 3:
-            raise ReobjError(f"{self.path}: no known object detector: input is {kind} {shape}, "
-                             "expected an image (1, 3, H, W)")  # fmt: skip
-        axis = shape[0] if len(shape) == 4 else 1
-        self._fixed = axis if isinstance(axis, int) else 0  # images of every run; 0: any number
-        self.batch = self._fixed or frames_at_once(self.config.batch, device)
-        if self._fixed and self.config.batch not in (0, self._fixed):
-            log.warning("%s: takes %d images at once, not detect.batch=%d", self.path, self._fixed,
-                        self.config.batch)  # fmt: skip
-        self._model = self._trial_run()
-        self._layout, self.class_names = self._recognise(weights.layout if weights else "")
-        self.layout = self._layout.name
-        wanted = self.config.classes
-        self._allowed = class_filter(wanted, self.class_names) if wanted else None
-
-    def __call__(self, image: Image) -> Detections:
-        """Detect the objects in one BGR image (H, W, 3); best first, boxes clipped to the image."""
-        return next(self.detect([image]))
-
-    def detect(self, images: Sequence[Image]) -> Iterator[Detections]:
-        """Detect the objects in each of several images, as one call for each would."""
-        images = [as_frame(image) for image in images]
-        # Images of the same input size are given to the network together
-        for size, group in itertools.groupby(images, lambda a: self._input_size(*a.shape[1::-1])):
-            for batch in in_batches(group, self.batch):
-                fitted = [fit_image(image, size, self._layout.fit) for image in batch]
-                with failing(str(self.path), len(batch)):
-                    each = self._run(fitted, self._layout.pixels)
-                for outputs, (_, geometry) in zip(each, fitted, strict=True):
-                    yield self._decoded(outputs, geometry)
-
-    def _decoded(self, outputs: list[Any], geometry: Geometry) -> Detections:
-        """Decode and select the detections of one image."""
-        assert self._layout.read is not None
-        decoded = self._layout.read(outputs, geometry, self._model)
-        label = decoded.class_id
-        use = label >= 0 if self._allowed is None else np.isin(label, self._allowed)
-        size = geometry.image_size
-        boxes, keep = _best(decoded.xyxy, decoded.score, use, size, self.config)
-        if self._layout.nms_iou is not None:
-            keep = keep[nms(boxes[keep], label[keep], self._layout.nms_iou)]
-        keep = keep[: self.config.max_detections or 100]  # of a frame (COCO's maxDets)
-        _check_names(label[keep], self.class_names, f"{self.path}: ")
-        masks = decoded.masks(keep) if decoded.masks is not None else None
-        return Detections(boxes[keep], decoded.score[keep], label[keep], masks)
-
-    def _input_size(self, width: int, height: int) -> tuple[int, int]:
-        """Return the input (w, h) for an image: the model's, or, if dynamic, the image's shape."""
-        fixed = self._inputs[self._image_input][:-3:-1]
-        longer = 640  # px, longer side (YOLO11's training size)
-        stride = 32  # px, largest cells of YOLO: sides are multiples of it
-        ratio = longer / max(width, height) / stride
-        scaled = [max(math.ceil(round(v * ratio, 3)), 1) * stride for v in (width, height)]
-        w, h = (a if isinstance(a, int) else b for a, b in zip(fixed, scaled, strict=True))
-        return w, h
-
-    def _run(self, fitted: list[tuple[Image, Geometry]], pixels: Pixels) -> list[list[Any]]:
-        """Run the model on fitted BGR images; return the outputs of each, with a batch axis of 1.
-
-        A fixed batch is filled up with the last image.
-        """
-        count = len(fitted)
-        fitted = fitted + fitted[-1:] * (self._fixed - count)
-        mean, std = np.array([pixels.mean, pixels.std], np.float32)
-        canvases = np.stack([canvas for canvas, _ in fitted])
-        blob = (canvases[..., ::-1] if pixels.rgb else canvases).astype(np.float32)
-        blob = np.ascontiguousarray(((blob - mean) / std).transpose(0, 3, 1, 2))  # (B, 3, H, W)
-        sizes = np.array([geometry.image_size for _, geometry in fitted])
-        image = blob if len(self._inputs[self._image_input]) == 4 else blob[0]
-        feeds = dict.fromkeys(self._inputs, sizes) | {self._image_input: image}
-        outputs = [np.asarray(output) for output in self._session.run(None, feeds)]
-        if len(fitted) == 1:
-            return [outputs]  # some have no batch axis
-        if any(output.shape[:1] != (len(fitted),) for output in outputs):
-            raise RuntimeError("its outputs have no batch axis")
-        return [[output[i : i + 1] for output in outputs] for i in range(count)]
-
-    def _trial_run(self) -> ModelProbe:
-        """Run the model on a square grey image to get the shapes of its outputs."""
-        size = self._input_size(1, 1)
-        grey = np.full((size[1], size[0], 3), 114, np.uint8)
-        with failing(f"{self.path}: no known object detector: a trial run", 1):
-            (outputs,) = self._run([(grey, Geometry(size, size, (1.0, 1.0), (0, 0)))], UNIT_RGB)
-            names = [output.name for output in self._session.get_outputs()]
-            metadata = self._session.get_modelmeta().custom_metadata_map
-        of_name = dict(zip(names, outputs, strict=True))
-        return ModelProbe(self.path, self._inputs, of_name, size, metadata)
-
-    def _recognise(self, declared: str) -> tuple[Layout, tuple[str, ...]]:
-        """Find the layout, and the names of its classes: by option, metadata, COCO, or numbers.
-
-        declared: layout of known weights.
-        """
-        names: tuple[str, ...] = ()
-        names_of = f"of COCO, as the model names none; {NAMES}"
-        if self.config.class_names:
-            names_of = self.config.class_names
-            names = load_class_names(names_of)
-        elif text := self._model.metadata.get("names", "").strip():
-            names_of = "of its metadata"
-            names = parse_class_names(text, f"{self.path}: metadata `names`; {NAMES}")
-        self._model.count = len(names or COCO_NAMES)
-        declared = self.config.layout or declared
-        layout = find_layout(self._model, declared, names_of)
-        count = layout.classes(self._model)
-        if count not in (None, self._model.count):
-            if names:
-                raise ReobjError(f"{self.path}: {len(names)} class names ({names_of}), but layout "
-                                 f"{layout.name} has {count} classes")  # fmt: skip
-            log.warning("%s: %d classes without names: %s", self.path, count, NAMES)
-            names = tuple(f"class {i}" for i in range(count or 0))
-        names = names or COCO_NAMES
-        self._model.count = len(names)
-        unread = f"; not read: {layout.unread}" if layout.unread else ""
-        text = f"{NOTE_START}{self.path}: read as {layout.name} ({layout.title}){unread}"
-        self.messages = () if declared else (text,)
-        return layout, names
-
-
-NAMES = "give a file of names with --set detect.class_names=FILE"
-
-
-def _check_names(class_id: IntArray, names: Sequence[str], where: str = "") -> None:
-    """Refuse class ids (D,) without a name."""
-    if len(class_id) and class_id.max() >= len(names):
-        raise ReobjError(where + unnamed_class(int(class_id.max()), len(names)))
-
-
-def _best(
-    xyxy: Array, score: Array, use: BoolArray, size: Sequence[int], config: DetectConfig
-) -> tuple[Array, IntArray]:
-    """Clip boxes to the image of (w, h); select rows, among those to `use`, by score and area.
-
-    Returns:
-        the boxes (N, 4) of all rows, and the selected rows, best first.
-    """
-    boxes = np.clip(xyxy, 0, np.tile(size, 2))
-    rows = np.flatnonzero(use & (score >= config.min_score) & (boxes[:, 2:] > boxes[:, :2]).all(1))
-    return boxes, rows[best_rows(score[rows])]
 
 
 class DetectionCache:
@@ -264,20 +50,11 @@ class DetectionCache:
 
     Args:
         folder: for the cache alone. image_size: (w, h) of the frames and of their masks.
-        file_frames: frames of a file; a kill loses a few seconds of work at most. mask_frames: of
-            one with masks, which fill the memory.
     """
 
-    def __init__(
-        self,
-        folder: str | Path,
-        image_size: tuple[int, int],
-        file_frames: int = 64,
-        mask_frames: int = 8,
-    ) -> None:
+    def __init__(self, folder: str | Path, image_size: tuple[int, int]) -> None:
         self.folder = Path(folder)
         self.image_size = image_size
-        self._frames = (file_frames, mask_frames)
         self._stored: dict[int, RecordedDetections | None] = {}  # by frame; None: skipped
         self._pending: dict[int, Detections] = {}  # by frame, not on disk yet
         chunks = sorted(self.folder.glob("chunk_*.npz"))
@@ -309,7 +86,8 @@ class DetectionCache:
         if detections is None:
             return
         self._pending[index] = detections
-        if len(self._pending) >= self._frames[detections.masks is not None]:
+        # Of a file; a kill loses a few seconds of work at most, and masks fill the memory
+        if len(self._pending) >= (64 if detections.masks is None else 8):
             self._write()
 
     def _write(self) -> None:
@@ -404,20 +182,18 @@ def open_detections(
             ONNX model, cpu, cuda, coreml, ... poses: for files of boxes in 3D.
     """
     config, detections = with_detector(config, detections)
-    names = load_class_names(config.class_names) if config.class_names else ()
+    names = class_names(config)
     if detections and isinstance(detections, str | Path):
         recorded = read_detections(detections, video, config, poses)
         key = _cache_key(config, recorded.fingerprint())
         return dataclasses.replace(as_source(recorded), key=key)
     if detections not in (None, ""):
         return as_source(detections, names)
-    words = tuple(word.strip() for word in config.words.split(",") if word.strip())
+    words = [word.strip() for word in config.words.split(",") if word.strip()]
     if library_of(config.model):
-        batch = frames_at_once(config.batch, device)
-        opened, version = library_detector(config.model, words, config.min_score, device, batch)
+        source, version = _library_source(config.model, words, config, device)
         file = config.model.partition(":")[2] or config.model
-        key = _cache_key(config, version, file, device)
-        return dataclasses.replace(_filtered(as_source(opened), config), key=key, slow=True)
+        return dataclasses.replace(source, key=_cache_key(config, version, file, device))
     if words:
         raise fixed_classes(config.model)
     if is_function(config.model):
@@ -448,7 +224,7 @@ def _filtered(
         use = np.ones(len(found), bool) if allowed is None else np.isin(found.class_id, allowed)
         if wanted and allowed is None:
             use = among(source.class_names, wanted.split(","))[found.class_id]
-        boxes, rows = _best(found.xyxy, found.score, use, frame.image.shape[1::-1], config)
+        boxes, rows = best_boxes(found.xyxy, found.score, use, frame.image.shape[1::-1], config)
         return dataclasses.replace(found, xyxy=boxes)[rows[: config.max_detections or None]]
 
     def run(frames: Sequence[Frame]) -> Iterator[Detections | None]:
@@ -507,24 +283,42 @@ def as_source(detector: Any, class_names: Sequence[str] = ()) -> DetectionSource
         return detector
     if isinstance(detector, RecordedDetections):
         return _recorded_source(detector)
-    known = isinstance(detector, OnnxDetector | LibraryDetector)
-    several = type(detector) in (OnnxDetector, LibraryDetector)  # a subclass may change a call
-    if not several and not callable(detector):
+    several = isinstance(detector, OnnxDetector)
+    if not callable(detector):
         raise ReobjError(f"{detector!r:.80} is no detector: expected a function image -> detections"
                          "; a file is opened by read_detections(path, video)")  # fmt: skip
-    answer = detector.detect if several else lambda images: map(detector, images)
-    stated = tuple(class_names) or _stated_names(detector)
-    names = Vocabulary(stated or COCO_NAMES)
+    source = _source_of(
+        detector.detect if several else lambda images: map(detector, images),
+        tuple(class_names) or _stated_names(detector),
+        has_numbers=bool(class_names),
+    )
+    if not several:
+        return source
+    return dataclasses.replace(
+        source, messages=detector.messages, always_looks=True, batch=detector.batch
+    )
+
+
+def _source_of(
+    answer: Callable[[list[Image]], Iterable[Any]], stated: Sequence[str], has_numbers: bool
+) -> DetectionSource:
+    """Make a source from a function of BGR images that returns detections of each.
+
+    Args:
+        stated: class names by number, (): COCO's. has_numbers: they name the numbers, so that text
+            labels are not read.
+    """
+    names = Vocabulary(map(visible_name, stated or COCO_NAMES))
     warn = not stated
 
     def checked(found: Any) -> Detections | None:
         nonlocal warn
         if found is None:
             return None
-        labels = None if class_names else text_labels(found)  # else its numbers have names
+        labels = None if has_numbers else text_labels(found)
         kinds = None if labels is None else np.array(names.numbers(labels), np.int64)
         detections = as_detections(found, kinds)
-        _check_names(detections.class_id, names)
+        check_names(detections.class_id, names)
         if warn and isinstance(found, Mapping) and kinds is None and len(detections):
             log.warning(
                 "the detector has no class names: its numbers are read as COCO's 80 classes, from "
@@ -535,10 +329,8 @@ def as_source(detector: Any, class_names: Sequence[str] = ()) -> DetectionSource
         return detections
 
     return DetectionSource(
-        lambda frames: map(checked, answer([frame.image for frame in frames])), names,
-        messages=detector.messages if known else (), always_looks=known,
-        batch=detector.batch if several else 1,
-    )  # fmt: skip
+        lambda frames: map(checked, answer([frame.image for frame in frames])), names
+    )
 
 
 def _recorded_source(recorded: RecordedDetections) -> DetectionSource:
@@ -561,3 +353,229 @@ def _stated_names(detector: Any) -> tuple[str, ...]:
     if names and isinstance(names, Mapping | list | tuple):
         return names_by_number(names)
     return ()
+
+
+# ---- Other libraries ----------------------------------------------------------------------------
+
+
+Opened = tuple[Callable[[list[Image]], Iterable[Any]], Sequence[str]]
+
+
+@dataclass(frozen=True, slots=True)
+class Library:
+    """A library whose detectors can be used.
+
+    Attributes:
+        open: makes a detector of a model (name or file, as the library expects it), words that it
+            looks for ((): its classes), least score, and device of PyTorch: a function of images
+            (H, W, 3) uint8 that returns detections of each as `reobj.types.as_detections` accepts
+            them, and class names by number.
+        install: what pip installs.
+        takes_words: an example of a model that finds free text; "": none.
+        is_rgb: images are RGB; else BGR.
+    """
+
+    open: Callable[[str, list[str], float, str], Opened]
+    install: str
+    takes_words: str = ""
+    is_rgb: bool = True
+
+
+def _ultralytics(name: str, words: list[str], min_score: float, device: str) -> Opened:
+    from ultralytics import YOLO
+
+    model = YOLO(name)
+    if words:
+        if not hasattr(model.model, "set_classes"):
+            raise fixed_classes(f"ultralytics:{name}")
+        model.set_classes(words)
+
+    def run(images: list[Image]) -> Any:
+        return model.predict(
+            images, conf=min_score, device=device, retina_masks=True, verbose=False
+        )
+
+    return run, names_by_number(model.names)
+
+
+def _rfdetr(name: str, _: list[str], min_score: float, device: str) -> Opened:
+    import rfdetr
+
+    name, given, weights = name.partition("=")
+    classes = {key[6:].lower(): key for key in dir(rfdetr) if key[:6] == "RFDETR" and key[6:]}
+    wanted = name.lower().replace("-", "")
+    if wanted not in classes:
+        raise _unknown(f"rfdetr:{name}", classes)
+    options = {"pretrain_weights": weights or None} if given else {}
+    model = getattr(rfdetr, classes[wanted])(device=device, **options)
+
+    def run(images: list[Image]) -> Iterator[Any]:
+        answer = model.predict(images, threshold=min_score)
+        for found in answer if isinstance(answer, list) else [answer]:  # of one image: no list
+            yield found[np.array([bool(name) for name in found.data["class_name"]], bool)]
+
+    return run, tuple(map(str, model.class_names))
+
+
+def _torchvision(name: str, _: list[str], min_score: float, device: str) -> Opened:
+    import torch
+    from torchvision.models import detection, get_model, get_model_weights, list_models
+
+    name, given, weights = name.partition("=")
+    known = list_models(detection)
+    if name not in known:
+        raise _unknown(f"torchvision:{name}", known)
+    trained = get_model_weights(name).DEFAULT
+    if given:
+        model = get_model(name, weights=None, weights_backbone=None)
+        if weights:
+            model.load_state_dict(torch.load(weights, map_location="cpu", weights_only=True))
+    else:
+        model = get_model(name, weights=trained)
+    model = model.to(device).eval()
+
+    def run(images: list[Image]) -> Iterator[dict[str, Any]]:
+        stack = torch.from_numpy(np.stack(images)).to(device)
+        with torch.inference_mode():
+            answers = model(list(stack.permute(0, 3, 1, 2).float() / 255))
+        for found in answers:
+            keep = (found["scores"] >= min_score) & (found["labels"] > 0)  # 0: background
+            yield {key: value[keep].cpu() for key, value in found.items()}
+
+    return run, tuple(trained.meta["categories"])
+
+
+def _transformers(name: str, words: list[str], min_score: float, device: str) -> Opened:
+    import torch
+    import transformers
+
+    kind = "ZeroShotObjectDetection" if words else "ObjectDetection"
+    try:
+        model = getattr(transformers, f"AutoModelFor{kind}").from_pretrained(name)
+        loader = transformers.AutoProcessor if words else transformers.AutoImageProcessor
+        processor = loader.from_pretrained(name)
+    except (OSError, ValueError) as error:
+        advice = "" if words else "; a detector of free text needs --words"
+        raise ReobjError(f"hf:{name}: {str(error).splitlines()[0]}{advice}") from error
+    model = model.to(device).eval()
+
+    def run(images: list[Image]) -> Any:
+        count = len(images)
+        text = {"text": [words] * count, "padding": True, "truncation": True} if words else {}
+        inputs = processor(images=images, return_tensors="pt", **text).to(device)
+        with torch.inference_mode():
+            outputs = model(**inputs)
+        asked: dict[str, Any] = {"threshold": min_score}
+        asked["target_sizes"] = [image.shape[:2] for image in images]
+        if not words:
+            return processor.post_process_object_detection(outputs, **asked)
+        if "input_ids" in inputs and type(processor).__name__.startswith("GroundingDino"):
+            asked |= {"input_ids": inputs["input_ids"], "text_threshold": min_score}
+        else:
+            asked["text_labels"] = [words] * count
+        answers = processor.post_process_grounded_object_detection(outputs, **asked)
+        return (_with_words(found, words) for found in answers)
+
+    return run, tuple(words) or names_by_number(model.config.id2label)
+
+
+def _with_words(image: Any, words: list[str]) -> dict[str, Any]:
+    """Number detections of one image by the word that shares most tokens with their phrase.
+
+    Grounding DINO returns phrases, which may lack tokens of a word or join several words.
+    """
+    phrases = [set(str(text).lower().split()) for text in image["text_labels"]]
+    tokens = [set(word.lower().split()) for word in words]
+    shared = np.array([[len(p & t) / len(t) for t in tokens] for p in phrases])
+    shared = shared.reshape(len(phrases), len(words))
+    rows = np.flatnonzero(shared.max(1, initial=0) > 0)
+    kept = {key: image[key][rows] for key in ("boxes", "scores")}
+    return kept | {"labels": shared[rows].argmax(1)}
+
+
+LIBRARIES = {
+    "ultralytics": Library(_ultralytics, "ultralytics", "yolov8s-worldv2.pt", is_rgb=False),
+    "rfdetr": Library(_rfdetr, "rfdetr"),
+    "torchvision": Library(_torchvision, "torchvision"),
+    "hf": Library(_transformers, "transformers torchvision", "IDEA-Research/grounding-dino-tiny"),
+}
+
+
+def library_of(detector: str) -> tuple[str, str] | None:
+    """Split `library:model` or `FILE.pt`; None: another kind of detector."""
+    name, _, model = detector.partition(":")
+    if name in LIBRARIES and model:
+        return name, model
+    return ("ultralytics", detector) if Path(detector).suffix == ".pt" else None
+
+
+def _library_source(
+    detector: str, words: list[str], config: DetectConfig, device: str
+) -> tuple[DetectionSource, str]:
+    """Open a detector of another library.
+
+    Args:
+        detector: `library:model`, or a .pt file of ultralytics. words: to look for; []: the
+            model's classes. device: of PyTorch.
+    Returns:
+        the source, and name and version of its library for cache keys.
+    Raises:
+        ReobjError: the library is not installed, has no such model, or does not take words.
+    """
+    name, model = library_of(detector) or ("", "")
+    library = LIBRARIES[name]
+    if words and not library.takes_words:
+        raise fixed_classes(detector)
+    with failing(f"--detector {detector}"):
+        try:
+            run, names = library.open(model, words, config.min_score, device)
+        except ImportError as error:
+            raise ReobjError(f"--detector {detector}: {error}; it needs: pip install "
+                             f"{library.install}, or what {name} needs for this model"
+                             ) from error  # fmt: skip
+
+    def answer(images: list[Image]) -> Iterator[Any]:
+        with failing(f"--detector {detector}", len(images)):
+            yield from run([a[..., ::-1].copy() for a in images] if library.is_rgb else images)
+
+    source = _source_of(answer, names, has_numbers=False)
+    batch = frames_at_once(config.batch, device)
+    source = dataclasses.replace(source, slow=True, always_looks=True, batch=batch)
+    package = library.install.partition(" ")[0]
+    return _filtered(source, config), f"{package} {importlib.metadata.version(package)}"
+
+
+def is_function(detector: str) -> bool:
+    """Return whether a detector is named as `module:function`."""
+    module, _, function = detector.partition(":")
+    return all(part.isidentifier() for part in [*module.split("."), function])
+
+
+def user_function(detector: str) -> Any:
+    """Import `module:function`, also from the current folder."""
+    module, _, function = detector.partition(":")
+    sys.path.insert(0, str(Path.cwd()))
+    try:
+        found = getattr(importlib.import_module(module), function)
+    except (ImportError, AttributeError) as error:
+        known = ", ".join(LIBRARIES)
+        text = f"expected a function of a module in this folder or installed, or one of {known}"
+        raise ReobjError(f"--detector {detector}: {error}; {text}") from error
+    finally:
+        sys.path.pop(0)
+    if not callable(found):
+        raise ReobjError(f"--detector {detector}: it is no function image -> detections")
+    return found
+
+
+def fixed_classes(detector: str) -> ReobjError:
+    """Make the error for words given to a detector with fixed classes."""
+    others = [f"{name}:{lib.takes_words}" for name, lib in LIBRARIES.items() if lib.takes_words]
+    return ReobjError(
+        f"--words: {detector} has fixed classes; detectors that take words: {', '.join(others)}"
+    )
+
+
+def _unknown(detector: str, known: Any) -> ReobjError:
+    """Make the error for a name that a library does not have."""
+    return ReobjError(f"--detector {detector}: no such model; there are {', '.join(sorted(known))}")

@@ -1,6 +1,7 @@
-"""Image files: selection, order and times of the frames of a folder; reading images.
+"""Image files and decoding: frames of a folder, of video files, streams, cameras and animations.
 
-Start at `list_images`.
+Start at `list_images` and `open_file`. PyAV reads everything but images (OpenCV, their headers
+Pillow), cameras (OpenCV) and animated images (Pillow).
 """
 
 from __future__ import annotations
@@ -9,21 +10,27 @@ import contextlib
 import enum
 import glob
 import itertools
+import math
 import re
+import time
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 from PIL import Image as PillowImage
+from PIL import ImageSequence
 
 from reobj.files import shortened
-from reobj.types import Array, ReobjError
+from reobj.runtime import quiet_opencv
+from reobj.types import Array, Image, ReobjError
 
 IMAGE_FPS = 30.0  # Hz, rate of images without times; chosen: most phones record at 30 Hz
 IMAGE_SUFFIXES = tuple(".jpg .jpeg .jpe .jfif .mpo .png .bmp .webp .tif .tiff".split())
@@ -124,21 +131,6 @@ OTHER_WORDS = frozenset(
 )
 
 
-@dataclass(slots=True)
-class _Kind:
-    """Images whose names differ only in their numbers."""
-
-    files: list[Path]
-    is_named_otherwise: bool
-    numbers: set[tuple[int, ...]]
-    color: bool
-
-    def shares(self, other: _Kind) -> bool:
-        """Test whether more than half of the smaller kind has numbers of the other one."""
-        count = min(len(self.numbers), len(other.numbers))
-        return () not in self.numbers and 2 * len(self.numbers & other.numbers) > count
-
-
 def _only_pictures(
     files: list[Path], headers: dict[Path, Header | None], folder: str
 ) -> tuple[list[Path], list[str]]:
@@ -157,24 +149,26 @@ def _only_pictures(
     elif deep:
         files = [p for p in files if p not in set(deep)]
         messages.append(_left_out(deep, "one channel with more than 8 bits, as depth maps have"))
-    kinds = _kinds(files, headers)
-    for kind in list(kinds):
-        beside = [k for k in kinds if k is not kind and kind.shares(k)]
-        gray = not kind.color and any(k.color for k in beside)
-        if gray or (kind.is_named_otherwise and not all(k.is_named_otherwise for k in beside)):
-            why = "one channel, beside images in colour" if gray else "by their name"
-            messages.append(_left_out(kind.files, why))
-            kinds.remove(kind)
+    kinds = _kinds(files)
+    grays = {p for p in files if (h := headers[p]) is not None and h.is_gray}
+    gray = {name: grays >= kinds[name].keys() for name in kinds}
+    other = {name: not OTHER_WORDS.isdisjoint(re.split(r"[^a-z]+", name)) for name in kinds}
+    for name in list(kinds):
+        beside = [k for k in kinds if k != name and _share_numbers(kinds[k], kinds[name])]
+        masks = gray[name] and not all(gray[k] for k in beside)
+        if masks or (other[name] and not all(other[k] for k in beside)):
+            why = "one channel, beside images in colour" if masks else "by their name"
+            messages.append(_left_out(list(kinds.pop(name)), why))
     least = 3  # images of each of two kinds: the numbers of fewer may agree by chance
-    for pair in itertools.combinations(kinds if folder else (), 2):
-        if pair[0].shares(pair[1]) and min(len(k.files) for k in pair) >= least:
-            names = [min((p.name for p in k.files), key=by_number) for k in pair]
+    for pair in itertools.combinations(kinds.values() if folder else (), 2):
+        if _share_numbers(*pair) and min(map(len, pair)) >= least:
+            names = [min((p.name for p in kind), key=by_number) for kind in pair]
             chosen = re.sub(r"\d+", "*", glob.escape(names[0]))
             raise ReobjError(
                 f"{folder}: two kinds of images, {' and '.join(names)}; which are the frames? "
                 f"Give a glob in quotes, such as '{Path(folder) / chosen}'"
             )
-    return [p for kind in kinds for p in kind.files], messages
+    return [p for kind in kinds.values() for p in kind], messages
 
 
 def _left_out(files: Sequence[Path], why: str) -> str:
@@ -182,22 +176,29 @@ def _left_out(files: Sequence[Path], why: str) -> str:
     return f"{len(files)} images are no frames ({why}): {first}" + " ..." * (len(files) > 1)
 
 
-def _kinds(files: Sequence[Path], headers: dict[Path, Header | None]) -> list[_Kind]:
-    """Group images by their names without numbers; copies, a(1).jpg, belong to the original."""
-    groups: dict[str, list[tuple[Path, str]]] = {}
+def _kinds(files: Sequence[Path]) -> dict[str, dict[Path, tuple[int, ...]]]:
+    """Group images by their names without numbers, in lower case; with the numbers that differ.
+
+    Copies, a(1).jpg, belong to the original.
+    """
+    groups: dict[str, dict[Path, list[str]]] = {}
     for path in files:
         stem = re.sub(r"\s*\(\d+\)$", "", path.stem.casefold())
-        groups.setdefault(re.sub(r"\d+", "#", stem) + path.suffix.lower(), []).append((path, stem))
-    kinds = []
-    for text, members in groups.items():
-        rows = np.array([re.findall(r"\d+", stem) for _, stem in members], object)
-        varied = [len(set(column)) > 1 for column in rows.T.tolist()] if len(rows) > 1 else ...
-        numbers = {tuple(map(int, row)) for row in rows[:, varied].tolist()}
-        known = [h for path, _ in members if (h := headers[path]) is not None]
-        color = 2 * sum(h.is_gray for h in known) <= len(known)
-        named = not OTHER_WORDS.isdisjoint(re.split(r"[^a-z]+", text.rpartition(".")[0]))
-        kinds.append(_Kind([path for path, _ in members], named, numbers, color))
+        name = re.sub(r"\d+", "#", stem) + path.suffix.lower()
+        groups.setdefault(name, {})[path] = re.findall(r"\d+", stem)
+    kinds = {}
+    for name, members in groups.items():
+        columns = list(zip(*members.values(), strict=True))
+        varied = [k for k, column in enumerate(columns) if len({*column}) > 1 or len(members) == 1]
+        kinds[name] = {path: tuple(int(row[k]) for k in varied) for path, row in members.items()}
     return kinds
+
+
+def _share_numbers(kind: dict[Path, tuple[int, ...]], other: dict[Path, tuple[int, ...]]) -> bool:
+    """Test whether more than half of the smaller kind of images has numbers of the other one."""
+    one = {*kind.values()}
+    two = {*other.values()}
+    return () not in one and 2 * len(one & two) > min(len(one), len(two))
 
 
 # ---- Order and times of names --------------------------------------------------------------------
@@ -216,26 +217,8 @@ def by_number(name: str) -> tuple[Any, ...]:
 
 
 def sorted_names(names: Iterable[str]) -> list[str]:
-    """Sort names by the numbers in them, decimal numbers by their value."""
-    names = list(names)
-    if (values := _decimals(names)) is None:
-        return sorted(names, key=by_number)
-    order = sorted(range(len(names)), key=lambda k: (values[k], by_number(names[k])))
-    return [names[k] for k in order]
-
-
-def _decimals(names: Sequence[str]) -> list[float] | None:
-    """Read the numbers at the end of otherwise equal names; None if the names differ elsewhere."""
-    decimal = re.compile(r"(.*?)((?:(?<![^_= ])-)?\d+(?:\.(\d+))?)")  # no hyphen after a word
-    matches = [decimal.fullmatch(Path(name).stem.casefold()) for name in names]
-    known = [match for match in matches if match is not None]
-    if not known or len(known) < len(names) or len({match[1] for match in known}) > 1:
-        return None
-    digits = [match[3] for match in known if match[3]]
-    # 1.8, 1.9, 1.10 are two counters: decimals of unequal length do not end in 0 (except 10.0)
-    if len(set(map(len, digits))) > 1 and any(len(d) > 1 and d.endswith("0") for d in digits):
-        return None
-    return [float(match[2]) for match in known]
+    """Sort names by the numbers in them."""
+    return sorted(names, key=by_number)
 
 
 class TimeUnit(enum.Enum):
@@ -264,13 +247,11 @@ def times_of_names(names: Sequence[str]) -> Array | None:
     words = [re.findall(r"\d+(?:\.\d+)?", Path(name).stem)[-1:] for name in names]
     if not words or not all(words):
         return None
-    decimals = _decimals(names)
-    numbers = np.array(decimals or [float(word) for (word,) in words])
+    numbers = np.array([float(word) for (word,) in words])
     steps = np.diff(numbers)
-    points = ["." in word for (word,) in words]
     if (steps <= 0).any():
         return None
-    if all(points) or (decimals and any(points)):  # in s, unless closer than on the fastest phones
+    if all("." in word for (word,) in words):  # in s, unless closer than on the fastest phones
         return numbers if not len(steps) or np.median(steps) >= 1 / 240 else None
     units = [unit.value for unit in TimeUnit if all(map(is_date, numbers / unit.value))]
     return numbers / units[0] if units else None
@@ -318,14 +299,10 @@ def exif_orientation(path: Path) -> int:
 
 
 def header(path: Path) -> Header | None:
-    """Read the header of an image file; None if Pillow cannot.
-
-    Raises:
-        ReobjError: more pixels than Pillow allows.
-    """
+    """Read the header of an image file; None if Pillow cannot."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # half as many pixels, as photos of phones have
+            warnings.simplefilter("ignore")  # many pixels, as photos of phones have
             with PillowImage.open(path) as image:
                 turn = _orientation(image)
                 turned = image.format != "TIFF" and turn >= 5  # Pillow turns TIFF itself
@@ -337,8 +314,6 @@ def header(path: Path) -> Header | None:
                     1 if image.format == "MPO" else getattr(image, "n_frames", 1),
                     turn,
                 )
-    except PillowImage.DecompressionBombError as error:
-        raise ReobjError(f"{path}: {error}") from None
     except Exception:  # Pillow raises ten types of errors for damaged files
         return None
 
@@ -350,16 +325,191 @@ def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> npt.NDArray[Any] | 
         image = cv2.imdecode(data, flags) if len(data) else None
     except (OSError, cv2.error):
         return None
-    if image is None:  # OpenCV 4 reads no animated WebP
-        with contextlib.suppress(Exception), PillowImage.open(path) as opened:
-            if getattr(opened, "is_animated", False):
-                image = np.ascontiguousarray(np.asarray(opened.convert("RGB"))[..., ::-1])
     return image
 
 
-def why_unreadable(path: Path) -> str:
-    """Say why `read_image` returns no image in colour."""
-    image = read_image(path, cv2.IMREAD_UNCHANGED)
-    if image is None:
-        return "damaged, or no image"
-    return f"pixels of type {image.dtype}; convert them to 8 bits a channel"
+# ---- Decoding ------------------------------------------------------------------------------------
+
+
+class Decoded(NamedTuple):
+    """A frame: time in s (NaN: none), its image in BGR (None: undecodable, or not yet there).
+
+    turned: rotation by metadata of the upright image against the stored one, deg anticlockwise.
+    """
+
+    time_s: float = math.nan
+    image: Callable[[], Image] | None = None
+    turned: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Opened:
+    """An opened source.
+
+    Attributes:
+        frames: in the order of their display. codec: name.
+        fps, count, duration_s: declared rate in Hz, number of frames and length in s; 0: unknown.
+        pixel_aspect: width over height of a stored pixel.
+    """
+
+    frames: Generator[Decoded]
+    codec: str = ""
+    fps: float = 0.0
+    count: int = 0
+    duration_s: float = 0.0
+    pixel_aspect: Fraction = Fraction(1)
+
+
+def open_camera(number: int, silent_s: float) -> Opened:
+    """Open a camera, which ends after `silent_s` without a frame."""
+    with quiet_opencv():
+        capture = cv2.VideoCapture(number)
+    if not capture.isOpened():
+        raise ReobjError("cannot be opened as a camera (is it connected?)")
+    return Opened(_camera_frames(capture, silent_s), fps=capture.get(cv2.CAP_PROP_FPS))
+
+
+def _camera_frames(capture: Any, silent_s: float) -> Generator[Decoded]:
+    last_s = time.monotonic()
+    try:
+        while time.monotonic() - last_s < silent_s:
+            ok, image = capture.read()
+            if not ok:
+                time.sleep(0.01)
+                continue
+            last_s = time.monotonic()
+            yield Decoded(image=partial(np.asarray, image))
+    finally:
+        capture.release()
+
+
+def open_animation(path: Path) -> Opened:
+    """Open an animated image file, whose header can be read."""
+    return Opened(_animation_frames(path), path.suffix)
+
+
+def _animation_frames(path: Path) -> Generator[Decoded]:
+    milliseconds = 0.0
+    with PillowImage.open(path) as image:
+        for frame in ImageSequence.Iterator(image):
+            try:
+                bgr = np.asarray(frame.convert("RGB"))[..., ::-1]
+            except (OSError, ValueError):
+                yield Decoded()
+                continue
+            yield Decoded(milliseconds / 1000, partial(np.ascontiguousarray, bgr))
+            milliseconds += frame.info.get("duration", 0)
+
+
+def open_file(address: str, open_s: float | None = None, read_s: float | None = None) -> Opened:
+    """Open a video file, or with time limits the URL of a stream or file.
+
+    Raises:
+        ReobjError: no container, no video stream in it, or no decoder. The source is not named.
+    """
+    import av
+
+    try:  # tags in other encodings than UTF-8 are no error
+        options = {"rtsp_flags": "prefer_tcp"}
+        timeout = (open_s, read_s) if open_s else None
+        file = av.open(address, options=options, timeout=timeout, metadata_errors="replace")
+    except (av.FFmpegError, OSError, ValueError) as error:
+        late = isinstance(error, av.error.ExitError)
+        reason = "no answer in time" if late else getattr(error, "strerror", "") or error
+        raise ReobjError(f"cannot be opened as a video ({reason})") from None
+    cover = av.stream.Disposition.attached_pic
+    stream = next((s for s in file.streams.video if not s.disposition & cover), None)
+    if stream is None or stream.codec_context is None:
+        file.close()
+        codec = "its codec cannot be decoded here; convert it (ffmpeg -i IN OUT.mp4)"
+        raise ReobjError("no video in it" if stream is None else codec)
+    fps = float(stream.guessed_rate or 0)
+    duration_s = float((stream.duration or 0) * stream.time_base)
+    if not duration_s and len(file.streams) == 1:  # else it may be that of the sound
+        duration_s = (file.duration or 0) / 1e6 - (file.start_time or 0) / 1e6
+    count = stream.frames or round((duration_s or (file.duration or 0) / 1e6) * fps)
+    # Several frames at a time delay those of a live stream
+    stream.thread_type = "AUTO" if count or not open_s else "SLICE"
+    aspect = stream.sample_aspect_ratio or Fraction(1)
+    return Opened(_file_frames(file, stream), stream.name, fps, count, duration_s, aspect)
+
+
+def _packets(file: Any, stream: Any) -> Iterator[Any]:
+    """Read the packets of a stream up to its end or a time limit, across damaged places."""
+    import av
+
+    for _ in range(64):  # places
+        try:
+            yield from file.demux(stream)
+        except av.error.ExitError:  # time limit
+            break
+        except av.FFmpegError:
+            continue
+        break
+    yield None  # returns the frames that the decoder holds
+
+
+def packet_count(path: str) -> int:
+    """Count the packets of the video stream of a file: its frames."""
+    import av
+
+    with av.open(path, metadata_errors="replace") as file:
+        return sum(1 for packet in _packets(file, file.streams.video[0]) if packet and packet.size)
+
+
+def _file_frames(file: Any, stream: Any) -> Generator[Decoded]:
+    import av
+
+    reformatter = av.video.reformatter.VideoReformatter()
+    start_s = float((stream.start_time or 0) * stream.time_base)
+    with file:
+        for packet in _packets(file, stream):
+            try:
+                frames = stream.decode(packet)
+            except av.EOFError:  # the decoder has returned all frames
+                return
+            except av.FFmpegError:
+                yield Decoded()
+                continue
+            for frame in frames:
+                at = frame.dts if frame.pts is None else frame.pts
+                time_s = math.nan if at is None else float(at * stream.time_base) - start_s
+                yield Decoded(time_s, partial(_bgr, reformatter, frame), frame.rotation)
+
+
+def _bgr(reformatter: Any, frame: Any) -> Image:
+    """Convert a frame to BGR, upright by the rotation in its metadata."""
+    # Bicubic: the pixels are those of OpenCV's VideoCapture
+    image = reformatter.reformat(frame, format="bgr24", interpolation="BICUBIC").to_ndarray()
+    quarters = round(frame.rotation / 90) % 4  # anticlockwise; OpenCV's codes count clockwise
+    return np.asarray(cv2.rotate(image, 3 - quarters) if quarters else image, np.uint8)
+
+
+def settled_times(raw_s: Array, step_s: float) -> tuple[Array, int, bool]:
+    """Make the times of frames (F,) strictly increasing.
+
+    Where the clock restarts (concatenated recordings), times continue one step after the frame
+    before. Other times that do not increase are interpolated. Times before the first one that does
+    not increase are unchanged.
+
+    Args:
+        raw_s: times in the container, NaN: none. step_s: interval of frames without times.
+    Returns:
+        times (F,) in s, number of restarts of the clock, and whether the container has times.
+    """
+    restart_steps = 3.0  # backward, in usual steps; less is a wrong or coarse time stamp
+    count = len(raw_s)
+    known = np.flatnonzero(np.isfinite(raw_s))
+    if len(known) < 2 or np.ptp(raw_s[known]) == 0:
+        return np.arange(0.0, count) * step_s, 0, count < 2 and len(known) == count
+    time_s: Array = np.interp(np.arange(count), known, raw_s[known])  # (F,)
+    steps = np.diff(time_s)  # (F - 1,)
+    step = float(np.median(steps[steps > 0])) if (steps > 0).any() else step_s
+    restarts = steps < -restart_steps * step
+    time_s[1:] += np.cumsum(np.where(restarts, step - steps, 0))
+    highest = np.maximum.accumulate(time_s)
+    rising = np.flatnonzero(np.r_[True, time_s[1:] > highest[:-1]])
+    if len(rising) < count:
+        end_s = time_s[rising[-1]] + step * (count - rising[-1])
+        time_s = np.interp(np.arange(count), [*rising, count], [*time_s[rising], end_s])
+    return time_s, int(restarts.sum()), True

@@ -14,9 +14,15 @@ import numpy as np
 
 from reobj.files import LINES_MAX, read_lines, read_text
 from reobj.sources.class_names import is_yaml, load_class_names
-from reobj.sources.image_frames import frames_of_names
-from reobj.sources.masks import NO_RUNS, polygon_runs
-from reobj.sources.recorded import CENTRES, NORMALISED_MAX, RecordedDetections, Source
+from reobj.sources.recorded import (
+    CENTRES,
+    NO_RUNS,
+    NORMALISED_MAX,
+    RecordedDetections,
+    Source,
+    frames_of_names,
+    polygon_runs,
+)
 from reobj.types import COCO_NAMES, Array, IntArray, ReobjError, cxcywh_from_xyxy
 
 NO_LABELS = ("classes.txt train.txt val.txt valid.txt test.txt readme.txt readme.dataset.txt "
@@ -83,7 +89,7 @@ def read_label_folder(source: Source, pose: int = 0) -> RecordedDetections:
                              " a corner is no fraction of the image size")  # fmt: skip
         box[i] = cxcywh_from_xyxy(np.hstack([points.min(0), points.max(0)])[None])[0]
         if not source.describes:
-            runs[i] = polygon_runs([(points * video.size).ravel().tolist()], video.size)
+            runs[i] = polygon_runs([points * video.size], video.size)
     six = np.array([row[2:] for row in rows if len(row) == 6]).reshape(-1, 4)
     if len(six) == len(box) and _leaving(box) > 0.1 and _leaving(six) < 0.02:
         raise ReobjError(f"{path}: boxes that leave the image as class cx cy w h conf fit it as "

@@ -1,14 +1,16 @@
-"""Layouts of ONNX detectors: how each family is recognised, fed and decoded.
+"""ONNX detectors: `OnnxDetector` runs a model in one of the layouts.
 
-LAYOUTS is the registry; docs/input_formats.md has its table. `OnnxDetector` runs the models.
+LAYOUTS is the registry of families: how each is recognised, fed and decoded. docs/input_formats.md
+has its table.
 """
 
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,8 +19,31 @@ import cv2
 import numpy as np
 
 from reobj.formats import Format, Probe, Registry
-from reobj.sources.weights import IMAGENET_MEAN, IMAGENET_STD
-from reobj.types import Array, BoolArray, Image, IntArray, ReobjError, xyxy_from_cxcywh
+from reobj.sources.class_names import load_class_names, names_by_number, parse_yaml
+from reobj.sources.detection_files import DetectConfig, class_filter, unnamed_class
+from reobj.sources.video import in_batches
+from reobj.sources.weights import (
+    IMAGENET_MEAN,
+    IMAGENET_STD,
+    failing,
+    frames_at_once,
+    known_weights,
+    model_path,
+    onnx_session,
+)
+from reobj.types import (
+    COCO_NAMES,
+    NOTE_START,
+    Array,
+    BoolArray,
+    Detections,
+    Image,
+    IntArray,
+    ReobjError,
+    as_frame,
+    log,
+    xyxy_from_cxcywh,
+)
 
 GFL_BINS = 8  # bins of a distance, 0 to 7 strides (NanoDet-Plus, PicoDet: reg_max 7)
 
@@ -335,6 +360,10 @@ def _layout(
     return Layout(name, title, recognise, decode, shape=shape, classes=classes, **fields)
 
 
+def _in_px(model: ModelProbe) -> bool:
+    return not model.in_fractions
+
+
 IMAGENET_RGB = Pixels("RGB, ImageNet", True, IMAGENET_MEAN, IMAGENET_STD)
 IMAGENET_BGR = Pixels("BGR, ImageNet", False, IMAGENET_MEAN[::-1], IMAGENET_STD[::-1])
 BYTES_BGR = Pixels("BGR, 0..255", False, std=(1.0, 1.0, 1.0))
@@ -356,18 +385,18 @@ ENTRIES: list[Layout] = [
             _decode_zoo, fit="corner", pixels=CAFFE_BGR, nms_iou=None),
     _layout("yolo", f"{YOLO}, also -seg", "(1, 4 + classes [+ 32], cells)[, (1, 32, h, w)]",
             lambda m: m.values(0) - 4 - sum(shape[1] for shape in m.shapes[1:] if len(shape) == 4),
-            _decode_yolo, ("", "detect", "segment"), also=lambda m: not m.in_fractions,
+            _decode_yolo, ("", "detect", "segment"), also=_in_px,
             fit="centre"),
     _layout("yolo-rows", f"{YOLO}, transposed", "(1, cells, 4 + classes)",
             lambda m: m.values(1) - 4,
             lambda outs, *more: _decode_yolo([outs[0].swapaxes(1, 2)], *more),
-            also=lambda m: not m.in_fractions, fit="centre"),
+            also=_in_px, fit="centre"),
     _layout("yolo-obb", f"{YOLO}, rotated boxes: the upright one around each",
             "(1, 4 + classes + 1, cells)", lambda m: m.values(0) - 5, _decode_rotated, ("obb",),
-            also=lambda m: not m.in_fractions, fit="centre"),
+            also=_in_px, fit="centre"),
     _layout("yolo-pose", f"{YOLO}, key points", "(1, 4 + classes + key points, cells)",
             lambda m: m.values(0) - 4 - _keypoint_values(m), _decode_yolo, ("pose",),
-            also=lambda m: not m.in_fractions, fit="centre", unread="the key points"),
+            also=_in_px, fit="centre", unread="the key points"),
     _layout("yolov5", "YOLOv5, YOLOv7, YOLOv6", "(1, cells or 3 * cells, 5 + classes)",
             lambda m: max(m.values(1), m.values(1, boxes=3)) - 5, _decode_yolov5,
             also=lambda m: m.in_px and ("output" not in m.outputs or not m.values(1)),
@@ -418,3 +447,180 @@ def layouts_table() -> str:
         image = f"{entry.fit}, {entry.pixels.title}"
         rows.append((f"`{entry.name}`", entry.title, entry.shape, image, entry.unread))
     return "".join(f"| {' | '.join(row)} |\n" for row in rows)
+
+
+# ---- The detector -------------------------------------------------------------------------------
+
+
+NAMES = "give a file of names with --set detect.class_names=FILE"
+
+
+def check_names(class_id: IntArray, names: Sequence[str], where: str = "") -> None:
+    """Refuse class ids (D,) without a name."""
+    if len(class_id) and class_id.max() >= len(names):
+        raise ReobjError(where + unnamed_class(int(class_id.max()), len(names)))
+
+
+def best_boxes(
+    xyxy: Array, score: Array, use: BoolArray, size: Sequence[int], config: DetectConfig
+) -> tuple[Array, IntArray]:
+    """Clip boxes to the image of (w, h); select rows, among those to `use`, by score and area.
+
+    Returns:
+        the boxes (N, 4) of all rows, and the selected rows, best first.
+    """
+    boxes = np.clip(xyxy, 0, np.tile(size, 2))
+    rows = np.flatnonzero(use & (score >= config.min_score) & (boxes[:, 2:] > boxes[:, :2]).all(1))
+    return boxes, rows[best_rows(score[rows])]
+
+
+class OnnxDetector:
+    """Detect objects with an ONNX model of one of the `onnx_layouts`.
+
+        detector = OnnxDetector("fast")
+        detections = detector(image)  # BGR; boxes in its pixels
+
+    Args:
+        path_or_name: file or name of a model ("": `config.model`).
+        threads: of onnxruntime (0: all cores). offline: never download.
+        device: cpu, cuda, coreml, ... (`onnx_session`).
+    Attributes:
+        class_names: names by class id. layout: name of the layout. path: of the file.
+        batch: most images that `detect` gives the network at once. messages: which layout was
+            recognised; (): it is declared.
+    Raises:
+        ReobjError: no such file; outputs of no layout, or of several; or names of the classes that
+            are not as many as the layout has.
+    """
+
+    def __init__(
+        self,
+        path_or_name: str | Path = "",
+        config: DetectConfig | None = None,
+        threads: int = 0,
+        offline: bool = False,
+        device: str = "cpu",
+    ) -> None:
+        self.config = config or DetectConfig()
+        name = path_or_name or self.config.model
+        weights = known_weights(name)
+        self.path = model_path(name, offline)
+        self._session = onnx_session(self.path, threads, device)
+        self._inputs = {i.name: list(i.shape) for i in self._session.get_inputs()}
+        kind = self._session.get_inputs()[0].type
+        self._image_input, shape = next(iter(self._inputs.items()))
+        if kind != "tensor(float)" or len(shape) not in (3, 4) or shape[-3] != 3:
+            raise ReobjError(f"{self.path}: no known object detector: input is {kind} {shape}, "
+                             "expected an image (1, 3, H, W)")  # fmt: skip
+        axis = shape[0] if len(shape) == 4 else 1
+        self._fixed = axis if isinstance(axis, int) else 0  # images of every run; 0: any number
+        self.batch = self._fixed or frames_at_once(self.config.batch, device)
+        self._model = self._trial_run()
+        self._layout, self.class_names = self._recognise(weights.layout if weights else "")
+        self.layout = self._layout.name
+        wanted = self.config.classes
+        self._allowed = class_filter(wanted, self.class_names) if wanted else None
+
+    def __call__(self, image: Image) -> Detections:
+        """Detect the objects in one BGR image (H, W, 3); best first, boxes clipped to the image."""
+        return next(self.detect([image]))
+
+    def detect(self, images: Sequence[Image]) -> Iterator[Detections]:
+        """Detect the objects in each of several images, as one call for each would."""
+        images = [as_frame(image) for image in images]
+        # Images of the same input size are given to the network together
+        for size, group in itertools.groupby(images, lambda a: self._input_size(*a.shape[1::-1])):
+            for batch in in_batches(group, self.batch):
+                fitted = [fit_image(image, size, self._layout.fit) for image in batch]
+                with failing(str(self.path), len(batch)):
+                    each = self._run(fitted, self._layout.pixels)
+                for outputs, (_, geometry) in zip(each, fitted, strict=True):
+                    yield self._decoded(outputs, geometry)
+
+    def _decoded(self, outputs: list[Any], geometry: Geometry) -> Detections:
+        """Decode and select the detections of one image."""
+        assert self._layout.read is not None
+        decoded = self._layout.read(outputs, geometry, self._model)
+        label = decoded.class_id
+        use = label >= 0 if self._allowed is None else np.isin(label, self._allowed)
+        size = geometry.image_size
+        boxes, keep = best_boxes(decoded.xyxy, decoded.score, use, size, self.config)
+        if self._layout.nms_iou is not None:
+            keep = keep[nms(boxes[keep], label[keep], self._layout.nms_iou)]
+        keep = keep[: self.config.max_detections or 100]  # of a frame (COCO's maxDets)
+        check_names(label[keep], self.class_names, f"{self.path}: ")
+        masks = decoded.masks(keep) if decoded.masks is not None else None
+        return Detections(boxes[keep], decoded.score[keep], label[keep], masks)
+
+    def _input_size(self, width: int, height: int) -> tuple[int, int]:
+        """Return the input (w, h) for an image: the model's, or, if dynamic, the image's shape."""
+        fixed = self._inputs[self._image_input][:-3:-1]
+        longer = 640  # px, longer side (YOLO11's training size)
+        stride = 32  # px, largest cells of YOLO: sides are multiples of it
+        ratio = longer / max(width, height) / stride
+        scaled = [max(math.ceil(round(v * ratio, 3)), 1) * stride for v in (width, height)]
+        w, h = (a if isinstance(a, int) else b for a, b in zip(fixed, scaled, strict=True))
+        return w, h
+
+    def _run(self, fitted: list[tuple[Image, Geometry]], pixels: Pixels) -> list[list[Any]]:
+        """Run the model on fitted BGR images; return the outputs of each, with a batch axis of 1.
+
+        A fixed batch is filled up with the last image.
+        """
+        count = len(fitted)
+        fitted = fitted + fitted[-1:] * (self._fixed - count)
+        mean, std = np.array([pixels.mean, pixels.std], np.float32)
+        canvases = np.stack([canvas for canvas, _ in fitted])
+        blob = (canvases[..., ::-1] if pixels.rgb else canvases).astype(np.float32)
+        blob = np.ascontiguousarray(((blob - mean) / std).transpose(0, 3, 1, 2))  # (B, 3, H, W)
+        sizes = np.array([geometry.image_size for _, geometry in fitted])
+        image = blob if len(self._inputs[self._image_input]) == 4 else blob[0]
+        feeds = dict.fromkeys(self._inputs, sizes) | {self._image_input: image}
+        outputs = [np.asarray(output) for output in self._session.run(None, feeds)]
+        if len(fitted) == 1:
+            return [outputs]  # some have no batch axis
+        if any(output.shape[:1] != (len(fitted),) for output in outputs):
+            raise RuntimeError("its outputs have no batch axis")
+        return [[output[i : i + 1] for output in outputs] for i in range(count)]
+
+    def _trial_run(self) -> ModelProbe:
+        """Run the model on a square grey image to get the shapes of its outputs."""
+        size = self._input_size(1, 1)
+        grey = np.full((size[1], size[0], 3), 114, np.uint8)
+        with failing(f"{self.path}: no known object detector: a trial run", 1):
+            (outputs,) = self._run([(grey, Geometry(size, size, (1.0, 1.0), (0, 0)))], UNIT_RGB)
+            names = [output.name for output in self._session.get_outputs()]
+            metadata = self._session.get_modelmeta().custom_metadata_map
+        of_name = dict(zip(names, outputs, strict=True))
+        return ModelProbe(self.path, self._inputs, of_name, size, metadata)
+
+    def _recognise(self, declared: str) -> tuple[Layout, tuple[str, ...]]:
+        """Find the layout, and the names of its classes: by option, metadata, COCO, or numbers.
+
+        declared: layout of known weights.
+        """
+        names: tuple[str, ...] = ()
+        names_of = f"of COCO, as the model names none; {NAMES}"
+        if self.config.class_names:
+            names_of = self.config.class_names
+            names = load_class_names(names_of)
+        elif text := self._model.metadata.get("names", "").strip():
+            names_of = "of its metadata"
+            where = f"{self.path}: metadata `names`; {NAMES}"
+            names = names_by_number(parse_yaml(text, where), where)
+        self._model.count = len(names or COCO_NAMES)
+        declared = self.config.layout or declared
+        layout = find_layout(self._model, declared, names_of)
+        count = layout.classes(self._model)
+        if count not in (None, self._model.count):
+            if names:
+                raise ReobjError(f"{self.path}: {len(names)} class names ({names_of}), but layout "
+                                 f"{layout.name} has {count} classes")  # fmt: skip
+            log.warning("%s: %d classes without names: %s", self.path, count, NAMES)
+            names = tuple(f"class {i}" for i in range(count or 0))
+        names = names or COCO_NAMES
+        self._model.count = len(names)
+        unread = f"; not read: {layout.unread}" if layout.unread else ""
+        text = f"{NOTE_START}{self.path}: read as {layout.name} ({layout.title}){unread}"
+        self.messages = () if declared else (text,)
+        return layout, names

@@ -1,12 +1,21 @@
-"""Detections of a video as arrays, and the npz format for them and their masks.
+"""Detections of a video as arrays: frames of a file, masks, and the npz format.
 
-A reader (`detection_formats`) makes them from a `Source`; `detection_files` validates the content.
+A reader of `detection_files.DETECTIONS` makes `RecordedDetections` from a `Source`, with one rule
+for frames in all formats: names are matched to those of the source's images (`frame_lookup`). If
+none matches, the number in a name is that of an image, or of a frame. A number 0, or one that only
+counting from 1 places in the video, decides where frames begin; else the convention of the format;
+else it is an error.
+
+Masks are run lengths along the columns of the image (COCO's order) that start with a run of zeros.
+A mask without pixels has none (`NO_RUNS`) and means "no mask".
 """
 
 from __future__ import annotations
 
 import functools
 import hashlib
+import math
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,10 +26,11 @@ import numpy as np
 import numpy.typing as npt
 
 from reobj.cameras import Poses
-from reobj.files import LINES_MAX, MEMORY_MAX, load_npz, save_npz
-from reobj.sources.masks import NO_RUNS, Counts, rle_decode, rle_encode
+from reobj.files import LINES_MAX, MEMORY_MAX, load_npz, save_npz, shortened
+from reobj.frame_lookup import frames_by_name
 from reobj.types import (
     CLASS_MAX,
+    COORDINATE_MAX,
     Array,
     BoolArray,
     Detections,
@@ -31,6 +41,13 @@ from reobj.types import (
 )
 
 CORNERS, SIZES, CENTRES = "x1, y1, x2, y2", "x, y, w, h", "cx, cy, w, h"  # forms of a box
+Counts = npt.NDArray[np.uint32]
+NO_RUNS: Counts = np.empty(0, np.uint32)
+# Coordinates up to this are fractions of the image size; chosen: boxes may extend a little outside
+NORMALISED_MAX = 1.5
+
+
+# ---- Forms of boxes ------------------------------------------------------------------------------
 
 
 def corners(box: Array, form: str) -> Array:
@@ -55,33 +72,27 @@ def other_form(
         its place does.
     """
     low, high = xyxy[:, :2], xyxy[:, 2:]
-    centre = (low + high) / 2
     given = xyxy  # the numbers in the file
+    remedy = "convert them, or name these columns in the header of a CSV"
     if form != CORNERS:
-        given = np.hstack([low if form == SIZES else centre, high - low])
+        given = np.hstack([low if form == SIZES else (low + high) / 2, high - low])
         if len(identity) and _move_as_corners(given, frame, identity):
             return (f"all boxes are {CORNERS}, expected {form}: the third and fourth number "
-                    f"are above the first and second, and change with them; {REMEDY}")  # fmt: skip
-    if 0 in size:
-        return ""
+                    f"are above the first and second, and change with them; {remedy}")  # fmt: skip
     inverted = (high < low).any(1)
     leave = ~_inside(xyxy, size)
-    if not inverted.any() and leave.sum() <= max(2, 0.1 * len(xyxy)):
+    if 0 in size or (not inverted.any() and leave.sum() <= max(2, 0.1 * len(xyxy))):
         return ""
-    image = f"the image of {size[0]:g}x{size[1]:g}"
-    why = f"as {form}, {leave.sum()} of {len(xyxy)} boxes leave {image}"
-    why += f", and {inverted.sum()} have x2 < x1 or y2 < y1" * bool(inverted.any())
     others = [other for other in (CORNERS, SIZES, CENTRES) if other != form]
     fits = [other for other in others if _inside(corners(given, other), size).mean() > 0.98]
-    if fits:
-        return f"{why}; all fit it as {' or '.join(fits)}: {REMEDY}"
-    if _inside(xyxy, size[::-1]).all():
-        return (f"{why}; all fit the frame turned by 90 deg: made on frames that were not turned "
-                "upright? Detect on upright frames")  # fmt: skip
-    return ""
-
-
-REMEDY = "convert them, or name these columns in the header of a CSV"
+    turned = _inside(xyxy, size[::-1]).all()
+    if not fits and not turned:
+        return ""
+    why = f"{leave.sum()} of {len(xyxy)} boxes leave the image of {size[0]:g}x{size[1]:g}"
+    why += f", and {inverted.sum()} have x2 < x1 or y2 < y1" * bool(inverted.any())
+    if not fits:
+        return f"{why}; all fit the frame turned by 90 deg: detect on upright frames"
+    return f"as {form}, {why}; all fit it as {' or '.join(fits)}: {remedy}"
 
 
 def _move_as_corners(box: Array, frame: IntArray, identity: IntArray) -> bool:
@@ -107,6 +118,9 @@ def _inside(xyxy: Array, size: Sequence[float]) -> BoolArray:
     return np.asarray(((low >= -1) & (low <= high) & (high <= np.add(size, 1))).all(1))
 
 
+# ---- Detections ----------------------------------------------------------------------------------
+
+
 @dataclass(slots=True)
 class RecordedDetections:
     """Detections of a video as a struct of arrays; `at` returns those of a frame.
@@ -114,13 +128,13 @@ class RecordedDetections:
     Attributes:
         frame: (N,) source frame numbers, ascending once validated.
         xyxy: (N, 4) px of the source. score: (N,) in [0, 1]. class_id: (N,) index into class_names.
-        runs: run lengths of the N masks (see `masks`), empty where there is none.
+        runs: run lengths of the N masks, empty where there is none.
         size, working_size: (w, h) of the masks, and of the frames of `at`.
         line: (N,) position in the file, a number of `unit`s or text; for messages.
         messages: about dropped rows and assumptions, for the user.
         identity: (N,) as in the file, or empty.
         looked: frames on which the detector was run, ascending; None: all.
-        boxes_3d: (N, 15) of `boxes_3d.Boxes3D`, or empty.
+        boxes_3d: (N, 15) of `tables.Boxes3D`, or empty.
         ignored: (N,) regions that do not count, as the file marks them, or empty.
         form: of the boxes in the file.
     """
@@ -148,10 +162,6 @@ class RecordedDetections:
     def __len__(self) -> int:
         return len(self.frame)
 
-    def other_form(self, size: Sequence[float]) -> str:
-        """Describe another form of the boxes, as the function of this name."""
-        return other_form(self.xyxy, self.form, size, self.frame, self.identity)
-
     def select(self, rows: IntArray) -> None:
         """Select rows (n,), in this order."""
         count = len(self)
@@ -173,11 +183,10 @@ class RecordedDetections:
         """Return the detections of a frame, with masks, in px of the working size."""
         low, high = np.searchsorted(self.frame, [frame_index, frame_index + 1])
         rows = slice(low, high)
-        runs = self.runs[low:high]
         masks = None
         ratio = np.tile(np.divide(self.working_size, self.size), 2)  # (4,)
-        if any(map(len, runs)):
-            decoded = (rle_decode(counts, self.size) for counts in runs)
+        if any(map(len, self.runs[rows])):
+            decoded = (rle_decode(counts, self.size) for counts in self.runs[rows])
             masks = np.stack([_resized_mask(mask, self.working_size) for mask in decoded])
         return Detections(self.xyxy[rows] * ratio, self.score[rows], self.class_id[rows], masks)
 
@@ -220,9 +229,9 @@ class Source:
     image_sizes: set[tuple[int, int]] = field(default_factory=set)
     times_s: Array | None = None
 
-    def say(self, *texts: str) -> None:
-        """Add messages, without empty ones."""
-        self.messages += filter(None, texts)
+    def say(self, text: str) -> None:
+        """Add a message, unless it is empty."""
+        self.messages += [text] if text else []
 
     def recorded(
         self,
@@ -250,31 +259,295 @@ class Source:
             self.messages, form=form, **columns,
         )  # fmt: skip
 
-    def scale(self, made_for: Array, used: BoolArray | None = None) -> Array:
+    def scale(self, made_for: Array, used: BoolArray | bool = True) -> Array:
         """Return the factors (N, 4) from the images of the boxes to those of the video.
 
         Args:
             made_for: (N, 2) size of each box's image, 0: unknown. used: (N,) the box belongs to a
-                frame; None: all do.
+                frame.
         Raises:
             ReobjError: images of another aspect ratio.
         """
         size = self.video.size
         self.image_sizes |= {(int(w), int(h)) for w, h in np.unique(made_for, axis=0)}
         scale = np.ones((len(made_for), 4))
-        known = (made_for > 0).all(1) & (True if used is None else used)
+        known = (made_for > 0).all(1) & used
         for w, h in np.unique(made_for[known], axis=0).tolist() if size != (0, 0) else ():
             text = f"made for images of {w:g}x{h:g}, but the video is {size[0]}x{size[1]}"
-            if (w, h) == size:
-                continue
             if abs(w * size[1] / size[0] - h) > 1:  # px: sides of resized images are rounded
-                turned = (h, w) == size
-                why = ": made on frames that were not turned upright?" if turned else ""
-                raise ReobjError(f"{self.path}: {text}, of another shape{why or ': other images?'} "
-                                 "Run the detector on the frames of this video")  # fmt: skip
+                raise ReobjError(f"{self.path}: {text}, of another shape: run the detector on the "
+                                 "frames of this video, turned upright")  # fmt: skip
             scale[(made_for == (w, h)).all(1)] = np.tile([size[0] / w, size[1] / h], 2)
-            self.say(f"{text}: boxes are scaled")
+            self.say(f"{text}: boxes are scaled" * ((w, h) != size))
         return scale
+
+
+# ---- Frames --------------------------------------------------------------------------------------
+
+
+def original_name(name: str) -> str:
+    """Return the name that an image had before its export by Roboflow; other names unchanged.
+
+    >>> original_name("frame_0001_png.rf.3f2a9c.jpg")
+    'frame_0001.png'
+    """
+    match = re.search(r"_(jpe?g|png|bmp|webp|tiff?)\.rf\.[^./\\]+", name, re.IGNORECASE)
+    return f"{name[: match.start()]}.{match[1]}" if match else name
+
+
+def _last_numbers(names: Sequence[str]) -> IntArray:
+    """Return the last whole number (N,) in each name without its suffix, -1 where there is none.
+
+    Numbers before a letter do not count: they may be part of a hash.
+    """
+    stems = [re.split(r"[\\/]", name)[-1] for name in names]
+    stems = [stem.rpartition(".")[0] or stem for stem in stems]
+    digits = [re.findall(r"\d+(?![0-9A-Za-z])", stem) for stem in stems]
+    return np.array([int(d[-1][-18:]) if d else -1 for d in digits], np.int64)  # 18 digits fit
+
+
+def _first_number(numbers: IntArray, frame_count: int) -> int | None:
+    """Return the number of the first frame if only 0 or only 1 is possible; else None.
+
+    Args:
+        numbers: (N,) at least one. frame_count: of the source, 0: unknown.
+    """
+    if numbers.min() <= 0:
+        return 0
+    return 1 if numbers.max() == frame_count else None  # from 0 it is beyond the last frame
+
+
+def frames_of_numbers(numbers: IntArray, source: Source, usual: int | None) -> IntArray:
+    """Convert frame numbers (N,) of a file to those of the source, from 0.
+
+    Args:
+        usual: number of the first frame by the convention of the format; None: it has none, and
+            numbers that leave it open are an error.
+    """
+    if not len(numbers):
+        return numbers
+    low, high = int(numbers.min()), int(numbers.max())
+    known = _first_number(numbers, source.video.frame_count)
+    begin = int(source.first) if source.first in ("0", "1") else usual if known is None else known
+    if begin is None:
+        raise ReobjError(
+            f"{source.path}: numbers {low} to {high} count frames from 0, or from 1 (then the "
+            f"first of them is frame {low - 1}); say which with --set detect.first_frame=0 or "
+            "detect.first_frame=1"
+        )
+    unclear = not begin and low == 1
+    if not source.first and (unclear or begin != usual):
+        text = f"frame numbers {low} to {high} are taken as "
+        text += "counted from 1" if begin else "0-based"
+        unclear_text = ", there is no 0; if they count from 1: --set detect.first_frame=1"
+        source.say(text + unclear_text * unclear)
+    return numbers - begin
+
+
+def frames_of_names(names: Sequence[str], source: Source, usual: int | None = None) -> IntArray:
+    """Find the frames (N,) of image names, or of ids used as names; -1: none.
+
+    Args:
+        names: (N,) with or without folders and suffix. usual: as in `frames_of_numbers`.
+    Raises:
+        ReobjError: no rule matches, or several do.
+    """
+    video = source.video
+    distinct, row = np.unique(np.array(names, object), return_inverse=True)
+    given = [original_name(name) for name in distinct.tolist()]
+    if source.describes and not all(name.isdecimal() for name in given):
+        source.image_names += given
+    if source.describes or not given:
+        return np.zeros(len(names), np.int64)
+    frame, rule = frames_by_name(given, video.files or video.names, str(source.path))
+    if rule:
+        unmatched = [name for name, f in zip(given, frame.tolist(), strict=True) if f < 0]
+        text = f"{len(unmatched)} names match no image of the video: {shortened(unmatched)}"
+        source.say(text * bool(unmatched))
+        return np.asarray(frame[row], np.int64)
+    number = _last_numbers(given)
+    if number.min() < 0 or len(np.unique(number)) < len(number):
+        why = "have no number" if number.min() < 0 else "repeat their last number"
+        raise ReobjError(
+            f"{source.path}: names such as {given[int(number.argmin())]!r} match no frame of the "
+            f"video, and {why}; name them as the images {shortened(video.names)}, or by the frame, "
+            "or list the images of all frames in order (--set detect.first_frame=order)"
+        )
+    numbered = _by_image_number(number, source, given)
+    if numbered is not None:
+        number = numbered
+    elif (number.min(), number.max()) != (0, video.frame_count - 1):  # else it is unambiguous
+        source.say("the number in a name is the frame's")
+        number = frames_of_numbers(number, source, usual)
+    return np.asarray(number[row], np.int64)
+
+
+def _by_image_number(number: IntArray, source: Source, given: Sequence[str]) -> IntArray | None:
+    """Match numbers (N,) to the last numbers in the names of images: frames (N,), -1: none.
+
+    None: the images have no such numbers, or the numbers are those of frames.
+    """
+    video = source.video
+    image = _last_numbers(video.names)
+    unusable = not len(image) or video.times_s is not None or image.min() < 0
+    if source.first or unusable or len(np.unique(image)) < len(image):
+        return None
+    frame_of = {n: frame for frame, n in enumerate(image.tolist())}
+    frame = np.array([frame_of.get(n, -1) for n in number.tolist()])
+    matched = frame >= 0
+    begin = _first_number(number, video.frame_count)
+    position = begin is not None and number.max() - begin < video.frame_count
+    if not matched.any() or (position and not matched.all()):
+        return None
+    missing = [name for name, match in zip(given, matched.tolist(), strict=True) if not match]
+    first = int(matched.argmax())
+    example = f"{given[first]}: {video.names[frame[first]]}"
+    text = f"the number in a name or id is that of an image ({example})"
+    source.say(text + f"; {len(missing)} match none: {shortened(missing)}" * bool(missing))
+    return frame
+
+
+@dataclass(slots=True)
+class Intervals:
+    """Intervals of the frames with boxes so far.
+
+    Attributes:
+        first, last: frame with boxes. count: of such frames. step: greatest common divisor of their
+            intervals.
+    """
+
+    first: int = 0
+    last: int = 0
+    count: int = 0
+    step: int = 0
+
+    def add(self, frame: int) -> None:
+        """Add the next frame with boxes."""
+        if self.count:
+            self.step = math.gcd(self.step, frame - self.last)
+        else:
+            self.first = frame
+        self.last = frame
+        self.count = self.count + 1
+
+    def looked_at(self, frame: int) -> bool:
+        """Return whether the detector was run on a frame without boxes."""
+        return self.count < 3 or self.step < 2 or (frame - self.first) % self.step == 0
+
+
+def _usual_step(frames: IntArray) -> int:
+    """Return the greatest common divisor of the intervals of at least three frames; else 1."""
+    return int(np.gcd.reduce(np.diff(frames))) if len(frames) > 2 else 1
+
+
+def frames_looked_at(frame: IntArray, frame_count: int) -> IntArray | None:
+    """Return the frames on which a detector was run: every n-th if all boxes are in such frames.
+
+    Tracks must not count frames that the detector skipped as missed detections.
+
+    Args:
+        frame: (N,) of each box. frame_count: of the video, 0: unknown.
+    Returns:
+        frame numbers, ascending; None: all frames of the video.
+    """
+    seen = np.unique(frame[frame >= 0])
+    step = _usual_step(seen)
+    end = max(frame_count, int(seen.max(initial=-1)) + 1)
+    return np.arange(seen[0] % step, end, step) if step > 1 else None
+
+
+def looked_message(looked: IntArray, listed: bool) -> str:
+    """Return the message about the frames on which the detector was run.
+
+    Args:
+        looked: frame numbers, ascending. listed: in the file; else inferred from its boxes.
+    """
+    step = _usual_step(looked)
+    which = f"1 frame in {step}" if step > 1 else f"{len(looked)} frames only"
+    return (
+        f"{'lists' if listed else 'has boxes in'} {which} ({shortened(looked.tolist())}): the "
+        "detector was not run on the others, which do not count as empty frames"
+    )
+
+
+# ---- Masks ---------------------------------------------------------------------------------------
+
+
+def rle_encode(mask: BoolArray) -> Counts:
+    """Encode an (H, W) mask as run lengths."""
+    return _runs_of_columns(mask, 0, mask.shape[1])
+
+
+def _runs_of_columns(columns: BoolArray, first: int, width: int) -> Counts:
+    """Encode columns (H, w) of the mask of an image, from `first` of `width`; others are zero."""
+    flat = cv2.transpose(columns.view(np.uint8)).ravel()  # (w * H,)
+    none = np.uint8(0)
+    edges = np.flatnonzero(np.diff(flat, prepend=none, append=none)) + first * len(columns)
+    end = width * len(columns)
+    counts = np.diff(edges[edges < end], prepend=0, append=end).astype(np.uint32)
+    return counts if len(counts) > 1 else NO_RUNS
+
+
+def rle_decode(counts: Counts, size: tuple[int, int]) -> BoolArray:
+    """Decode run lengths to the (H, W) mask of a (w, h) image."""
+    if not len(counts):
+        return np.zeros(size[::-1], bool)
+    flat = np.repeat(np.arange(len(counts)) % 2 == 1, counts)  # (W * H,)
+    return np.asarray(cv2.transpose(flat.view(np.uint8).reshape(size))).view(bool)
+
+
+def coco_runs(text: str) -> Counts:
+    """Decode COCO's compressed run lengths (maskApi.c of pycocotools, rleFrString).
+
+    Each character holds five bits, lowest first; flag 0x20: more follow; 0x10 of the last: sign.
+    From the fourth run on a number is the difference to the last run but one.
+    """
+    runs: list[int] = []
+    value = shift = 0
+    for byte in text.encode():
+        value |= (byte - 48 & 0x1F) << shift
+        shift += 5
+        if byte - 48 & 0x20:
+            if shift >= 35:  # holds any signed uint32; longer ones would take quadratic time
+                raise ValueError("a run length of more than 35 bits")
+            continue
+        value -= (byte - 48 >> 4 & 1) << shift  # sign
+        runs.append(value + (runs[-2] if len(runs) > 2 else 0))
+        value = shift = 0
+    return np.array(runs, np.uint32)
+
+
+def crop_runs(mask: BoolArray, corner: tuple[int, int], size: tuple[int, int]) -> Counts:
+    """Encode an (h, w) part of the mask of an image; what lies outside the image is cut off.
+
+    Args:
+        corner: (x, y) of its first pixel in the image. size: (w, h) of the image.
+    """
+    width, height = size
+    x, y = corner
+    mask = mask[max(-y, 0) : max(height - y, 0), max(-x, 0) : max(width - x, 0)]
+    strip = np.zeros((height, mask.shape[1]), bool)  # whole columns: runs follow them
+    strip[max(y, 0) :][: len(mask)] = mask
+    return _runs_of_columns(strip, max(x, 0), width) if mask.size else NO_RUNS
+
+
+def polygon_runs(rings: Sequence[Array], size: tuple[int, int]) -> Counts:
+    """Fill polygons (K, 2), in px (corner convention), in a (w, h) image."""
+    flat = np.concatenate([np.empty((0, 2)), *rings])
+    if not (np.abs(flat) <= COORDINATE_MAX).all():
+        raise ValueError("a polygon with corners that are not finite, or beyond 1e7 px")
+    width, height = size
+    low, high = flat.min(0, initial=width), flat.max(0, initial=0)
+    left = int(np.clip(np.floor(low[0]) - 1, 0, width))  # only the columns of the polygon
+    right = int(np.clip(np.ceil(high[0]) + 1, left, width))
+    canvas = np.zeros((height, right - left), np.uint8)
+    if not canvas.size:
+        return NO_RUNS
+    bits = 4  # of fractions of a pixel, 1/16 px: finer than annotations
+    for ring in rings:  # OpenCV's first pixel has its centre at (0, 0), ours at (0.5, 0.5)
+        fixed = np.round((ring - (left + 0.5, 0.5)) * (1 << bits)).astype(np.int32)
+        cv2.fillPoly(canvas, [fixed], 1, shift=bits)
+    return _runs_of_columns(canvas > 0, left, width)
 
 
 def _resized_mask(mask: BoolArray, size: tuple[int, int]) -> BoolArray:
@@ -283,6 +556,9 @@ def _resized_mask(mask: BoolArray, size: tuple[int, int]) -> BoolArray:
         return mask
     covered = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     return np.asarray(covered >= 0.5)
+
+
+# ---- npz files -----------------------------------------------------------------------------------
 
 
 def pack_detections(
@@ -333,10 +609,6 @@ def write_detections_npz(
     save_npz(Path(path), pack_detections(list(frames), class_names, image_size))
 
 
-# Coordinates up to this are fractions of the image size; chosen: boxes may extend a little outside
-NORMALISED_MAX = 1.5
-
-
 def read_npz(
     path: Path, size: tuple[int, int], working_size: tuple[int, int], sealed: bool = False
 ) -> tuple[RecordedDetections, IntArray]:
@@ -359,13 +631,9 @@ def read_npz(
     if (np.diff(offsets, prepend=0) < 0).any() or offsets[-1] > runs.size or (runs < 0).any():
         raise ReobjError(f"{path}: mask_counts and mask_offsets are inconsistent")
     width, height = take("image_size", "iu", (2,)).tolist()
-    if min(width, height) < 1:
-        raise ReobjError(f"{path}: image_size {width}, {height}, expected (w, h) in px")
-    if (width, height) != size and size != (0, 0):
-        turned = (height, width) == size
-        why = ": made on frames that were not turned upright?" if turned else ""
-        text = f"made for images of {(width, height)} px, but the video is {size} px"
-        raise ReobjError(f"{path}: {text}{why}")
+    if min(width, height) < 1 or size not in ((0, 0), (width, height)):
+        raise ReobjError(f"{path}: made for images of {(width, height)} px, but the video is "
+                         f"{size} px, turned upright")  # fmt: skip
     recorded = RecordedDetections(
         frame, take("xyxy", "fiu", (count, 4)).astype(np.float64),
         take("score", "fiu", (count,)).astype(np.float64),
@@ -374,26 +642,21 @@ def read_npz(
         tuple(take("class_names", "U", (-1,), CLASS_MAX).tolist()), (width, height), working_size,
         np.arange(count), "row",
     )  # fmt: skip
-    if "done" not in data:
-        return recorded, recorded.frame
-    recorded.looked = np.unique(take("done", "iu", (-1,), LINES_MAX)).astype(np.int64)
-    return recorded, recorded.looked
+    if "done" in data:
+        recorded.looked = np.unique(take("done", "iu", (-1,), LINES_MAX)).astype(np.int64)
+    return recorded, frame if recorded.looked is None else recorded.looked
 
 
 def _array(
     data: dict[str, npt.NDArray[Any]], path: Path, key: str, kinds: str, shape: tuple[int, ...],
     most: int = MEMORY_MAX,
 ) -> npt.NDArray[Any]:  # fmt: skip
-    """Return an array of an npz file; refuse another kind, shape (-1: any) or more numbers."""
-    if key not in data:
+    """Return an array of an npz file; refuse another kind, shape (-1: any) or more rows."""
+    array = data.get(key)
+    if array is None:
         raise ReobjError(f"{path}: array {key} is missing")
-    array = data[key]
-    if array.ndim != len(shape) or any(
-        n not in (-1, m) for n, m in zip(shape, array.shape, strict=True)
-    ):
-        raise ReobjError(f"{path}: array {key} is {array.shape}, expected shape {shape}")
-    if array.dtype.kind not in kinds and array.size:
-        raise ReobjError(f"{path}: array {key} is of {array.dtype}, expected {kinds}")
-    if len(array) > most:
-        raise ReobjError(f"{path}: {len(array)} {key}, at most {most} are allowed")
+    fits = array.ndim == len(shape) and all(map(lambda n, m: n in (-1, m), shape, array.shape))
+    if not fits or len(array) > most or (array.size and array.dtype.kind not in kinds):
+        raise ReobjError(f"{path}: array {key} is {array.dtype} of shape {array.shape}, expected "
+                         f"{kinds} of shape {shape} with at most {most} rows")  # fmt: skip
     return array

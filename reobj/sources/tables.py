@@ -1,7 +1,12 @@
 """Detections and tracks in text tables: MOTChallenge and similar, KITTI tracking, CSV with header.
 
 Cells are separated by commas, semicolons, tabs or spaces; a comma that is no separator may be the
-decimal point. `detection_formats` lists the formats.
+decimal point. A row of Boxer's CSV, which WildDet3D writes too, is a box in the world of the
+supplied cameras, seen in the frame of its time stamp. Its projection is a detection like any other;
+the boxes themselves are measurements of the objects' shapes (`objects.given_boxes`).
+
+Ref: github.com/facebookresearch/boxer, utils/file_io.py (`ObbCsvWriter2`): z up, full extents,
+quaternions w first.
 """
 
 from __future__ import annotations
@@ -17,21 +22,30 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+import quadrics
+from reobj.cameras import Poses, distort_boxes
 from reobj.files import load_json, read_lines
 from reobj.formats import HEAD_BYTES, Probe
 from reobj.sources.class_names import load_class_names
 from reobj.sources.image_files import TimeUnit
-from reobj.sources.image_frames import frames_of_names, frames_of_numbers
-from reobj.sources.recorded import CENTRES, CORNERS, SIZES, RecordedDetections, Source
+from reobj.sources.recorded import (
+    CENTRES,
+    CORNERS,
+    SIZES,
+    RecordedDetections,
+    Source,
+    frames_of_names,
+    frames_of_numbers,
+)
 from reobj.types import (
     CLASS_MAX,
     COCO_NAMES,
-    COORDINATE_MAX,
     Array,
-    BoolArray,
     IntArray,
     ReobjError,
+    Tracks,
     nearest_of,
 )
 
@@ -67,12 +81,15 @@ ALIASES: dict[str, str] = {  # names of columns; the first one with values is us
     "class": "class_name category_name class_label label name category type class class_id cls "
              "category_id label_id coco80_class",
 }  # fmt: skip
-NONE = np.empty(0, bool)
 BOX_FORMS: dict[tuple[str, ...], str] = {
     ("x1", "y1", "x2", "y2"): CORNERS,
     ("x1", "y1", "w", "h"): SIZES,
     ("cx", "cy", "w", "h"): CENTRES,
 }
+BOXES_3D = (
+    "tx_world_object ty_world_object tz_world_object qw_world_object qx_world_object "
+    "qy_world_object qz_world_object scale_x scale_y scale_z"
+).split()
 
 
 @dataclass(slots=True)
@@ -94,10 +111,15 @@ class Table:
         """Return the position of a row, for messages."""
         return f"{self.path}, {self.unit} {self.line[row]}"
 
-    def numbers(self, role: str) -> Array:
-        """Convert a column to finite numbers (N,); an error names the line."""
+    def numbers(self, role: str, whole: bool = False) -> Array:
+        """Convert a column to finite numbers (N,), perhaps whole ones; an error names the line."""
         values = np.array([_number(cell) for cell in self.cells[role]], np.float64)
-        self._check(role, ~np.isfinite(values), "{!r} is no finite number")
+        with np.errstate(invalid="ignore"):
+            # Above 2^53 not every integer is a float64
+            bad = ~np.isfinite(values) | (whole & ((np.abs(values) > 2.0**53) | (values % 1 != 0)))
+        for row in np.flatnonzero(bad)[:1].tolist():
+            text = f"{role} {self.cells[role][row]!r}, expected a {'whole' if whole else 'finite'}"
+            raise ReobjError(f"{self.where(row)}: {text} number")
         return values
 
     def columns(self, roles: Sequence[str]) -> Array:
@@ -106,16 +128,7 @@ class Table:
 
     def whole(self, role: str) -> IntArray:
         """Convert a column to whole numbers (N,)."""
-        values = self.numbers(role)
-        # Above 2^53 not every integer is a float64
-        bad = (np.abs(values) > 2.0**53) | (values % 1 != 0)
-        self._check(role, bad, f"{role} {{}}, expected a whole number")
-        return values.astype(np.int64)
-
-    def _check(self, role: str, bad: BoolArray, why: str) -> None:
-        """Refuse the first cell of a column that is `bad` (N,); why: its text in braces."""
-        for row in np.flatnonzero(bad)[:1].tolist():
-            raise ReobjError(f"{self.where(row)}: {why.format(self.cells[role][row])}")
+        return self.numbers(role, whole=True).astype(np.int64)
 
 
 # ---- Cells ---------------------------------------------------------------------------------------
@@ -150,21 +163,22 @@ def _is_comment(line: str) -> bool:
 
 
 def split(lines: Sequence[str]) -> tuple[list[list[str]], IntArray]:
-    """Split lines into rows of cells, without comments and the empty cells at all their ends.
+    """Split lines into rows of cells, without comments and an empty last column.
 
     Returns:
         rows, and the lines on which they end.
     """
     lines = ["\n" if _is_comment(line) else line for line in lines]
     separator = _separator(next((line for line in lines if line.strip()), ""))
-    reader: Any = csv.reader(lines, delimiter=separator, strict=True)
-    split = [([cell.strip() for cell in cells], reader.line_num) for cells in reader]
     if separator == " ":
         split = [(line.split(), i) for i, line in enumerate(lines, 1)]
+    else:
+        reader: Any = csv.reader(lines, delimiter=separator, strict=True)
+        split = [([cell.strip() for cell in cells], reader.line_num) for cells in reader]
     kept = [(cells, i) for cells, i in split if any(cells)]
-    if kept and kept[0][0][0] == "#":  # of a header, separated from its first name
-        kept[0][0].pop(0)
     rows = [cells for cells, _ in kept]
+    if rows and rows[0][0] == "#":  # of a header, separated from its first name
+        rows[0] = rows[0][1:]
     if rows and len(rows[0]) > 1 and not any(cells[-1] for cells in rows):
         rows = [cells[:-1] for cells in rows]
     return rows, np.array([i for _, i in kept], np.int64)
@@ -219,14 +233,6 @@ def _roles(by_name: Mapping[str, list[str]]) -> dict[str, str]:
     return name_of
 
 
-def _unread(by_name: Mapping[str, list[str]], used: set[str]) -> list[str]:
-    """List the columns with values that name a class, an identity or a size and are not read."""
-    kinds = r"class|label|categor|type|track|inst|obj|ident|width|height|size|resolution|"
-    kinds += r"(^|_)(id|w|h)($|_)"
-    names = [name for name in by_name if name not in used and re.search(kinds, name)]
-    return [name for name in names if not {"-1", ""} >= {*by_name[name]}]
-
-
 def _is_empty(cell: str) -> bool:
     return cell.lower() in ("", "nan", "none", "null", "na")  # as pandas and others write it
 
@@ -239,7 +245,7 @@ def _box_roles(roles: Mapping[str, object]) -> tuple[str, ...]:
 # ---- Structure -----------------------------------------------------------------------------------
 
 
-def head(probe: Probe) -> list[list[str]]:
+def _head(probe: Probe) -> list[list[str]]:
     """Return the cells of the first rows of a text table; [] of other files and folders."""
     if probe.kind != "text" or probe.suffix == ".npz":
         return []
@@ -257,27 +263,28 @@ def forms(probe: Probe) -> frozenset[str]:
     nine columns end in 1, a class and a score, without the names of classes that CVAT writes beside
     them; if all identities are below 0, they are detections, which ground truth is not.
     """
-    rows = head(probe)
+    rows = _head(probe)
+    mot = frozenset({"mot"})
     if not rows:
         empty = not probe.is_dir and not probe.path.read_bytes()[:4096].strip()
-        return frozenset({"mot"} if empty else ())
+        return mot if empty else frozenset()
+    count = len(rows[0])
     if not are_numbers(rows[0][:1]):
         return frozenset({"boxer-3d" if "tx_world_object" in rows[0] else "csv"})
-    if len(rows[0]) in (17, 18) and not are_numbers(rows[0][2:3]):
+    if count in (17, 18) and not are_numbers(rows[0][2:3]):
         return frozenset({"kitti"})
-    count = len(rows[0])
     if count not in (9, 10) or any(len(cells) != count for cells in rows):
-        return frozenset({"mot"})
+        return mot
     values = np.array([[_number(cell) for cell in cells] for cells in rows])  # (N, 9 or 10)
-    flag, kind, last = values[:, 6], values[:, 7], values[:, 8:]
+    flag, kind, *last = values[:, 6:].T
     whole = (kind >= 0) & (kind == np.floor(kind))
     if count == 10:
-        fits = whole & (kind <= 11) & np.isin(last, range(3)).all(1) & ((kind > 0) | (flag == 0))
-        return frozenset({"visdrone" if fits.all() and kind.any() else "mot"})
+        fits = whole & (kind <= 11) & np.isin(last, range(3)).all(0) & ((kind > 0) | (flag == 0))
+        return frozenset({"visdrone"}) if fits.all() and kind.any() else mot
     named = (probe.path.parent / "labels.txt").exists()
-    if named or not (whole & (flag == 1) & (last[:, 0] <= 1)).all():
-        return frozenset({"mot"})
-    return frozenset({"boxmot"} if (values[:, 1] < 0).all() else {"boxmot", "mot"})
+    if named or not (whole & (flag == 1) & (last[0] <= 1)).all():
+        return mot
+    return frozenset({"boxmot"}) | (mot if (values[:, 1] >= 0).any() else set())
 
 
 # ---- Readers -------------------------------------------------------------------------------------
@@ -293,18 +300,13 @@ def read_mot_rows(path: Path) -> Array:
         ReobjError: a line with another number of columns, or with a cell that is no number.
     """
     table = read_columns(path, MOT, 6)
-    rows = table.columns(list(table.cells))  # (N, 6 to 10)
     table.whole("frame"), table.whole("id")
-    if (too_large := (np.abs(rows[:, 2:6]) > COORDINATE_MAX).any(1)).any():
-        row = int(too_large.argmax())
-        text = f"box {rows[row, 2:6]}, expected at most {COORDINATE_MAX:g} px"
-        raise ReobjError(f"{table.where(row)}: {text}")
-    return rows
+    return table.columns(list(table.cells))  # (N, 6 to 10)
 
 
 def read_mot(source: Source) -> RecordedDetections:
     """Read MOTChallenge rows; classes count from 1, or from 0 if there is a 0."""
-    table = _mot_table(source)
+    table = read_columns(source.path, MOT, 6)
     number = np.full(len(table.line), -1)
     if "z" in table.cells and (table.numbers("z") != -1).any():
         source.say("columns 8 to 10 are x, y, z in the world, which are not read")
@@ -323,25 +325,24 @@ def read_mot(source: Source) -> RecordedDetections:
 
 def read_boxmot(source: Source) -> RecordedDetections:
     """Read results of boxmot: columns 7 to 9 are 1, class from 0, score."""
-    table = _mot_table(source)
+    table = read_columns(source.path, MOT, 6)
     table.cells["score"] = table.cells["extra"]
-    source.say("read as boxmot's results: columns 7 to 9 are 1, class from 0, score")
     return _recorded(table, source, 1, _numbered(table.whole("class"), 0, source))
 
 
 def read_visdrone(source: Source) -> RecordedDetections:
     """Read VisDrone's annotations: class 0 is an ignored region."""
-    table = _mot_table(source)
+    table = read_columns(source.path, MOT, 6)
     number = table.whole("class")
     classes = _numbered(np.maximum(number, 1) - 1, 1, source, VISDRONE.split())
-    return _recorded(table, source, 1, classes, number == 0)
+    return _recorded(table, source, 1, classes, ignored=number == 0)
 
 
 def read_kitti(source: Source) -> RecordedDetections:
     """Read KITTI's tracking labels or results; DontCare is an ignored region."""
     table = read_columns(source.path, KITTI, 17)
     care = np.array(table.cells["class"]) == "DontCare"
-    return _recorded(table, source, 0, text_classes(table, source, ()), care)
+    return _recorded(table, source, 0, _text_classes(table, source, ()), ignored=care)
 
 
 def read_csv(source: Source) -> RecordedDetections:
@@ -352,17 +353,13 @@ def read_csv(source: Source) -> RecordedDetections:
 def read_records(source: Source) -> RecordedDetections:
     """Read a JSON list of flat objects (supervision's JSONSink)."""
     records = load_json(source.path)
-    if not all(isinstance(record, dict) for record in records):
-        raise ReobjError(f"{source.path}: an entry is no object; expected objects with the same "
-                         "keys")  # fmt: skip
     names = list(dict.fromkeys(name for record in records for name in record))
     header = _header([name.replace(",", " ") for name in names])
     texts = [["" if r.get(name) is None else str(r[name]).strip() for r in records]
              for name in names]  # fmt: skip
     by_name = dict(zip(header, texts, strict=True))
-    return _read_named(
-        Table(source.path, by_name, np.arange(len(records)), "entry", header), source
-    )
+    table = Table(source.path, by_name, np.arange(len(records)), "entry", header)
+    return _read_named(table, source)
 
 
 def _read_named(table: Table, source: Source) -> RecordedDetections:
@@ -381,24 +378,12 @@ def _read_named(table: Table, source: Source) -> RecordedDetections:
         example = "expected one such as frame,x1,y1,x2,y2,score,class"
         raise ReobjError(f"{table.path}, line 1: {text}: {example}")
     table.cells = {role: by_name[name] for role, name in name_of.items()}
-    unread = _unread(by_name, {*name_of.values()})
-    source.say(f"columns that are not read: {', '.join(unread)}" * bool(unread))
-    if "detection_id" in table.header and _box_roles(table.cells)[0] == "cx":
-        source.say("x, y are the centres of boxes, as in all files with detection_id (Roboflow)")
     _drop_empty(table, source)
     if "id" in table.cells:
         table.cells["id"] = ["-1" if _is_empty(cell) else cell for cell in table.cells["id"]]
     # MOTChallenge counts frames from 1; its names of columns begin with bb_
     usual = 1 if any(name.startswith("bb_") for name in table.header) else 0
-    return _recorded(table, source, usual, text_classes(table, source, COCO_NAMES))
-
-
-def _mot_table(source: Source) -> Table:
-    table = read_columns(source.path, MOT, 6)
-    if (table.numbers("id") % 1 != 0).any():
-        raise ReobjError(f"{table.path}: the second column is no identity. If this is no MOT file: "
-                         "CSV needs a header such as frame,x1,y1,x2,y2,score,class")  # fmt: skip
-    return table
+    return _recorded(table, source, usual, _text_classes(table, source, COCO_NAMES))
 
 
 def _recorded(
@@ -406,7 +391,7 @@ def _recorded(
     source: Source,
     usual: int,
     classes: tuple[IntArray, Sequence[str]],
-    ignored: BoolArray = NONE,
+    **columns: Any,
 ) -> RecordedDetections:
     """Convert a table to detections; usual: number of the first frame."""
     roles = _box_roles(table.cells)
@@ -419,8 +404,8 @@ def _recorded(
             scale = source.scale(size, frame >= 0)
     return source.recorded(
         frame, box, classes, table.numbers("score") if "score" in table.cells else None,
-        line=table.line, unit=table.unit, form=BOX_FORMS[roles], scale=scale, ignored=ignored,
-        identity=table.whole("id") if "id" in table.cells else np.empty(0, np.int64),
+        line=table.line, unit=table.unit, form=BOX_FORMS[roles], scale=scale,
+        identity=table.whole("id") if "id" in table.cells else np.empty(0, np.int64), **columns,
     )  # fmt: skip
 
 
@@ -443,34 +428,27 @@ def _frames(table: Table, source: Source, usual: int) -> IntArray:
         return frames_of_numbers(table.whole("frame"), source, usual)
     if names is not None:
         return frames_of_names(names, source, 0)
-    source.times_s = seconds(table)
+    source.times_s = _seconds(table)
     if source.describes:
         return np.zeros(len(source.times_s), np.int64)
     if source.video.times_s is None:
         raise ReobjError(f"{source.path}, line 1: no column frame; time stamps can be used only if "
                          "the names of the images are time stamps too")  # fmt: skip
-    return nearest_times(source.video.times_s, source.times_s, 0.0)
+    return _nearest_times(source.video.times_s, source.times_s)
 
 
-def seconds(table: Table) -> Array:
+def _seconds(table: Table) -> Array:
     """Return the times (N,) of a table in s: of the unit that ends the column's name, else in s."""
-    values = table.numbers("time")
     name = next(name for name in ALIASES["time"].split() if name in table.header)
     per_s = next((unit.value for unit in TimeUnit if name.endswith(f"_{unit.name}")), 1.0)
-    if (latest := values.max(initial=0)) > 1e11 * per_s:
-        raise ReobjError(f"{table.path}: column {name}: {latest:g} is no time in s; name its unit: "
-                         "timestamp_ms, timestamp_us or timestamp_ns")  # fmt: skip
-    return values / per_s
+    return table.numbers("time") / per_s
 
 
-def nearest_times(times_s: Array, time_s: Array, alone_s: float) -> IntArray:
-    """Return the rows of the nearest times (N,); -1 beyond half of the usual step.
-
-    alone_s: half the step of a single time.
-    """
+def _nearest_times(times_s: Array, time_s: Array) -> IntArray:
+    """Return the rows of the nearest times (N,); -1 beyond half of the usual step (1 s)."""
     if not len(times_s):
         return np.full(len(time_s), -1)
-    half = 0.5 * float(np.median(np.diff(times_s))) if len(times_s) > 1 else alone_s
+    half = 0.5 * float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.5
     nearest = nearest_of(time_s, times_s)
     return np.where(np.abs(times_s[nearest] - time_s) <= half, nearest, -1)
 
@@ -478,7 +456,7 @@ def nearest_times(times_s: Array, time_s: Array, alone_s: float) -> IntArray:
 # ---- Classes -------------------------------------------------------------------------------------
 
 
-def text_classes(table: Table, source: Source, base: Sequence[str]) -> tuple[IntArray, list[str]]:
+def _text_classes(table: Table, source: Source, base: Sequence[str]) -> tuple[IntArray, list[str]]:
     """Read a column of class names or of numbers from 0; empty cells and -1: no class.
 
     base: names by number, if the user gives none; other names in the file follow them.
@@ -516,3 +494,107 @@ def _with_unnamed(
         return class_id, names
     source.say(f"{blank.sum()} boxes without a class are called object")
     return np.where(blank, len(names), class_id), [*names, "object"]
+
+
+# ---- Boxes in 3D ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Boxes3D:
+    """Boxes in the world of the cameras, each of one detection of a video.
+
+    Attributes (N rows, by frame):
+        frame: (N,) source frame numbers. detection_index: (N,) as in `Tracks`.
+        box: (N, 15) centre (3), half extents (3) and rotation world_from_box (9, by rows).
+        score: (N,) in [0, 1].
+    """
+
+    frame: IntArray
+    detection_index: IntArray
+    box: Array
+    score: Array
+
+    def of_rows(self, tracks: Tracks) -> IntArray:
+        """Return the row of each detection (M,) of tracks; -1: it has no box in 3D."""
+        keys = zip(self.frame.tolist(), self.detection_index.tolist(), strict=True)
+        row_of = {key: row for row, key in enumerate(keys)}
+        wanted = zip(tracks.frame.tolist(), tracks.detection_index.tolist(), strict=True)
+        return np.array([row_of.get(key, -1) for key in wanted], np.int64)
+
+
+def boxes_3d_of(recorded: RecordedDetections | None) -> Boxes3D | None:
+    """Return the boxes in 3D of validated detections; None: they have none."""
+    if recorded is None or not len(recorded.boxes_3d):
+        return None
+    index = np.arange(len(recorded)) - np.searchsorted(recorded.frame, recorded.frame)
+    return Boxes3D(recorded.frame, index, recorded.boxes_3d, recorded.score)
+
+
+def read_source_3d(source: Source) -> RecordedDetections:
+    """Read boxes in 3D and project them to the frames of their time stamps.
+
+    Raises:
+        ReobjError: no cameras, an invalid value, or no box that is visible in its frame.
+    """
+    path = source.path
+    video = source.video
+    table = read_columns(path)
+    role_of = {"time_ns": "time", "prob": "score", "name": "class"}
+    table.cells = {role_of.get(name, name): cells for name, cells in table.cells.items()}
+    time_s = _seconds(table)
+    if source.describes:
+        source.times_s = time_s
+        return source.recorded(np.empty(0, np.int64), np.empty((0, 4)), (np.empty(0, np.int64), ()))
+    if source.poses is None:
+        fault = "these are 3D boxes in the world, which need its cameras"
+        raise ReobjError(f"{path}, line 1: {fault}: `run` with --detections and --poses FILE")
+    box = _boxes(table)
+    known = source.poses.known
+    frames = source.poses.frame[known]
+    times_s = source.poses.time_s[known] if video.times_s is None else video.times_s[frames]
+    nearest = _nearest_times(times_s, time_s)
+    xyxy = _projected(box, nearest, source.poses, video.size)
+    timed = nearest >= 0
+    visible = np.isfinite(xyxy[:, 0])
+    if len(box) and not visible.any():
+        span = f"{time_s.min():.3f} to {time_s.max():.3f} s"
+        poses_span = f"{times_s.min(initial=0):.3f} to {times_s.max(initial=0):.3f} s"
+        raise ReobjError(f"{path}: no box ({span}) is in the image of a frame with a pose at its "
+                         f"time stamp ({poses_span}); expected boxes in the world of --poses"
+                         )  # fmt: skip
+    recorded = source.recorded(
+        frames[nearest], xyxy, _text_classes(table, source, COCO_NAMES), table.numbers("score"),
+        line=table.line, unit=table.unit, boxes_3d=box,
+    )  # fmt: skip
+    for left, why in ((~timed, "at times without a frame with a pose"),
+                      (timed & ~visible, "outside the image of their frame")):  # fmt: skip
+        source.say(f"{left.sum()} boxes {why} left out" * bool(left.any()))
+    recorded.select(np.flatnonzero(visible))
+    return recorded
+
+
+def _boxes(table: Table) -> Array:
+    """Return centre, half extents and rotation (N, 15) of the rows."""
+    center, quat, size = np.split(table.columns(BOXES_3D), [3, 7], 1)
+    bad = (size <= 0).any(1) | (np.abs(np.linalg.norm(quat, axis=1) - 1) > 0.01)
+    if bad.any():
+        row = int(bad.argmax())
+        raise ReobjError(f"{table.where(row)}: extents {size[row]} and quaternion {quat[row]}, "
+                         "expected extents above 0 and a quaternion of length 1")  # fmt: skip
+    turn = np.empty((0, 3, 3))
+    if len(quat):
+        turn = Rotation.from_quat(np.roll(quat, -1, 1)).as_matrix()
+    return np.hstack([center, size / 2, turn.reshape(-1, 9)])
+
+
+def _projected(box: Array, nearest: IntArray, poses: Poses, video_size: tuple[int, int]) -> Array:
+    """Return the image bounds (N, 4) of boxes (N, 15), NaN: not visible; nearest: known pose."""
+    xyxy = np.full((len(box), 4), np.nan)
+    img_from_world = poses.camera.K @ poses.cam_from_world[poses.known]  # (F, 3, 4)
+    solids = quadrics.Ellipsoids(box[:, :3], box[:, 3:6], box[:, 6:].reshape(-1, 3, 3))
+    for k in np.unique(nearest[nearest >= 0]):
+        rows = np.flatnonzero(nearest == k)
+        xyxy[rows] = quadrics.solid_boxes(solids[rows], "box", img_from_world[k : k + 1])[0]
+    size = (poses.camera.width, poses.camera.height)
+    xyxy = quadrics.clip_boxes(distort_boxes(xyxy, poses.camera), size)
+    return np.asarray(xyxy * np.tile(np.divide(video_size, size), 2))

@@ -1,6 +1,7 @@
-"""Frames of a video file, an image folder, a camera or a stream, and checks of the source.
+"""Frames of a video file, an image folder, a camera or a stream; or frames without images.
 
-Start at `Video`; `resized` and `shrunk` scale images.
+Start at `Video`; `ImagelessVideo` replaces it where only detections and poses are given. `resized`
+and `shrunk` scale images.
 """
 
 from __future__ import annotations
@@ -30,37 +31,26 @@ from typing import Any, TypeVar
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from reobj.files import shortened
-from reobj.runtime import check_versions, guard_forks, quiet_opencv
-from reobj.sources.decoding import (
+from reobj.runtime import quiet_opencv
+from reobj.sources.image_files import (
+    IMAGE_FPS,
+    IMAGE_SUFFIXES,
     Decoded,
+    ImageList,
     Opened,
+    list_images,
     open_animation,
     open_camera,
     open_file,
     packet_count,
-    settled_times,
-)
-from reobj.sources.image_files import (
-    IMAGE_FPS,
-    IMAGE_SUFFIXES,
-    ImageList,
-    list_images,
     read_image,
+    settled_times,
     times_of_names,
-    why_unreadable,
 )
-from reobj.types import (
-    Array,
-    Frame,
-    Image,
-    ReobjError,
-    counted,
-    log,
-    option,
-    without_secrets,
-)
+from reobj.types import Array, Frame, Image, ReobjError, log, option, without_secrets
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +67,10 @@ class InputConfig:
     reconnect: int = option(
         0, "reconnection attempts after a live source ends, after 1, 2, 4, ... 30 s"
     )
+
+    def __post_init__(self) -> None:
+        if self.every < 1 or min(dataclasses.astuple(self)) < 0:
+            raise ReobjError("--every must be at least 1; --start, --stop, --max-size at least 0")
 
     def selects(self, frame: Any) -> Any:
         """Test whether frame numbers of the source, one or (N,), are to be read."""
@@ -136,7 +130,13 @@ class Video:
     """
 
     has_images = True
+    is_live = False
+    pixel_aspect = scale = 1.0
+    read = dropped = _seen = _taken = 0
     _after = -1  # frames up to this one are decoded and checked, but not yielded
+    _declared_s = 0.0
+    _opened: Opened | None = None  # a live source, until it is iterated
+    _clock: tuple[Array, bool] | None = None  # times (F,) in s; the file has them
 
     def __init__(
         self,
@@ -144,30 +144,21 @@ class Video:
         config: InputConfig | None = None,
         live: LiveTimes | None = None,
     ) -> None:
-        check_versions()
-        guard_forks()
         self._address = str(source)
         self.config = config or InputConfig()
         self._live = live or LiveTimes()
         self.source = without_secrets(self._address)
-        if self.config.every < 1 or min(dataclasses.astuple(self.config)) < 0:
-            raise ReobjError("--every must be at least 1; --start, --stop, --max-size at least 0")
         self.skipped: list[int] = []
         self.messages: list[str] = []
-        self.read = self.dropped = self._seen = self._taken = 0
-        self._declared_s = 0.0
-        self._opened: Opened | None = None  # a live source, until it is iterated
         self._is_url = _is_stream_url(self._address)
         self.fingerprint = source_fingerprint(source)
         images = ImageList([], [], []) if self._is_url else list_images(self.source)
         self.files = images.files
-        self._clock: tuple[Array, bool] | None = None  # times (F,) in s; the file has them
         for text in images.messages:
             self._warn(text)
         self.names = [path.name for path in self.files]
         self.times_s = times_of_names(self.names)
         self.is_live = self._is_url or (self.source.isdecimal() and not Path(self.source).exists())
-        self.pixel_aspect = 1.0
         self.size, self._announced_fps, self._announced = self._probe(images.usual)
         start = self.config.start
         if start and not self.is_live and not start < self.frame_count:
@@ -177,12 +168,6 @@ class Video:
         width, height = (max(round(side * ratio), 1) for side in self.size)
         self.working_size = (width, height)
         self.scale = width / self.size[0]
-
-    def __repr__(self) -> str:
-        """Describe the video in one line; a file is not decoded for it."""
-        width, height = self.size
-        frames = "live" if self.is_live else f"{counted(self.expected, 'frame', 'frames')} to read"
-        return f"{type(self).__name__}({self.source!r}, {width}x{height}, {frames})"
 
     def after(self, index: int) -> Video:
         """Return this video without the frames up to `index`, to continue with the next one.
@@ -420,8 +405,8 @@ class Video:
             with quiet_opencv():
                 image = next((image for image in images if image is not None), None)
             if image is None:
-                why = why_unreadable(self.files[0])
-                raise ReobjError(f"{self.source}: no frame can be decoded ({why})")
+                raise ReobjError(f"{self.source}: no frame can be decoded: damaged, or not images "
+                                 "of 8 or 16 bits a channel")  # fmt: skip
             return (image.shape[1], image.shape[0]), IMAGE_FPS, len(self.files)
         opened = self._open()
         first = itertools.islice(opened.frames, MAX_UNREADABLE)
@@ -429,8 +414,9 @@ class Video:
         if frame.image is None:
             raise ReobjError(f"{self.source}: no frame can be decoded (codec {opened.codec})")
         self.is_live = self.is_live and not opened.count  # the URL of a file is not live
-        self._opened = opened if self.is_live else None
-        if not self.is_live:
+        if self.is_live:
+            self._opened = opened
+        else:
             self._declared_s = opened.duration_s
             self._set_aspect(opened.pixel_aspect, frame.turned % 180 == 90)
         height, width = frame.image().shape[:2]
@@ -446,6 +432,65 @@ class Video:
             self._warn(f"its pixels are {wide}:{high}, not square, by its metadata: boxes are in "
                        "stored pixels, cameras have two focal lengths; if that is wrong, correct "
                        "its sample aspect ratio (ffmpeg -i IN -vf setsar=1 OUT)")  # fmt: skip
+
+
+class ImagelessVideo(Video):
+    """Iterate over frames with a number, a time and perhaps a name, but without an image.
+
+    Supports tracking by motion and given cameras, 3D objects and all files; not detectors,
+    appearance, reconstruction, overlay video and pictures in the viewer.
+
+    Args:
+        source: file or folder of poses that defines the frames.
+        size: (w, h) of the images of the detections, px.
+        times_s: (F,) of the frames by number. None: from their names, else 30 Hz.
+        names: (F,) of the images by number, "" where unknown, or [].
+        count: F, if there are neither times nor names.
+    """
+
+    has_images = False
+
+    def __init__(
+        self,
+        source: str | Path,
+        size: Sequence[int],
+        config: InputConfig | None = None,
+        *,
+        times_s: npt.ArrayLike | None = None,
+        names: Sequence[str] = (),
+        count: int = 0,
+    ) -> None:
+        self.source = str(source)
+        self.config = config or InputConfig()
+        self.fingerprint = source_fingerprint(source)
+        self.size = self.working_size = (int(size[0]), int(size[1]))
+        self.names = list(names)
+        self.files = []
+        given = times_of_names(self.names) if times_s is None else np.asarray(times_s, np.float64)
+        self.times_s = given
+        self.times_are_known = given is not None
+        self.frame_count = max(len(self.names), count, 0 if given is None else len(given))
+        self._announced = self.frame_count
+        self.fps = IMAGE_FPS
+        if given is not None and len(given) > 1:
+            self.fps = 1 / max(float(np.median(np.diff(given))), 1e-3)
+        self.skipped = []
+        self.messages = []
+
+    def facts(self) -> dict[str, Any]:
+        """Return the arguments to make the same frames again, as JSON values."""
+        times_s = None if self.times_s is None else self.times_s.tolist()
+        return {"size": self.size, "times_s": times_s, "names": self.names,
+                "count": self.frame_count}  # fmt: skip
+
+    def __iter__(self) -> Iterator[Frame]:
+        stop = min(self.config.stop or self.frame_count, self.frame_count)
+        times_s = self.times_s
+        no_image: Any = None
+        for index in range(self.config.start, stop, self.config.every):
+            time_s = index / IMAGE_FPS if times_s is None else float(times_s[index])
+            if index > self._after:
+                yield Frame(index, time_s, no_image)
 
 
 def resized(image: Image, size: Sequence[int]) -> Image:
@@ -487,19 +532,21 @@ def source_fingerprint(source: Any) -> str:
     return hashlib.sha256(json.dumps(facts).encode()).hexdigest()[:16]
 
 
-def content_fingerprint(files: Sequence[Path], most: int = 16, piece: int = 4096) -> str:
+def content_fingerprint(files: Sequence[Path]) -> str:
     """Hash sizes and some content of files.
 
     Copies have the same one, whatever their names, folders and times.
 
-    Args:
-        most: pieces of `piece` bytes that are read, spread over at most most / 2 files, with the
-            first and the last bytes of each.
+    At most 16 pieces are read, spread over at most 8 files, with the first and the last bytes of
+    each.
+
     Returns:
         16 hex digits; "" without files.
     """
     if not files:
         return ""
+    most = 16  # pieces
+    piece = 4096  # bytes
     digest = hashlib.sha256(json.dumps([p.stat().st_size for p in files]).encode())
     read = files[:: -(-len(files) // (most // 2))]
     for path in read:

@@ -5,11 +5,13 @@ Start at `model_path`.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import http.client
 import json
 import os
 import urllib.request
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +23,6 @@ from reobj.types import NOTE, ReobjError, log
 # and .229, .224, .225, times 255), as used to train most published networks
 IMAGENET_MEAN = (123.675, 116.28, 103.53)
 IMAGENET_STD = (58.395, 57.12, 57.375)
-FILE_MAX = 100_000_000  # bytes of a download; of DEIMv2's largest: a third
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,9 +180,8 @@ def _fetch(weights: Weights, offline: bool) -> Path:
     folder = _model_folders()[0]
     target = folder / weights.file
     expected = f"{weights.digest_kind} {weights.digest}"
-    smaller = "; or take the small detector: --detector fast" if weights.alias != "fast" else ""
     by_hand = (f"get a file with {expected} from {weights.url}, put it at {target}, or set "
-               f"REOBJ_MODELS to its folder{smaller * (weights.role == 'detector')}")  # fmt: skip
+               "REOBJ_MODELS to its folder")  # fmt: skip
     if offline:
         raise ReobjError(f"model {weights.name} is not in {folder}, and --offline forbids the "
                          f"download: {by_hand}")  # fmt: skip
@@ -207,12 +207,32 @@ def _download(weights: Weights, target: Path) -> None:
             part.open("wb") as file,
             Progress("fetch kB", weights.size // 1000) as progress,
         ):
-            while file.tell() < FILE_MAX and (chunk := response.read(1 << 16)):
+            while chunk := response.read(1 << 16):
                 file.write(chunk)
                 progress.step(file.tell() // 1000 - progress.done)
         if (digest := weights.digest_of(part)) != weights.digest:
             raise ReobjError(f"{weights.digest_kind} is {digest}, not kept: an incomplete download "
                              "or another file")  # fmt: skip
+
+
+@contextlib.contextmanager
+def failing(name: str, count: int = 0) -> Iterator[None]:
+    """Convert any error of a network's library to one line.
+
+    Args:
+        count: images that it gets at once; 0: it is being opened.
+    """
+    try:
+        yield
+    except ReobjError:
+        raise
+    except Exception as error:  # no memory on the device, no such file, no download, ...
+        at_once = f" on {count} images at once (detect.batch)" if count > 1 else ""
+        text = next((line.strip() for line in str(error).splitlines() if line.strip()), "")
+        if not text or not isinstance(error, OSError | RuntimeError):
+            text = f"{type(error).__name__}: {text}"
+        failed = f" failed{at_once}" if count else ""
+        raise ReobjError(f"{name}{failed}: {text}") from error
 
 
 def frames_at_once(asked: int, device: str) -> int:

@@ -528,12 +528,3 @@ def test_corners_in_a_sequence_of_known_size(
         entry["bbox_mode"] = 0
     (tmp_path / "gt.json").write_text(json.dumps(data))
     assert score(result, tmp_path / "gt.json")[0]["gt_objects"] == 5
-
-
-def test_a_folder_of_another_tool_as_truth(
-    tmp_path: Path, result: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "VOC/Annotations").mkdir(parents=True)
-    (tmp_path / "VOC/Annotations/0.xml").write_text("<annotation><object/></annotation>")
-    text = refused(capsys, result, tmp_path / "VOC")
-    assert "Pascal VOC" in text and "COCO JSON with track_id" in text

@@ -1,4 +1,4 @@
-"""Frames without images (`sources.imageless`), numbered as in the files of poses and detections.
+"""Frames without images (`sources.video`), numbered as in the files of poses and detections.
 
 Start at `open_video`.
 """
@@ -29,8 +29,7 @@ from reobj.sources.detection_files import (
     read_detections,
 )
 from reobj.sources.image_files import sorted_names
-from reobj.sources.imageless import ImagelessVideo
-from reobj.sources.video import InputConfig, Video
+from reobj.sources.video import ImagelessVideo, InputConfig, Video
 from reobj.types import NOTE_START, ReobjError
 
 
