@@ -144,13 +144,12 @@ from reobj.poses.stage import (
 from reobj.poses.supplied.imageless import open_video
 from reobj.poses.supplied.readers import read_poses
 from reobj.results.changes import Change, Changes, read_changes
-from reobj.results.checkpoint import Checkpoint
 from reobj.results.edits import kept_edits, read_edits
+from reobj.results.entries import OutputFile
 from reobj.results.evaluation import evaluate, score_report
 from reobj.results.export import EXPORTS, Viewer, export
 from reobj.results.links import Links
 from reobj.results.live import LivePage, open_viewer
-from reobj.results.names import OutputFile
 from reobj.results.overlay import film_layers
 from reobj.results.plausibility import implausible
 from reobj.results.result import Object, Part, Result, VideoInfo, World
@@ -1476,7 +1475,7 @@ def refit(
         sizes = config.objects
         check_known_size(sizes.known_size, sizes.size_priors(), last.class_names)
         result = last
-        links = workspace.last_links(dataclasses.asdict(last_config.objects))
+        links = workspace.last_links()
         if tracks:
             links = None
             result = _given_tracks(tracks, video, config.detect, last)
@@ -1538,7 +1537,7 @@ def _last_config(out: str | Path) -> Config:
 KEPT = {
     "detect": "the frames detected so far",
     "poses": "the features and matches so far",
-    "track": "the frames up to the last save",  # `collect_tracks` says how many
+    "track": "nothing",
     "map": "nothing",
     "objects": "nothing",
     "write": "the files that are complete",
@@ -1584,8 +1583,7 @@ class _Job:
         try:
             yield
         except KeyboardInterrupt as interruption:
-            kept = getattr(interruption, "__notes__", None) or [KEPT[stage]]
-            interruption.add_note(f"in the stage {stage}, which keeps {kept[0]}")
+            interruption.add_note(f"in the stage {stage}, which keeps {KEPT[stage]}")
             raise
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.monotonic() - started
         steps = self.step_seconds.get(stage, {})
@@ -1660,19 +1658,12 @@ def _track_video(
             return known
         embedder = make_embedder(config.embed.model, config.embed.head, *job.runtime)
         tracker = Tracker(config.tracker, embedder)
-        checkpoint = None
-        if keep and viewer is None:  # which shows all frames
-            checkpoint = Checkpoint(job.workspace.path("tracking", *key).with_suffix(""))
-            tracker = checkpoint.load(lambda file: Tracker.load(file, embedder)) or tracker
-            video = video.after(checkpoint.last)
         steps = track(video, source, tracker, poses=poses)
         if viewer is not None:
             steps = viewer.follow(steps, source.class_names, video, poses)
-        result = collect_tracks(steps, tracker, video, source, job.progress, checkpoint)
+        result = collect_tracks(steps, tracker, video, source, job.progress)
         result = dataclasses.replace(result, boxes_3d=boxes_3d_of(source.recorded))
         result.save_tracked(path)
-        if checkpoint is not None:
-            checkpoint.remove()
     return result
 
 

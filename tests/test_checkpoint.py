@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from reobj.results.checkpoint import Checkpoint, TrackedFrames
 
 import reobj_track as rt
 from reobj.files import load_npz
 from reobj.poses import stage
-from reobj.results.checkpoint import Checkpoint, TrackedFrames
 
 ROOM = Path(__file__).resolve().parent.parent / "examples/room"
 FRAMES = 40  # of the room: objects appear, leave and return

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from reobj.results.report import sides
 from scipy.spatial.transform import Rotation
 from simulated import CHAIR, CUP, chair_solids, fitted, tracks_of, walk, with_columns
 
@@ -21,7 +22,6 @@ import quadrics
 import reobj_track as rt
 from reobj.results.entries import decode
 from reobj.results.ply import write_ply
-from reobj.results.report import sides
 from reobj.results.result import VideoInfo
 from reobj.results.saving import validate_objects, write_mot
 from reobj.results.stages import tracked_embeddings

@@ -262,7 +262,7 @@ def read_earlier(path: Path) -> tuple[EarlierSession, ...]:
     Raises:
         ReobjError: damaged, or another kind of file.
     """
-    return read_json(_EarlierFile, path, out=path.parent.parent).sessions
+    return read_json(_EarlierFile, path, own=True).sessions
 
 
 def _moved_text(change: Change) -> str:
@@ -284,4 +284,4 @@ def read_changes(path: Path) -> Changes:
     Raises:
         ReobjError: damaged, or another kind of file.
     """
-    return read_json(Changes, path, HEADER, path.parent, Changes.KINDS)
+    return read_json(Changes, path, HEADER, own=True)

@@ -18,8 +18,8 @@ from scipy.optimize import linear_sum_assignment
 from reobj import __version__
 from reobj.files import wrapped
 from reobj.formats import AUTO
+from reobj.results.entries import OutputFile
 from reobj.results.evaluation_3d import score_objects
-from reobj.results.names import OutputFile
 from reobj.results.result import Result
 from reobj.results.truth import (
     LabelledBoxes,

@@ -11,7 +11,7 @@ import numpy as np
 
 from reobj.files import cut
 from reobj.results.entries import Object
-from reobj.results.report import sides
+from reobj.results.result import sides
 from reobj.results.scene import Pictures, write_scene
 from reobj.sources.imageless import ImagelessVideo
 

@@ -22,8 +22,8 @@ import quadrics
 from reobj.cameras import Camera
 from reobj.files import cut
 from reobj.results.changes import Change
+from reobj.results.export_source import centred
 from reobj.results.film import FilmWriter
-from reobj.results.origin import centred
 from reobj.results.ply import CYLINDER_SIDES as SIDES
 from reobj.sources.image_files import IMAGE_FPS
 from reobj.sources.video import Video

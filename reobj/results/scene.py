@@ -30,11 +30,10 @@ from reobj.poses.floor import NOISE
 from reobj.results.changes import EarlierSession
 from reobj.results.cloud import MOST, Cloud, DenseFrames
 from reobj.results.depth_cloud import dense_frames
-from reobj.results.entries import Object, World, visit_gap
-from reobj.results.names import recording_name
-from reobj.results.origin import centred
+from reobj.results.entries import Object, World, recording_name, visit_gap
+from reobj.results.export_source import centred
 from reobj.results.overlay import Overlay, film_layers
-from reobj.results.report import sides
+from reobj.results.result import sides
 from reobj.sources.image_files import IMAGE_FPS
 from reobj.sources.video import Video, shrunk
 from reobj.types import (

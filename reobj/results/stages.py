@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 
 from reobj.files import Progress, load_cached, load_npz, save_npz
-from reobj.results.checkpoint import Checkpoint, TrackedFrames
 from reobj.results.result import Result, VideoInfo
 from reobj.results.workspace import Workspace
 from reobj.sources.detectors import DetectionCache, DetectionSource
@@ -99,14 +98,14 @@ def _untracked(
     tracks: Tracks, frames: list[int], detected: list[Detections], scale: float
 ) -> Tracks:
     """Make rows, without tracklets, of the detections that are in no row of the tracks."""
-    index = np.concatenate([np.arange(len(detections)) for detections in detected])
-    frame = np.repeat(np.asarray(frames, np.int64), [len(detections) for detections in detected])
-    xyxy = np.concatenate([detections.xyxy for detections in detected]) / scale
-    score = np.concatenate([detections.score for detections in detected])
-    class_id = np.concatenate([detections.class_id for detections in detected])
+    columns = [
+        (np.full(len(d), frame), d.xyxy, d.score, d.class_id, np.arange(len(d)))
+        for frame, d in zip(frames, detected, strict=True)
+    ]
+    frame, xyxy, score, class_id, index = map(np.concatenate, zip(*columns, strict=True))
     tracked = set(zip(tracks.frame.tolist(), tracks.detection_index.tolist(), strict=True))
     free = [key not in tracked for key in zip(frame.tolist(), index.tolist(), strict=True)]
-    rows = dataclasses.replace(_rows(frame, xyxy, score, class_id), detection_index=index)
+    rows = dataclasses.replace(_rows(frame, xyxy / scale, score, class_id), detection_index=index)
     return rows[np.array(free, bool)]
 
 
@@ -143,49 +142,46 @@ def collect_tracks(
     video: Video,
     source: DetectionSource,
     progress: Callable[[str, int], Progress] = Progress,
-    checkpoint: Checkpoint | None = None,
 ) -> Result:
     """Run a tracker over a video and collect its tracks, embeddings and warnings.
 
     Args:
         steps: the running `track(video, source, tracker)`.
         progress: makes the progress line of a step from its name and total.
-        checkpoint: keeps the tracker and what was collected; after an interruption `steps` begins
-            after its frames.
     """
-    collected = TrackedFrames() if checkpoint is None else checkpoint.collected
+    frames: list[int] = []
+    found: list[Tracks] = []  # also tentative ones
+    embedded: list[tuple[IntArray, npt.NDArray[np.float16]]] = []
+    detected: list[Detections] = []
+    looked: list[bool] = []
     try:
         with progress("track", video.expected) as line:
-            line.resume(len(collected.frames))
             for frame, _ in steps:
-                collected.add(frame.index, tracker)
-                if checkpoint is not None:
-                    checkpoint.save_if_due(tracker)
+                index, rows = tracker.latest_embeddings()
+                frames.append(frame.index)
+                found.append(tracker.latest)
+                embedded.append((index, rows.astype(np.float16)))
+                detected.append(dataclasses.replace(tracker.detections, masks=None))
+                looked.append(tracker.looked)
                 line.step()
-    except KeyboardInterrupt as interruption:  # the way to end a live source
+    except KeyboardInterrupt:  # the way to end a live source
         if not video.is_live:
-            if checkpoint is not None:
-                interruption.add_note(f"{checkpoint.kept} tracked frames")
             raise
     finally:
         _finish_cache(source)
-    frames = collected.frames
     if not frames:
         why = "--start/--stop/--every leave none, or the file is damaged"
         raise ReobjError(f"{video.source}: no frame could be read ({why})")
-    tracks = Tracks.concatenate(frames, collected.found, video.scale)
-    untracked = _untracked(tracks, frames, collected.detected, video.scale)
+    tracks = Tracks.concatenate(frames, found, video.scale)
+    untracked = _untracked(tracks, frames, detected, video.scale)
     foreground_width = tracker.state.gallery.foreground_width
-    embeddings, embedding_row = tracked_embeddings(
-        tracks, frames, collected.embedded, foreground_width
-    )
+    embeddings, embedding_row = tracked_embeddings(tracks, frames, embedded, foreground_width)
     warnings = [*source.messages, *video.messages]
     if video.is_live:
         warnings += [
             f"live: {video.read} frames came, {video.dropped} of them were dropped to keep up",
             "a live source cannot be read twice: identities only; record it for 3D",
         ]
-    looked = collected.looked
     if not len(tracks):
         reason = _why_none(untracked.score, sum(looked), tracker)
         warnings.append(f"no object was tracked: {reason}")
@@ -196,7 +192,7 @@ def collect_tracks(
         embeddings=embeddings,
         embedding_row=embedding_row,
         untracked=untracked,
-        looked=None if all(looked) else np.array(frames, np.int64)[np.array(looked, bool)],
+        looked=None if all(looked) else np.array(frames, np.int64)[looked],
         warnings=warnings,
     )
 

@@ -37,7 +37,7 @@ from reobj.cameras import Camera
 from reobj.maps.stage import session_key
 from reobj.poses.keyframes import ResizedVideo
 from reobj.poses.sfm import rescale
-from reobj.results.names import recording_name
+from reobj.results.entries import recording_name
 from reobj.results.workspace import Workspace
 from reobj.sources import video as sources
 from reobj.sources.decoding import settled_times
