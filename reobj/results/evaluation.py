@@ -484,7 +484,6 @@ def _in_true_frames(
         true, found = (f"{boxes.frame.min()}-{boxes.frame.max()}" for boxes in (truth, predicted))
         notes.append(f"no true box overlaps a box of the result (frames from 1: truth {true}, "
                      f"result {found}): truth of another video?")  # fmt: skip
-    notes += _scale_note(truth, unnamed)
     if truth.listed is not None:
         kept = predicted[np.isin(predicted.frame, truth.listed)]
         if left := len(predicted) - len(kept):
@@ -495,29 +494,9 @@ def _in_true_frames(
     frames = np.unique(predicted.frame)
     without = np.setdiff1d(frames, truth.frame)
     if len(without):
-        true_frames = np.unique(truth.frame)
-        step = int(np.gcd.reduce(np.diff(true_frames))) if len(true_frames) > 2 else 1
-        apart = f", whose frames are a multiple of {step} apart" if step > 1 else ""
         notes.append(f"{len(without)} of {len(frames)} frames with boxes of the result have no "
-                     f"ground truth{apart}: boxes in them count as false")  # fmt: skip
+                     "ground truth: boxes in them count as false")  # fmt: skip
     return predicted
-
-
-def _scale_note(truth: LabelledBoxes, predicted: LabelledBoxes) -> list[str]:
-    """Note that most true boxes match only after all boxes of the result are scaled."""
-    counts: dict[float, int] = {}
-    for scale in (1, 1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 2, 3, 4):
-        scaled = dataclasses.replace(predicted, xyxy=predicted.xyxy * scale)
-        steps = _frame_steps(truth, scaled)
-        counts[scale] = sum(int((iou >= MATCH_IOU).any(1).sum()) for *_, iou in steps)
-        if counts[1] > 0.3 * len(truth):
-            return []
-    best = max(counts, key=lambda scale: counts[scale])
-    if counts[best] <= max(3 * counts[1], 0.3 * len(truth)):
-        return []
-    return [f"{counts[1]} of {len(truth)} true boxes match a box of the result, but {counts[best]} "
-            f"do if the boxes of the result are scaled by {best:.3g}: boxes of frames of another "
-            "size?"]  # fmt: skip
 
 
 def score_appearance(tracked: Result, truth: LabelledBoxes) -> dict[str, float]:
