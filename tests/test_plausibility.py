@@ -82,19 +82,6 @@ def test_most_objects_of_one_class(classes: dict[int, int], warned: bool) -> Non
     assert said(result(classes), identities_given=True) == []
 
 
-def test_unmatched_boxes_of_other_classes_prevent_the_warning() -> None:
-    """Boxes of other classes in no track prove that the detector has other classes."""
-    assert len(said(result({CHAIR: 20}), untracked=rows(1, 0, FRIDGE, 0.1))) == 1
-
-
-@pytest.mark.parametrize("status", ["doubtful", "implausible"])
-def test_doubtful_and_implausible_objects_are_not_counted(status: str) -> None:
-    found = result({FRIDGE: 9, CHAIR: 5}, boxes=2)
-    assert len(said(found)) == 1
-    found.objects[:2] = [dataclasses.replace(o, status=status) for o in found.objects[:2]]
-    assert said(found) == []
-
-
 @pytest.mark.parametrize(
     ("status", "count", "warned"),
     [("prior_dominated", 3, True), ("rejected", 5, True), ("prior_dominated", 2, False),
@@ -117,10 +104,6 @@ def test_nothing_measured(status: str, count: int, warned: bool) -> None:
             assert said(found) == []
     assert said(found) == []
     assert said(found, poses=lost(1)) == said(found, poses=None) == []  # nothing could be
-
-
-def test_people_are_never_measured() -> None:
-    assert said(result({PERSON: 9}, "rejected", walk())) == []
 
 
 @pytest.mark.parametrize(("fraction", "warned"), [(0, 0), (0.5, 0), (0.55, 1), (0.9, 1), (1, 0)])
@@ -181,22 +164,6 @@ def test_the_most_frequent_cause_is_reported(untracked: rt.Tracks, cause: str) -
     assert line.startswith(f"{len(number)} of {60 + len(number)} boxes of score 0.4 or more")
     assert cause in line and line.endswith("listed object") == (not cause)
     assert ("--detector" in line) == ("before and after" in cause)
-
-
-def test_boxes_of_doubtful_objects_are_unexplained() -> None:
-    found = result({CHAIR: 3, FRIDGE: 3})
-    for k in range(4):
-        found.objects[k] = dataclasses.replace(found.objects[k], status="doubtful")
-    (line,) = said(found)
-    assert line.startswith("40 of 60 boxes") and "output.doubtful=true" in line
-    filled = dataclasses.replace(rows(90, 6, score=0.0), detection_index=np.full(90, -1))
-    assert said(found, tracks=rt.Tracks.joined([found.tracks, filled])) == [line]
-    # a box assigned to an object after the video is still among the untracked ones
-    assert said(found, untracked=found.tracks[found.tracks.track_id == 6]) == [line]
-    assert implausible(found, 0.95, MOVING) == []  # another scale of scores
-    few = result({CHAIR: 3}, boxes=5)
-    few.objects[:2] = [dataclasses.replace(o, status="doubtful") for o in few.objects[:2]]
-    assert said(few) == []
 
 
 def test_the_warning_appears_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

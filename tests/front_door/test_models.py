@@ -301,8 +301,8 @@ def test_names_in_a_locale_without_utf8(tmp_path: Path) -> None:
     assert "1 椅子" in shown and "1 Stuhl grün" in shown and "out ü" in shown
     words = ["track", "Küche.mp4", *track[2:], "-o", "one", "--classes", "椅子"]
     assert "1 object: 1 椅子" in run(*words)
-    assert "out ü" in run("export", "out ü", "--to", "labelme")
-    exported = (tmp_path / "out ü/labelme/labels.txt").read_text(encoding="utf-8")
-    assert set(exported.split("\n")) >= {"Stuhl grün", "椅子"}
+    assert "out ü" in run("export", "out ü", "--to", "coco-vid")
+    exported = json.loads((tmp_path / "out ü/coco_vid.json").read_text(encoding="utf-8"))
+    assert {kind["name"] for kind in exported["categories"]} >= {"Stuhl grün", "椅子"}
     data = json.loads((tmp_path / "out ü/objects.json").read_text(encoding="utf-8"))
     assert {entry["class"] for entry in data["objects"]} == {"椅子", "Stuhl grün"}

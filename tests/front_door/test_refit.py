@@ -74,21 +74,6 @@ def test_options_of_the_fit_keep_the_identities(
     assert [o["center"] for o in new] != [o["center"] for o in old]  # they were fitted again
 
 
-def test_the_fit_before_comes_back(made: Path, out: Path) -> None:
-    """A second refit with the first options gives the first result."""
-    refit(out, "--known-size", "chair=2m")
-    assert info(out)["objects"] != info(made)["objects"]
-    refit(out, "--known-size", "")
-    assert info(out)["objects"] == info(made)["objects"] and boxes(out) == boxes(made)
-
-
-def test_a_folder_without_stored_identities_keeps_the_numbers(made: Path, out: Path) -> None:
-    """As that of an earlier version: tracks.txt and the options of its run give them."""
-    (out / "cache" / "last-links.npz").unlink()
-    refit(out, "--known-size", "chair=2m")
-    assert boxes(out) == boxes(made) and described(out) == described(made)
-
-
 def test_damaged_stored_identities_are_made_again(made: Path, out: Path, capsys: Any) -> None:
     (out / "cache" / "last-links.npz").write_bytes(b"x")
     refit(out)
@@ -169,17 +154,6 @@ def test_numbers_of_edited_objects_are_never_reassigned(
     refit(out, *edits(path, split(made, last)))
     (new,) = boxes(out).keys() - boxes(made).keys()
     assert new > another
-
-
-def test_corrections_stay_when_tracks_are_linked_again(
-    made: Path, out: Path, tmp_path: Path
-) -> None:
-    number = list(boxes(made))[1]
-    refit(out, *edits(tmp_path / "e.json", split(made, number)))
-    (new,) = boxes(out).keys() - boxes(made).keys()
-    part = boxes(out)[new]
-    refit(out, "--set", "objects.link=0")
-    assert len(part & boxes(out)[new]) > 0.8 * len(part)
 
 
 def test_given_identities_replace_all_numbers(made: Path, out: Path, tmp_path: Path) -> None:
