@@ -152,7 +152,16 @@ from reobj.results.links import Links
 from reobj.results.live import LivePage, open_viewer
 from reobj.results.overlay import film_layers
 from reobj.results.plausibility import implausible
-from reobj.results.result import Object, Part, Result, VideoInfo, World
+from reobj.results.result import (
+    Object,
+    Part,
+    Result,
+    VideoInfo,
+    World,
+    load_tracked,
+    save_tracked,
+    write_objects,
+)
 from reobj.results.saving import (
     copy_models,
     replaced,
@@ -1654,7 +1663,7 @@ def _track_video(
     path = job.workspace.path("tracks", *key)
     keep = bool(source.key) and not video.is_live
     with job.timed("track", may_be_cached=keep):
-        if keep and (known := load_cached(path, Result.load_tracked)):
+        if keep and (known := load_cached(path, load_tracked)):
             return known
         embedder = make_embedder(config.embed.model, config.embed.head, *job.runtime)
         tracker = Tracker(config.tracker, embedder)
@@ -1663,7 +1672,7 @@ def _track_video(
             steps = viewer.follow(steps, source.class_names, video, poses)
         result = collect_tracks(steps, tracker, video, source, job.progress)
         result = dataclasses.replace(result, boxes_3d=boxes_3d_of(source.recorded))
-        result.save_tracked(path)
+        save_tracked(result, path)
     return result
 
 
@@ -1857,7 +1866,7 @@ def _write(job: _Job, result: Result) -> Result:
     )
     if failures:
         result = dataclasses.replace(result, warnings=[*result.warnings, *failures])
-        result.write_objects(workspace.out / OutputFile.OBJECTS)
+        write_objects(result, workspace.out / OutputFile.OBJECTS)
     return result
 
 

@@ -17,6 +17,7 @@ from simulated import SIZE, chair_solids, walk
 import reobj_track as rt
 from reobj.cameras import invert_rigid
 from reobj.results.export import EXPORTS
+from reobj.results.result import write_objects
 from reobj.results.workspace import Workspace
 from reobj.types import object_color
 
@@ -73,7 +74,7 @@ def written(result: rt.Result, to: str, path: Path) -> Path:
 
 
 def upright_entries(result: rt.Result, path: Path) -> list[dict[str, Any]]:
-    result.write_objects(path)
+    write_objects(result, path)
     return list(json.loads(path.read_text())["objects"])
 
 

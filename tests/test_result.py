@@ -18,7 +18,7 @@ from simulated import CHAIR, CUP, chair_solids, fitted, tracks_of, walk, with_co
 import quadrics
 import reobj_track as rt
 from reobj.results.ply import write_ply
-from reobj.results.result import VideoInfo, sides
+from reobj.results.result import VideoInfo, load_tracked, save_tracked, sides
 from reobj.results.saving import validate_objects, write_mot
 from reobj.results.stages import tracked_embeddings
 
@@ -305,8 +305,8 @@ def test_embeddings_belong_to_their_rows() -> None:
 def test_tracker_output_is_read_back(tmp_path: Path) -> None:
     before = embedded_result()
     before = dataclasses.replace(before, warnings=["dark"], identities_given=True)
-    before.save_tracked(tmp_path / "a.npz")
-    after = rt.Result.load_tracked(tmp_path / "a.npz")
+    save_tracked(before, tmp_path / "a.npz")
+    after = load_tracked(tmp_path / "a.npz")
     for f in dataclasses.fields(rt.Tracks):
         a, b = getattr(before.tracks, f.name), getattr(after.tracks, f.name)
         np.testing.assert_array_equal(a, b, f.name)

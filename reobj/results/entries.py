@@ -50,7 +50,7 @@ Spans = list[Annotated[list[NonNegativeInt], msgspec.Meta(min_length=2, max_leng
 
 # Names of fields that differ from the keys of objects.json and changes.json, by the key above
 _OF_CHANGE = {"class": "class_name", "from": "before", "to": "after", "from_shape": "before_shape"}
-_FIELD_NAMES = {
+_FIELD_NAMES: dict[str, dict[str, str]] = {
     "objects": {"class": "class_name", "tracks": "tracklet_ids", "frames": "visits"},
     "": {"map": "map_path"},
     "changes": {"map": "map_path"},

@@ -68,7 +68,8 @@ def export_glb(result: Result, path: Path) -> None:
         scene.add_geometry(mesh, name, name, transform=turn @ world_from_sphere)
     poses = world.poses
     if poses is not None and len(poses.points):
-        cloud: Any = trimesh.PointCloud(poses.points, colors=poses.colors)
+        make_cloud: Any = trimesh.PointCloud
+        cloud = make_cloud(poses.points, colors=poses.colors)
         scene.add_geometry(cloud, "points", "points", transform=turn)
     if poses is not None and poses.known.sum() > 1:
         centers = invert_rigid(poses.cam_from_world[poses.known])[:, :, 3]

@@ -261,19 +261,6 @@ class Result:
         """
         return load(Path(out))
 
-    def save_tracked(self, path: Path) -> None:
-        """Write tracks and embeddings, before they are linked and fitted, as npz."""
-        save_tracked(self, path)
-
-    @classmethod
-    def load_tracked(cls, path: Path) -> Result:
-        """Read what `save_tracked` wrote."""
-        return load_tracked(path)
-
-    def write_objects(self, path: Path) -> None:
-        """Write objects.json."""
-        write_objects(self, path)
-
 
 # ---- Output folder -----------------------------------------------------------------------------
 

@@ -183,8 +183,11 @@ def collect_tracks(
             "a live source cannot be read twice: identities only; record it for 3D",
         ]
     if not len(tracks):
-        reason = _why_none(untracked.score, sum(looked), tracker)
-        warnings.append(f"no object was tracked: {reason}")
+        best = untracked.score.max(initial=0)
+        warnings.append(f"no object was tracked: {len(untracked)} detections in the {sum(looked)} "
+                        f"frames that the detector was run on, the best of score {best:.2f} "
+                        f"(tracker.new_score={tracker.config.new_score:g}, tracker.n_init)"
+                        )  # fmt: skip
     return Result(
         tracks,
         tuple(source.class_names),
@@ -195,19 +198,3 @@ def collect_tracks(
         looked=None if all(looked) else np.array(frames, np.int64)[looked],
         warnings=warnings,
     )
-
-
-def _why_none(score: Array, looked: int, tracker: Any) -> str:
-    """Explain why nothing was tracked.
-
-    Args:
-        score: of all detections. looked: number of frames that the detector was run on.
-    """
-    least = tracker.config.new_score
-    if not looked:
-        return "the detector was run on no frame (it returned None each time)"
-    if not len(score):
-        return f"no detections in the {looked} frames that the detector was run on"
-    if score.max() < least:
-        return f"all {len(score)} detections are below tracker.new_score={least:g}"
-    return f"none of the {len(score)} detections was followed by enough others (tracker.n_init)"

@@ -232,8 +232,8 @@ def _mot_classes(
         boxes = counted(int(unnamed.sum()), "true box", "true boxes")
         note += f"; {boxes} without a class (below 0) do not count, nor do boxes on them"
     by_number = {str(i): name for i, name in enumerate(source.names)}
-    names = np.where(unnamed, "", _names_of(number, by_number))
-    return names, (flagged | unnamed) * Role.IGNORED, note
+    named = np.where(unnamed, "", _names_of(number, by_number))
+    return named, (flagged | unnamed) * Role.IGNORED, note
 
 
 WITH_TRACKS = "export it as COCO JSON with track_id, or as MOTChallenge rows"

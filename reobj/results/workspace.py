@@ -28,7 +28,7 @@ from reobj.files import (
 )
 from reobj.results.entries import OutputFile, read_json
 from reobj.results.links import Links, load_links
-from reobj.results.result import Result
+from reobj.results.result import Result, load_tracked, save_tracked
 from reobj.results.saving import (
     check_results,
     load_last_poses,
@@ -226,7 +226,7 @@ class Workspace:
             warnings.
         """
         warnings = []
-        tracked.save_tracked(self.out / OutputFile.LAST_TRACKS)
+        save_tracked(tracked, self.out / OutputFile.LAST_TRACKS)
         edits = self.out / OutputFile.EDITS
         if tracked.identities_given and edits.exists():
             edits.unlink()
@@ -248,7 +248,7 @@ class Workspace:
     def last_tracks(self) -> Result | None:
         """The latest tracks of the tracker, before linking; None if there are none."""
         path = self.out / OutputFile.LAST_TRACKS
-        return Result.load_tracked(path) if path.exists() else None
+        return load_tracked(path) if path.exists() else None
 
     def last_links(self) -> Links | None:
         """Return the links of the last result; None: there are none, or they are damaged."""
