@@ -15,8 +15,6 @@ from scipy.spatial.transform import Rotation
 import quadrics
 import reobj_track as rt
 from reobj.results.evaluation import (
-    drop_ignored,
-    identity_map,
     return_ranks,
     score_report,
     score_tracks,
@@ -24,7 +22,7 @@ from reobj.results.evaluation import (
 )
 from reobj.results.evaluation_3d import read_true_objects, score_objects
 from reobj.results.result import VideoInfo
-from reobj.results.truth import LabelledBoxes, Role, labelled
+from reobj.results.truth import LabelledBoxes, labelled
 from reobj.results.workspace import Workspace
 from reobj.types import Embeddings
 
@@ -185,15 +183,6 @@ def test_eval_ranks_the_embeddings_of_the_folder(tmp_path: Path) -> None:
     assert "2 queries: Rank-1 0.500, Rank-5 1.000" in score_report(scores)
 
 
-def test_objects_of_other_classes_are_not_in_the_gallery() -> None:
-    """A cup looks like the returning chair, whose own appearance has changed."""
-    truth = boxes((0, 1, 0), (0, 2, 50), (0, 3, 90), (50, 1, 0))
-    embedding = np.array([[0.8, 0.6], [1, 0], [0, 1], [1, 0]])
-    for names, rank in ((["chair", "cup", "chair", "chair"], 1), (["chair"] * 4, 2)):
-        named = dataclasses.replace(truth, name=np.array(names))
-        assert return_ranks(named, named, embedding).tolist() == [rank]
-
-
 def test_frames_that_were_not_read_do_not_count(tmp_path: Path) -> None:
     """--start 2 --stop 8 --every 2 read frames 2, 4, 6; the truth has 0 to 9, counted from 1."""
     truth = cups(list(range(10)), [1] * 10)
@@ -220,40 +209,6 @@ def test_scores_by_class(tmp_path: Path) -> None:
     assert list(one) == ["all"] and one["all"]["recall"] == 0
     (tmp_path / "gt_mot_format.json").write_text('{"classes": {"56": "cup", "41": "cup"}}')
     assert rt.evaluate(tmp_path / "out", gt_file)["tracks"]["all"]["recall"] == 1
-
-
-def test_results_on_ignored_truth_are_dropped() -> None:
-    """A box is matched by the larger overlap; a box without overlap is kept."""
-    truth = boxes((0, 1, 0), (0, 2, 4), (0, 3, 90))
-    role = np.array([Role.SCORED, Role.IGNORED, Role.ABSENT])
-    truth = LabelledBoxes(truth.frame, truth.identity, truth.xyxy, truth.name, role)
-    found = boxes((0, 7, 0), (0, 8, 5), (0, 9, 90), (0, 10, 300), (1, 8, 5))
-    kept = drop_ignored(truth, found)
-    assert list(zip(kept.frame.tolist(), kept.identity.tolist(), strict=True)) == [
-        (0, 7), (0, 9), (0, 10), (1, 8),
-    ]  # fmt: skip
-
-
-def test_identities_are_mapped_one_to_one_by_common_frames() -> None:
-    truth = boxes(*((f, 1, 0) for f in range(10)), *((f, 2, 50) for f in range(10)), (0, 3, 200))
-    found = boxes(*((f, 5, 0) for f in range(6)), *((f, 6, 0) for f in range(6, 10)),
-                  *((f, 5, 50) for f in range(6, 10)), *((f, 7, 50) for f in range(3)))  # fmt: skip
-    assert identity_map(truth, found) == {1: 5, 2: 7, 3: None}
-    mine = score_tracks(truth, found)
-    assert mine["IDR"] == pytest.approx(9 / 21) and mine["IDP"] == pytest.approx(9 / 17)
-    assert mine["IDF1"] == pytest.approx(18 / 38)
-
-
-@pytest.mark.parametrize(
-    ("shift", "expected"),  # of 19 thresholds; IoU of two squares of side 10 shifted by s px is
-    [(0, 1), (2, 13 / 19), (5, 6 / 19), (6, 5 / 19), (9, 1 / 19)],  # (10 - s) / (10 + s)
-)
-def test_hota_counts_the_thresholds_that_the_overlap_passes(shift: float, expected: float) -> None:
-    truth, found = boxes((0, 1, 0), (1, 1, 0)), boxes((0, 5, shift), (1, 5, shift))
-    mine = score_tracks(truth, found)
-    hit = np.mean([(10 - shift) / (10 + shift) >= k * 0.05 - 1e-9 for k in range(1, 20)])
-    assert hit == pytest.approx(expected)
-    assert mine["HOTA"] == pytest.approx(expected) and mine["AssA"] == pytest.approx(expected)
 
 
 def test_a_return_is_kept_if_any_earlier_visit_had_its_identity() -> None:
@@ -351,18 +306,6 @@ def test_supplied_cameras_are_in_the_true_world_already(tmp_path: Path) -> None:
     found = score_objects(result, solids, None, {4: 9})
     truth, ours = np.array(TRUE["center"]), result.objects[0].center
     assert found["center_error_median"] == pytest.approx(np.linalg.norm(truth - ours))
-
-
-def test_true_cameras_may_be_tum_rows(tmp_path: Path) -> None:
-    """Rows belong to frames by time; frames without a row are not used."""
-    result, solids, path = half_sized(tmp_path)
-    c2w = np.loadtxt(path).reshape(-1, 4, 4)
-    rows = np.c_[np.arange(12) / 10 + 0.01, c2w[:, :3, 3], np.tile([0, 0, 0, 1], (12, 1))]
-    rows[3, 0] = 0.345  # between two frames: unassigned
-    rows[3, 1] = 99
-    np.savetxt(tmp_path / "tum.txt", rows[::-1])
-    found = score_objects(result, solids, tmp_path / "tum.txt", {4: 9})
-    assert found["center_error_median"] == pytest.approx(0, abs=1e-9)
 
 
 def straight(tmp_path: Path, form: str, turned: np.ndarray) -> float:

@@ -46,26 +46,6 @@ def objects(out: Path) -> list[dict[str, object]]:
     return json.loads((out / "objects.json").read_text())["objects"]
 
 
-# ---- COCO-VID ----
-
-
-def test_coco_vid_holds_every_row(room: Path, tmp_path: Path) -> None:
-    path = tmp_path / "a.json"
-    assert cli("export", room, "--to", "coco-vid", "-o", path) == 0
-    data, rows = json.loads(path.read_text()), mot(room / "tracks.txt")
-    frame_of = {i["id"]: i["frame_id"] for i in data["images"]}
-    assert sorted(frame_of.values()) == list(range(0, 120, 3))  # also those without any object
-    assert sorted(frame_of) == list(range(1, 41)) and data["annotations"][0]["id"] == 1
-    assert {i["video_id"] for i in data["images"]} == {v["id"] for v in data["videos"]} == {1}
-    found = np.array(
-        [[frame_of[a["image_id"]] + 1, a["instance_id"], *a["bbox"]] for a in data["annotations"]]
-    )
-    np.testing.assert_allclose(found, rows[:, :6], atol=0.021)
-    name = {c["id"]: c["name"] for c in data["categories"]}
-    classes = {a["instance_id"]: name[a["category_id"]] for a in data["annotations"]}
-    assert classes == {o["id"]: o["class"] for o in objects(room)}
-
-
 # ---- CVAT: manually corrected identities ----
 
 
@@ -162,23 +142,6 @@ def test_csv_runs_no_formula(tmp_path: Path, chairs: rt.Result, name: str, cell:
 # ---- nerfstudio ----
 
 
-def test_nerfstudio_of_a_video(room: Path, tmp_path: Path) -> None:
-    """Cameras and images are read back by this package, which is tested with nerfstudio's files."""
-    path = rt.export(room, "nerfstudio", tmp_path / "nerf/transforms.json")
-    data = json.loads(path.read_text())
-    assert len(data["frames"]) == 40
-    video = rt.Video(tmp_path / "nerf/images")
-    assert len(video.names) == 40 and video.size == (640, 480)
-    assert {f["file_path"] for f in data["frames"]} == {f"images/{n}" for n in video.names}
-    poses = rt.read_poses(str(path), video)
-    known = rt.Result.load(room).poses
-    np.testing.assert_allclose(poses.cam_from_world, known.cam_from_world, atol=1e-9)
-    np.testing.assert_allclose(poses.camera.K, known.camera.K, atol=1e-9)
-    original = [frame.image for frame in rt.Video(ROOM / "room.mp4", rt.InputConfig(stop=4))]
-    second = next(frame.image for frame in video if frame.index == 1).astype(int)
-    assert np.abs(second - original[3]).mean() < 3 < np.abs(second - original[0]).mean()
-
-
 def test_nerfstudio_of_a_folder_copies_nothing(tmp_path: Path) -> None:
     """Images are not copied; sparse points are exported, frames without a pose are not."""
     (tmp_path / "frames").mkdir()
@@ -203,42 +166,6 @@ def test_nerfstudio_of_a_folder_copies_nothing(tmp_path: Path) -> None:
     cloud = trimesh.load(out / "nerfstudio" / data["ply_file_path"])
     np.testing.assert_allclose(cloud.vertices, points, atol=1e-6)
     assert (np.asarray(cloud.colors)[:, :3] == 9).all()
-
-
-@pytest.mark.parametrize(
-    ("camera", "terms", "said"),
-    [
-        (("OPENCV", 500.0, 510.0, 320.0, 240.0, 0.1, 0.2, 0.03, 0.04),
-         {"k1": 0.1, "k2": 0.2, "p1": 0.03, "p2": 0.04}, False),
-        (("OPENCV_FISHEYE", 500.0, 510.0, 320.0, 240.0, 0.1, 0.2, 0.3, 0.4),
-         {"k3": 0.3, "k4": 0.4}, False),
-        (("FULL_OPENCV", 500.0, 510.0, 320.0, 240.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.0, 0.0, 0.0),
-         {"k1": 0.1, "p2": 0.4}, True),
-    ],
-)  # fmt: skip
-def test_nerfstudio_has_the_distortion(
-    tmp_path: Path, camera: tuple, terms: dict, said: bool, caplog: pytest.LogCaptureFixture
-) -> None:
-    (tmp_path / "f").mkdir()
-    for i in range(40):
-        cv2.imwrite(str(tmp_path / f"f/{i:03d}.png"), np.zeros((480, 640, 3), np.uint8))
-    lens = rt.Camera(camera[0], 640, 480, camera[1:])
-    poses = dataclasses.replace(walk(40), camera=lens)
-    Workspace(tmp_path / "out").bind(rt.Video(tmp_path / "f"))
-    empty = rt.Result(rt.Tracks.empty(), (), VideoInfo("f", 640, 480, 30.0), poses=poses)
-    empty.save(tmp_path / "out")
-    path = rt.export(tmp_path / "out", "nerfstudio")
-    data = json.loads(path.read_text())
-    assert {k: data[k] for k in terms} == terms and (data["w"], data["h"]) == (640, 480)
-    assert (data["fl_x"], data["cx"]) == (lens.K[0, 0], lens.K[0, 2])
-    assert ("distortion is left out" in caplog.text) == said
-    if not said:
-        again = rt.read_poses(str(path), rt.Video(tmp_path / "f")).camera
-        pixels = np.array([[10.0, 20], [600, 400]])
-        np.testing.assert_allclose(again.undistort(pixels), lens.undistort(pixels), atol=1e-6)
-
-
-# ---- PLY ----
 
 
 # ---- What every export must do ----

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import dataclasses
 import json
 import re
@@ -46,15 +45,6 @@ def test_every_component_has_its_own_identities(parted: rt.Result) -> None:
     np.testing.assert_array_equal(tracks.track_id % 3, (tracks.detection_index + 1) % 3)
     assert [o.visits for o in parted.objects] == [[[0, 39]]] * 3 + [[[40, 63]]] * 3
     assert len({t for o in parted.objects for t in o.tracklet_ids}) == 6
-
-
-def test_every_component_has_its_own_frame_and_scale(parted: rt.Result) -> None:
-    for part, (scale, *_) in enumerate(PARTS):
-        own = [o for o in parted.objects if o.part == part]
-        centers = np.array([o.center for o in own])
-        np.testing.assert_allclose(centers, into_part(part, CENTERS), atol=0.02 * scale)
-        np.testing.assert_allclose([o.size[2] for o in own], 0.82 * scale, rtol=0.03)
-        np.testing.assert_allclose([o.size_m[2] for o in own], 0.82, rtol=0.2)
 
 
 def test_a_component_equals_the_result_of_a_separate_video(parted: rt.Result) -> None:
@@ -134,29 +124,6 @@ def test_a_component_with_too_few_cameras_rejects_its_objects_only() -> None:
     assert len(result.ellipsoids()) == 3
 
 
-@pytest.mark.parametrize("empty", [0, 1])
-def test_a_component_without_objects(empty: int, tmp_path: Path) -> None:
-    poses = two_parts()
-    tracks = tracks_in_two_parts(poses)
-    result = finished(unlinked(poses, tracks[poses.part_of(tracks.frame) != empty]))
-    assert [(o.id, o.part, o.status) for o in result.objects] == [
-        (i, 1 - empty, "ok") for i in (1, 2, 3)
-    ]
-    assert result.world.parts[empty].scale is None is not result.world.parts[1 - empty].scale
-    assert (result.fits.scale.source == "none") == (empty == 0) == (result.world.scale is None)
-    result.save(tmp_path)
-    assert f"component {empty}: " in rt.Result.load(tmp_path).summary()
-
-
-def test_up_of_the_poses_is_that_of_the_largest_component() -> None:
-    up = into_part(0, np.array([[0, 0, 1.0], [0, 0, 0]]))
-    poses = dataclasses.replace(two_parts(), up_in_world=(up[0] - up[1]) / PARTS[0][0])
-    parts = finished(unlinked(poses)).world.parts
-    assert [p.up_source == "given" for p in parts] == [True, False]
-    true = into_part(1, np.array([[0, 0, 1.0], [0, 0, 0]]))
-    np.testing.assert_allclose(parts[1].up_in_world, (true[0] - true[1]) / PARTS[1][0], atol=0.03)
-
-
 def test_manually_merged_identities_are_kept(parted_folder: Path, tmp_path: Path) -> None:
     """Object 4 is object 1 after the break: merged in tracks.txt and supplied again."""
     out = tmp_path / "out"
@@ -229,28 +196,6 @@ def test_the_summary_has_a_line_for_each_component(parted: rt.Result) -> None:
     mixed = dataclasses.replace(parted, objects=sorted(parted.objects, key=lambda o: o.id % 3))
     lines = mixed.summary().splitlines()
     assert [k for k, line in enumerate(lines) if line in ("component 0", "component 1")] == groups
-
-
-# ---- Overlay and viewer ----
-
-
-def test_the_viewer_contains_every_component(parted_folder: Path) -> None:
-    text = (parted_folder / "scene.html").read_text()
-    data = json.loads(text.split('id="data">')[1].split("</script>")[0])
-    assert data["steps"]["part"] == [0] * 40 + [1] * 24
-    assert [p["name"] for p in data["parts"]] == [
-        "component 0: frames 0-39; 3 objects", "component 1: frames 40-63; 3 objects",
-    ]  # fmt: skip
-    assert [p["facts"].split(" · ")[0] for p in data["parts"]] == [
-        "cameras of 38 of 40 frames", "cameras of 23 of 24 frames",
-    ]  # fmt: skip
-    poses = two_parts()
-    for part, entry in enumerate(data["parts"]):
-        points = np.frombuffer(base64.b64decode(entry["points"]), "<f4")
-        np.testing.assert_allclose(points.reshape(-1, 3), poses.of_part(part).points, atol=1e-5)
-        assert entry["scale"]["metres_per_unit"] == pytest.approx(1 / PARTS[part][0], rel=0.2)
-    assert [o["part"] for o in data["objects"]] == [0, 0, 0, 1, 1, 1]
-    assert all(len(o["crops"]) >= 3 for o in data["objects"])
 
 
 # ---- Exports and scores ----

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from simulated import CHAIR, CUP, chair_solids, fitted, tracks_of, walk, with_columns
+from simulated import chair_solids, fitted, tracks_of, walk
 
 import quadrics
 import reobj_track as rt
@@ -51,29 +51,6 @@ def test_doubtful_objects_are_in_the_list_and_not_in_the_tracks(
         assert set(found.tracks.track_id) >= {o.id for o in rest}
 
 
-def test_implausible_objects_keep_their_tracks_and_are_not_counted(
-    chairs: rt.Result, tmp_path: Path
-) -> None:
-    first, *rest = chairs.objects
-    why = "size is 7.2 sigma from the usual one: another object?"
-    odd = dataclasses.replace(first, status="implausible", reason=why)
-    result = copy_of(chairs, objects=[odd, *rest], fits=None)
-    result.save(tmp_path)
-    assert validate_objects(tmp_path / "objects.json") == []
-    found = rt.Result.load(tmp_path)
-    assert [o.status for o in found.objects] == ["implausible", "ok", "ok"]
-    assert first.id in found.tracks.track_id and [o.id for o in found.located] == [2, 3]
-    lines = " ".join(found.summary().split())
-    assert f"implausible, not counted: chair 1 ({why})" in lines
-    assert "2 objects with a shape: 2 chair" in lines and "low confidence" not in lines
-    assert not any(line.split()[:1] == ["1"] for line in found.summary().splitlines())
-    data = json.loads((tmp_path / "objects.json").read_text())
-    data["objects"][0]["center"] = None
-    (tmp_path / "objects.json").write_text(json.dumps(data))
-    with pytest.raises(rt.ReobjError, match="object 1 is implausible without a shape"):
-        rt.Result.load(tmp_path)
-
-
 def test_save_then_load_gives_the_same(chairs: rt.Result, tmp_path: Path) -> None:
     poses = dataclasses.replace(chairs.poses, points=np.eye(3), colors=np.eye(3, dtype=np.uint8),
                                 messages=("a gap",))  # fmt: skip
@@ -106,19 +83,6 @@ def test_save_then_load_gives_the_same(chairs: rt.Result, tmp_path: Path) -> Non
     np.testing.assert_allclose(after.tracks.xyxy, before.tracks.xyxy, atol=0.0101)
     np.testing.assert_allclose(after.tracks.score, before.tracks.score, atol=1e-4)
     assert {after.class_names[c] for c in after.tracks.class_id} == {"chair"}
-
-
-def test_rows_of_a_class_get_that_of_their_object(chairs: rt.Result, tmp_path: Path) -> None:
-    """tracks.txt has no classes; a result without poses and objects loads completely."""
-    tracks = chairs.tracks[chairs.tracks.track_id < 3]
-    tracks = with_columns(tracks, class_id=np.where(tracks.track_id == 1, CHAIR, CUP))
-    fitted(tracks, None).save(tmp_path)
-    after = rt.Result.load(tmp_path)
-    assert after.poses is None and after.world.scale is None and after.world.units is None
-    assert [after.class_names[c] for c in after.tracks.class_id] == [
-        rt.COCO_NAMES[c] for c in tracks.class_id
-    ]
-    assert not (tmp_path / "poses.txt").exists() and not (tmp_path / "objects.ply").exists()
 
 
 def test_an_empty_result(tmp_path: Path) -> None:
@@ -211,21 +175,6 @@ def test_the_summary_is_the_table_printed_by_run(chairs: rt.Result, saved: Path)
     assert f"look at: {saved / 'objects.json'}" in text
 
 
-def test_the_summary_counts_objects_without_a_shape_apart(chairs: rt.Result) -> None:
-    """They come second, also in the table; without cameras there is one number."""
-    first, *rest = chairs.objects
-    person = rt.Object(1, "person", 0.9, "rejected", "objects of this class move")
-    result = copy_of(chairs, objects=[person, *rest], fits=None)
-    lines = result.summary().splitlines()
-    assert lines[0] == "2 objects with a shape: 2 chair; 1 without: 1 person"
-    assert "2 objects with a shape, 1 without" in repr(result)
-    rows = [line.split()[0] for line in lines if line.endswith((" measured", " none"))]
-    assert rows == ["2", "3", "1"]
-    flat = [dataclasses.replace(o, status="tracked") for o in (person, first)]
-    result = copy_of(chairs, objects=flat, poses=None, fits=None)
-    assert result.summary().startswith("2 objects: 1 chair, 1 person")
-
-
 # ---- The schema ----
 
 
@@ -292,16 +241,6 @@ def embedded_result() -> rt.Result:
     return copy_of(result, embeddings=embeddings, embedding_row=row)
 
 
-def test_embeddings_belong_to_their_rows() -> None:
-    """Frame 0 has chairs 2 and 0, frame 2 chair 1; detection 9 is in no track."""
-    result = embedded_result()
-    rows = result.tracks[result.embedding_row]
-    assert rows.frame.tolist() == [0, 0, 2] and rows.detection_index.tolist() == [2, 0, 1]
-    np.testing.assert_array_equal(result.embeddings.foreground, [[0, 1], [3, 4], [6, 7]])
-    np.testing.assert_array_equal(result.embeddings.background, [[2], [5], [8]])
-    assert result.embeddings.foreground.dtype == np.float16
-
-
 def test_tracker_output_is_read_back(tmp_path: Path) -> None:
     before = embedded_result()
     before = dataclasses.replace(before, warnings=["dark"], identities_given=True)
@@ -316,9 +255,6 @@ def test_tracker_output_is_read_back(tmp_path: Path) -> None:
     np.testing.assert_array_equal(after.embedding_row, before.embedding_row)
     assert after.class_names == rt.COCO_NAMES and after.video == before.video
     assert after.warnings == ["dark"] and after.identities_given and after.objects == []
-
-
-# ---- Folders of version 0.1.0 ----
 
 
 # ---- In Python and in a notebook ----

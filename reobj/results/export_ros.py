@@ -265,15 +265,7 @@ _PARTS = {
 
 
 def _definition(kind: str) -> str:
-    """Return the definition of a message type followed by those of all types that it contains."""
-    texts = [MESSAGES[kind]]
-    found = list[str]()
-    for text in texts:
-        for line in text.splitlines():
-            name = line.split()[0].partition("[")[0]
-            if name in _PARTS and name not in found:
-                found.append(name)
-                texts.append(_PARTS[name])
+    """Return the definition of a message type followed by those of the types in messages."""
     rule = "=" * 80
-    parts = [f"{rule}\nMSG: {name}\n{_PARTS[name]}" for name in found]
+    parts = [f"{rule}\nMSG: {name}\n{text}" for name, text in _PARTS.items()]
     return "\n".join([MESSAGES[kind], *parts])

@@ -392,28 +392,3 @@ def test_the_number_of_the_first_frame_of_the_truth(
         assert "100.0 100.0 100.0" in capsys.readouterr().out
     words[-1] = "detect.first_frame=order"
     assert rt.main(words) == 2
-
-
-def test_corners_in_a_sequence_of_known_size(
-    tmp_path: Path, result: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Of seqinfo.ini, or of the images of a dataset."""
-    rows = ROWS[ROWS[:, 0] == 1]
-    rows[:, 4:6] += rows[:, 2:4]
-    gt = write(tmp_path / "room/gt/gt.txt", rows, "1")
-    assert score(result, gt)  # of one frame: nothing shows it
-    size = "[Sequence]\nname=room\nimWidth=200\nimHeight=800\n"
-    (tmp_path / "room/seqinfo.ini").write_text(size)
-    assert "all fit it as x1, y1, x2, y2" in refused(capsys, result, gt)
-    data = {
-        "images": [{"id": 1, "frame_id": 0, "width": 200, "height": 800}],
-        "categories": [{"id": 1, "name": "chair"}],
-        "annotations": [{"image_id": 1, "category_id": 1, "bbox": row[2:6], "track_id": int(row[1])}
-                        for row in rows.tolist()],
-    }  # fmt: skip
-    (tmp_path / "gt.json").write_text(json.dumps(data))
-    assert "all fit it as x1, y1, x2, y2" in refused(capsys, result, tmp_path / "gt.json")
-    for entry in data["annotations"]:
-        entry["bbox_mode"] = 0
-    (tmp_path / "gt.json").write_text(json.dumps(data))
-    assert score(result, tmp_path / "gt.json")[0]["gt_objects"] == 5
