@@ -34,7 +34,6 @@ from reobj.sources.video import InputConfig
 from reobj.types import (
     COCO_NAMES,
     Array,
-    BoolArray,
     IntArray,
     ReobjError,
     box_iou,
@@ -329,7 +328,11 @@ def score_report(scores: dict[str, Any]) -> str:
     """Format the result of `evaluate` for the terminal."""
     tracks: dict[str, dict[str, float]] = scores["tracks"]
     matched = {n: s for n, s in tracks.items() if n == "all" or s["IDF1"] or s["HOTA"] or s["IDP"]}
-    lines = [score_table(matched), *_missed_text(scores["missed"])]
+    lines = [score_table(matched)]
+    if missed := scores["missed"]:
+        names = [f"{name} {', '.join(map(str, ids))}".strip() for name, ids in missed.items()]
+        count = sum(map(len, missed.values()))
+        lines += wrapped(f"not found: {count} true objects ({'; '.join(names)})")
     ranks = scores["ranks"]
     rates = [f"{k.replace('rank', 'Rank-')} {v:.3f}" for k, v in ranks.items() if k != "queries"]
     if rates:
@@ -344,15 +347,6 @@ def score_report(scores: dict[str, Any]) -> str:
         lines += wrapped(f"note: {text}")
     lines += [f"{column:<5}{meaning}" for column, meaning in COLUMNS.items()]
     return "\n".join(lines)
-
-
-def _missed_text(missed: dict[str, list[int]]) -> list[str]:
-    """Format the true objects that no identity of the result matches, by class."""
-    if not missed:
-        return []
-    count = sum(map(len, missed.values()))
-    names = [f"{name} {', '.join(map(str, ids))}".strip() for name, ids in missed.items()]
-    return wrapped(f"not found: {count} true objects ({'; '.join(names)})")
 
 
 def _missed(truth: LabelledBoxes, predicted: LabelledBoxes) -> dict[str, list[int]]:
@@ -412,12 +406,10 @@ def evaluate(
     truth = read_truth(Path(gt), names, min_visibility, notes, size, gt_format, first_frame)
     check_counts(truth, Path(gt))
     if tracked is not None:
-        read = truth[_was_read(truth.frame - 1, workspace.source[1])]
-        check_counts(
-            read, Path(gt), "none lies in a frame that was read (--start, --stop, --every)"
-        )
-        truth, predicted = _looked_at(read, predicted, tracked.looked, notes)
-        check_counts(truth, Path(gt), "none lies in a frame that the detector was run on")
+        config = workspace.source[1]
+        truth, predicted = _in_frames_of_run(truth, predicted, config, tracked.looked, notes)
+        why = "none lies in a frame that was read, and that the detector was run on"
+        check_counts(truth, Path(gt), f"{why} (--start, --stop, --every)")
     predicted = _in_true_frames(truth, predicted, notes)
     truth, predicted, named = with_common_names(truth, predicted, notes)
     known = sorted({*truth.name.tolist(), *predicted.name.tolist()} - {""})
@@ -461,10 +453,17 @@ def _of_classes(
     return dataclasses.replace(truth, role=role), predicted
 
 
-def _looked_at(
-    truth: LabelledBoxes, predicted: LabelledBoxes, looked: IntArray | None, notes: list[str]
+def _in_frames_of_run(
+    truth: LabelledBoxes,
+    predicted: LabelledBoxes,
+    config: InputConfig,
+    looked: IntArray | None,
+    notes: list[str],
 ) -> tuple[LabelledBoxes, LabelledBoxes]:
-    """Select the frames on which the detector was run (None: all)."""
+    """Select the frames that were read, and on which the detector was run (None: on all)."""
+    frame = truth.frame - 1
+    read = (frame >= config.start) & ((frame - config.start) % config.every == 0)
+    truth = truth[read & (frame < (config.stop or np.inf))]
     if looked is None:
         return truth, predicted
     kept = truth[np.isin(truth.frame - 1, looked)]
@@ -518,10 +517,3 @@ def score_appearance(tracked: Result, truth: LabelledBoxes) -> dict[str, float]:
     rank = return_ranks(truth, predicted, unit_rows(fused))
     shares = {f"rank{k}": float((rank <= k).mean()) for k in (1, 5, 20, 50)} if len(rank) else {}
     return {"queries": len(rank), **shares}
-
-
-def _was_read(frame: IntArray, config: InputConfig) -> BoolArray:
-    """Mark the source frames (N,) that lie within --start, --stop, --every."""
-    after = frame - config.start
-    inside = (after >= 0) & (after % config.every == 0)
-    return np.asarray(inside & (frame < (config.stop or np.inf)), bool)
