@@ -16,13 +16,12 @@ import cv2
 import numpy as np
 import pytest
 from front_door.room import ROOM
-from simulated import fitted, tracks_of, walk
+from simulated import walk
 
 import reobj_track as rt
 from reobj.cameras import invert_rigid
 from reobj.results.export import EXPORTS, Viewer
 from reobj.results.result import VideoInfo
-from reobj.results.workspace import Workspace
 
 NO_PICTURES = ("--set", "output.overlay=0", "--set", "output.scene=0")
 CORNERS = {"xtl", "ytl", "xbr", "ybr"}  # of a box in CVAT's XML
@@ -140,32 +139,6 @@ def test_csv_runs_no_formula(tmp_path: Path, chairs: rt.Result, name: str, cell:
 
 
 # ---- nerfstudio ----
-
-
-def test_nerfstudio_of_a_folder_copies_nothing(tmp_path: Path) -> None:
-    """Images are not copied; sparse points are exported, frames without a pose are not."""
-    (tmp_path / "frames").mkdir()
-    for i in range(40):
-        cv2.imwrite(str(tmp_path / f"frames/{i:03d}.png"), np.zeros((480, 640, 3), np.uint8))
-    poses = walk(40)
-    poses.cam_from_world[7] = np.nan
-    points = np.random.default_rng(0).uniform(-1, 1, (50, 3))
-    poses = dataclasses.replace(poses, points=points, colors=np.full((50, 3), 9, np.uint8))
-    out = tmp_path / "out"
-    Workspace(out).bind(rt.Video(tmp_path / "frames"))
-    result = fitted(tracks_of(walk(40)), poses)
-    result.save(out)
-    data = json.loads(rt.export(out, "nerfstudio").read_text())
-    files = [f["file_path"] for f in data["frames"]]
-    assert files[:2] == ["../../frames/000.png", "../../frames/001.png"]
-    assert len(files) == 39 and "../../frames/007.png" not in files
-    assert sorted(p.name for p in (out / "nerfstudio").iterdir()) == [
-        "sparse_pc.ply", "transforms.json",
-    ]  # fmt: skip
-    trimesh = pytest.importorskip("trimesh", reason="pip install trimesh (dev extra)")
-    cloud = trimesh.load(out / "nerfstudio" / data["ply_file_path"])
-    np.testing.assert_allclose(cloud.vertices, points, atol=1e-6)
-    assert (np.asarray(cloud.colors)[:, :3] == 9).all()
 
 
 # ---- What every export must do ----

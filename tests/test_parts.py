@@ -21,7 +21,6 @@ from simulated import (
     two_parts,
     unlinked,
     walk,
-    with_columns,
 )
 
 import reobj_track as rt
@@ -89,28 +88,6 @@ def test_a_track_that_starts_in_the_break_belongs_to_the_next_component() -> Non
     objects = finished(given).objects
     assert [(o.part, o.status != "rejected") for o in objects] == [(0, True)] * 2 + [(1, True)] * 3
     assert sorted(o.visits[0][0] for o in objects) == [0, 0, BREAK - 1, BREAK, BREAK]
-
-
-def test_identities_of_the_user_may_span_components() -> None:
-    """They are unchanged; the shape belongs to the component with most of the boxes."""
-    poses = two_parts()
-    tracks = tracks_in_two_parts(poses)
-    tracks = tracks[(tracks.detection_index < 2) | (tracks.frame >= BREAK - 10)]  # chair 3: late
-    given = unlinked(
-        poses, with_columns(tracks, track_id=np.array([7, 5, 6])[tracks.detection_index])
-    )
-    given = dataclasses.replace(given, identities_given=True)
-    result = finished(given)
-    assert [(o.id, o.part, o.status) for o in result.objects] == [
-        (5, 0, "ok"), (6, 1, "ok"), (7, 0, "ok"),
-    ]  # fmt: skip
-    assert [o.frames_seen for o in result.objects] == [64, 34, 64]
-    assert [o.views for o in result.objects] == [38, 23, 38]
-    at = (0, CENTERS[1:2]), (1, CENTERS[2:]), (0, CENTERS)
-    centers = [into_part(*a)[0] for a in at]
-    np.testing.assert_allclose([o.center for o in result.objects], centers, atol=0.06)
-    np.testing.assert_allclose(result.ellipsoids().center_in_world, centers, atol=0.06)
-    np.testing.assert_array_equal(result.tracks.track_id, given.tracks.track_id)
 
 
 def test_a_component_with_too_few_cameras_rejects_its_objects_only() -> None:

@@ -483,6 +483,7 @@ def _in_true_frames(
         true, found = (f"{boxes.frame.min()}-{boxes.frame.max()}" for boxes in (truth, predicted))
         notes.append(f"no true box overlaps a box of the result (frames from 1: truth {true}, "
                      f"result {found}): truth of another video?")  # fmt: skip
+    notes += _scale_note(truth, unnamed)
     if truth.listed is not None:
         kept = predicted[np.isin(predicted.frame, truth.listed)]
         if left := len(predicted) - len(kept):
@@ -496,6 +497,25 @@ def _in_true_frames(
         notes.append(f"{len(without)} of {len(frames)} frames with boxes of the result have no "
                      "ground truth: boxes in them count as false")  # fmt: skip
     return predicted
+
+
+def _scale_note(truth: LabelledBoxes, predicted: LabelledBoxes) -> list[str]:
+    """Note that most true boxes match only after all boxes of the result are scaled."""
+
+    def matches(scale: float) -> int:
+        scaled = dataclasses.replace(predicted, xyxy=predicted.xyxy * scale)
+        steps = _frame_steps(truth, scaled)
+        return sum(int((iou >= MATCH_IOU).any(1).sum()) for *_, iou in steps)
+
+    few = 0.3 * len(truth)
+    if (plain := matches(1)) > few:
+        return []
+    best, scale = max((matches(s), s) for s in (0.25, 1 / 3, 0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2, 3, 4))
+    if best <= max(3 * plain, few):
+        return []
+    return [f"{plain} of {len(truth)} true boxes match a box of the result, but {best} do if the "
+            f"boxes of the result are scaled by {scale:.3g}: boxes of frames of another size?"
+            ]  # fmt: skip
 
 
 def score_appearance(tracked: Result, truth: LabelledBoxes) -> dict[str, float]:

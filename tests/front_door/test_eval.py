@@ -392,3 +392,11 @@ def test_the_number_of_the_first_frame_of_the_truth(
         assert "100.0 100.0 100.0" in capsys.readouterr().out
     words[-1] = "detect.first_frame=order"
     assert rt.main(words) == 2
+
+
+def test_a_result_of_frames_of_another_size(tmp_path: Path) -> None:
+    rows = ROWS * [1, 1, 2, 2, 2, 2]
+    gt = write(tmp_path / "gt.txt", ROWS, "1")
+    _, said = score(write(tmp_path / "res.txt", rows, "0.9,-1,-1,-1"), gt)
+    (note,) = [text for text in said if "frames of another size" in text]
+    assert "150 do if the boxes of the result are scaled by 0.5" in note
