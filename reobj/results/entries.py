@@ -398,7 +398,8 @@ def _with_field_names(value: Any, key: str = "") -> Any:
     if key == "scale":
         return [value.get(name) for name in SCALE_KEYS]
     names = _FIELD_NAMES.get(key, {})
-    return {(name := names.get(k, k)): _with_field_names(v, name) for k, v in value.items()}
+    renamed: dict[str, Any] = {names.get(k, k): item for k, item in value.items()}
+    return {name: _with_field_names(item, name) for name, item in renamed.items()}
 
 
 def _array(kind: Any, value: Any) -> Array:
