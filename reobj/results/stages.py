@@ -94,6 +94,14 @@ def _rows(frame: IntArray, xyxy: Array, score: Array, class_id: IntArray) -> Tra
     return Tracks(frame, zeros, zeros, xyxy, score, class_id, zeros - 1)
 
 
+def _rows_in(tracks: Tracks, frame: IntArray, index: IntArray) -> IntArray:
+    """Return the rows (n,) of detections in the tracks, by frame and index (n,); -1: none."""
+    keys = zip(tracks.frame.tolist(), tracks.detection_index.tolist(), strict=True)
+    row_of = {key: row for row, key in enumerate(keys)}
+    wanted = zip(frame.tolist(), index.tolist(), strict=True)
+    return np.array([row_of.get(key, -1) for key in wanted], np.int64)
+
+
 def _untracked(
     tracks: Tracks, frames: list[int], detected: list[Detections], scale: float
 ) -> Tracks:
@@ -103,10 +111,8 @@ def _untracked(
         for frame, d in zip(frames, detected, strict=True)
     ]
     frame, xyxy, score, class_id, index = map(np.concatenate, zip(*columns, strict=True))
-    tracked = set(zip(tracks.frame.tolist(), tracks.detection_index.tolist(), strict=True))
-    free = [key not in tracked for key in zip(frame.tolist(), index.tolist(), strict=True)]
     rows = dataclasses.replace(_rows(frame, xyxy / scale, score, class_id), detection_index=index)
-    return rows[np.array(free, bool)]
+    return rows[_rows_in(tracks, frame, index) < 0]
 
 
 def tracked_embeddings(
@@ -123,13 +129,8 @@ def tracked_embeddings(
     Returns:
         n embeddings, and their rows (n,) in the tracks.
     """
-    keys = zip(tracks.frame.tolist(), tracks.detection_index.tolist(), strict=True)
-    row_of = {key: row for row, key in enumerate(keys)}
-    row = np.array([
-        row_of.get((frame, detection), -1)
-        for frame, (index, _) in zip(frames, embedded, strict=True)
-        for detection in index.tolist()
-    ], np.int64)  # fmt: skip
+    frame = np.repeat(np.array(frames, np.int64), [len(index) for index, _ in embedded])
+    row = _rows_in(tracks, frame, np.concatenate([index for index, _ in embedded]))
     blocks = [block for _, block in embedded if block.size] or [np.empty((0, 0), np.float16)]
     fused = np.concatenate(blocks)[row >= 0].astype(np.float16)
     width = foreground_width or fused.shape[1]
