@@ -398,7 +398,7 @@ def _with_field_names(value: Any, key: str = "") -> Any:
     if key == "scale":
         return [value.get(name) for name in SCALE_KEYS]
     names = _FIELD_NAMES.get(key, {})
-    renamed: dict[str, Any] = {names.get(k, k): item for k, item in value.items()}
+    renamed = {str(names.get(k, k)): item for k, item in value.items()}
     return {name: _with_field_names(item, name) for name, item in renamed.items()}
 
 
