@@ -144,16 +144,24 @@ from reobj.poses.stage import (
 from reobj.poses.supplied.imageless import open_video
 from reobj.poses.supplied.readers import read_poses
 from reobj.results.changes import Change, Changes, read_changes
-from reobj.results.checkpoint import Checkpoint
 from reobj.results.edits import kept_edits, read_edits
+from reobj.results.entries import OutputFile
 from reobj.results.evaluation import evaluate, score_report
 from reobj.results.export import EXPORTS, Viewer, export
 from reobj.results.links import Links
 from reobj.results.live import LivePage, open_viewer
-from reobj.results.names import OutputFile
 from reobj.results.overlay import film_layers
 from reobj.results.plausibility import implausible
-from reobj.results.result import Object, Part, Result, VideoInfo, World
+from reobj.results.result import (
+    Object,
+    Part,
+    Result,
+    VideoInfo,
+    World,
+    load_tracked,
+    save_tracked,
+    write_objects,
+)
 from reobj.results.saving import (
     copy_models,
     replaced,
@@ -1471,7 +1479,7 @@ def refit(
         sizes = config.objects
         check_known_size(sizes.known_size, sizes.size_priors(), last.class_names)
         result = last
-        links = workspace.last_links(dataclasses.asdict(last_config.objects))
+        links = workspace.last_links()
         if tracks:
             links = None
             result = _given_tracks(tracks, video, config.detect, last)
@@ -1533,7 +1541,7 @@ def _last_config(out: str | Path) -> Config:
 KEPT = {
     "detect": "the frames detected so far",
     "poses": "the features and matches so far",
-    "track": "the frames up to the last save",  # `collect_tracks` says how many
+    "track": "nothing",
     "map": "nothing",
     "objects": "nothing",
     "write": "the files that are complete",
@@ -1579,8 +1587,7 @@ class _Job:
         try:
             yield
         except KeyboardInterrupt as interruption:
-            kept = getattr(interruption, "__notes__", None) or [KEPT[stage]]
-            interruption.add_note(f"in the stage {stage}, which keeps {kept[0]}")
+            interruption.add_note(f"in the stage {stage}, which keeps {KEPT[stage]}")
             raise
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.monotonic() - started
         steps = self.step_seconds.get(stage, {})
@@ -1651,23 +1658,16 @@ def _track_video(
     path = job.workspace.path("tracks", *key)
     keep = bool(source.key) and not video.is_live
     with job.timed("track", may_be_cached=keep):
-        if keep and (known := load_cached(path, Result.load_tracked)):
+        if keep and (known := load_cached(path, load_tracked)):
             return known
         embedder = make_embedder(config.embed.model, config.embed.head, *job.runtime)
         tracker = Tracker(config.tracker, embedder)
-        checkpoint = None
-        if keep and viewer is None:  # which shows all frames
-            checkpoint = Checkpoint(job.workspace.path("tracking", *key).with_suffix(""))
-            tracker = checkpoint.load(lambda file: Tracker.load(file, embedder)) or tracker
-            video = video.after(checkpoint.last)
         steps = track(video, source, tracker, poses=poses)
         if viewer is not None:
             steps = viewer.follow(steps, source.class_names, video, poses)
-        result = collect_tracks(steps, tracker, video, source, job.progress, checkpoint)
+        result = collect_tracks(steps, tracker, video, source, job.progress)
         result = dataclasses.replace(result, boxes_3d=boxes_3d_of(source.recorded))
-        result.save_tracked(path)
-        if checkpoint is not None:
-            checkpoint.remove()
+        save_tracked(result, path)
     return result
 
 
@@ -1861,7 +1861,7 @@ def _write(job: _Job, result: Result) -> Result:
     )
     if failures:
         result = dataclasses.replace(result, warnings=[*result.warnings, *failures])
-        result.write_objects(workspace.out / OutputFile.OBJECTS)
+        write_objects(result, workspace.out / OutputFile.OBJECTS)
     return result
 
 

@@ -56,7 +56,7 @@ import reobj_track as rt
 from reobj.cameras import place_of, undistort_boxes
 from reobj.objects.fit import link_and_fit
 from reobj.options import read_config
-from reobj.results.names import OutputFile
+from reobj.results.entries import OutputFile
 from reobj.results.result import Object, Result
 from reobj.results.workspace import Workspace
 from reobj.types import Array, BoolArray, Embeddings, IntArray, ReobjError, Tracks

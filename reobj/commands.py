@@ -218,8 +218,8 @@ def make_parser(
     text = "convert the results of an output folder to the format of another tool"
     add = command("export", text, "out --to glb")
     add("out", help="output folder of an earlier `run`")
-    text = "format to write; of label tools: coco-vid, cvat, kitti, labelme, yolo; tables: boxer, "
-    text += "csv; of 3D viewers: glb, ply, rrd, usd; of robots (ROS 2): mcap, ros; nerfstudio"
+    text = "format to write; of label tools: coco-vid, cvat, yolo; tables: boxer, "
+    text += "csv; of 3D viewers: glb, ply, rrd, usd; of robots (ROS 2): mcap; nerfstudio"
     add("--to", required=True, choices=exports, help=text)
     add("-o", "--output", help="file to write (default: in the output folder)")
     _add_map(command, map_exports)

@@ -1,8 +1,7 @@
-"""Exports to USD, ROS 2, MCAP, Boxer, KITTI, YOLO and labelme, opened by their own libraries."""
+"""Exports to USD, MCAP (ROS 2), Boxer and YOLO, opened by their own libraries."""
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import json
 from pathlib import Path
@@ -13,14 +12,13 @@ import numpy as np
 import pytest
 from front_door.room import ROOM
 from scipy.spatial.transform import Rotation
-from simulated import SIZE, chair_solids, looking_at, walk
+from simulated import SIZE, chair_solids, walk
 
-import quadrics
 import reobj_track as rt
 from reobj.cameras import invert_rigid
 from reobj.results.export import EXPORTS
+from reobj.results.result import write_objects
 from reobj.results.workspace import Workspace
-from reobj.sources.video import ImagelessVideo
 from reobj.types import object_color
 
 TILT = Rotation.from_euler("xyz", [40, 70, -20], degrees=True).as_matrix()
@@ -76,7 +74,7 @@ def written(result: rt.Result, to: str, path: Path) -> Path:
 
 
 def upright_entries(result: rt.Result, path: Path) -> list[dict[str, Any]]:
-    result.write_objects(path)
+    write_objects(result, path)
     return list(json.loads(path.read_text())["objects"])
 
 
@@ -94,32 +92,6 @@ def test_objects_json_has_upright_metric_poses(chairs: rt.Result, tmp_path: Path
     turn = Rotation.from_euler("z", about_z[0], degrees=True)
     np.testing.assert_allclose((about_z - about_z[0] + 180) % 360, 180, atol=0.02)
     np.testing.assert_allclose(found, turn.apply(true.center_in_world), atol=1e-3)
-
-
-def test_objects_json_leaves_out_what_is_unknown(chairs: rt.Result, tmp_path: Path) -> None:
-    no_scale = chairs.world.scale._replace(source="none")
-    for changes, yaw_known in (({"up_in_world": None}, False), ({"scale": no_scale}, True)):
-        result = tilted(chairs, **changes)
-        for entry in upright_entries(result, tmp_path / "a.json"):
-            assert entry["center_m"] is None and (entry["yaw_deg"] is not None) == yaw_known
-        with written(result, "csv", tmp_path / "a.csv").open() as file:
-            rows = list(csv.DictReader(file))
-        assert [r["center_m_z"] for r in rows] == [""] * 3
-        assert [bool(r["yaw_deg"]) for r in rows] == [yaw_known] * 3
-
-
-def test_each_component_has_its_own_upright_frame(chairs: rt.Result, tmp_path: Path) -> None:
-    turned = tilted(chairs)
-    parts = (chairs.world.parts[0], turned.world.parts[0])
-    other = dataclasses.replace(turned.objects[0], id=4, part=1)
-    world = dataclasses.replace(chairs.world, parts=parts)
-    both = dataclasses.replace(chairs, objects=[*chairs.objects, other], world=world, fits=None)
-    entries = upright_entries(both, tmp_path / "both.json")
-    alone = upright_entries(turned, tmp_path / "turned.json")
-    assert [entry["part"] for entry in entries] == [0, 0, 0, 1]
-    for name in ("center_m", "yaw_deg"):
-        assert entries[3][name] == alone[0][name]
-    np.testing.assert_allclose(entries[0]["center_m"], entries[0]["center"], atol=1e-5)
 
 
 # ---- USD ----
@@ -181,54 +153,7 @@ def test_the_camera_of_usd_projects_as_that_of_the_result(
             np.testing.assert_allclose(found, expected, atol=0.01)
 
 
-def test_usd_of_shapes_names_and_unknown_units(
-    chairs: rt.Result, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    names = ('1 "odd" \\ name', "stůl 桌子", "cup")
-    shapes = ("ellipsoid", "cylinder", None)
-    scale = chairs.world.scale._replace(source="none")
-    result = tilted(chairs, scale=scale)
-    objects = [
-        dataclasses.replace(o, class_name=name, support=shape)
-        for o, name, shape in zip(result.objects, names, shapes, strict=True)
-    ]
-    result = dataclasses.replace(result, objects=objects, class_names=names)
-    stage = stage_of(written(result, "usd", tmp_path / "a.usda"))
-    assert "the scale is unknown" in caplog.text
-    assert stage.GetRootLayer().customLayerData["units"] == "arbitrary"
-    prims = stage.GetPrimAtPath("/World/objects").GetChildren()
-    assert [p.GetTypeName() for p in prims] == ["Sphere", "Cylinder", "Sphere"]
-    assert [p.GetDisplayName() for p in prims] == [f"{n} {i}" for i, n in enumerate(names, 1)]
-    assert [p.GetAttribute("semantics:labels:class").Get()[0] for p in prims] == list(names)
-
-
-# ---- ROS 2: JSON, MCAP ----
-
-
-def positions(detections: list[Any]) -> np.ndarray:
-    return np.array([[d["bbox"]["center"]["position"][a] for a in "xyz"] for d in detections])
-
-
-def test_ros_json_has_the_fields_of_detection3darray(chairs: rt.Result, tmp_path: Path) -> None:
-    data = json.loads(written(tilted(chairs), "ros", tmp_path / "a.json").read_text())
-    assert data["header"] == {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": "map"}
-    assert [d["id"] for d in data["detections"]] == ["1", "2", "3"]
-    true = chairs.ellipsoids()
-    for k, (found, entry) in enumerate(zip(data["detections"], chairs.objects, strict=True)):
-        assert sorted(found) == ["bbox", "header", "id", "results"]
-        size = [found["bbox"]["size"][axis] for axis in "xyz"]
-        np.testing.assert_allclose(size, 2 * true.half_axes[k], rtol=1e-6)
-        (result,) = found["results"]
-        hypothesis = {"class_id": "chair", "score": pytest.approx(entry.confidence or 1.0)}
-        assert result["hypothesis"] == hypothesis
-        assert result["pose"]["pose"] == found["bbox"]["center"]
-        cov = np.reshape(result["pose"]["covariance"], (6, 6))
-        np.testing.assert_allclose(cov, cov.T, atol=1e-12)
-        # z is up in the world of the chairs too: variances along it, and about it
-        assert cov[2, 2] == pytest.approx(entry.cov[2, 2], rel=1e-3)
-        axes = true.world_from_obj[k]
-        assert cov[5, 5] == pytest.approx((axes @ entry.cov[6:, 6:] @ axes.T)[2, 2], rel=1e-3)
-        assert np.trace(cov[:3, :3]) == pytest.approx(np.trace(entry.cov[:3, :3]), rel=1e-3)
+# ---- ROS 2 ----
 
 
 def messages_of(path: Path) -> dict[str, list[tuple[int, Any]]]:
@@ -279,6 +204,16 @@ def test_mcap_in_its_library(chairs: rt.Result, tmp_path: Path) -> None:
     np.testing.assert_allclose(
         [vector(m.scale) for m in shapes], 2 * chairs.ellipsoids().half_axes, rtol=1e-5
     )
+    for k, (found_3d, entry) in enumerate(zip(objects.detections, chairs.objects, strict=True)):
+        (guess,) = found_3d.results
+        assert guess.hypothesis.class_id == "chair"
+        assert guess.hypothesis.score == pytest.approx(entry.confidence or 1.0)
+        cov = np.reshape(guess.pose.covariance, (6, 6))
+        # z is up in the world of the chairs too: variances along it, and about it
+        assert cov[2, 2] == pytest.approx(entry.cov[2, 2], rel=1e-3)
+        axes = chairs.ellipsoids().world_from_obj[k]
+        assert cov[5, 5] == pytest.approx((axes @ entry.cov[6:, 6:] @ axes.T)[2, 2], rel=1e-3)
+        assert np.trace(cov[:3, :3]) == pytest.approx(np.trace(entry.cov[:3, :3]), rel=1e-3)
     boxes = found["/detections"][20][1].detections
     rows = chairs.tracks[chairs.tracks.frame == 21]
     assert [b.id for b in boxes] == [str(i) for i in rows.track_id]
@@ -291,14 +226,13 @@ def test_mcap_in_its_library(chairs: rt.Result, tmp_path: Path) -> None:
     ("model", "params", "ros", "said"),
     [
         ("PINHOLE", (500.0, 510, 320, 240), ("plumb_bob", [0, 0, 0, 0, 0]), False),
-        ("SIMPLE_RADIAL", (500.0, 320, 240, 0.1), ("plumb_bob", [0.1, 0, 0, 0, 0]), False),
         ("OPENCV", (500.0, 510, 320, 240, 0.1, 0.2, 0.3, 0.4),
          ("plumb_bob", [0.1, 0.2, 0.3, 0.4, 0]), False),
-        ("OPENCV_FISHEYE", (500.0, 510, 320, 240, 0.1, 0.2, 0.3, 0.4),
-         ("equidistant", [0.1, 0.2, 0.3, 0.4]), False),
         ("FULL_OPENCV", (500.0, 510, 320, 240, 1, 2, 3, 4, 5, 6, 7, 8),
          ("rational_polynomial", [1, 2, 3, 4, 5, 6, 7, 8]), False),
-        ("RADIAL_FISHEYE", (500.0, 320, 240, 0.1, 0.2), ("plumb_bob", [0, 0, 0, 0, 0]), True),
+        ("RADIAL_FISHEYE", (500.0, 320, 240, 0.1, 0.2), ("equidistant", [0.1, 0.2, 0, 0]), False),
+        ("THIN_PRISM_FISHEYE", (500.0, 510, 320, 240, 1, 2, 3, 4, 5, 6, 7, 8),
+         ("equidistant", [1, 2, 5, 6]), True),
     ],
 )  # fmt: skip
 def test_camera_info(
@@ -338,61 +272,14 @@ def test_boxer_columns(chairs: rt.Result, tmp_path: Path) -> None:
     assert [int(row[12]) for row in rows] == chairs.tracks.track_id.tolist()
     assert {row[11] for row in rows} == {"arm  chair"}
     values = np.array([[float(v) for v in row[1:11]] for row in rows[:3]])
-    plain = json.loads(written(result, "ros", tmp_path / "a.json").read_text())["detections"]
-    np.testing.assert_allclose(values[:, :3], positions(plain), atol=1e-6)
+    plain = [entry["center_m"] for entry in upright_entries(result, tmp_path / "a.json")]
+    np.testing.assert_allclose(values[:, :3], plain, atol=1e-5)
     true = chairs.ellipsoids()
     np.testing.assert_allclose(values[:, 7:], 2 * true.half_axes, rtol=1e-6)  # full extents
     axes = Rotation.from_quat(np.roll(values[:, 3:7], -1, 1)).as_matrix()
     relative = np.swapaxes(axes[:1], 1, 2) @ axes
     expected = np.swapaxes(true.world_from_obj[:1], 1, 2) @ true.world_from_obj
     np.testing.assert_allclose(relative, expected, atol=1e-4)
-
-
-# ---- KITTI ----
-
-
-def kitti_boxes(row: list[float], camera: rt.Camera) -> np.ndarray:
-    """Bounding box (4,) of the projected 3D box of KITTI's development kit (computeBox3D)."""
-    height, width, length, x, y, z, turn = row
-    corners = np.array([
-        [sx * length / 2, sy * height, sz * width / 2]
-        for sx in (-1, 1) for sy in (-1, 0) for sz in (-1, 1)
-    ])  # fmt: skip
-    rotation = [[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]]
-    pixels = (corners @ np.array(rotation).T + [x, y, z]) @ camera.K.T
-    pixels = pixels[:, :2] / pixels[:, 2:]
-    return np.concatenate([pixels.min(0), pixels.max(0)])
-
-
-def test_kitti_boxes_project_as_the_shapes(chairs: rt.Result, tmp_path: Path) -> None:
-    """Cameras are level, as KITTI's; the scale is half a metre per unit."""
-    eyes = invert_rigid(chairs.poses.cam_from_world)[:, :, 3]
-    level = np.stack([looking_at(eye, np.array([0, 0, eye[2]])) for eye in eyes])
-    level[5] = np.nan
-    poses = dataclasses.replace(chairs.poses, cam_from_world=level)
-    upright = [
-        dataclasses.replace(o, quat_wxyz=np.roll(Rotation.from_matrix(r).as_quat(), 1))
-        for o, r in zip(chairs.objects, chair_solids().world_from_obj, strict=True)
-    ]  # exactly, as the box of KITTI
-    result = dataclasses.replace(chairs, poses=poses, objects=upright, fits=None)
-    shapes = result.ellipsoids()
-    true = quadrics.solid_boxes(shapes, "box", poses.camera.K @ np.nan_to_num(level))  # (F, 3, 4)
-    result = tilted(dataclasses.replace(result, fits=None))
-    rows = [
-        r.split() for r in written(result, "kitti", tmp_path / "a.txt").read_text().splitlines()
-    ]
-    assert {len(row) for row in rows} == {18} and len(rows) == 120
-    for row in rows:
-        frame = int(row[0])
-        identity = int(row[1])
-        alpha, *box = map(float, (row[5], *row[10:17]))
-        if frame == 5:
-            assert [alpha, *box] == [-10, -1, -1, -1, -1000, -1000, -1000, -10]
-            continue
-        found = kitti_boxes(box, poses.camera)
-        np.testing.assert_allclose(found, true[frame, identity - 1], atol=0.1)
-        ray = np.arctan2(box[3], box[5])
-        assert (alpha - box[6] + ray + np.pi) % (2 * np.pi) == pytest.approx(np.pi, abs=1e-3)
 
 
 def same_tracks(found: rt.Tracks, names: Any, room: Path, atol: float) -> None:
@@ -407,61 +294,14 @@ def same_tracks(found: rt.Tracks, names: Any, room: Path, atol: float) -> None:
     assert [names[i] for i in found.class_id] == [result.class_names[i] for i in expected.class_id]
 
 
-@pytest.mark.parametrize("to", ["kitti", "yolo"])
-def test_identities_are_read_back(room: Path, tmp_path: Path, to: str) -> None:
-    path = rt.export(room, to, tmp_path / "new" / "data.yaml")
+def test_identities_are_read_back(room: Path, tmp_path: Path) -> None:
+    path = rt.export(room, "yolo", tmp_path / "new" / "data.yaml")
     video = rt.Video(ROOM / "room.mp4", rt.InputConfig(every=3, stop=120))
-    if to == "kitti":  # the folder of a file is read as YOLO labels
-        path = path.replace(tmp_path / "kitti.txt")
-    tracks, names, _ = rt.read_tracks(path.parent if to == "yolo" else path, video)
-    names = [name.replace("_", " ") for name in names]
+    tracks, names, _ = rt.read_tracks(path.parent, video)
     same_tracks(tracks[tracks.score > 0], names, room, 0.011)
 
 
-# ---- YOLO, labelme ----
-
-
-def test_yolo_boxes_lie_in_the_image(chairs: rt.Result, tmp_path: Path) -> None:
-    boxes = chairs.tracks.xyxy.copy()
-    boxes[0] = [-50, -20, 100, 90]
-    boxes[1] = [700, 10, 800, 90]  # outside
-    score = chairs.tracks.score.copy()
-    score[2] = 0  # a filled gap
-    columns = {"xyxy": boxes, "score": score, "class_id": np.zeros(120, np.int64)}
-    tracks = dataclasses.replace(chairs.tracks, **columns)
-    result = dataclasses.replace(chairs, tracks=tracks, class_names=('a "b": 桌', "chair"))
-    path = written(result, "yolo", tmp_path / "y/data.yaml")
-    yaml = pytest.importorskip("yaml", reason="pip install pyyaml (with the dev extra)")
-    assert yaml.safe_load(path.read_text())["names"] == {0: 'a "b": 桌', 1: "chair"}
-    first, second = np.loadtxt(tmp_path / "y/labels/walk_1.txt")
-    np.testing.assert_allclose(
-        first, [0, 50 / 640, 45 / 480, 100 / 640, 90 / 480, 0.9, 1], atol=1e-5
-    )
-    assert second[5:].tolist() == [0, 3]
-    assert len(list((tmp_path / "y/labels").iterdir())) == 40
-
-
-def test_labelme_files_have_what_its_loader_checks(room: Path, tmp_path: Path) -> None:
-    """The conditions of `LabelFile.load` and `_load_shape_json_obj`."""
-    path = rt.export(room, "labelme", tmp_path / "l/labels.txt")
-    classes = path.read_text().splitlines()
-    result = rt.Result.load(room)
-    rows = []
-    for file in sorted(path.parent.glob("images/*.json")):
-        data = json.loads(file.read_text())
-        assert {"version", "imageData", "imagePath", "shapes", "flags"} <= set(data)
-        image = cv2.imread(str(file.parent / data["imagePath"]))
-        assert image.shape[:2] == (data["imageHeight"], data["imageWidth"]) == (480, 640)
-        for shape in data["shapes"]:
-            assert shape["shape_type"] == "rectangle" and shape["label"] in classes
-            assert isinstance(shape["group_id"], int) and shape["flags"] == {}
-            frame = int(file.stem.removeprefix("frame_"))
-            rows.append([frame, shape["group_id"], *np.ravel(shape["points"])])
-    expected = result.tracks[result.tracks.score > 0]
-    expected = np.column_stack([expected.frame, expected.track_id, expected.xyxy])
-    found = np.array(rows)
-    np.testing.assert_allclose(found[np.lexsort(found[:, 1::-1].T)],
-                               expected[np.lexsort(expected[:, 1::-1].T)])  # fmt: skip
+# ---- YOLO ----
 
 
 def test_labels_of_images_in_folders(chairs: rt.Result, tmp_path: Path) -> None:
@@ -475,32 +315,33 @@ def test_labels_of_images_in_folders(chairs: rt.Result, tmp_path: Path) -> None:
     out = tmp_path / "out"
     Workspace(out).bind(video)
     chairs.save(out)
-    rt.export(out, "labelme")
     rt.export(out, "yolo")
-    assert not (out / "labelme/images").exists()
     frames = json.loads(rt.export(out, "nerfstudio").read_text())["frames"]
     for frame, image in enumerate(video.files):
         name = image.relative_to(tmp_path / "f")
         assert (out / "nerfstudio" / frames[frame]["file_path"]).samefile(image)
-        file = (out / "labelme" / name).with_suffix(".json")
-        data = json.loads(file.read_text())
-        assert (file.parent / data["imagePath"]).samefile(image)
         rows = np.loadtxt((out / "yolo/labels" / name).with_suffix(".txt"))
-        shown = [shape["points"][0][0] for shape in data["shapes"]]
-        np.testing.assert_allclose((rows[:, 1] - rows[:, 3] / 2) * 640, shown, atol=0.01), frame
+        shown = chairs.tracks.xyxy[chairs.tracks.frame == frame, 0]
+        np.testing.assert_allclose((rows[:, 1] - rows[:, 3] / 2) * 640, shown, atol=0.01)
 
 
-def test_names_in_a_file_cannot_leave_the_folder(chairs: rt.Result, tmp_path: Path) -> None:
-    """A run without images takes the names of its frames from a file."""
-    absolute = tmp_path / "abs.png"
-    names = ["../../evil.jpg", str(absolute), "", "..", "a/b.c", *(f"{i}.jpg" for i in range(35))]
-    (tmp_path / "poses.txt").write_text("")
-    video = ImagelessVideo(tmp_path / "poses.txt", SIZE, names=names)
-    out = tmp_path / "deep" / "er" / "out"
-    Workspace(out).bind(video)
-    chairs.save(out)
-    rt.export(out, "yolo")
-    labels = sorted(str(p.relative_to(out / "yolo/labels")) for p in tmp_path.rglob("*.txt")
-                    if p.parent not in (tmp_path, out))  # fmt: skip
-    expected = ["evil.txt", f"{str(absolute)[1:-4]}.txt", "walk_3.txt", "walk_4.txt", "a/b.c.txt"]
-    assert labels == sorted([*expected, *(f"{i}.txt" for i in range(35))])
+# ---- Message types of ROS ----
+
+
+@pytest.mark.parametrize("distribution", ["ROS2_HUMBLE", "LATEST"])
+def test_message_types_are_those_of_ros(
+    chairs: rt.Result, tmp_path: Path, distribution: str
+) -> None:
+    """By their hash (RIHS01), which ROS 2 compares; rosbags has no vision_msgs to compare."""
+    rosbags = pytest.importorskip("rosbags.highlevel", reason="pip install rosbags (extra `dev`)")
+    typesys = pytest.importorskip("rosbags.typesys")
+    ros = typesys.get_typestore(typesys.Stores[distribution])
+    with rosbags.AnyReader([written(chairs, "mcap", tmp_path / "a.mcap")]) as reader:
+        for connection, _, data in reader.messages():
+            reader.deserialize(data, connection.msgtype)
+        ours = reader.typestore
+        common = sorted(ours.fielddefs.keys() & ros.fielddefs.keys())
+        assert {"tf2_msgs/msg/TFMessage", "sensor_msgs/msg/CameraInfo",
+                "visualization_msgs/msg/MarkerArray"} < set(common)  # fmt: skip
+        hashes = {kind: (ours.hash_rihs01(kind), ros.hash_rihs01(kind)) for kind in common}
+    assert [kind for kind, (our, their) in hashes.items() if our != their] == []

@@ -61,14 +61,10 @@ def lost(fraction: float, **change: object) -> rt.Poses:
     ("classes", "warned"),
     [
         ({FRIDGE: 9, CHAIR: 5}, True),  # office_loop with a small detector
-        ({FRIDGE: 8, CHAIR: 7}, True),
         ({FRIDGE: 8, CHAIR: 8}, False),  # half is not more than half
         ({FRIDGE: 7, CHAIR: 1}, False),  # few
-        ({CHAIR: 4, FRIDGE: 2}, False),  # a table
-        ({CHAIR: 14, FRIDGE: 14}, False),
         ({PERSON: 20, FRIDGE: 4}, False),  # people come in crowds
         ({CHAIR: 20}, False),  # the only class of the detector
-        ({}, False),
     ],
 )
 def test_most_objects_of_one_class(classes: dict[int, int], warned: bool) -> None:
@@ -80,19 +76,6 @@ def test_most_objects_of_one_class(classes: dict[int, int], warned: bool) -> Non
         assert lines[0].startswith(expected) and "check that" in lines[0]
         assert "--detector" in lines[0] and "--detections" in lines[0]
     assert said(result(classes), identities_given=True) == []
-
-
-def test_unmatched_boxes_of_other_classes_prevent_the_warning() -> None:
-    """Boxes of other classes in no track prove that the detector has other classes."""
-    assert len(said(result({CHAIR: 20}), untracked=rows(1, 0, FRIDGE, 0.1))) == 1
-
-
-@pytest.mark.parametrize("status", ["doubtful", "implausible"])
-def test_doubtful_and_implausible_objects_are_not_counted(status: str) -> None:
-    found = result({FRIDGE: 9, CHAIR: 5}, boxes=2)
-    assert len(said(found)) == 1
-    found.objects[:2] = [dataclasses.replace(o, status=status) for o in found.objects[:2]]
-    assert said(found) == []
 
 
 @pytest.mark.parametrize(
@@ -119,10 +102,6 @@ def test_nothing_measured(status: str, count: int, warned: bool) -> None:
     assert said(found, poses=lost(1)) == said(found, poses=None) == []  # nothing could be
 
 
-def test_people_are_never_measured() -> None:
-    assert said(result({PERSON: 9}, "rejected", walk())) == []
-
-
 @pytest.mark.parametrize(("fraction", "warned"), [(0, 0), (0.5, 0), (0.55, 1), (0.9, 1), (1, 0)])
 def test_most_frames_without_a_camera(fraction: float, warned: bool) -> None:
     """Where none has one, the poses say why."""
@@ -144,43 +123,16 @@ def test_most_strong_boxes_unexplained(untracked: int, score: float, warned: boo
     assert len(lines) == warned
     if warned:
         assert lines[0].startswith(f"{untracked} of {60 + untracked} boxes of score 0.4 or more")
-        assert "--detector" in lines[0] and "low confidence" not in lines[0]
+        assert "low confidence" not in lines[0]
 
 
-def boxes(count: int, x: float, score: float = 0.9, apart: int = 1) -> rt.Tracks:
-    """Boxes of a chair in every `apart`-th frame at one position, in no track."""
-    found = rows(count, 0, CHAIR, score)
-    xyxy = np.tile([x, 10, x + 40, 60], (count, 1)).astype(float)
-    return dataclasses.replace(found, frame=found.frame * apart, xyxy=xyxy)
-
-
-def elsewhere(found: rt.Tracks) -> rt.Tracks:
-    """The same, at another position in each frame."""
-    shift = 100.0 * np.arange(len(found))[:, None]
-    return dataclasses.replace(found, xyxy=found.xyxy + shift)
-
-
-@pytest.mark.parametrize(
-    ("untracked", "cause"),
-    [
-        (boxes(70, 300, 0.45), "below the score at which a track starts (tracker.new_score=0.5)"),
-        (rt.Tracks.joined([boxes(70, 300), boxes(70, 302, 0.8), boxes(70, 301, 0.7)]),
-         "overlap a better box of their class in the same frame"),
-        (boxes(70, 300), ""),  # continuous: no known cause
-        (elsewhere(boxes(70, 300)), "overlap no box in the frames before and after"),
-    ],
-)  # fmt: skip
-def test_the_most_frequent_cause_is_reported(untracked: rt.Tracks, cause: str) -> None:
-    """Another detector is advised only for intermittent boxes."""
+@pytest.mark.parametrize(("score", "cause"), [(0.45, "below the score at which"), (0.9, "")])
+def test_the_most_frequent_cause_is_reported(score: float, cause: str) -> None:
     found = result({CHAIR: 3, FRIDGE: 3}, status="tracked")
-    number = 100 + np.arange(len(untracked))
-    found = dataclasses.replace(
-        found, untracked=dataclasses.replace(untracked, detection_index=number)
-    )
+    found = dataclasses.replace(found, untracked=rows(70, 0, CHAIR, score))
     (line,) = implausible(found, HIGH, MOVING, 0.5)
-    assert line.startswith(f"{len(number)} of {60 + len(number)} boxes of score 0.4 or more")
+    assert line.startswith("70 of 130 boxes of score 0.4 or more")
     assert cause in line and line.endswith("listed object") == (not cause)
-    assert ("--detector" in line) == ("before and after" in cause)
 
 
 def test_boxes_of_doubtful_objects_are_unexplained() -> None:
@@ -189,14 +141,7 @@ def test_boxes_of_doubtful_objects_are_unexplained() -> None:
         found.objects[k] = dataclasses.replace(found.objects[k], status="doubtful")
     (line,) = said(found)
     assert line.startswith("40 of 60 boxes") and "output.doubtful=true" in line
-    filled = dataclasses.replace(rows(90, 6, score=0.0), detection_index=np.full(90, -1))
-    assert said(found, tracks=rt.Tracks.joined([found.tracks, filled])) == [line]
-    # a box assigned to an object after the video is still among the untracked ones
-    assert said(found, untracked=found.tracks[found.tracks.track_id == 6]) == [line]
     assert implausible(found, 0.95, MOVING) == []  # another scale of scores
-    few = result({CHAIR: 3}, boxes=5)
-    few.objects[:2] = [dataclasses.replace(o, status="doubtful") for o in few.objects[:2]]
-    assert said(few) == []
 
 
 def test_the_warning_appears_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -26,6 +26,7 @@ from reobj.options import parse_known_size, parse_up, read_config, with_option
 from reobj.poses.intrinsics import parse_camera
 from reobj.results.edits import apply_edits, read_edits
 from reobj.results.evaluation_3d import read_true_objects
+from reobj.results.result import load_tracked, save_tracked
 from reobj.results.truth import read_truth
 from reobj.results.workspace import Workspace
 from reobj.sources.recorded import read_npz
@@ -464,8 +465,8 @@ def cached_poses(path: Path) -> Any:
 
 
 def cached_tracks(path: Path) -> Any:
-    fitted(tracks_of(walk(2)), None).save_tracked(path)
-    return rt.Result.load_tracked, lambda result: result.tracks.xyxy
+    save_tracked(fitted(tracks_of(walk(2)), None), path)
+    return load_tracked, lambda result: result.tracks.xyxy
 
 
 def cached_tracker(path: Path) -> Any:

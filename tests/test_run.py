@@ -1015,7 +1015,7 @@ def test_a_damaged_cache_is_reported(
     capsys.readouterr()
     np.savez(tmp_path / "out/cache/last-tracks.npz", frame=np.arange(3))
     assert cli("objects", tmp_path / "out") == 2
-    assert_one_clear_line(capsys, r"last-tracks\.npz: is damaged: run the video again")
+    assert_one_clear_line(capsys, r"last-tracks\.npz: damaged, or not written by")
 
 
 def test_a_damaged_cache_is_computed_again(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import shutil
 import subprocess
 import sys
@@ -47,26 +45,6 @@ def test_a_foreign_folder_is_not_written_into(tmp_path: Path) -> None:
     Workspace(tmp_path)  # it belongs to the tool now
 
 
-def test_a_foreign_model_is_never_deleted(tmp_path: Path) -> None:
-    (tmp_path / "sparse").mkdir()
-    with pytest.raises(rt.ReobjError, match="sparse/ of its own"):
-        Workspace(tmp_path, overwrite=True)
-    assert not (tmp_path / "cache").exists()
-
-
-def test_a_file_is_no_folder(tmp_path: Path) -> None:
-    (tmp_path / "out").write_text("")
-    for overwrite in (False, True):
-        with pytest.raises(rt.ReobjError, match="is a file"):
-            Workspace(tmp_path / "out", overwrite)
-
-
-def test_new_and_empty_folders_are_accepted(tmp_path: Path) -> None:
-    (tmp_path / "empty").mkdir()
-    for out in (tmp_path / "empty", tmp_path / "a" / "b"):
-        assert Workspace(out).cache.is_dir()
-
-
 def test_only_folders_of_earlier_runs_are_opened(tmp_path: Path) -> None:
     with pytest.raises(rt.ReobjError, match="make one with `run`"):
         Workspace.open(tmp_path / "nowhere")
@@ -96,15 +74,6 @@ def test_results_of_two_videos_are_never_mixed(video: rt.Video, tmp_path: Path) 
     assert space.source[0] == str(tmp_path / "other") and space.last_tracks is None
     left = sorted(str(p.relative_to(space.out)) for p in space.out.rglob("*"))
     assert left == ["cache", "cache/source.json"]
-
-
-def test_a_changed_video_is_another_video(video: rt.Video, tmp_path: Path) -> None:
-    space = Workspace(tmp_path / "out")
-    space.bind(video)
-    space.save_last(fitted(tracks_of(walk(2)), None), None)
-    cv2.imwrite(str(tmp_path / "frames/2.png"), np.zeros((48, 64, 3), np.uint8))
-    with pytest.raises(rt.ReobjError, match=r"results of .*frames as it was before it changed;"):
-        space.bind(rt.Video(tmp_path / "frames"))
 
 
 def test_a_run_that_failed_does_not_claim_the_folder(video: rt.Video, tmp_path: Path) -> None:
@@ -157,24 +126,14 @@ def test_the_same_video_with_other_options_is_the_same_video(
     assert space.last_tracks is not None
 
 
-def test_the_source_is_found_from_anywhere(
-    video: rt.Video, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    space = Workspace("out")
-    space.bind(rt.Video("frames"))
-    assert space.source[0] == str(tmp_path / "frames")
-
-
 FRAMES = '{"source": "a", "input": {}, "frames": {"size": [640, %s], "count": 3%s}}'
 
 
 @pytest.mark.parametrize(
     "text",
     [
-        "{", "[]", "{}", '{"source": "a", "input": {"evry": 1}}',
-        '{"source": "a", "input": {"every": 1.5}}', '{"source": "a", "input": {"every": 3e9}}',
-        FRAMES % (0, ""), FRAMES % ("NaN", ""), FRAMES % (480, ', "times_s": [1, "x"]'),
+        "{", "[]", "{}", '{"source": "a", "input": {"every": 1.5}}', FRAMES % (0, ""),
+        FRAMES % (480, ', "times_s": [1, "x"]'),
     ],
 )  # fmt: skip
 def test_a_damaged_source_file_is_reported(tmp_path: Path, text: str) -> None:
@@ -184,36 +143,7 @@ def test_a_damaged_source_file_is_reported(tmp_path: Path, text: str) -> None:
         space.video()
 
 
-def test_frames_without_images_are_restored(tmp_path: Path) -> None:
-    space = Workspace(tmp_path)
-    (space.cache / "source.json").write_text(FRAMES % (480, ', "times_s": [0, 1, 5]'))
-    assert [(f.index, f.time_s) for f in space.video()] == [(0, 0), (1, 1), (2, 5)]
-    (space.cache / "source.json").write_text(FRAMES % (480, ', "times_s": [0, 1]'))
-    with pytest.raises(rt.ReobjError, match="2 times of 3 frames; expected one each"):
-        space.video()
-
-
 # ---- The cache ----
-
-
-def test_cached_stages_require_the_same_inputs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    space = Workspace(tmp_path)
-    config = rt.TrackerConfig()
-    path = space.path("tracks", "video", config)
-    assert path == Workspace(tmp_path).path("tracks", "video", rt.TrackerConfig())
-    assert path.parent == space.cache and path.name.startswith("tracks-")
-    others = [
-        space.path("poses", "video", config),
-        space.path("tracks", "another video", config),
-        space.path("tracks", "video"),
-        *(space.path("tracks", "video", dataclasses.replace(config, **{f.name: 99}))
-          for f in dataclasses.fields(config)),
-    ]  # fmt: skip
-    monkeypatch.setattr("reobj.results.workspace.__version__", "9.9")
-    others.append(space.path("tracks", "video", config))
-    assert len({path, *others}) == 1 + len(others)
 
 
 def test_the_latest_tracks_and_poses_are_kept(tmp_path: Path) -> None:
@@ -253,34 +183,3 @@ def test_every_component_has_its_model(tmp_path: Path) -> None:
     assert (out / "sparse/b").read_text() == "b"
     assert published(out, models[:2]) == kept | {"sparse": ["a"]}  # a failed one has none
     assert published(out, []) == kept
-
-
-def test_models_of_a_killed_run_are_published_later(tmp_path: Path) -> None:
-    """They are stored with the poses until the results are written."""
-    space, poses = Workspace(tmp_path / "out"), walk(2)
-    result = fitted(tracks_of(poses), poses)
-    space.save_last(result, poses, [space.cache / "poses-1.sparse"])
-    assert space.last_models() == [space.cache / "poses-1.sparse"]
-    result.save(space.out)
-    assert space.last_models() is None
-    space.save_last(result, None, [])
-    assert space.last_models() is None
-
-
-def test_the_source_file_is_written_atomically(
-    video: rt.Video, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    space = Workspace(tmp_path / "out")
-    space.bind(video)
-    before = (space.cache / "source.json").read_bytes()
-
-    def full(path: Path, text: str, **_: str) -> None:
-        path.write_bytes(text.encode()[:10])
-        raise OSError("No space left on device")
-
-    monkeypatch.setattr(Path, "write_text", full)
-    with pytest.raises(OSError, match="No space left"):
-        space.bind(rt.Video(tmp_path / "frames", rt.InputConfig(every=2)))
-    assert (space.cache / "source.json").read_bytes() == before
-    assert json.loads(before)["input"]["every"] == 1
-    assert [p.name for p in space.cache.iterdir()] == ["source.json"]

@@ -33,7 +33,7 @@ from reobj.maps.room_map import RoomMap, Session, map_lock
 from reobj.maps.single_frames import locate_frames, locate_rest
 from reobj.maps.update import Recording, add_recording
 from reobj.results.changes import Changes
-from reobj.results.names import recording_name
+from reobj.results.entries import recording_name
 from reobj.results.result import Result
 from reobj.results.scene import best_pictures
 from reobj.sources.video import Video, content_fingerprint, files_of

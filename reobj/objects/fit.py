@@ -182,7 +182,7 @@ def _link(
     Without a change of the options of linking, detections are linked as in the last run: known
     sizes and priors of this one concern the fit.
     """
-    key = tracked_key(result)
+    key = tracked_key((result.tracks, result.untracked), result.poses)
     linking = config
     if last is not None and _same(last, config, OPTIONS_OF_LINKS):
         if last.key == key:

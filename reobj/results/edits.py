@@ -16,8 +16,7 @@ import msgspec
 import numpy as np
 
 from reobj.files import atomic
-from reobj.results.entries import read_json
-from reobj.results.names import OutputFile
+from reobj.results.entries import OutputFile, read_json
 from reobj.types import (
     CLASS_NAME_MAX,
     COORDINATE_MAX,

@@ -1,9 +1,14 @@
-"""Entries of objects.json as data: objects, their world, components of the trajectory, video."""
+"""Entries of objects.json as data: objects, their world, components of the trajectory, video.
+
+Also the names of the files of an output folder, and the reader of its JSON files.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import enum
 import json
+import os
 import re
 import typing
 from collections import Counter
@@ -19,7 +24,6 @@ import quadrics
 from reobj import __version__
 from reobj.files import load_json, rounded, shortened
 from reobj.poses.floor import Floor
-from reobj.results.names import OutputFile
 from reobj.sources.video import Video
 from reobj.types import (
     NUMBER_MAX,
@@ -28,7 +32,6 @@ from reobj.types import (
     FiniteFloat,
     IntArray,
     LinkEvent,
-    NonNegativeFloat,
     NonNegativeInt,
     PositiveFloat,
     PositiveInt,
@@ -38,6 +41,7 @@ from reobj.types import (
     counted,
     printable,
     visible_name,
+    without_secrets,
 )
 
 T = TypeVar("T")
@@ -46,14 +50,14 @@ Spans = list[Annotated[list[NonNegativeInt], msgspec.Meta(min_length=2, max_leng
 
 # Names of fields that differ from the keys of objects.json and changes.json, by the key above
 _OF_CHANGE = {"class": "class_name", "from": "before", "to": "after", "from_shape": "before_shape"}
-_FIELD_NAMES = {
+_FIELD_NAMES: dict[str, dict[str, str]] = {
     "objects": {"class": "class_name", "tracks": "tracklet_ids", "frames": "visits"},
     "": {"map": "map_path"},
     "changes": {"map": "map_path"},
     **dict.fromkeys(("stayed", "moved", "gone", "new", "not_seen", "ambiguous"), _OF_CHANGE),
 }
 _KEYS = {name: key for names in _FIELD_NAMES.values() for key, name in names.items()}
-_FIELD_NAMES["links"] = {"look": "appearance_log_odds"}  # in version 0.1
+SCALE_KEYS = ("metres_per_unit", "rel_sigma", "source")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,10 +114,8 @@ class Object:
     classes: dict[str, FiniteFloat] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check the shape; remove a covariance beyond 32 bits, as earlier versions wrote them."""
+        """Check the shape."""
         check_shape(self.quat_wxyz, self.half_axes, self.size, self.size_m)
-        if self.cov is not None and not np.abs(self.cov).max() <= NUMBER_MAX**2:
-            object.__setattr__(self, "cov", None)
 
     def __repr__(self) -> str:
         """Describe the object in one line."""
@@ -274,7 +276,7 @@ class World:
         worlds: list[World | Part] = [self, *self.parts]
         for world, entry in zip(worlds, (values, *values["parts"]), strict=True):
             if world.scale is not None:
-                entry["scale"] = msgspec.to_builtins(_Scale(*world.scale))
+                entry["scale"] = dict(zip(SCALE_KEYS, world.scale, strict=True))
         for link in values["links"]:
             for key in ("place_iou", "appearance_log_odds"):
                 link[key] = rounded(link[key], 4)  # a box is measured to 1 in 100
@@ -301,21 +303,57 @@ class VideoInfo:
         return VideoInfo(str(video.source), *video.size, video.fps)
 
 
-# ---- From JSON ---------------------------------------------------------------------------------
+# ---- Files of an output folder -----------------------------------------------------------------
+
+
+class OutputFile(enum.StrEnum):
+    """Paths in an output folder of what is read back or removed."""
+
+    TRACKS = "tracks.txt"
+    OBJECTS = "objects.json"
+    POSES = "poses.txt"
+    MESH = "objects.ply"
+    CHANGES = "changes.json"
+    EDITS = "edits.json"
+    CONFIG = "config.toml"  # options of the last run
+    MODEL = "sparse"  # folder of a COLMAP model
+    EARLIER = "cache/earlier.json"  # other recordings of the map
+    LAST_POSES = "cache/last-poses.npz"
+    LAST_TRACKS = "cache/last-tracks.npz"  # before linking
+    LAST_LINKS = "cache/last-links.npz"  # identities of the result, for refits
+
+
+GENERIC = frozenset({"color", "frames", "image", "images", "img", "rgb"})  # folders of recordings
+
+
+def recording_name(source: str) -> str:
+    """Return the name of a recording for titles: of its file or folder.
+
+    For a folder with a generic name, that of its parent; for a glob, that of its folder.
+
+    >>> recording_name("data/kitchen/images")
+    'kitchen'
+    >>> recording_name("data/kitchen/rgb/*.png")
+    'kitchen'
+    """
+    source = without_secrets(source)
+    path = Path(source) if "://" in source else Path(os.path.abspath(source))
+    is_glob = not os.path.exists(path)
+    names = [name for name in path.parts if not (is_glob and set(name) & set("*?["))]
+    specific = [name for name in names if name.lower() not in GENERIC]
+    if names and names[-1].lower() in GENERIC and specific:
+        return specific[-1]
+    return names[-1] if names else source
 
 
 def read_json(
-    kind: type[T],
-    path: Path,
-    header: dict[str, Any] | None = None,
-    out: Path | None = None,
-    required: Sequence[str] = (),
+    kind: type[T], path: Path, header: dict[str, Any] | None = None, own: bool = False
 ) -> T:
     """Read a JSON file of ours.
 
     Args:
         kind: type of the content, as in `decode`. header: keys with their values: format, version.
-        out: output folder of the file, for the advice. required: keys of fields with a default.
+        own: a file of an output folder, which only the tool writes.
     Raises:
         ReobjError: damaged, another kind of file, or of another version.
     """
@@ -323,69 +361,45 @@ def read_json(
         data = load_json(path)
         if header and not (isinstance(data, dict) and header.items() <= data.items()):
             raise ReobjError(f"expected {json.dumps(header)}")
-        if missing := [key for key in required if key not in data]:
-            raise ReobjError(f"{missing[0]!r} is missing")
         content: T = decode(kind, data)
     except ReobjError as error:
         fault = f"{path}: {str(error).removeprefix(f'{path}: ')}"
-        raise ReobjError(f"{fault}; {written_by(out)}" if out else fault) from error
+        raise ReobjError(f"{fault}; {RUN_AGAIN}" if own else fault) from error
     return content
 
 
-def written_by(out: Path) -> str:
-    """Explain why a file of an output folder is unreadable: damaged, or of another version."""
-    data: Any = None
-    with contextlib.suppress(ReobjError):
-        data = load_json(out / OutputFile.OBJECTS)
-    wrote = data.get("reobj_track") if isinstance(data, dict) else None
-    if wrote == __version__:
-        return "is damaged: run the video again"
-    by = f"written by reobj_track {wrote or 'before 0.2'}, this is {__version__}"
-    return f"{by}: run the video again"
+RUN_AGAIN = f"damaged, or not written by reobj_track {__version__}: run the video again"
 
 
-class _Scale(msgspec.Struct):
-    """A `quadrics.Scale` in JSON."""
-
-    metres_per_unit: PositiveFloat
-    rel_sigma: NonNegativeFloat
-    source: str
-
-
-def decode(kind: Any, value: Any, at: str = "$") -> Any:
+def decode(kind: Any, value: Any) -> Any:
     """Convert a JSON value to a type made of our dataclasses.
 
     Missing fields get their default; unknown keys are ignored.
 
-    Args:
-        at: JSON path of the value, for messages.
     Raises:
         ReobjError: the value has another type or shape, or a number is out of range.
     """
     try:
-        value = _with_field_names(value, "", at)
-        return msgspec.convert(value, kind, dec_hook=_array, str_keys=True)
+        return msgspec.convert(_with_field_names(value), kind, dec_hook=_array, str_keys=True)
     except (msgspec.ValidationError, UnicodeError, RecursionError) as error:
         text = re.sub(r"[.`]\w+", lambda m: m[0][0] + _KEYS.get(m[0][1:], m[0][1:]), str(error))
         fault, _, path = text.replace("`", "").rpartition(" - at ")
-        raise ReobjError(f"{at}{path[1:]}: {fault}" if fault else f"{at}: {path}") from error
+        raise ReobjError(f"{path}: {fault}" if fault else f"$: {path}") from error
 
 
-def _with_field_names(value: Any, key: str, at: str) -> Any:
+def _with_field_names(value: Any, key: str = "") -> Any:
     """Return the JSON value of a key with the names of our fields as keys of objects."""
     if isinstance(value, list):
-        return [_with_field_names(item, key, f"{at}[{k}]") for k, item in enumerate(value)]
-    if key == "scale" and value is not None:
-        return msgspec.structs.astuple(decode(_Scale, value, at=at))
+        return [_with_field_names(item, key) for item in value]
     if key == "class_name" and isinstance(value, str):
         return visible_name(value)
     if not isinstance(value, dict):
         return value
+    if key == "scale":
+        return [value.get(name) for name in SCALE_KEYS]
     names = _FIELD_NAMES.get(key, {})
-    return {
-        (name := str(names.get(k, k))): _with_field_names(v, name, f"{at}.{k}")
-        for k, v in value.items()
-    }
+    renamed = {str(names.get(k, k)): item for k, item in value.items()}
+    return {name: _with_field_names(item, name) for name, item in renamed.items()}
 
 
 def _array(kind: Any, value: Any) -> Array:

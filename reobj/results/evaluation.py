@@ -18,8 +18,8 @@ from scipy.optimize import linear_sum_assignment
 from reobj import __version__
 from reobj.files import wrapped
 from reobj.formats import AUTO
+from reobj.results.entries import OutputFile
 from reobj.results.evaluation_3d import score_objects
-from reobj.results.names import OutputFile
 from reobj.results.result import Result
 from reobj.results.truth import (
     LabelledBoxes,
@@ -34,7 +34,6 @@ from reobj.sources.video import InputConfig
 from reobj.types import (
     COCO_NAMES,
     Array,
-    BoolArray,
     IntArray,
     ReobjError,
     box_iou,
@@ -329,7 +328,11 @@ def score_report(scores: dict[str, Any]) -> str:
     """Format the result of `evaluate` for the terminal."""
     tracks: dict[str, dict[str, float]] = scores["tracks"]
     matched = {n: s for n, s in tracks.items() if n == "all" or s["IDF1"] or s["HOTA"] or s["IDP"]}
-    lines = [score_table(matched), *_missed_text(scores["missed"])]
+    lines = [score_table(matched)]
+    if missed := scores["missed"]:
+        names = [f"{name} {', '.join(map(str, ids))}".strip() for name, ids in missed.items()]
+        count = sum(map(len, missed.values()))
+        lines += wrapped(f"not found: {count} true objects ({'; '.join(names)})")
     ranks = scores["ranks"]
     rates = [f"{k.replace('rank', 'Rank-')} {v:.3f}" for k, v in ranks.items() if k != "queries"]
     if rates:
@@ -344,15 +347,6 @@ def score_report(scores: dict[str, Any]) -> str:
         lines += wrapped(f"note: {text}")
     lines += [f"{column:<5}{meaning}" for column, meaning in COLUMNS.items()]
     return "\n".join(lines)
-
-
-def _missed_text(missed: dict[str, list[int]]) -> list[str]:
-    """Format the true objects that no identity of the result matches, by class."""
-    if not missed:
-        return []
-    count = sum(map(len, missed.values()))
-    names = [f"{name} {', '.join(map(str, ids))}".strip() for name, ids in missed.items()]
-    return wrapped(f"not found: {count} true objects ({'; '.join(names)})")
 
 
 def _missed(truth: LabelledBoxes, predicted: LabelledBoxes) -> dict[str, list[int]]:
@@ -412,12 +406,10 @@ def evaluate(
     truth = read_truth(Path(gt), names, min_visibility, notes, size, gt_format, first_frame)
     check_counts(truth, Path(gt))
     if tracked is not None:
-        read = truth[_was_read(truth.frame - 1, workspace.source[1])]
-        check_counts(
-            read, Path(gt), "none lies in a frame that was read (--start, --stop, --every)"
-        )
-        truth, predicted = _looked_at(read, predicted, tracked.looked, notes)
-        check_counts(truth, Path(gt), "none lies in a frame that the detector was run on")
+        config = workspace.source[1]
+        truth, predicted = _in_frames_of_run(truth, predicted, config, tracked.looked, notes)
+        why = "none lies in a frame that was read, and that the detector was run on"
+        check_counts(truth, Path(gt), f"{why} (--start, --stop, --every)")
     predicted = _in_true_frames(truth, predicted, notes)
     truth, predicted, named = with_common_names(truth, predicted, notes)
     known = sorted({*truth.name.tolist(), *predicted.name.tolist()} - {""})
@@ -461,10 +453,17 @@ def _of_classes(
     return dataclasses.replace(truth, role=role), predicted
 
 
-def _looked_at(
-    truth: LabelledBoxes, predicted: LabelledBoxes, looked: IntArray | None, notes: list[str]
+def _in_frames_of_run(
+    truth: LabelledBoxes,
+    predicted: LabelledBoxes,
+    config: InputConfig,
+    looked: IntArray | None,
+    notes: list[str],
 ) -> tuple[LabelledBoxes, LabelledBoxes]:
-    """Select the frames on which the detector was run (None: all)."""
+    """Select the frames that were read, and on which the detector was run (None: on all)."""
+    frame = truth.frame - 1
+    read = (frame >= config.start) & ((frame - config.start) % config.every == 0)
+    truth = truth[read & (frame < (config.stop or np.inf))]
     if looked is None:
         return truth, predicted
     kept = truth[np.isin(truth.frame - 1, looked)]
@@ -495,29 +494,28 @@ def _in_true_frames(
     frames = np.unique(predicted.frame)
     without = np.setdiff1d(frames, truth.frame)
     if len(without):
-        true_frames = np.unique(truth.frame)
-        step = int(np.gcd.reduce(np.diff(true_frames))) if len(true_frames) > 2 else 1
-        apart = f", whose frames are a multiple of {step} apart" if step > 1 else ""
         notes.append(f"{len(without)} of {len(frames)} frames with boxes of the result have no "
-                     f"ground truth{apart}: boxes in them count as false")  # fmt: skip
+                     "ground truth: boxes in them count as false")  # fmt: skip
     return predicted
 
 
 def _scale_note(truth: LabelledBoxes, predicted: LabelledBoxes) -> list[str]:
     """Note that most true boxes match only after all boxes of the result are scaled."""
-    counts: dict[float, int] = {}
-    for scale in (1, 1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 2, 3, 4):
+
+    def matches(scale: float) -> int:
         scaled = dataclasses.replace(predicted, xyxy=predicted.xyxy * scale)
         steps = _frame_steps(truth, scaled)
-        counts[scale] = sum(int((iou >= MATCH_IOU).any(1).sum()) for *_, iou in steps)
-        if counts[1] > 0.3 * len(truth):
-            return []
-    best = max(counts, key=lambda scale: counts[scale])
-    if counts[best] <= max(3 * counts[1], 0.3 * len(truth)):
+        return sum(int((iou >= MATCH_IOU).any(1).sum()) for *_, iou in steps)
+
+    few = 0.3 * len(truth)
+    if (plain := matches(1)) > few:
         return []
-    return [f"{counts[1]} of {len(truth)} true boxes match a box of the result, but {counts[best]} "
-            f"do if the boxes of the result are scaled by {best:.3g}: boxes of frames of another "
-            "size?"]  # fmt: skip
+    best, scale = max((matches(s), s) for s in (0.25, 1 / 3, 0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2, 3, 4))
+    if best <= max(3 * plain, few):
+        return []
+    return [f"{plain} of {len(truth)} true boxes match a box of the result, but {best} do if the "
+            f"boxes of the result are scaled by {scale:.3g}: boxes of frames of another size?"
+            ]  # fmt: skip
 
 
 def score_appearance(tracked: Result, truth: LabelledBoxes) -> dict[str, float]:
@@ -539,10 +537,3 @@ def score_appearance(tracked: Result, truth: LabelledBoxes) -> dict[str, float]:
     rank = return_ranks(truth, predicted, unit_rows(fused))
     shares = {f"rank{k}": float((rank <= k).mean()) for k in (1, 5, 20, 50)} if len(rank) else {}
     return {"queries": len(rank), **shares}
-
-
-def _was_read(frame: IntArray, config: InputConfig) -> BoolArray:
-    """Mark the source frames (N,) that lie within --start, --stop, --every."""
-    after = frame - config.start
-    inside = (after >= 0) & (after % config.every == 0)
-    return np.asarray(inside & (frame < (config.stop or np.inf)), bool)

@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 import quadrics
 from reobj.cameras import Poses, import_pycolmap, invert_rigid
-from reobj.files import load_json, read_lines
-from reobj.poses.supplied.pose_formats import matrix_rows
+from reobj.files import load_json
+from reobj.formats import AUTO
+from reobj.poses.supplied.frame_assignment import rows_by_time, seconds_of
+from reobj.poses.supplied.readers import read_pose_file
 from reobj.results.result import Object, Result
 from reobj.types import Array, IntArray, ReobjError, log
 
@@ -28,22 +29,24 @@ def read_true_objects(path: Path) -> tuple[list[int], quadrics.Ellipsoids]:
 
     The `visible_part` of an object, if given, is the truth: no camera saw the rest.
     """
+    ids: list[int] = []
+    rows: list[Array] = []  # (15,) each: centre, half axes, axes
+    data = load_json(path)
     try:
-        entries = load_json(path)["objects"]
-        seen = [e | e.get("visible_part", {}) for e in entries]
-        half = [np.array(e["size"]) / 2 if "R" in e else np.array(e["half_axes"]) for e in seen]
-        axes = [np.array(e["R"] if "R" in e else e["world_from_obj"])[:3, :3] for e in seen]
-        center = np.array([e["center"] for e in seen], np.float64).reshape(-1, 3)
-        half_axes = np.maximum(np.array(half, np.float64).reshape(-1, 3), MIN_HALF_AXIS)
-        rotation = np.array(axes, np.float64).reshape(-1, 3, 3)
-        if not all(np.isfinite(array).all() for array in (center, half_axes, rotation)):
+        for entry in data["objects"]:
+            seen = entry | entry.get("visible_part", {})
+            half = np.array(seen["size"]) / 2 if "R" in seen else seen["half_axes"]
+            axes = np.array(seen["R"] if "R" in seen else seen["world_from_obj"])[:3, :3]
+            rows.append(np.concatenate([seen["center"], half, axes.ravel()]).astype(np.float64))
+            ids.append(int(entry["id"]))
+        table = np.array(rows).reshape(-1, 15)
+        if not np.isfinite(table).all():
             raise ValueError("a number is not finite")
-        return [int(e["id"]) for e in entries], quadrics.Ellipsoids(center, half_axes, rotation)
-    except ReobjError:
-        raise
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         expected = "objects with id, center, size and R, or half_axes and world_from_obj"
         raise ReobjError(f"{path}: {error!r}; expected {expected}") from error
+    half_axes = np.maximum(table[:, 3:6], MIN_HALF_AXIS)
+    return ids, quadrics.Ellipsoids(table[:, :3], half_axes, table[:, 6:].reshape(-1, 3, 3))
 
 
 def align_with_truth(result: Result, truth_poses: Path | None) -> tuple[float, Array, Array]:
@@ -54,7 +57,7 @@ def align_with_truth(result: Result, truth_poses: Path | None) -> tuple[float, A
     same convention as the truth's, their directions are aligned too.
 
     Args:
-        truth_poses: TUM, or a 4x4 world_from_cam a line; may be None for supplied poses.
+        truth_poses: in any format of poses; may be None for supplied poses.
     Returns:
         scale, rotation (3, 3) and shift (3,): x_in_truth = scale * rotation @ x_in_ours + shift.
     """
@@ -71,9 +74,7 @@ def align_with_truth(result: Result, truth_poses: Path | None) -> tuple[float, A
     use = poses.known & np.isfinite(truth[:, :, 3]).all(1)
     estimated = invert_rigid(poses.cam_from_world[use])  # (f, 3, 4)
     truth = truth[use]
-    similarity = None
-    if use.sum() >= 3:  # Umeyama, PAMI 1991
-        similarity = _similarity(estimated[:, :, 3], truth[:, :, 3])
+    similarity = _similarity(estimated[:, :, 3], truth[:, :, 3]) if use.sum() >= 3 else None
     if similarity is None:
         raise ReobjError(f"{truth_poses}: {use.sum()} poses in common; 3 or more are needed")
     scale, rotation, _ = similarity
@@ -103,36 +104,15 @@ def _similarity(estimated: Array, truth: Array) -> tuple[float, Array, Array] | 
 def _true_cameras(path: Path, poses: Poses) -> Array:
     """Read world_from_cam (F, 3, 4) of the poses' frames, NaN where unknown.
 
-    TUM rows are matched to frames by time; of rows of 12 or 16 numbers, row n is frame n.
+    Rows with time stamps are matched to frames by time; of others, row n is frame n.
     """
-    try:
-        table = np.loadtxt(read_lines(path), ndmin=2)
-    except ValueError as error:
-        raise ReobjError(
-            f"{path}: {error}; expected TUM rows, or 12 or 16 numbers a line"
-        ) from error
-    if table.shape[1] in (12, 16):
-        frame = poses.frame.clip(0, len(table) - 1)
-        rows = matrix_rows(path)[0][frame, :3]
-        return np.where((frame == poses.frame)[:, None, None], rows, np.nan)
-    if table.shape[1] != 8:
-        columns = f"{table.shape[1]} columns"
-        raise ReobjError(
-            f"{path}: {columns}; expected TUM rows of 8 numbers, or 12 or 16 numbers a line"
-        )
-    table = table[np.argsort(table[:, 0], kind="stable")]
-    after = np.searchsorted(table[:, 0], poses.time_s).clip(max=len(table) - 1)  # (F,)
-    pair = np.stack([(after - 1).clip(0), after])  # (2, F) the rows before and after
-    difference = np.abs(table[pair, 0] - poses.time_s)  # (2, F)
-    nearest = np.where(difference[0] <= difference[1], *pair)  # (F,)
-    unmatched = difference.min(0) > 0.02  # s, half a frame at 25 Hz
-    rotation = np.full((len(nearest), 3, 3), np.nan)
-    xyzw = table[nearest, 4:]
-    valid = np.isfinite(xyzw).all(1) & (np.linalg.norm(xyzw, axis=1) > 0)
-    if valid.any():
-        rotation[valid] = Rotation.from_quat(xyzw[valid]).as_matrix()
-    rows = np.concatenate([rotation, table[nearest, 1:4, None]], 2)  # (F, 3, 4)
-    return np.where(unmatched[:, None, None], np.nan, rows)
+    found = read_pose_file(path, AUTO, (poses.camera.width, poses.camera.height))
+    if found.stamps is None:
+        row = np.where(poses.frame < len(found.cam_from_world), poses.frame, -1)
+    else:
+        stamps_s = seconds_of(found.stamps, found.unit)
+        row = rows_by_time(stamps_s, poses.frame, poses.time_s)
+    return np.where((row < 0)[:, None, None], np.nan, invert_rigid(found.cam_from_world)[row])
 
 
 def score_objects(
@@ -220,9 +200,7 @@ def _ellipsoids_in_truth(
         component the relative error of its metres per unit, None where unknown.
     """
     objects: list[Object] = []
-    centers = [np.empty((0, 3))]
-    half_axes = [np.empty((0, 3))]
-    axes = [np.empty((0, 3, 3))]
+    solids: list[quadrics.Ellipsoids] = []
     scale_errors: list[float | None] = []
     faults: dict[int, ReobjError] = {}
     parts = result.parts()
@@ -233,16 +211,17 @@ def _ellipsoids_in_truth(
         except ReobjError as error:
             faults[k] = error
             continue
-        estimated = part.ellipsoids()
+        ours = part.ellipsoids()
         objects += part.located
-        centers.append(estimated.center_in_world @ (scale * turn).T + shift)
-        half_axes.append(scale * estimated.half_axes)
-        axes.append(turn @ estimated.world_from_obj)
+        center = ours.center_in_world @ (scale * turn).T + shift
+        axes = turn @ ours.world_from_obj
+        solids.append(quadrics.Ellipsoids(center, scale * ours.half_axes, axes))
         if part.world.scale is not None and part.world.scale.value:
             scale_errors[k] = abs(part.world.scale.value / scale - 1)
     if len(faults) == len(parts):
         raise faults[0]
     for k, fault in faults.items():
         log.warning("component %d of the trajectory is not evaluated in 3D: %s", k, fault)
-    solids = (np.concatenate(arrays) for arrays in (centers, half_axes, axes))
-    return objects, quadrics.Ellipsoids(*solids), scale_errors
+    columns = ("center_in_world", "half_axes", "world_from_obj")
+    joined = (np.concatenate([getattr(part, name) for part in solids]) for name in columns)
+    return objects, quadrics.Ellipsoids(*joined), scale_errors

@@ -1,31 +1,115 @@
-"""Labels of a result with identities: YOLO, labelme, KITTI tracking; 3D boxes as CSV of Boxer."""
+"""Labels and tables of a result: COCO-VID, CVAT, YOLO, CSV, and 3D boxes as CSV of Boxer."""
 
 from __future__ import annotations
 
+import csv
+import itertools
 import json
-import os
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree as ET
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from reobj import __version__
 from reobj.cameras import place_of
 from reobj.files import atomic, staged
-from reobj.results.entries import Object
 from reobj.results.export_source import (
     formula_safe,
-    image_files,
+    frames_read,
     label_names,
     upright_world,
-    video_of,
     warn_of_components,
 )
-from reobj.results.result import Result
-from reobj.results.upright import component_of
+from reobj.results.result import Object, Result, object_table
 from reobj.sources.image_files import IMAGE_FPS
-from reobj.types import Array, ReobjError, Tracks, rows_by, visible_name
+from reobj.types import Tracks, object_classes, rows_by, visible_name
+
+
+def export_coco_vid(result: Result, path: Path) -> None:
+    """Write COCO-VID for MMTracking: images with frame_id, annotations with instance_id.
+
+    bbox is x, y, w, h in the corner convention.
+    """
+    video = result.video
+    tracks = result.tracks
+    frames, names = frames_read(result)
+    size = {"width": video.width, "height": video.height}
+    image_id = {frame: i for i, frame in enumerate(frames, 1)}
+    images = [
+        {"id": image_id[f], "file_name": names[f] if names else f"{f:06d}.jpg", **size,
+         "video_id": 1, "frame_id": f}
+        for f in frames
+    ]  # fmt: skip
+    warn_of_components(result, path)
+    part_of: dict[int, dict[str, int]] = {}
+    if len(result.world.parts) > 1:
+        part_of = {o.id: {"part": o.part} for o in result.objects}
+    corners = tracks.xyxy.round(2)
+    boxes = np.hstack([corners[:, :2], corners[:, 2:] - corners[:, :2]]).round(2).tolist()
+    columns = (tracks.frame, tracks.track_id, tracks.class_id, tracks.score)
+    rows = zip(boxes, *(column.tolist() for column in columns), strict=True)
+    annotations = [
+        {"id": i, "image_id": image_id[frame], "video_id": 1, "category_id": kind + 1,
+         "instance_id": identity, "track_id": identity, "bbox": box,
+         "area": round(box[2] * box[3], 2), "iscrowd": 0, "score": score,
+         **part_of.get(identity, {})}
+        for i, (box, frame, identity, kind, score) in enumerate(rows, 1)
+    ]  # fmt: skip
+    data = {
+        "info": {"description": f"reobj_track {__version__}"},
+        "videos": [{"id": 1, "name": Path(video.path).name, "fps": video.fps, **size}],
+        "categories": [{"id": i, "name": name} for i, name in enumerate(result.class_names, 1)],
+        "images": images,
+        "annotations": annotations,
+    }
+    with atomic(path) as part:
+        part.write_text(json.dumps(data) + "\n", encoding="utf-8")
+
+
+def export_cvat(result: Result, path: Path) -> None:
+    """Write "CVAT for video 1.1": one track an object, every box a keyframe.
+
+    `outside` marks the frame after each visit. CVAT numbers tracks from 0 in the order of the file:
+    track 0 is object 1. Interpolated boxes are left out: reimported, they would be detections.
+
+    Ref: cvat/apps/dataset_manager/formats/cvat.py; only keyframes are imported.
+    """
+    tracks = result.tracks
+    frames, _ = frames_read(result)
+    warn_of_components(result, path)
+    root = ET.Element("annotations")
+    ET.SubElement(root, "version").text = "1.1"
+    task = ET.SubElement(ET.SubElement(root, "meta"), "task")
+    name = visible_name(Path(result.video.path).name)
+    facts = {"name": name, "mode": "interpolation", "start_frame": 0}
+    for key, value in (facts | {"stop_frame": max(frames, default=0)}).items():
+        ET.SubElement(task, key).text = str(value)
+    labels = ET.SubElement(task, "labels")
+    for name in result.class_names:
+        ET.SubElement(ET.SubElement(labels, "label"), "name").text = name
+    size = ET.SubElement(task, "original_size")
+    for key in ("width", "height"):
+        ET.SubElement(size, key).text = str(getattr(result.video, key))
+    following = dict(itertools.pairwise(frames))
+    for identity, class_id in object_classes(tracks).items():
+        about = {"id": str(identity - 1), "label": result.class_names[class_id], "source": "auto"}
+        rows = tracks[(tracks.track_id == identity) & (tracks.score > 0)]
+        _cvat_boxes(ET.SubElement(root, "track", about), rows, following)
+    ET.indent(root)
+    with atomic(path) as part:
+        ET.ElementTree(root).write(part, encoding="utf-8", xml_declaration=True)
+
+
+def _cvat_boxes(track: ET.Element, rows: Tracks, following: dict[int, int]) -> None:
+    """Add the boxes of a track, and an `outside` box in the frame after each visit."""
+    seen = set(rows.frame.tolist())
+    for frame, box in zip(rows.frame.tolist(), rows.xyxy, strict=True):
+        corners = {k: f"{v:.2f}" for k, v in zip(("xtl", "ytl", "xbr", "ybr"), box, strict=True)}
+        ends = following.get(frame, frame) not in seen
+        for at, outside in ((frame, "0"), (following.get(frame), "1"))[: 1 + ends]:
+            facts = {"frame": str(at), "outside": outside, "occluded": "0", "keyframe": "1"}
+            ET.SubElement(track, "box", facts | corners | {"z_order": "0"})
 
 
 def export_yolo(result: Result, path: Path) -> None:
@@ -35,141 +119,35 @@ def export_yolo(result: Result, path: Path) -> None:
     boxes are cut at the borders of the image. Filled gaps have score 0.
     """
     warn_of_components(result, path)
-    labels = label_names(result, video_of(result), result.tracks.frame.tolist())
+    labels = label_names(result)
     size = np.array([result.video.width, result.video.height], np.float64)
-    names = [visible_name(name) for name in result.class_names]
+    tracks = result.tracks
+    low, high = ((corner / size).clip(0, 1) for corner in np.hsplit(tracks.xyxy, 2))  # (M, 2) each
+    columns = (tracks.class_id, (low + high) / 2, high - low, tracks.score, tracks.track_id)
+    table = np.column_stack(columns)  # (M, 7)
     with staged(path.parent, ".part-yolo") as folder:
-        for frame, rows in _by_frame(result.tracks):
-            low = (rows.xyxy[:, :2] / size).clip(0, 1)
-            high = (rows.xyxy[:, 2:] / size).clip(0, 1)
-            box = np.hstack([(low + high) / 2, high - low])
-            lines = [
-                f"{kind} {' '.join(f'{v:.6f}' for v in values)} {score:.6g} {identity}\n"
-                for kind, values, score, identity in zip(
-                    rows.class_id.tolist(), box.tolist(), rows.score.tolist(),
-                    rows.track_id.tolist(), strict=True,
-                )
-                if values[2] > 0 and values[3] > 0
-            ]  # fmt: skip
-            label = folder / "labels" / f"{labels[frame]}.txt"
+        for rows in rows_by(tracks.frame):
+            label = folder / "labels" / f"{labels[int(tracks.frame[rows[0]])]}.txt"
             label.parent.mkdir(parents=True, exist_ok=True)
-            label.write_text("".join(lines), encoding="utf-8")
-        entries = "".join(f"  {i}: {json.dumps(name)}\n" for i, name in enumerate(names))
+            kept = rows[(high > low)[rows].all(1)]
+            np.savetxt(label, table[kept], ["%d", *["%.6f"] * 4, "%.6g", "%d"])
+        names = [json.dumps(visible_name(name)) for name in result.class_names]
+        entries = "".join(f"  {i}: {name}\n" for i, name in enumerate(names))
         head = "path: .\ntrain: images\nval: images\n"
         (folder / path.name).write_text(f"{head}names:\n{entries}", encoding="utf-8")
 
 
-def export_labelme(result: Result, path: Path) -> None:
-    """Write labelme's label files: the list of classes, and NAME.json for each frame with boxes.
+def export_csv(result: Result, path: Path) -> None:
+    """Write the table of the objects, one a line, for spreadsheets.
 
-    A rectangle has its class as `label` and its identity as `group_id`. Images of a folder are
-    referenced; frames of a video are written to images/, their labels beside them. Without filled
-    gaps, as they are no detections.
-
-    Ref: github.com/wkentaro/labelme, labelme/_label_file.py.
+    Text that a spreadsheet would read as a formula gets an apostrophe.
     """
-    warn_of_components(result, path)
-    video = video_of(result)
-    if video is None:
-        raise ReobjError(f"{path}: labelme needs the images, but the video was moved or deleted")
-    if not video.has_images:
-        raise ReobjError(f"{path}: this run had no images, and labelme needs them; try --to yolo")
-    names = [visible_name(name) for name in result.class_names]
-    tracks = result.tracks[result.tracks.score > 0]
-    with staged(path.parent, ".part-labelme") as folder:
-        files = image_files(video, tracks.frame.tolist(), path.parent, folder)
-        labels = {frame: Path(file).with_suffix("").as_posix() for frame, file in files.items()}
-        if video.files:
-            labels = label_names(result, video, files)
-        for frame, rows in _by_frame(tracks):
-            if frame not in files:
-                continue
-            shapes = [
-                {"label": names[kind], "points": [box[:2], box[2:]], "group_id": identity,
-                 "shape_type": "rectangle", "flags": {}}
-                for kind, box, identity in zip(
-                    rows.class_id.tolist(), rows.xyxy.tolist(), rows.track_id.tolist(), strict=True
-                )
-            ]  # fmt: skip
-            label = folder / f"{labels[frame]}.json"
-            image = os.path.relpath(files[frame], label.parent.relative_to(folder))
-            data: dict[str, Any] = {
-                "version": "5.5.0", "flags": {}, "shapes": shapes, "imageData": None,
-                "imagePath": Path(image).as_posix(), "imageHeight": result.video.height,
-                "imageWidth": result.video.width,
-            }  # fmt: skip
-            label.parent.mkdir(parents=True, exist_ok=True)
-            label.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
-        classes = "".join(f"{name}\n" for name in names)
-        (folder / path.name).write_text(classes, encoding="utf-8")
+    head, rows = object_table(result)
+    with atomic(path) as part, part.open("w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(head)
+        table.writerows([formula_safe(value) for value in row] for row in rows)
 
-
-def _by_frame(tracks: Tracks) -> Iterator[tuple[int, Tracks]]:
-    """Yield the rows of each frame with rows."""
-    for rows in rows_by(tracks.frame):
-        yield int(tracks.frame[rows[0]]), tracks[rows]
-
-
-# ---- KITTI -------------------------------------------------------------------------------------
-
-
-def export_kitti(result: Result, path: Path) -> None:
-    """Write results of KITTI tracking: 18 columns, frames from 0, metres if the scale is known.
-
-    Location and `rotation_y` are in the camera of the frame: bottom centre, and the heading of the
-    object's x axis in the camera's x-z plane; `l`, `w`, `h` are the extents along the object's x, y
-    and z axes. Without a shape, or in a frame without a pose: -1, -1000 and -10 as in KITTI.
-    Unknown are `truncated` and `occluded` (-1). Filled gaps have score 0.
-
-    Ref: KITTI tracking development kit, readme.txt.
-    """
-    warn_of_components(result, path)
-    tracks = result.tracks
-    names = [visible_name(name).replace(" ", "_") for name in result.class_names]
-    facts = _kitti_facts(result)  # (M, 8)
-    lines = []
-    for i, (frame, identity, kind) in enumerate(
-        zip(tracks.frame.tolist(), tracks.track_id.tolist(), tracks.class_id.tolist(), strict=True)
-    ):
-        alpha, *shape = facts[i].tolist()
-        box = " ".join(f"{v:.2f}" for v in tracks.xyxy[i])
-        solid = " ".join(f"{v:.4f}" for v in shape)
-        score = f"{tracks.score[i]:.6g}"
-        lines.append(f"{frame} {identity} {names[kind]} -1 -1 {alpha:.4f} {box} {solid} {score}\n")
-    with atomic(path) as part:
-        part.write_text("".join(lines), encoding="utf-8")
-
-
-def _kitti_facts(result: Result) -> Array:
-    """Return alpha, h, w, l, x, y, z, rotation_y (M, 8) of the rows of the tracks."""
-    tracks = result.tracks
-    facts = np.tile([-10.0, -1, -1, -1, -1000, -1000, -1000, -10], (len(tracks), 1))
-    poses = result.poses
-    if poses is None or not poses.known.any():
-        return facts
-    place, known = place_of(poses, tracks.frame)
-    for found in result.located:
-        rows = np.flatnonzero(known & (tracks.track_id == found.id))
-        rows = rows[poses.part[place[rows]] == found.part]
-        cams = poses.cam_from_world[place[rows]]  # (R, 3, 4)
-        scale = component_of(found, result.world).scale
-        metres = scale.value if scale is not None and scale.source != "none" else 1.0
-        xyzw = np.roll(np.asarray(found.quat_wxyz, np.float64), -1)
-        axes = Rotation.from_quat(xyzw).as_matrix()
-        size = np.asarray(found.size, np.float64)
-        bottom = np.asarray(found.center, np.float64) - axes[:, 2] * size[2] / 2
-        location = cams[:, :, :3] @ bottom + cams[:, :, 3]
-        heading = cams[:, :, :3] @ axes[:, 0]
-        turn = np.arctan2(-heading[:, 2], heading[:, 0])
-        alpha = turn - np.arctan2(location[:, 0], location[:, 2])
-        facts[rows, 0] = (alpha + np.pi) % (2 * np.pi) - np.pi
-        facts[rows, 1:4] = metres * size[::-1]
-        facts[rows, 4:7] = metres * location
-        facts[rows, 7] = turn
-    return facts
-
-
-# ---- Boxer -------------------------------------------------------------------------------------
 
 BOXER_HEADER = (
     "time_ns,tx_world_object,ty_world_object,tz_world_object,qw_world_object,qx_world_object,"
@@ -187,21 +165,17 @@ def export_boxer(result: Result, path: Path) -> None:
     """
     world = upright_world(result, path)
     numbers = {name: i for i, name in enumerate(result.class_names)}
-    tails = {found.id: _boxer_tail(found, numbers) for found in world.objects}
     quat = np.roll(world.quat_xyzw, 1, 1)
     size = 2 * world.ellipsoids.half_axes
     box = np.hstack([world.ellipsoids.center_in_world, quat, size])  # (O, 10)
     texts = {
-        found.id: ",".join(f"{value:.9g}" for value in box[i])
+        found.id: ",".join([*(f"{value:.9g}" for value in box[i]), _boxer_tail(found, numbers)])
         for i, found in enumerate(world.objects)
     }
     tracks = result.tracks[np.isin(result.tracks.track_id, list(texts))]
     tracks = tracks[tracks.score > 0]
-    times = _times_ns(result, tracks)
-    lines = [BOXER_HEADER, *(
-        f"{time},{texts[i]},{tails[i]}"
-        for time, i in zip(times, tracks.track_id.tolist(), strict=True)
-    )]  # fmt: skip
+    rows = zip(_times_ns(result, tracks), tracks.track_id.tolist(), strict=True)
+    lines = [BOXER_HEADER, *(f"{time},{texts[i]}" for time, i in rows)]
     with atomic(path) as part:
         part.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
@@ -215,8 +189,7 @@ def _boxer_tail(found: Object, numbers: dict[str, int]) -> str:
 
 def _times_ns(result: Result, tracks: Tracks) -> list[int]:
     """Return the times of rows in ns: of the poses, else by the frame rate."""
-    fps = result.video.fps or IMAGE_FPS
-    times: Any = tracks.frame / fps
+    times: Any = tracks.frame / (result.video.fps or IMAGE_FPS)
     if result.poses is not None and len(result.poses.frame):
         place, _ = place_of(result.poses, tracks.frame)
         read = result.poses.frame[place] == tracks.frame

@@ -1,40 +1,25 @@
-"""ROS 2 messages of a result: objects as JSON, and a recording (MCAP) of cameras and objects.
+"""ROS 2 messages of a result: a recording (MCAP) of cameras and objects.
 
 Frames follow REP 103 and 105: `map` is upright and in metres, `camera_optical_frame` looks along z.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from reobj.cameras import Camera, camera_parameters, invert_rigid, quat_wxyz_from_matrix
+from reobj.cameras import Camera, invert_rigid, quat_wxyz_from_matrix
 from reobj.files import atomic
-from reobj.results.entries import Object
-from reobj.results.export_source import UprightWorld, upright_world
-from reobj.results.result import Result
-from reobj.types import Array, ReobjError, Tracks, log, object_color, visible_name
+from reobj.results.export_source import UprightWorld, distortion, upright_world
+from reobj.results.result import Object, Result
+from reobj.types import Array, ReobjError, Tracks, object_color, visible_name
 
 Message = dict[str, Any]
 MAP = "map"
 CAMERA = "camera_optical_frame"
-
-
-def export_ros(result: Result, path: Path) -> None:
-    """Write the objects as JSON in the shape of vision_msgs/msg/Detection3DArray.
-
-    `id` is the number of the object; a hypothesis has the name of its class and the probability
-    that the object exists and has this class. Covariances are 0 where unknown, as in ROS.
-
-    Ref: github.com/ros-perception/vision_msgs, 4.0 (ROS 2 Humble) and later.
-    """
-    world = upright_world(result, path)
-    with atomic(path) as part:
-        part.write_text(json.dumps(_detections_3d(world, 0), indent=1) + "\n", encoding="utf-8")
 
 
 def export_mcap(result: Result, path: Path) -> None:
@@ -191,28 +176,21 @@ def _detections_2d(rows: Tracks, names: dict[int, str], time_ns: int) -> Message
 
 
 def _camera_info(camera: Camera, path: Path) -> Message:
-    """Convert intrinsics to those of ROS; warn about distortion that it does not support.
-
-    ROS has the centre of the first pixel at (0, 0), COLMAP at (.5, .5).
-    """
-    values = dict(zip(camera_parameters(camera.model), camera.params, strict=True))
+    """Convert intrinsics to those of ROS, whose first pixel has its centre at (0, 0)."""
     K = camera.K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-    orders = {
-        "OPENCV_FISHEYE": ("equidistant", ("k1", "k2", "k3", "k4")),
-        "FULL_OPENCV": ("rational_polynomial", ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
-    }
-    usual = ("plumb_bob", ("k1", "k2", "p1", "p2", "k3"))
-    model, order = orders.get(camera.model, usual)
-    fisheye = "FISHEYE" in camera.model and camera.model not in orders
-    terms = {"k1": values.pop("k", 0.0)} | {k: v for k, v in values.items() if k[0] not in "fc"}
-    if fisheye or any(value for name, value in terms.items() if name not in order):
-        log.warning("%s: ROS has no %s cameras: the rest of the distortion is left out",
-                    path, camera.model)  # fmt: skip
+    model = "plumb_bob"
+    names = "k1 k2 p1 p2 k3"
+    if "FISHEYE" in camera.model:
+        model = "equidistant"
+        names = "k1 k2 k3 k4"
+    elif camera.model == "FULL_OPENCV":
+        model = "rational_polynomial"
+        names += " k4 k5 k6"
     return {
         "height": camera.height,
         "width": camera.width,
         "distortion_model": model,
-        "d": [0.0] * len(order) if fisheye else [float(terms.get(name, 0.0)) for name in order],
+        "d": list(distortion(camera, names.split(), path, "ROS").values()),
         "k": K.ravel().tolist(),
         "r": np.eye(3).ravel().tolist(),
         "p": np.column_stack([K, np.zeros(3)]).ravel().tolist(),
@@ -287,15 +265,7 @@ _PARTS = {
 
 
 def _definition(kind: str) -> str:
-    """Return the definition of a message type followed by those of all types that it contains."""
-    texts = [MESSAGES[kind]]
-    found = list[str]()
-    for text in texts:
-        for line in text.splitlines():
-            name = line.split()[0].partition("[")[0]
-            if name in _PARTS and name not in found:
-                found.append(name)
-                texts.append(_PARTS[name])
+    """Return the definition of a message type followed by those of the types in messages."""
     rule = "=" * 80
-    parts = [f"{rule}\nMSG: {name}\n{_PARTS[name]}" for name in found]
+    parts = [f"{rule}\nMSG: {name}\n{text}" for name, text in _PARTS.items()]
     return "\n".join([MESSAGES[kind], *parts])

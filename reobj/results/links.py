@@ -8,23 +8,22 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Mapping
+import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
 import quadrics
+from reobj.cameras import Poses
 from reobj.files import columns_of, from_columns, load_npz, save_npz
 from reobj.types import Existence, IntArray, LinkEvent, ReobjError, Tracks
 
-if TYPE_CHECKING:
-    from reobj.results.result import Result
-
-SAME_PX = 0.02  # between a box and the same one in tracks.txt, which is rounded to .01 px
+SAME_PX = 0.02  # between a box and the same one; chosen
 
 
 class ComponentShapes(NamedTuple):
@@ -51,11 +50,10 @@ class Links:
         number: (N,) identity of each row after edits, and in a map; 0: deleted.
         highest: number that an identity of the folder ever had.
         options: of the objects stage when they were linked. key: of the tracks and cameras
-            (`tracked_key`); "": read from the results of a folder without links.
+            (`tracked_key`).
         in_map: numbers that the map of the recording gave to some of its identities.
         before: numbers in the last result of the folder; none before a refit. changed: how many
             identities of the last result have other boxes, as the detections were linked again.
-        hidden: tracklets of identities of a folder without links whose boxes are not in tracks.txt.
     """
 
     tracks: Tracks
@@ -72,7 +70,6 @@ class Links:
     in_map: frozenset[int] = frozenset()
     before: frozenset[int] = frozenset()
     changed: int = 0
-    hidden: Mapping[int, frozenset[int]] = field(default_factory=dict)
 
     def renumbered(self, numbers: Mapping[int, int]) -> Links:
         """Return the links with other numbers of identities, which must differ.
@@ -102,7 +99,7 @@ class Links:
         """Number identities as those of the last result with which they share most boxes.
 
         The assignment is one to one, with most shared boxes in all. Identities without an earlier
-        one get numbers that none had. Those without known boxes are the same if the tracklets are.
+        one get numbers that none had.
         """
         row = last.rows_of(self.tracks)
         new, new_of_row = np.unique(self.tracks.track_id, return_inverse=True)
@@ -111,17 +108,8 @@ class Links:
         np.add.at(shared, (new_of_row[row >= 0], old_of_row[row[row >= 0]]), 1)
         pairs = zip(*linear_sum_assignment(-shared), strict=True)
         numbers = {int(new[i]): int(old[j]) for i, j in pairs if shared[i, j]}
-        hidden = dict(last.hidden)
-        free = last.highest + 1
-        for identity in new.tolist():
-            if identity in numbers:
-                continue
-            of_identity = self.tracks.track_id == identity
-            tracklets = set(self.tracks.tracklet_id[of_identity].tolist())
-            alike = [i for i, known in hidden.items() if known == tracklets]
-            numbers[identity] = identity if identity in alike else min(alike, default=free)
-            free += numbers[identity] == free
-            hidden.pop(numbers[identity], None)
+        free = itertools.count(last.highest + 1)
+        numbers |= {i: next(free) for i in new.tolist() if i not in numbers}
         made = self.renumbered(numbers)
         return dataclasses.replace(
             made,
@@ -135,9 +123,8 @@ class Links:
         if not len(self.tracks):
             return np.full(len(tracks), -1)
         own, others = (
-            np.column_stack([t.frame, t.xyxy, t.detection_index * bool(self.key)])
-            for t in (self.tracks, tracks)
-        )  # tracks.txt has no detection index
+            np.column_stack([t.frame, t.xyxy, t.detection_index]) for t in (self.tracks, tracks)
+        )
         row = cKDTree(own).query(others, p=np.inf, distance_upper_bound=SAME_PX)[1]
         return np.where(row < len(own), row, -1)
 
@@ -150,9 +137,7 @@ class Links:
         kept = np.append(self.tracks.track_id, -1)[row] == tracks.track_id  # (M,)
         found = np.zeros(len(self.tracks), bool)
         found[row[kept]] = True
-        changed = {*self.tracks.track_id[~found].tolist()}
-        if self.key:  # else the boxes of some identities are unknown
-            changed |= {*tracks.track_id[~kept].tolist()}
+        changed = {*self.tracks.track_id[~found].tolist(), *tracks.track_id[~kept].tolist()}
         return len(changed & {*self.tracks.track_id.tolist()})
 
 
@@ -163,12 +148,11 @@ def _mapped(identity: IntArray, numbers: Mapping[int, int]) -> IntArray:
     return np.asarray(new[row])
 
 
-def tracked_key(result: Result) -> str:
-    """Hash the tracks before linking, and the cameras."""
-    tables = (result.tracks, result.untracked)
-    arrays = [array for t in tables for array in columns_of(t).values()]
-    if result.poses is not None:
-        arrays += [result.poses.cam_from_world, result.poses.part]
+def tracked_key(tables: Sequence[Tracks], poses: Poses | None) -> str:
+    """Hash the tables of tracks before linking, and the cameras."""
+    arrays = [array for table in tables for array in columns_of(table).values()]
+    if poses is not None:
+        arrays += [poses.cam_from_world, poses.part]
     digest = hashlib.sha256()
     for array in arrays:
         digest.update(np.ascontiguousarray(array).tobytes())
@@ -245,31 +229,3 @@ def load_links(path: Path) -> Links:
         )
     except (KeyError, TypeError, ValueError) as error:
         raise ReobjError(f"{path}: written by another version ({error})") from error
-
-
-def links_of_results(result: Result, options: Mapping[str, Any]) -> Links:
-    """Make links of the results of a folder that has none: for the numbers of its identities.
-
-    Args:
-        result: of the folder. options: of the last run.
-    """
-    tracks = result.tracks[result.tracks.score > 0]
-    ids = {o.id for o in result.objects} | set(result.tracks.track_id.tolist())
-    changes = result.changes
-    matched = () if changes is None else (*changes.stayed, *changes.moved)
-    none = np.full(len(tracks), -1)
-    return Links(
-        tracks,
-        none,
-        none,
-        number=tracks.track_id,
-        highest=max(ids, default=0),
-        options=options,
-        in_map=frozenset(change.id for change in matched),
-        before=frozenset(ids),
-        hidden={
-            o.id: frozenset(o.tracklet_ids)
-            for o in result.objects
-            if not (tracks.track_id == o.id).any()
-        },
-    )

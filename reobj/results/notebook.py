@@ -5,18 +5,14 @@ from __future__ import annotations
 import html
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from reobj.files import cut
 from reobj.results.entries import Object
-from reobj.results.report import sides
+from reobj.results.result import Result, sides
 from reobj.results.scene import Pictures, write_scene
 from reobj.sources.video import ImagelessVideo
-
-if TYPE_CHECKING:
-    from reobj.results.result import Result
 
 VIEWER_PX = 600  # height of the viewer: a notebook on a laptop shows it whole
 

@@ -12,7 +12,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,15 +22,13 @@ import quadrics
 from reobj.cameras import Camera
 from reobj.files import cut
 from reobj.results.changes import Change
+from reobj.results.export_source import centred
 from reobj.results.film import FilmWriter
-from reobj.results.origin import centred
 from reobj.results.ply import CYLINDER_SIDES as SIDES
+from reobj.results.result import Result
 from reobj.sources.image_files import IMAGE_FPS
 from reobj.sources.video import Video
 from reobj.types import Array, BoolArray, Frame, Image, IntArray, ReobjError, Tracks, object_color
-
-if TYPE_CHECKING:
-    from reobj.results.result import Result
 
 Color = tuple[int, int, int]
 

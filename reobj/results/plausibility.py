@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from reobj.results.result import Object, Result
-from reobj.types import BoolArray, IntArray, Tracks, box_iou, rows_by
+from reobj.types import IntArray, Tracks
 from reobj.words import among
 
 OTHER_BOXES = "another detector (--detector, or other boxes with --detections)"
@@ -83,10 +83,7 @@ def _one_class(result: Result, still: Sequence[Object]) -> str:
 
 
 def _unexplained(result: Result, high_score: float, new_score: float) -> str:
-    """Warn if most boxes of high score belong to no listed object, with their most common cause.
-
-    Another detector is suggested only if boxes are isolated or their objects have low confidence.
-    """
+    """Warn if most boxes of high score belong to no listed object, with their most common cause."""
     doubtful = [o.id for o in result.objects if o.status == "doubtful"]
     tracks = result.tracks
     weak = result.tracks.score < high_score
@@ -103,44 +100,11 @@ def _unexplained(result: Result, high_score: float, new_score: float) -> str:
         if 2 * (rest.score < new_score).sum() > len(rest):
             return (f"{text}: most of them are below the score at which a track starts "
                     f"(tracker.new_score={new_score:g})")  # fmt: skip
-        doubled = _doubled(rest, strong)
-        alone = _alone(rest, strong)
-        if 2 * doubled.sum() > len(rest):
-            return (f"{text}: most of them overlap a better box of their class in the same frame "
-                    "(detections without non-maximum suppression)")  # fmt: skip
-        if 2 * alone.sum() <= len(rest):
-            return text
-        text += ": most of them overlap no box in the frames before and after"
-        return f"{text}: boxes of other frames, photos far apart, or try {OTHER_BOXES}"
+        return text
     return (
         f"{text}: look at the objects of low confidence (--set output.doubtful=true), or try "
         f"{OTHER_BOXES}"
     )
-
-
-def _doubled(rows: Tracks, others: Tracks) -> BoolArray:
-    """Mark rows that overlap a better box of their class in the same frame."""
-    doubled = np.zeros(len(rows), bool)
-    for group in rows_by(rows.frame):
-        same_frame = others[others.frame == rows.frame[group[0]]]
-        same = box_iou(rows.xyxy[group], same_frame.xyxy) > 0.6  # NMS: .5 to .7
-        same &= rows.class_id[group][:, None] == same_frame.class_id
-        doubled[group] = (same & (same_frame.score > rows.score[group][:, None])).any(1)
-    return doubled
-
-
-def _alone(rows: Tracks, others: Tracks) -> BoolArray:
-    """Mark rows that overlap no box of their class in the previous and next frame with boxes."""
-    frames = np.unique(others.frame)
-    alone = np.ones(len(rows), bool)
-    for group in rows_by(rows.frame):
-        at = np.searchsorted(frames, rows.frame[group[0]])
-        beside = frames[[k for k in (at - 1, at + 1) if 0 <= k < len(frames)]]
-        neighbours = others[np.isin(others.frame, beside)]
-        overlaps = box_iou(rows.xyxy[group], neighbours.xyxy) > 0.3  # as the tracker's low_iou
-        same_class = rows.class_id[group][:, None] == neighbours.class_id
-        alone[group] = ~(overlaps & same_class).any(1)
-    return alone
 
 
 def _distinct(rows: Tracks) -> IntArray:

@@ -1,13 +1,17 @@
-"""Result of a run: tracks, cameras and objects of a video; its files and report are methods.
+"""Result of a run: tracks, cameras and objects of a video; its files, its table and its report.
 
-`Result` and `reobj.results.entries` hold data only; `saving` and `report` do the work.
+`Result` holds data; the functions below it write and read the output folder, and summarise it.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import json
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +19,60 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import quadrics
-from reobj.cameras import Poses
-from reobj.results import notebook, report, saving, table
-from reobj.results.changes import Changes, EarlierSession
-from reobj.results.edits import Edits
-from reobj.results.entries import Object, Part, VideoInfo, World, found_text
-from reobj.results.links import Links
-from reobj.sources.tables import Boxes3D
-from reobj.types import Embeddings, IntArray, ReobjError, Tracks, counted
+from reobj import __version__
+from reobj.cameras import Poses, save_poses
+from reobj.files import (
+    atomic,
+    columns_of,
+    cut,
+    from_columns,
+    load_npz,
+    part_path,
+    save_npz,
+    texts_with_sigma,
+    wrapped,
+)
+from reobj.results.changes import (
+    Changes,
+    EarlierSession,
+    read_changes,
+    read_earlier,
+    write_changes,
+    write_earlier,
+)
+from reobj.results.edits import Edits, write_edits
+from reobj.results.entries import (
+    RUN_AGAIN,
+    Object,
+    OutputFile,
+    Part,
+    VideoInfo,
+    World,
+    found_text,
+    read_json,
+)
+from reobj.results.links import Links, save_links
+from reobj.results.ply import write_ply
+from reobj.results.saving import (
+    HEADER,
+    STALE,
+    load_last_poses,
+    replaced,
+    write_mot,
+    write_trajectories,
+)
+from reobj.results.upright import component_of, upright_pose
+from reobj.sources.tables import Boxes3D, read_mot_rows
+from reobj.types import (
+    Array,
+    Embeddings,
+    IntArray,
+    ReobjError,
+    Tracks,
+    counted,
+    log,
+    without_secrets,
+)
 
 __all__ = ["Object", "Part", "Result", "VideoInfo", "World"]
 
@@ -88,6 +138,8 @@ class Result:
 
     def _repr_html_(self) -> str:
         """Show the objects and the viewer in a notebook."""
+        from reobj.results import notebook  # the viewer needs this module
+
         return notebook.to_html(self)
 
     def object(self, number: int) -> Object:
@@ -108,7 +160,12 @@ class Result:
 
         The columns are those of `export --to csv`: lengths in world units, `_m` in metres.
         """
-        return table.to_pandas(self)
+        try:
+            import pandas
+        except ImportError as error:
+            raise ReobjError("to_pandas needs pandas: pip install pandas") from error
+        head, rows = object_table(self)
+        return pandas.DataFrame(rows, columns=head).set_index("id")
 
     @property
     def located(self) -> list[Object]:
@@ -163,7 +220,7 @@ class Result:
 
     def summary(self) -> str:
         """Return the report that `run` prints: objects with their sizes, cameras, times, files."""
-        return report.summary(self)
+        return summary(self)
 
     def save(
         self,
@@ -188,7 +245,7 @@ class Result:
         Returns:
             The same result with `out`, which `summary` and the evaluation name.
         """
-        saving.save(self, Path(out), doubtful, more, stale)
+        save(self, Path(out), doubtful, more, stale)
         return dataclasses.replace(self, out=Path(out))
 
     @classmethod
@@ -201,17 +258,369 @@ class Result:
         Raises:
             ReobjError: no `run` or `track` finished there, or another version wrote the folder.
         """
-        return saving.load(cls, Path(out))
+        return load(Path(out))
 
-    def save_tracked(self, path: Path) -> None:
-        """Write tracks and embeddings, before they are linked and fitted, as npz."""
-        saving.save_tracked(self, path)
 
-    @classmethod
-    def load_tracked(cls, path: Path) -> Result:
-        """Read what `save_tracked` wrote."""
-        return saving.load_tracked(cls, path)
+# ---- Output folder -----------------------------------------------------------------------------
 
-    def write_objects(self, path: Path) -> None:
-        """Write objects.json."""
-        saving.write_objects(self, path)
+
+def save(
+    result: Result,
+    out: Path,
+    doubtful: bool,
+    write_more: Callable[[Path], None] | None,
+    stale: Sequence[str],
+) -> None:
+    """Write the files of a result; for the arguments see `Result.save`."""
+    edited = () if result.edits is None else (OutputFile.EDITS,)
+    with replaced(out, (*STALE, *edited, *stale)) as new:
+        shown = result if doubtful else result.without_doubtful()
+        write_mot(new / OutputFile.TRACKS, shown.tracks)
+        write_objects(result, new / OutputFile.OBJECTS)
+        write_edits(new, result.edits)
+        if result.links is not None:
+            save_links(result.links, new / OutputFile.LAST_LINKS)
+        if result.changes is not None:
+            write_changes(new / OutputFile.CHANGES, result.changes)
+        if result.earlier:
+            write_earlier(new / OutputFile.EARLIER, result.earlier)
+        if result.poses is not None:
+            save_poses(new / OutputFile.LAST_POSES, result.poses)
+            write_trajectories(new, result.poses)
+        if result.fits is not None or result.located:
+            for k, component in enumerate(result.parts()):
+                ids = [o.id for o in component.located]
+                write_ply(part_path(new / OutputFile.MESH, k), component.ellipsoids(), ids)
+        if write_more is not None:
+            write_more(new)
+
+
+def load(out: Path) -> Result:
+    """Read what `save` wrote; for the errors see `Result.load`."""
+    path = out / OutputFile.OBJECTS
+    if not path.is_file() or not (out / OutputFile.TRACKS).is_file():
+        raise ReobjError(f"{out}: no objects.json and tracks.txt; make them first with `run`")
+    poses = load_last_poses(out)
+    entries = read_json(ObjectsFile, path, HEADER, own=True)
+    if fault := _contradiction(entries, poses):
+        raise ReobjError(f"{path}: {fault}; {RUN_AGAIN}")
+    class_names = tuple(dict.fromkeys(o.class_name for o in entries.objects))
+    class_of = {o.id: class_names.index(o.class_name) for o in entries.objects}
+    rows = read_mot_rows(out / OutputFile.TRACKS)
+    frame = rows[:, 0].astype(np.int64) - 1
+    ids = rows[:, 1].astype(np.int64)
+    corners = np.concatenate([rows[:, 2:4], rows[:, 2:4] + rows[:, 4:6]], 1)  # (N, 4)
+    classes = np.array([class_of.get(i, -1) for i in ids.tolist()], np.int64)
+    unknown = np.full(len(rows), -1, np.int64)
+    changes = out / OutputFile.CHANGES
+    return Result(
+        Tracks(frame, ids, ids, corners, rows[:, 6], classes, unknown),
+        class_names,
+        entries.video,
+        entries.objects,
+        entries.world,
+        poses,
+        warnings=entries.warnings,
+        changes=read_changes(changes) if changes.is_file() else None,
+        earlier=_load_earlier(out / OutputFile.EARLIER),
+        out=out,
+    )
+
+
+def _load_earlier(path: Path) -> Sequence[EarlierSession]:
+    """Read the other recordings of the map; () if there are none, or with a warning if damaged."""
+    try:
+        return read_earlier(path) if path.is_file() else ()
+    except ReobjError as error:
+        log.warning("%s; the result is read without the other recordings of its map", error)
+        return ()
+
+
+# ---- objects.json ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectsFile:
+    """Content of objects.json that is read back."""
+
+    video: VideoInfo
+    world: World
+    objects: list[Object]
+    warnings: list[str] = field(default_factory=list)
+
+
+def write_objects(result: Result, path: Path) -> None:
+    """Write objects.json."""
+    versions = {}
+    for name in ("numpy", "scipy", "opencv-python-headless", "pycolmap", "onnxruntime"):
+        with contextlib.suppress(PackageNotFoundError):  # installed under another name
+            versions[name] = version(name)
+    tracked = {"tracked_frames": len(np.unique(result.tracks.frame))}
+    data = {
+        **HEADER,
+        "command": " ".join(map(without_secrets, sys.argv)),
+        "reobj_track": __version__,
+        "versions": versions,
+        "conventions": {
+            "pose": "cam_from_world",
+            "camera_axes": "x right, y down, z forward",
+            "quaternion": "wxyz, world_from_obj",
+            "pixels": "centre of the top-left pixel at (0.5, 0.5) (COLMAP)",
+            "frames": "0-based",
+            "size": "full extents of the solid along its own axes",
+            "ellipsoid": "inscribed in a box or cylinder",
+            "cov": "9x9: center, log half axes, rotation vector in object axes",
+            "center_m": "metres, z up, from the origin of the world",
+            "yaw_deg": "of the x axis of the object about z",
+        },
+        "video": dataclasses.asdict(result.video) | tracked,
+        "world": result.world.to_json(),
+        "objects": [
+            o.to_json() | upright_pose(o, component_of(o, result.world)) for o in result.objects
+        ],
+        "warnings": result.warnings,
+    }
+    with atomic(path) as part:
+        part.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+
+
+def _contradiction(entries: ObjectsFile, poses: Poses | None) -> str:
+    """Describe a contradiction between entries of objects.json, or to the poses; "" if none."""
+    ids = [o.id for o in entries.objects]
+    if len(set(ids)) != len(ids):
+        return "two objects of one id"
+    component_count = 1 if poses is None else poses.part_count
+    described = len(entries.world.parts)
+    if component_count not in (1, described):
+        return f"{described} components of a trajectory that has {component_count}"
+    for o in entries.objects:
+        shape = (o.center, o.half_axes, o.size, o.quat_wxyz)
+        if (o.located or o.status == "implausible") and any(value is None for value in shape):
+            return f"object {o.id} is {o.status} without a shape"
+        if o.part >= max(component_count, described):
+            return f"object {o.id} is in component {o.part}, which does not exist"
+    return ""
+
+
+# ---- Tracks before linking ---------------------------------------------------------------------
+
+
+def save_tracked(result: Result, path: Path) -> None:
+    """Write tracks and embeddings, before they are linked and fitted, as npz."""
+    columns = columns_of(result.tracks) | columns_of(result.untracked, "untracked_{}")
+    columns |= columns_of(result.embeddings) | {"embedding_row": result.embedding_row}
+    if result.boxes_3d is not None:
+        columns |= columns_of(result.boxes_3d, "boxes_3d_{}")
+    if result.looked is not None:
+        columns["looked"] = result.looked
+    facts = {"class_names": result.class_names, "warnings": result.warnings,
+             "identities_given": result.identities_given,
+             "video": dataclasses.asdict(result.video), "version": __version__}  # fmt: skip
+    save_npz(path, columns, **facts)
+
+
+def load_tracked(path: Path) -> Result:
+    """Read what `save_tracked` wrote."""
+    try:
+        data, facts = load_npz(path, sealed=True)
+        boxes = "boxes_3d_frame" in data
+        return Result(
+            from_columns(Tracks, data),
+            tuple(facts["class_names"]),
+            VideoInfo(**facts["video"]),
+            embeddings=from_columns(Embeddings, data),
+            embedding_row=data["embedding_row"],
+            untracked=from_columns(Tracks, data, "untracked_{}"),
+            looked=data.get("looked"),
+            boxes_3d=from_columns(Boxes3D, data, "boxes_3d_{}") if boxes else None,
+            identities_given=bool(facts["identities_given"]),
+            warnings=list(facts["warnings"]),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise ReobjError(f"{path}: {RUN_AGAIN}") from error
+
+
+# ---- Table and report --------------------------------------------------------------------------
+
+
+def object_table(result: Result) -> tuple[list[str], list[list[Any]]]:
+    """Return the names of the columns, and a row for each object.
+
+    Lengths are in world units, `_m` in metres; None where unknown. `center_m` and `yaw_deg` are in
+    an upright frame (`upright_pose`).
+    """
+    head = ["id", "class", "status", "reason", "score", "confidence", "support"]
+    vectors = ("center", "size", "size_m", "size_rel_sigma")
+    head += [f"{name}_{axis}" for name in vectors for axis in "xyz"]
+    head += ["qw", "qx", "qy", "qz", "views", "frames_seen", "visits", "part"]
+    head += ["center_m_x", "center_m_y", "center_m_z", "yaw_deg"]
+    rows = list[list[Any]]()
+    for o in result.objects:
+        row = [o.id, o.class_name, o.status, o.reason, o.score, o.confidence, o.support]
+        for name in vectors:
+            row += _numbers(getattr(o, name), 3)
+        row += [*_numbers(o.quat_wxyz, 4), o.views, o.frames_seen, len(o.visits), o.part]
+        pose = upright_pose(o, component_of(o, result.world))
+        rows.append([*row, *(pose["center_m"] or [None] * 3), pose["yaw_deg"]])
+    return head, rows
+
+
+def _numbers(values: Array | None, count: int) -> list[float | None]:
+    return [None] * count if values is None else values.tolist()
+
+
+LEAST_NAME = 14  # characters of a class
+MOST_NAME = 20
+SIZE_WORDS = {"ok": "measured", "prior_dominated": "guessed", "rejected": "none"}
+
+
+def summary(result: Result) -> str:
+    """Write the report that `run` prints: what was found, where to look, and the table."""
+    counted = [o for o in result.objects if o.counted]
+    lines = _counts(result, counted)
+    lines += _implausible(result)
+    if result.links is not None and (changed := result.links.changed):
+        total = len(result.links.before)
+        text = f"linked again: {changed} of {total} identities have other boxes than before"
+        lines += _lines(text)
+    if result.changes is not None:
+        lines += _lines(result.changes.summary())
+    if result.out is not None:
+        names = ("scene.html", "overlay.mp4", "objects.json")
+        files = [result.out / name for name in names]
+        lines.append("look at: " + ", ".join(str(file) for file in files if file.exists()))
+    if counted:
+        lines += ["", *_table(result, counted), *_reasons(counted)]
+    if any(o.size_rel_sigma is not None for o in counted):
+        lines.append("sigma: standard deviation of the least certain side")
+    lines += ["", *_cameras(result)]
+    lines.append("seconds: " + ", ".join(_stage_time(result, s) for s in result.seconds))
+    return "\n".join(lines)
+
+
+def _stage_time(result: Result, stage: str) -> str:
+    """Format the seconds of a stage: of its steps, or that it was taken from the cache."""
+    text = f"{stage} {result.seconds[stage]:.1f}"
+    steps = result.step_seconds.get(stage)
+    if steps is None or list(steps) == [stage]:
+        return text
+    times = ", ".join(f"{step} {seconds:.1f}" for step, seconds in steps.items())
+    return f"{text} ({times or 'from the cache'})"
+
+
+def sides(found: Object) -> list[tuple[str, ...]]:
+    """Format width, depth, height (own axes x, y, z; m or units) with sigmas, if they are known.
+
+    Returns:
+        three (value, sigma) or (value,); [] without a size.
+    """
+    size = found.size if found.size_m is None else found.size_m
+    if size is None:
+        return []
+    sigma = None if found.size_rel_sigma is None else size * found.size_rel_sigma
+    return texts_with_sigma(size, sigma)
+
+
+def _table(result: Result, counted: Sequence[Object]) -> list[str]:
+    """Format a header and a line for each object; sizes only if there are any.
+
+    Objects of several components are grouped by component, each below a line with its name. Those
+    without a shape come last.
+    """
+    in_metres = any(o.size_m is not None for o in result.objects)
+    has_sizes = any(o.size is not None for o in counted)
+    several = len(result.world.parts) > 1
+    unit = "m" if in_metres else "units"
+    width = max(LEAST_NAME, *(min(len(o.class_name), MOST_NAME) for o in counted))
+    columns = f"{'object':>6}  {'class':<{width}} {'frames':>6}"
+    if has_sizes:
+        columns += f"  {f'width x depth x height, {unit}':<26} {'sigma':>6}  size"
+    lines = [columns]
+    component = None
+    for o in sorted(counted, key=lambda o: (o.part, not o.located)):
+        if several and o.part != component:
+            component = o.part
+            lines.append(f"component {component}")
+        line = f"{o.id:>6}  {cut(o.class_name, MOST_NAME):<{width}} {o.frames_seen:>6}"
+        if has_sizes:
+            line += _size_columns(o, in_metres) + SIZE_WORDS.get(o.status, o.status)
+        lines.append(line)
+    return lines
+
+
+def _size_columns(found: Object, in_metres: bool) -> str:
+    """Format an object's size and the largest relative sigma of its sides.
+
+    Args:
+        in_metres: the header states metres; a size in world units then names its unit.
+    """
+    size = " x ".join(side for side, *_ in sides(found)) or "-"
+    if in_metres and found.size is not None and found.size_m is None:
+        size += " units"
+    sigma = "-"
+    if found.size_rel_sigma is not None:
+        sigma = f"{100 * found.size_rel_sigma.max():.0f} %"
+    return f"  {size:<26} {sigma:>6}  "
+
+
+def _reasons(counted: Sequence[Object]) -> list[str]:
+    """Format each reason once, with the objects that have it."""
+    objects_of: dict[str, list[int]] = {}
+    for o in counted:
+        for reason in filter(None, o.reason.split("; ")):
+            objects_of.setdefault(reason, []).append(o.id)
+    lines = list[str]()
+    for reason, ids in objects_of.items():
+        noun = "object" if len(ids) == 1 else "objects"
+        lines += _lines(f"{reason}: {noun} {', '.join(map(str, ids))}")
+    return lines
+
+
+def _implausible(result: Result) -> list[str]:
+    """List the objects that are not counted because of their size, with the reason of each."""
+    odd = [o for o in result.objects if o.status == "implausible"]
+    texts = [f"{o.class_name} {o.id} ({o.reason})" for o in odd]
+    return _lines(f"implausible, not counted: {', '.join(texts)}") if texts else []
+
+
+def _counts(result: Result, counted: Sequence[Object]) -> list[str]:
+    """Format the number of objects with and without a shape, in all and of each class."""
+    text = found_text(result.objects, names=True) if counted else "objects: none"
+    if len(result.world.parts) > 1:
+        text += " (each component counted separately)"
+    if doubtful := sum(o.status == "doubtful" for o in result.objects):
+        text += f"; {doubtful} more of low confidence, probably false positives (objects.json)"
+    return _lines(text)
+
+
+def _cameras(result: Result) -> list[str]:
+    """Format the number of frames with a pose, and the scale, of each component."""
+    world = result.world
+    if result.poses is None:
+        return []
+    if len(world.parts) < 2:
+        scale = [f"scale: {_scale_text(world.scale)}"] if world.scale else []
+        return [result.poses.cameras_text, *scale]
+    count = f"{len(world.parts)} components, each with its own frame and scale"
+    lines = [f"{result.poses.cameras_text} in {count}"]
+    for k, component in enumerate(world.parts):
+        facts = [
+            component.span_text,
+            f"{component.registered_frames} of {component.frames} frames",
+            found_text(o for o in result.objects if o.part == k),
+        ]
+        if component.scale:
+            facts.append(f"scale {_scale_text(component.scale)}")
+        lines += _lines(f"component {k}: " + "; ".join(facts))
+    return lines
+
+
+def _scale_text(scale: quadrics.Scale) -> str:
+    sigma = scale.rel_sigma or 0.0
+    ((value, *_),) = texts_with_sigma(np.array([scale.value]), np.array([sigma * scale.value]))
+    return f"{value} m per unit, sigma {100 * sigma:.0f} % (from {scale.source.replace('_', ' ')})"
+
+
+def _lines(text: str) -> list[str]:
+    """Wrap a line for a terminal of 80 columns."""
+    return wrapped(text, 80)

@@ -16,7 +16,7 @@ import os
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import msgspec
@@ -30,11 +30,10 @@ from reobj.poses.floor import NOISE
 from reobj.results.changes import EarlierSession
 from reobj.results.cloud import MOST, Cloud, DenseFrames
 from reobj.results.depth_cloud import dense_frames
-from reobj.results.entries import Object, World, visit_gap
-from reobj.results.names import recording_name
-from reobj.results.origin import centred
+from reobj.results.entries import Object, World, recording_name, visit_gap
+from reobj.results.export_source import centred
 from reobj.results.overlay import Overlay, film_layers
-from reobj.results.report import sides
+from reobj.results.result import Result, sides
 from reobj.sources.image_files import IMAGE_FPS
 from reobj.sources.video import Video, shrunk
 from reobj.types import (
@@ -50,10 +49,6 @@ from reobj.types import (
     one_line,
     rows_by,
 )
-
-if TYPE_CHECKING:
-    from reobj.results.result import Result
-
 
 PAGE_MAX = 15_000_000  # bytes of a page with dense points
 POINT_BYTES = 16  # of a dense point in the page: 12 as base64

@@ -25,8 +25,8 @@ import cv2
 from reobj.files import atomic
 from reobj.results.changes import EarlierSession
 from reobj.results.edits import HEADER, Edits, read_edits
+from reobj.results.entries import OutputFile
 from reobj.results.local_server import LocalHandler, LocalServer
-from reobj.results.names import OutputFile
 from reobj.results.scene import served_page
 from reobj.results.workspace import Workspace
 from reobj.sources.image_files import read_image

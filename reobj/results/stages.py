@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 
 from reobj.files import Progress, load_cached, load_npz, save_npz
-from reobj.results.checkpoint import Checkpoint, TrackedFrames
 from reobj.results.result import Result, VideoInfo
 from reobj.results.workspace import Workspace
 from reobj.sources.detectors import DetectionCache, DetectionSource
@@ -95,19 +94,25 @@ def _rows(frame: IntArray, xyxy: Array, score: Array, class_id: IntArray) -> Tra
     return Tracks(frame, zeros, zeros, xyxy, score, class_id, zeros - 1)
 
 
+def _rows_in(tracks: Tracks, frame: IntArray, index: IntArray) -> IntArray:
+    """Return the rows (n,) of detections in the tracks, by frame and index (n,); -1: none."""
+    keys = zip(tracks.frame.tolist(), tracks.detection_index.tolist(), strict=True)
+    row_of = {key: row for row, key in enumerate(keys)}
+    wanted = zip(frame.tolist(), index.tolist(), strict=True)
+    return np.array([row_of.get(key, -1) for key in wanted], np.int64)
+
+
 def _untracked(
     tracks: Tracks, frames: list[int], detected: list[Detections], scale: float
 ) -> Tracks:
     """Make rows, without tracklets, of the detections that are in no row of the tracks."""
-    index = np.concatenate([np.arange(len(detections)) for detections in detected])
-    frame = np.repeat(np.asarray(frames, np.int64), [len(detections) for detections in detected])
-    xyxy = np.concatenate([detections.xyxy for detections in detected]) / scale
-    score = np.concatenate([detections.score for detections in detected])
-    class_id = np.concatenate([detections.class_id for detections in detected])
-    tracked = set(zip(tracks.frame.tolist(), tracks.detection_index.tolist(), strict=True))
-    free = [key not in tracked for key in zip(frame.tolist(), index.tolist(), strict=True)]
-    rows = dataclasses.replace(_rows(frame, xyxy, score, class_id), detection_index=index)
-    return rows[np.array(free, bool)]
+    columns = [
+        (np.full(len(d), frame), d.xyxy, d.score, d.class_id, np.arange(len(d)))
+        for frame, d in zip(frames, detected, strict=True)
+    ]
+    frame, xyxy, score, class_id, index = map(np.concatenate, zip(*columns, strict=True))
+    rows = dataclasses.replace(_rows(frame, xyxy / scale, score, class_id), detection_index=index)
+    return rows[_rows_in(tracks, frame, index) < 0]
 
 
 def tracked_embeddings(
@@ -124,13 +129,8 @@ def tracked_embeddings(
     Returns:
         n embeddings, and their rows (n,) in the tracks.
     """
-    keys = zip(tracks.frame.tolist(), tracks.detection_index.tolist(), strict=True)
-    row_of = {key: row for row, key in enumerate(keys)}
-    row = np.array([
-        row_of.get((frame, detection), -1)
-        for frame, (index, _) in zip(frames, embedded, strict=True)
-        for detection in index.tolist()
-    ], np.int64)  # fmt: skip
+    frame = np.repeat(np.array(frames, np.int64), [len(index) for index, _ in embedded])
+    row = _rows_in(tracks, frame, np.concatenate([index for index, _ in embedded]))
     blocks = [block for _, block in embedded if block.size] or [np.empty((0, 0), np.float16)]
     fused = np.concatenate(blocks)[row >= 0].astype(np.float16)
     width = foreground_width or fused.shape[1]
@@ -143,52 +143,52 @@ def collect_tracks(
     video: Video,
     source: DetectionSource,
     progress: Callable[[str, int], Progress] = Progress,
-    checkpoint: Checkpoint | None = None,
 ) -> Result:
     """Run a tracker over a video and collect its tracks, embeddings and warnings.
 
     Args:
         steps: the running `track(video, source, tracker)`.
         progress: makes the progress line of a step from its name and total.
-        checkpoint: keeps the tracker and what was collected; after an interruption `steps` begins
-            after its frames.
     """
-    collected = TrackedFrames() if checkpoint is None else checkpoint.collected
+    frames: list[int] = []
+    found: list[Tracks] = []  # also tentative ones
+    embedded: list[tuple[IntArray, npt.NDArray[np.float16]]] = []
+    detected: list[Detections] = []
+    looked: list[bool] = []
     try:
         with progress("track", video.expected) as line:
-            line.resume(len(collected.frames))
             for frame, _ in steps:
-                collected.add(frame.index, tracker)
-                if checkpoint is not None:
-                    checkpoint.save_if_due(tracker)
+                index, rows = tracker.latest_embeddings()
+                frames.append(frame.index)
+                found.append(tracker.latest)
+                embedded.append((index, rows.astype(np.float16)))
+                detected.append(dataclasses.replace(tracker.detections, masks=None))
+                looked.append(tracker.looked)
                 line.step()
-    except KeyboardInterrupt as interruption:  # the way to end a live source
+    except KeyboardInterrupt:  # the way to end a live source
         if not video.is_live:
-            if checkpoint is not None:
-                interruption.add_note(f"{checkpoint.kept} tracked frames")
             raise
     finally:
         _finish_cache(source)
-    frames = collected.frames
     if not frames:
         why = "--start/--stop/--every leave none, or the file is damaged"
         raise ReobjError(f"{video.source}: no frame could be read ({why})")
-    tracks = Tracks.concatenate(frames, collected.found, video.scale)
-    untracked = _untracked(tracks, frames, collected.detected, video.scale)
+    tracks = Tracks.concatenate(frames, found, video.scale)
+    untracked = _untracked(tracks, frames, detected, video.scale)
     foreground_width = tracker.state.gallery.foreground_width
-    embeddings, embedding_row = tracked_embeddings(
-        tracks, frames, collected.embedded, foreground_width
-    )
+    embeddings, embedding_row = tracked_embeddings(tracks, frames, embedded, foreground_width)
     warnings = [*source.messages, *video.messages]
     if video.is_live:
         warnings += [
             f"live: {video.read} frames came, {video.dropped} of them were dropped to keep up",
             "a live source cannot be read twice: identities only; record it for 3D",
         ]
-    looked = collected.looked
     if not len(tracks):
-        reason = _why_none(untracked.score, sum(looked), tracker)
-        warnings.append(f"no object was tracked: {reason}")
+        best = untracked.score.max(initial=0)
+        warnings.append(f"no object was tracked: {len(untracked)} detections in the {sum(looked)} "
+                        f"frames that the detector was run on, the best of score {best:.2f} "
+                        f"(tracker.new_score={tracker.config.new_score:g}, tracker.n_init)"
+                        )  # fmt: skip
     return Result(
         tracks,
         tuple(source.class_names),
@@ -196,22 +196,6 @@ def collect_tracks(
         embeddings=embeddings,
         embedding_row=embedding_row,
         untracked=untracked,
-        looked=None if all(looked) else np.array(frames, np.int64)[np.array(looked, bool)],
+        looked=None if all(looked) else np.array(frames, np.int64)[looked],
         warnings=warnings,
     )
-
-
-def _why_none(score: Array, looked: int, tracker: Any) -> str:
-    """Explain why nothing was tracked.
-
-    Args:
-        score: of all detections. looked: number of frames that the detector was run on.
-    """
-    least = tracker.config.new_score
-    if not looked:
-        return "the detector was run on no frame (it returned None each time)"
-    if not len(score):
-        return f"no detections in the {looked} frames that the detector was run on"
-    if score.max() < least:
-        return f"all {len(score)} detections are below tracker.new_score={least:g}"
-    return f"none of the {len(score)} detections was followed by enough others (tracker.n_init)"

@@ -11,16 +11,18 @@ import configparser
 import dataclasses
 import enum
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from reobj.files import load_json, read_lines, shortened
 from reobj.formats import AUTO, Format, Registry
+from reobj.results.entries import OutputFile
 from reobj.results.result import Result
 from reobj.sources.detection_files import DETECTIONS, FROM_1, Reader, check_rows, read_source
 from reobj.sources.recorded import SIZES, NoVideo, Source, corners, other_form
@@ -28,7 +30,7 @@ from reobj.sources.tables import forms, read_mot_rows
 from reobj.types import CLASS_MAX, Array, BoolArray, IntArray, ReobjError, counted
 from reobj.words import among, canonical
 
-TruthReader = Callable[..., "LabelledBoxes"]
+TruthReader = Callable[[Source, float], "LabelledBoxes"]
 
 
 class Role(enum.IntEnum):
@@ -94,49 +96,40 @@ def read_truth(
     Raises:
         ReobjError: the file cannot be read, or an identity has two boxes in a frame.
     """
-    notes = [] if notes is None else notes
     reader = TRUTH.reader(path, fmt)
     if first not in ("", "0", "1"):
         raise ReobjError(f"detect.first_frame {first}: expected 0 or 1 for ground truth")
-    truth = reader(path, class_names, min_visibility, notes, size, first)
+    notes = [] if notes is None else notes
+    source = Source(path, NoVideo(path.stem, size, size), class_names, first, messages=notes)
+    truth = reader(source, min_visibility)
     _check_identities(truth, path)
     return truth
 
 
-def _with_roles(entry: Format[Reader]) -> Format[TruthReader]:
-    """Return a format of detections with identities as one of ground truth."""
-
-    def read(
-        path: Path, _: Sequence[str], __: float, notes: list[str], size: tuple[int, int], first: str
-    ) -> LabelledBoxes:
-        video = NoVideo(path.stem, size, size)
-        source = Source(path, video, first=first, messages=notes)
-        assert entry.read is not None
-        recorded = read_source(source, entry.read)
-        check_rows(recorded, path)
-        sizes = {size, *source.image_sizes} - {(0, 0)}
-        image = min(sizes) if len(sizes) == 1 else (0, 0)
-        if fault := other_form(
-            recorded.xyxy, recorded.form, image, recorded.frame, recorded.identity
-        ):
-            raise ReobjError(f"{path}: {fault}")
-        if not len(recorded.identity):
-            raise ReobjError(f"{path}: boxes without identities; expected tracks")
-        names = np.array([*recorded.class_names, ""], str)[recorded.class_id]
-        role = np.full(len(recorded), Role.SCORED)
-        if len(recorded.ignored):
-            role[recorded.ignored] = Role.IGNORED
-        if entry.name == "kitti":
-            names[recorded.ignored] = ""
-            notes.append("KITTI's labels: frames from 0; boxes on DontCare do not count; KITTI's "
-                         "rules of distractors, occlusion and height are not applied"
-                         )  # fmt: skip
-        listed = None if recorded.looked is None else recorded.looked + 1
-        ids = recorded.identity
-        return LabelledBoxes(recorded.frame + 1, ids, recorded.xyxy, names, role, listed)
-
-    return Format(entry.name, entry.title, entry.recognise, entry.read and read, entry.frames,
-                  entry.units, entry.unread, WITH_TRACKS, entry.kind)  # fmt: skip
+def _read_labelled(entry: Format[Reader], source: Source, _: float) -> LabelledBoxes:
+    """Read a format of detections with identities as ground truth."""
+    assert entry.read is not None
+    path = source.path
+    source.names = ()  # the file has its own
+    recorded = read_source(source, entry.read)
+    check_rows(recorded, path)
+    sizes = {source.video.size, *source.image_sizes} - {(0, 0)}
+    image = min(sizes) if len(sizes) == 1 else (0, 0)
+    if fault := other_form(recorded.xyxy, recorded.form, image, recorded.frame, recorded.identity):
+        raise ReobjError(f"{path}: {fault}")
+    if not len(recorded.identity):
+        raise ReobjError(f"{path}: boxes without identities; expected tracks")
+    names = np.array([*recorded.class_names, ""], str)[recorded.class_id]
+    role = np.full(len(recorded), Role.SCORED)
+    if len(recorded.ignored):
+        role[recorded.ignored] = Role.IGNORED
+    if entry.name == "kitti":
+        names[recorded.ignored] = ""
+        source.say("KITTI's labels: frames from 0; boxes on DontCare do not count; KITTI's rules "
+                   "of distractors, occlusion and height are not applied")  # fmt: skip
+    listed = None if recorded.looked is None else recorded.looked + 1
+    ids = recorded.identity
+    return LabelledBoxes(recorded.frame + 1, ids, recorded.xyxy, names, role, listed)
 
 
 def read_result(out: Path, notes: list[str] | None = None) -> LabelledBoxes:
@@ -145,18 +138,19 @@ def read_result(out: Path, notes: list[str] | None = None) -> LabelledBoxes:
     Args:
         notes: assumptions about the file are appended.
     """
-    notes = [] if notes is None else notes
     if out.is_dir():
         result = Result.load(out)
         tracks = result.tracks
         names = np.array([*result.class_names, ""], str)  # the last one is that of class -1
         role = np.full(len(tracks), Role.SCORED)
-        ids = tracks.track_id
         frame = tracks.frame + 1
-        predicted = LabelledBoxes(frame, ids, tracks.xyxy, names[tracks.class_id], role)
+        names = names[tracks.class_id]
+        predicted = LabelledBoxes(frame, tracks.track_id, tracks.xyxy, names, role)
+        out = out / OutputFile.TRACKS
     else:
+        notes = [] if notes is None else notes
         predicted = labelled(_checked(read_mot_rows(out), out, notes))
-    _check_identities(predicted, out / "tracks.txt" if out.is_dir() else out)
+    _check_identities(predicted, out)
     return predicted
 
 
@@ -174,62 +168,71 @@ class MotClass(enum.IntEnum):
     REFLECTION = 12
 
 
-def _read_mot(
-    path: Path,
-    class_names: Sequence[str],
-    min_visibility: float,
-    notes: list[str],
-    size: tuple[int, int],
-    first: str,
-) -> LabelledBoxes:
+def _read_mot(source: Source, min_visibility: float) -> LabelledBoxes:
     """Read MOTChallenge rows.
 
     Column 7 is a flag (0: the row does not count). In files of nine columns, column 8 is the class
     and column 9 the visibility; MOT15 has ten columns, with world coordinates instead.
     """
+    path = source.path
     sequence = _sequence(path)
+    size = source.video.size
     sides = [sequence.get(key, "") for key in ("imwidth", "imheight")]
     if 0 in size and all(map(str.isdecimal, sides)):
         size = (int(sides[0]), int(sides[1]))
-    rows = _checked(read_mot_rows(path), path, notes, first, size)
+    rows = _checked(read_mot_rows(path), path, source.messages, source.first, size)
     flagged = rows[:, 6] == 0 if rows.shape[1] > 6 else np.zeros(len(rows), bool)
-    _check_length(rows, path, sequence)
+    length = sequence.get("seqlength", "")
+    last = rows[:, 0].max(initial=0)
+    if length.isdecimal() and last > int(length):  # refused by TrackEval too
+        known = f"seqinfo.ini says seqLength={length}"
+        raise ReobjError(f"{path}: frame {last:.0f}, but {known}: truth of another sequence?")
     if rows.shape[1] != 9:
-        return labelled(rows, "", np.where(flagged, Role.ABSENT, Role.SCORED))
+        return labelled(rows, "", flagged * Role.ABSENT)
     number = rows[:, 7].clip(-CLASS_MAX, CLASS_MAX).astype(np.int64)
-    hidden = rows[:, 8] < min_visibility
-    labels = path.with_name("labels.txt")
-    stated = path.with_name("gt_mot_format.json")
+    names, role, note = _mot_classes(number, flagged, source, sequence)
+    source.say(note)
+    hidden = (rows[:, 8] < min_visibility) & (role == Role.SCORED)
+    return labelled(rows, names, np.where(hidden, Role.IGNORED, role))
+
+
+def _mot_classes(
+    number: IntArray, flagged: BoolArray, source: Source, sequence: dict[str, str]
+) -> tuple[Any, IntArray, str]:
+    """Interpret the classes (N,) of MOTChallenge rows, and their flags (N,): 0 in the file.
+
+    Returns:
+        class names, (N,) or of all rows; roles (N,); the interpretation, for the user.
+    """
+    labels = source.path.with_name("labels.txt")
+    stated = source.path.with_name("gt_mot_format.json")
+    absent = flagged * Role.ABSENT
     if labels.exists():
-        notes.append(f"classes are lines of {labels.name}, from 1 (CVAT's MOT 1.1)")
-        role = np.where(flagged, Role.ABSENT, hidden * Role.IGNORED)
-        return labelled(rows, _by_line(number, labels, path), role)
+        return (_by_line(number, labels, source.path), absent,
+                f"classes are lines of {labels.name}, from 1 (CVAT's MOT 1.1)")  # fmt: skip
     if stated.exists():
-        notes.append(f"classes are named by {stated.name}")
-        return labelled(
-            rows, _names_of(number, stated, class_names), (flagged | hidden) * Role.IGNORED
-        )
-    benchmark, why = _benchmark(sequence.get("name", ""), path, number, flagged)
+        names = _names_of(number, load_json(stated)["classes"])
+        return names, flagged * Role.IGNORED, f"classes are named by {stated.name}"
+    benchmark, why = _benchmark(sequence.get("name", ""), source.path, number, flagged)
     if benchmark:
-        text = "pedestrians count, boxes on distractors do not"
-        notes.append(f"classes are {benchmark}'s, by {why}: {text}")
-        pedestrian = number == MotClass.PEDESTRIAN
-        role = np.where(flagged | ~pedestrian, Role.ABSENT, hidden * Role.IGNORED)
         only_mot20 = {MotClass.NON_MOTORISED_VEHICLE} if benchmark != "MOT20" else set()
         distractors = set(MotClass) - {MotClass.PEDESTRIAN} - only_mot20
+        role = (flagged | (number != MotClass.PEDESTRIAN)) * Role.ABSENT
         role[np.isin(number, list(distractors))] = Role.IGNORED
-        return labelled(rows, "", role)
+        return "", role, (f"classes are {benchmark}'s, by {why}: pedestrians count, boxes on "
+                          "distractors do not")  # fmt: skip
     if (number < 0).all() or (sequence and (number == MotClass.PEDESTRIAN).all()):
         by = " (class 1, by seqinfo.ini)" if sequence else ""
-        notes.append(f"the truth has one class without a name{by}: classes do not count")
-        return labelled(rows, "", np.where(flagged, Role.ABSENT, hidden * Role.IGNORED))
-    notes.append("class numbers of the truth are those of the detector (COCO's), from 0")
+        note = f"the truth has one class without a name{by}: classes do not count"
+        return "", absent, note
     unnamed = number < 0
+    note = "class numbers of the truth are those of the detector (COCO's), from 0"
     if unnamed.any():
         boxes = counted(int(unnamed.sum()), "true box", "true boxes")
-        notes.append(f"{boxes} without a class (below 0) do not count, nor do boxes on them")
-    names = np.where(unnamed, "", _names_of(number, None, class_names))
-    return labelled(rows, names, (flagged | hidden | unnamed) * Role.IGNORED)
+        note += f"; {boxes} without a class (below 0) do not count, nor do boxes on them"
+    by_number = {str(i): name for i, name in enumerate(source.names)}
+    named = np.where(unnamed, "", _names_of(number, by_number))
+    return named, (flagged | unnamed) * Role.IGNORED, note
 
 
 WITH_TRACKS = "export it as COCO JSON with track_id, or as MOTChallenge rows"
@@ -238,7 +241,9 @@ TRUTH: Registry[TruthReader] = Registry("ground truth", "--gt-format", [
     Format("mot", "MOTChallenge, CVAT's MOT 1.1, DanceTrack: rows of 6 to 10 numbers",
            lambda probe: bool(forms(probe) & {"mot", "boxmot"}), _read_mot, FROM_1, "px",
            "x, y, z in ten columns", kind="text"),
-    *(_with_roles(entry) for entry in DETECTIONS.formats
+    *(dataclasses.replace(entry, read=entry.read and partial(_read_labelled, entry),
+                          advice=WITH_TRACKS)
+      for entry in cast(Sequence[Any], DETECTIONS.formats)
       if entry.name in WITH_IDENTITIES or entry.read is None),
 ])  # fmt: skip
 
@@ -247,21 +252,17 @@ def _checked(
     rows: Array, path: Path, notes: list[str], begin: str = "", size: tuple[int, int] = (0, 0)
 ) -> Array:
     """Refuse rows of another form; return them with frames that count from 1."""
-    whole = rows[:, :2].astype(np.int64)
-    xyxy = corners(rows[:, 2:6], SIZES)
-    fault = other_form(xyxy, SIZES, size, whole[:, 0], whole[:, 1])
-    if fault:
+    frame, identity = rows[:, :2].T.astype(np.int64)
+    if fault := other_form(corners(rows[:, 2:6], SIZES), SIZES, size, frame, identity):
         raise ReobjError(f"{path}: {fault}")
-    first = rows[:, 0].min(initial=1)
+    first = frame.min(initial=1)
     if first < int(begin or 0):
         expected = f"from {begin}" if begin else "from 1, or from 0"
-        raise ReobjError(f"{path}: frame {first:.0f}; expected frames {expected}")
-    if (rows[:, 4:6] < 0).any():
-        at = int((rows[:, 4:6] < 0).any(1).argmax())
-        where = f"frame {rows[at, 0]:.0f}, identity {rows[at, 1]:.0f}"
-        raise ReobjError(
-            f"{path}, {where}: width or height below 0; expected left,top,width,height"
-        )
+        raise ReobjError(f"{path}: frame {first}; expected frames {expected}")
+    for at in np.flatnonzero((rows[:, 4:6] < 0).any(1))[:1]:
+        where = f"frame {frame[at]}, identity {identity[at]}"
+        expected = "expected left,top,width,height"
+        raise ReobjError(f"{path}, {where}: width or height below 0; {expected}")
     if first == 0 or begin == "0":
         why = f"{path.name} has a frame 0: its" if first == 0 else f"{path.name}: its"
         notes.append(f"{why} frames are taken as 0-based")
@@ -280,15 +281,6 @@ def _sequence(path: Path) -> dict[str, str]:
     except configparser.Error as error:
         raise ReobjError(f"{file}: {error}; expected [Sequence] with name, seqLength") from error
     return dict(parser["Sequence"]) if parser.has_section("Sequence") else {"name": ""}
-
-
-def _check_length(rows: Array, path: Path, sequence: dict[str, str]) -> None:
-    """Refuse frames beyond the length of the sequence, as TrackEval does."""
-    length = sequence.get("seqlength", "")
-    last = rows[:, 0].max(initial=0)
-    if length.isdecimal() and last > int(length):
-        known = f"seqinfo.ini says seqLength={length}"
-        raise ReobjError(f"{path}: frame {last:.0f}, but {known}: truth of another sequence?")
 
 
 def _benchmark(name: str, path: Path, number: IntArray, flagged: BoolArray) -> tuple[str, str]:
@@ -314,35 +306,26 @@ def _by_line(number: IntArray, labels: Path, path: Path) -> list[str]:
     return [lines[n - 1] if n > 0 else "" for n in number.tolist()]
 
 
-def _names_of(number: IntArray, stated: Path | None, class_names: Sequence[str]) -> list[str]:
-    """Name classes by our JSON file, {"classes": {number: name}}, or by class_names."""
-    names = {str(i): n for i, n in enumerate(class_names)}
-    if stated is not None:
-        classes = load_json(stated)
-        classes = classes.get("classes") if isinstance(classes, dict) else None
-        if isinstance(classes, dict):
-            names = {str(k): str(v) for k, v in classes.items()}
+def _names_of(number: IntArray, names: Mapping[str, str]) -> list[str]:
+    """Name classes (N,) by number; those without a name by their number."""
     return [names.get(str(n), str(n)) for n in number]
 
 
 def _check_identities(boxes: LabelledBoxes, path: Path) -> None:
     """Refuse boxes without identity, and an identity that has two boxes in a frame."""
     scored = boxes[boxes.role == Role.SCORED]
-    if (scored.identity < 0).any():
-        count = (scored.identity < 0).sum()
-        total = len(scored)
-        frame = scored.frame[scored.identity < 0].min()
-        why = ": detections, not tracks?" if count == total else ""
-        raise ReobjError(f"{path}: {count} of {total} boxes have no identity (below 0), the first "
-                         f"in frame {frame} (from 1){why}")  # fmt: skip
+    without = scored.identity < 0
+    if without.any():
+        raise ReobjError(f"{path}: {without.sum()} of {len(scored)} boxes have no identity (below "
+                         f"0), the first in frame {scored.frame[without].min()} (from 1): "
+                         "detections, not tracks?")  # fmt: skip
     pairs = np.column_stack([scored.frame, scored.identity])
     unique, count = np.unique(pairs, axis=0, return_counts=True)
-    if (count > 1).any():
-        frame, identity = unique[(count > 1).argmax()]
-        more = (count > 1).sum()
+    for row in np.flatnonzero(count > 1)[:1]:
+        frame, identity = unique[row]
         raise ReobjError(
-            f"{path}: identity {identity} has {count[(count > 1).argmax()]} boxes in frame {frame} "
-            f"(from 1; {more} such cases); expected one box per object and frame"
+            f"{path}: identity {identity} has {count[row]} boxes in frame {frame} (from 1; "
+            f"{(count > 1).sum()} such cases); expected one box per object and frame"
         )
 
 
@@ -354,12 +337,10 @@ def check_counts(truth: LabelledBoxes, path: Path, left_out: str = "") -> None:
     """
     if (truth.role == Role.SCORED).any():
         return
-    absent = (truth.role == Role.ABSENT).sum()
-    ignored = (truth.role == Role.IGNORED).sum()
     why = "no boxes in it"
     if len(truth):
-        why = (f"of {len(truth)} rows {absent} are marked not to count (column 7 is 0, or another "
-               f"class) and {ignored} to be ignored")  # fmt: skip
+        why = (f"of {len(truth)} rows {(truth.role == Role.ABSENT).sum()} are marked not to count "
+               f"(column 7 is 0, or another class), the others to be ignored")  # fmt: skip
     raise ReobjError(f"{path}: no true box counts: {left_out or why}")
 
 

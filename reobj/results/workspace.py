@@ -7,7 +7,7 @@ import dataclasses
 import hashlib
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -26,10 +26,9 @@ from reobj.files import (
     locked,
     writing,
 )
-from reobj.results.entries import read_json, written_by
-from reobj.results.links import Links, links_of_results, load_links
-from reobj.results.names import OutputFile
-from reobj.results.result import Result
+from reobj.results.entries import OutputFile, read_json
+from reobj.results.links import Links, load_links
+from reobj.results.result import Result, load_tracked, save_tracked
 from reobj.results.saving import (
     check_results,
     load_last_poses,
@@ -56,7 +55,7 @@ class _Binding:
     """Content of cache/source.json that is read back."""
 
     source: str
-    input: dict[str, Int32]
+    input: InputConfig
     content: str = ""
     frames: _Frames | None = None
 
@@ -136,7 +135,9 @@ class Workspace:
             "frames": video.facts() if isinstance(video, ImagelessVideo) else None,
         }
         if path.exists():
-            old = load_cached(path, partial(read_json, _Binding)) or _Binding("another video", {})
+            old = load_cached(path, partial(read_json, _Binding)) or _Binding(
+                "another video", InputConfig()
+            )
             if old.content != fingerprint["content"]:
                 if not overwrite and self._has_results():
                     found = f"{old.source}, not of {video.source}"
@@ -161,10 +162,7 @@ class Workspace:
     def source(self) -> tuple[str, InputConfig]:
         """The video that the folder is bound to, and the options that it was read with."""
         binding = self._read_binding()
-        try:
-            return binding.source, InputConfig(**binding.input)
-        except TypeError as error:  # an option of another version
-            raise ReobjError(f"{self._source_file}: {written_by(self.out)} ({error})") from error
+        return binding.source, binding.input
 
     @property
     def fingerprint(self) -> str:
@@ -173,11 +171,11 @@ class Workspace:
 
     def video(self) -> Video:
         """Open the video that the folder is bound to, with the options of that run."""
-        source, config = self.source
-        frames = self._read_binding().frames
-        if frames is None:
-            return Video(source, config)
-        return ImagelessVideo(source, config=config, **dataclasses.asdict(frames))
+        binding = self._read_binding()
+        if binding.frames is None:
+            return Video(binding.source, binding.input)
+        facts = dataclasses.asdict(binding.frames)
+        return ImagelessVideo(binding.source, config=binding.input, **facts)
 
     def video_or_frames(self, result: Result) -> tuple[Video, list[str]]:
         """Open the video, or its frames without images if it was moved or deleted since.
@@ -202,7 +200,7 @@ class Workspace:
 
     def _read_binding(self) -> _Binding:
         """Read what `bind` wrote."""
-        return read_json(_Binding, self._source_file, out=self.out)
+        return read_json(_Binding, self._source_file, own=True)
 
     def path(self, stage: str, *key: Any) -> Path:
         """Return the cache file of a stage's result.
@@ -227,7 +225,7 @@ class Workspace:
             warnings.
         """
         warnings = []
-        tracked.save_tracked(self.out / OutputFile.LAST_TRACKS)
+        save_tracked(tracked, self.out / OutputFile.LAST_TRACKS)
         edits = self.out / OutputFile.EDITS
         if tracked.identities_given and edits.exists():
             edits.unlink()
@@ -249,22 +247,11 @@ class Workspace:
     def last_tracks(self) -> Result | None:
         """The latest tracks of the tracker, before linking; None if there are none."""
         path = self.out / OutputFile.LAST_TRACKS
-        return Result.load_tracked(path) if path.exists() else None
+        return load_tracked(path) if path.exists() else None
 
-    def last_links(self, options: Mapping[str, Any]) -> Links | None:
-        """Return the links of the last result; those without a file are made of the results.
-
-        Args:
-            options: of the objects stage in the last run.
-        Returns:
-            None if there is no readable result.
-        """
-        if (links := load_cached(self.out / OutputFile.LAST_LINKS, load_links)) is not None:
-            return links
-        try:
-            return links_of_results(Result.load(self.out), options)
-        except ReobjError:
-            return None
+    def last_links(self) -> Links | None:
+        """Return the links of the last result; None: there are none, or they are damaged."""
+        return load_cached(self.out / OutputFile.LAST_LINKS, load_links)
 
     def load_last(self) -> Result:
         """Return the latest tracks of the tracker, before linking, with the latest poses."""

@@ -299,23 +299,6 @@ def check_boxer(path: Path) -> None:
     near_true([r["name"] for r in rows], np.array([[float(r[k]) for k in column] for r in rows]))
 
 
-def boxes_of_kitti(path: Path) -> tuple[list[list[float]], dict[int, str]]:
-    cells = [line.split() for line in path.read_text().splitlines()]
-    rows = [[float(v) for v in (*row[:2], *row[6:10])] for row in cells]
-    return rows, {int(row[1]): row[2].replace("_", " ") for row in cells}
-
-
-def boxes_of_labelme(path: Path) -> tuple[list[list[float]], dict[int, str]]:
-    rows = []
-    names = {}
-    for file in path.parent.glob("images/*.json"):
-        for shape in json.loads(file.read_text())["shapes"]:
-            corners = [v for point in shape["points"] for v in point]
-            rows.append([float(file.stem.removeprefix("frame_")), shape["group_id"], *corners])
-            names[shape["group_id"]] = shape["label"]
-    return rows, names
-
-
 def boxes_of_yolo(path: Path) -> tuple[list[list[float]], dict[int, str]]:
     kinds = [json.loads(k) for k in re.findall(r"^  \d+: (.+)$", path.read_text(), re.M)]
     rows = []
@@ -327,16 +310,6 @@ def boxes_of_yolo(path: Path) -> tuple[list[list[float]], dict[int, str]]:
             rows.append([frame, identity, x - w / 2, y - h / 2, x + w / 2, y + h / 2])
             names[int(identity)] = kinds[int(kind)]
     return rows, names
-
-
-def ros_objects(detections: list[Any]) -> tuple[list[str], np.ndarray]:
-    names = [d["results"][0]["hypothesis"]["class_id"] for d in detections]
-    places = [d["bbox"]["center"]["position"] for d in detections]
-    return names, np.array([[place[axis] for axis in "xyz"] for place in places])
-
-
-def check_ros(path: Path) -> None:
-    near_true(*ros_objects(json.loads(path.read_text())["detections"]))
 
 
 def check_mcap(path: Path) -> None:
@@ -392,12 +365,9 @@ EXPORTED: dict[str, Callable[[Path], None]] = {
     "csv": check_csv,
     "cvat": check_tracks(boxes_of_cvat),
     "glb": check_glb,
-    "kitti": check_tracks(boxes_of_kitti),
-    "labelme": check_tracks(boxes_of_labelme),
     "mcap": check_mcap,
     "nerfstudio": check_nerfstudio,
     "ply": check_ply,
-    "ros": check_ros,
     "rrd": check_rrd,
     "usd": check_usd,
     "yolo": check_tracks(boxes_of_yolo),

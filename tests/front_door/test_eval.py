@@ -58,18 +58,6 @@ def test_identities_twice_in_a_frame_are_refused(
     assert score(write(tmp_path / "x.txt", ROWS[ROWS[:, 1] != 2]), unmarked)[0]["HOTA"] == 1
 
 
-def test_boxes_without_identity_are_refused(
-    result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    rows = ROWS.copy()
-    rows[:, 1] = -1
-    gt = write(tmp_path / "gt.txt", ROWS, "1")
-    text = refused(capsys, write(tmp_path / "det.txt", rows, "0.9,-1,-1,-1"), gt)
-    assert "det.txt: 150 of 150 boxes have no identity" in text and "detections, not tracks" in text
-    rows[:-1, 1] = ROWS[:-1, 1]
-    assert "1 of 150 boxes" in refused(capsys, write(tmp_path / "one.txt", rows), gt)
-
-
 def test_frames_from_0_are_accepted_and_reported(result: Path, tmp_path: Path) -> None:
     rows = ROWS - np.eye(1, 6)
     zero = write(tmp_path / "zero.txt", rows, "1")
@@ -102,12 +90,6 @@ def test_truth_without_scored_boxes(
         assert f"{gt}: no true box counts: {why}" in text
 
 
-def test_a_result_without_boxes_scores_0(tmp_path: Path) -> None:
-    gt = write(tmp_path / "gt.txt", ROWS, "1")
-    found, _ = score(write(tmp_path / "none.txt", ROWS[:0]), gt)
-    assert found["HOTA"] == found["IDF1"] == found["MOTA"] == 0 and found["gt_objects"] == 5
-
-
 @pytest.mark.parametrize(
     ("rows", "what"),
     [
@@ -121,26 +103,6 @@ def test_invalid_rows_are_refused(
     bad, gt = write(tmp_path / "bad.txt", rows), write(tmp_path / "gt.txt", ROWS, "1")
     assert f"bad.txt{', ' if 'identity' in what else ': '}{what}" in refused(capsys, bad, gt)
     assert "bad.txt" in refused(capsys, result, bad)
-
-
-def test_large_identities_and_boxes_without_area(tmp_path: Path) -> None:
-    """Identities beyond 2^31 are identities; a box without area matches nothing."""
-    gt, rows = write(tmp_path / "gt.txt", ROWS, "1"), ROWS.copy()
-    rows[:, 1] += 2**52
-    large = write(tmp_path / "large.txt", rows)
-    large.write_text("\n".join(",".join(f"{x:.0f}" for x in row) for row in rows))
-    assert score(large, gt)[0]["HOTA"] == 1
-    rows = ROWS.copy()
-    rows[rows[:, 0] == 3, 4:] = 0
-    found, _ = score(write(tmp_path / "flat.txt", rows), gt)
-    assert found["recall"] == found["precision"] == pytest.approx(29 / 30)
-
-
-def test_columns_parted_by_spaces(result: Path, tmp_path: Path) -> None:
-    gt = write(tmp_path / "gt.txt", ROWS, "1 -1 -1 -1", " ")
-    assert score(result, gt)[0]["HOTA"] == 1
-    spaces = write(tmp_path / "res2.txt", ROWS, "0.9", "  ")
-    assert score(spaces, gt)[0]["HOTA"] == 1
 
 
 # ---- Classes ----
@@ -229,12 +191,6 @@ def test_one_class_without_a_name_is_any_class(tmp_path: Path) -> None:
     assert "one class without a name" in found["messages"][0]
 
 
-def test_frames_beyond_the_sequence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    files = mot_files(tmp_path, "MOT17-02")
-    (tmp_path / "MOT17-02/seqinfo.ini").write_text("[Sequence]\nname=MOT17-02\nseqLength=20\n")
-    assert "frame 30, but seqinfo.ini says seqLength=20" in refused(capsys, *files)
-
-
 @pytest.mark.parametrize("names", [("object",), ("Ball", "x")])
 def test_a_result_without_these_classes_is_scored_without(
     tmp_path: Path, names: tuple[str, ...], capsys: pytest.CaptureFixture[str]
@@ -249,15 +205,6 @@ def test_a_result_without_these_classes_is_scored_without(
     assert "\nnote: " in capsys.readouterr().out
     kept = json.loads((out / "eval.json").read_text())
     assert kept["messages"] == found["messages"]
-
-
-def test_no_row_of_a_class_counts(tmp_path: Path) -> None:
-    out, gt = folder(tmp_path / "out"), nine(tmp_path / "gt.txt", COCO)
-    assert score(out, gt, "chair")[0]["gt_objects"] == 2
-    rows = [line for line in gt.read_text().splitlines() if f",{COCO['cup']},0.8" not in line]
-    gt.write_text("\n".join(rows))
-    with pytest.raises(rt.ReobjError, match=r"no true box counts: none is of cup"):
-        score(out, gt, "cup")
 
 
 # ---- Other formats of truth ----
@@ -338,20 +285,6 @@ def test_synonyms_are_one_class(tmp_path: Path) -> None:
         rt.evaluate(out, truth, classes=["table"])
 
 
-def test_cvat_for_video(tmp_path: Path) -> None:
-    out = folder(tmp_path / "out")
-    text = "<annotations>"
-    for i, name in NAMES.items():
-        text += f'<track id="{i - 1}" label="{name}">'
-        for f, _, x, y, w, h in ROWS[ROWS[:, 1] == i].tolist():
-            text += (f'<box frame="{f - 1:.0f}" xtl="{x}" ytl="{y}" xbr="{x + w}" ybr="{y + h}" '
-                     'outside="0" occluded="0" keyframe="1"/>')  # fmt: skip
-        text += "</track>"
-    (tmp_path / "cvat.xml").write_text(text + "</annotations>")
-    found = rt.evaluate(out, tmp_path / "cvat.xml")["tracks"]
-    assert len(found) == 5 and all(s["HOTA"] == 1 for s in found.values())
-
-
 # ---- Truth in some frames only ----
 
 LISTED = (1, 6, 11, 16, 21, 26)  # frames from 1, a step of 5
@@ -412,30 +345,13 @@ def test_frames_that_the_truth_does_not_list_do_not_count(result: Path, tmp_path
     assert found["MOTA"] == 1 and not any("do not count" in text for text in said)
 
 
-@pytest.mark.parametrize(
-    ("frames", "count", "step"), [(LISTED, 24, "5 apart"), ((1, 2, 3, 7, 30), 25, "")]
-)
-def test_frames_without_truth_are_counted_in_a_note(
-    result: Path, tmp_path: Path, frames: tuple[int, ...], count: int, step: str
-) -> None:
+def test_frames_without_truth_are_counted_in_a_note(result: Path, tmp_path: Path) -> None:
     """A MOT file does not list its frames: one without a row may be empty."""
-    gt = write(tmp_path / "gt.txt", ROWS[np.isin(ROWS[:, 0], frames)], "1")
+    gt = write(tmp_path / "gt.txt", ROWS[np.isin(ROWS[:, 0], LISTED)], "1")
     found, said = score(result, gt)
-    assert found["precision"] == pytest.approx(1 - count / 30)
+    assert found["precision"] == pytest.approx(1 - 24 / 30)
     (note,) = said
-    assert f"{count} of 30 frames with boxes of the result have no ground truth" in note
-    assert step in note and ("apart" in note) == bool(step)
-
-
-def test_the_truth_of_another_video_is_noted(result: Path, tmp_path: Path) -> None:
-    later, elsewhere = ROWS + 1000 * np.eye(1, 6), ROWS + 5000 * np.eye(1, 6, 2)
-    for gt in (
-        write(tmp_path / "gt.txt", later, "1"),
-        write(tmp_path / "gt2.txt", elsewhere, "1"),
-        coco_video(tmp_path / "gt.json", later, tuple(range(1001, 1031))),
-    ):
-        found, said = score(result, gt)
-        assert found["HOTA"] == 0 and any("truth of another video?" in text for text in said)
+    assert "24 of 30 frames with boxes of the result have no ground truth" in note
 
 
 # ---- Formats, and frames of another size ---------------------------------------------------------
@@ -478,14 +394,12 @@ def test_the_number_of_the_first_frame_of_the_truth(
     assert rt.main(words) == 2
 
 
-@pytest.mark.parametrize("scale", [0.5, 2.0])
-def test_a_result_of_frames_of_another_size(tmp_path: Path, scale: float) -> None:
-    rows = ROWS.copy()
-    rows[:, 2:] *= scale
+def test_a_result_of_frames_of_another_size(tmp_path: Path) -> None:
+    rows = ROWS * [1, 1, 2, 2, 2, 2]
     gt = write(tmp_path / "gt.txt", ROWS, "1")
     _, said = score(write(tmp_path / "res.txt", rows, "0.9,-1,-1,-1"), gt)
     (note,) = [text for text in said if "frames of another size" in text]
-    assert f"150 do if the boxes of the result are scaled by {1 / scale:g}" in note
+    assert "150 do if the boxes of the result are scaled by 0.5" in note
 
 
 @pytest.mark.parametrize("wrong", ["truth", "result"])
