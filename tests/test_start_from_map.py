@@ -13,7 +13,7 @@ from simulated import CAMERA, SIZE, walk
 import quadrics
 import reobj_track as rt
 from reobj.cameras import quat_wxyz_from_matrix
-from reobj.maps.known import class_ids
+from reobj.maps.fusion import class_ids
 from reobj.types import Embeddings
 
 NAMES = ("chair", "cup", "book", "bottle")

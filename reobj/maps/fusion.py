@@ -11,7 +11,10 @@ from scipy.spatial.transform import Rotation
 import quadrics
 from reobj.cameras import quat_wxyz_from_matrix
 from reobj.maps.room_map import MapObject, Observation, RoomMap, Session
-from reobj.types import Array, BoolArray, Floats, ReobjError, unit_rows
+from reobj.results.result import Object
+from reobj.tracking.ellipsoid_map import EllipsoidMap
+from reobj.types import Array, BoolArray, Embeddings, Floats, IntArray, ReobjError, unit_rows
+from reobj.words import meant
 
 PLACE_SIGMA_M = 0.01  # of a place between sessions: cleaning and leaning shift an object by 1 cm
 CHI2_3 = 14.16  # 3 sigma of a normal variable (99.73 %), for the squared distance in 3 dimensions
@@ -130,6 +133,17 @@ def _embeddings(detected: Sequence[Observation], room: RoomMap) -> tuple[str, Fl
     return embedder, mean("foreground"), mean("background")
 
 
+def shapes_of(objects: Sequence[ObjectState] | Sequence[Object]) -> quadrics.Ellipsoids:
+    """Return the ellipsoids of objects, in the world of the map, inscribed in their shapes."""
+    wxyz = np.array([o.quat_wxyz for o in objects]).reshape(-1, 4)
+    axes = Rotation.from_quat(wxyz[:, [1, 2, 3, 0]]).as_matrix() if len(objects) else wxyz
+    return quadrics.Ellipsoids(
+        np.array([o.center for o in objects]).reshape(-1, 3),
+        np.array([o.half_axes for o in objects]).reshape(-1, 3),
+        axes.reshape(-1, 3, 3),
+    )
+
+
 # ---- Shape -------------------------------------------------------------------------------------
 
 
@@ -148,7 +162,7 @@ class Shapes:
     cov: Array
 
 
-def shapes_of(detected: Sequence[Observation], room: RoomMap) -> Shapes:
+def observed_shapes(detected: Sequence[Observation], room: RoomMap) -> Shapes:
     """Stack the shapes of K observations and add the uncertainty of their alignment.
 
     A similarity x -> exp(scale) exp([rotation]) x + translation about the origin of the world acts
@@ -215,7 +229,7 @@ def _fused(detected: Sequence[Observation], room: RoomMap) -> tuple[str, Shapes]
     last = [o for o, at_place in zip(detected, here, strict=True) if at_place]
     support = max(last, key=lambda o: o.views).support
     same = np.array([o.support == support for o in detected])
-    shapes = shapes_of(detected, room)
+    shapes = observed_shapes(detected, room)
     turning = np.einsum("kii->k", shapes.cov[:, 6:, 6:])
     ref = int(np.where(here & same, turning, np.inf).argmin())
     upright = room.up is not None or support == "cylinder"
@@ -353,3 +367,45 @@ def _scale_variance(session: Session) -> float:
     At least (1e-6)^2: exact poses have sigma 0.
     """
     return max(session.scale_rel_sigma**2 + float(session.alignment_cov[6, 6]), 1e-12)
+
+
+# ---- For a tracker that starts from a map -------------------------------------------------------
+
+
+def class_ids(states: Sequence[ObjectState], class_names: Sequence[str]) -> IntArray:
+    """Return the class id (N,) of each object: of its likeliest class in the names, -1: none."""
+    found = [[k for word in (s.class_name, *s.classes) for k in meant(word, class_names)[:1]]
+             for s in states]  # fmt: skip
+    return np.array([ids[0] if ids else -1 for ids in found], np.int64)
+
+
+def ellipsoid_map_of(states: Sequence[ObjectState]) -> EllipsoidMap:
+    """Return the ellipsoids of objects, inscribed in their shapes; unknown of objects now gone."""
+    made = EllipsoidMap()
+    if states:
+        shapes = shapes_of(states)
+        present = np.array([s.present for s in states])
+        center = np.where(present[:, None], shapes.center_in_world, np.nan)
+        ellipsoids = quadrics.Ellipsoids(center, shapes.half_axes, shapes.world_from_obj)
+        made.give(ellipsoids, np.array([s.cov[:3, :3] for s in states]))
+    return made
+
+
+def embeddings_of(states: Sequence[ObjectState], embedder: str) -> tuple[IntArray, Embeddings]:
+    """Return the mean embeddings of the objects that have some of an embedder.
+
+    Args:
+        embedder: key of the model. "": none.
+    Returns:
+        rows (n,) of the objects, and their embeddings; zeros for a background that is missing.
+    """
+    rows = [k for k, s in enumerate(states) if embedder and s.embedder == embedder]
+    rows = [k for k in rows if states[k].foreground.size]
+    fore = [states[k].foreground for k in rows]
+    if not rows:
+        return np.empty(0, np.int64), Embeddings.empty()
+    width = max(states[k].background.size for k in rows)
+    back = np.zeros((len(rows), width), np.float32)
+    for row, k in enumerate(rows):
+        back[row, : states[k].background.size] = states[k].background
+    return np.array(rows, np.int64), Embeddings(np.array(fore, np.float32), back)
