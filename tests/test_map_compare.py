@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import pytest
 
 from reobj.maps.compare import Decision, FoundObject, PointMotion, Visibility, compare
 from reobj.maps.fusion import ObjectState
@@ -249,32 +250,29 @@ def test_an_identical_chair_that_left_the_row_is_the_one_that_is_missing() -> No
     assert summary(decide(states, detected, views))[7] == ("moved", 12, 112)
 
 
-def test_swapped_identical_chairs_give_no_stolen_number() -> None:
-    """Both left their places, without evidence which is which: candidates, no number."""
-    states = [*room(), *chairs((1, 2, 0.4), (3, 2, 0.4))]
-    points = {11: 20, 12: 20}
+@pytest.mark.parametrize(
+    ("before", "now", "numbers"),
+    [
+        (((1, 2), (3, 2)), ((2, 3.2), (2, 2.6)), False),  # each may be either
+        (((1, 2), (2.05, 2)), ((1, 2.62), (2.05, 2.62)), False),  # 62 cm against 122: not half
+        (((1, 2), (3, 2)), ((1, 2.5), (3, 2.5)), True),  # 50 cm against 2 m
+    ],
+)
+def test_a_much_shorter_way_decides_between_identical_chairs(
+    before: Any, now: Any, numbers: bool
+) -> None:
+    """Both left their places; otherwise they get candidates, and no stolen number."""
+    states = [*room(), *chairs(*((*place, 0.4) for place in before))]
     detected = all_found(states)[:6]
-    for identity, place in ((111, (2, 3.2, 0.4)), (112, (2, 2.6, 0.4))):
-        recognised = motions(states, place, points)
-        detected.append(found(states[6], identity, place, motion_of=recognised))
-    views = seen(8, 6, [0] * 6 + [5] * 2)
-    decisions = decide(states, detected, views)
-    assert summary(decisions)[6:] == [
-        ("gone", 11, 0), ("gone", 12, 0), ("new", 0, 111), ("new", 0, 112)
-    ]  # fmt: skip
-    assert decisions[8].candidates == decisions[9].candidates == (11, 12)
-
-
-def test_the_displacement_decides_between_identical_chairs() -> None:
-    """Each moved by 50 cm; exchanged they would have moved by 2 m."""
-    states = [*room(), *chairs((1, 2, 0.4), (3, 2, 0.4))]
-    points = {11: 20, 12: 20}
-    detected = all_found(states)[:6]
-    for identity, place in ((111, (1, 2.5, 0.4)), (112, (3, 2.5, 0.4))):
-        recognised = motions(states, place, points)
-        detected.append(found(states[6], identity, place, motion_of=recognised))
-    decisions = decide(states, detected)
-    assert summary(decisions)[6:] == [("moved", 11, 111), ("moved", 12, 112)]
+    for identity, place in zip((111, 112), now, strict=True):
+        recognised = motions(states, (*place, 0.4), {11: 20, 12: 20})
+        detected.append(found(states[6], identity, (*place, 0.4), motion_of=recognised))
+    decisions = decide(states, detected, seen(8, 6, [0] * 6 + [5] * 2))
+    if numbers:
+        assert summary(decisions)[6:] == [("moved", 11, 111), ("moved", 12, 112)]
+    else:
+        assert summary(decisions)[-2:] == [("new", 0, 111), ("new", 0, 112)]
+        assert 11 in decisions[-2].candidates and 12 in decisions[-1].candidates
 
 
 def test_chairs_between_two_places_are_ambiguous_and_the_shorter_way_wins() -> None:
@@ -304,20 +302,6 @@ def test_own_points_prove_a_move_that_looks_contradict() -> None:
             motion_of=motions(states, (3, 2, 0.4), {4: inliers}) if inliers else {},
         )
         assert expected in summary(decide(states, detected, visibility))
-
-
-def test_a_displacement_less_than_half_as_long_is_needed() -> None:
-    """62 cm against 122 cm: more probable by three nats, and yet no number."""
-    states = [*room(), *chairs((1, 2, 0.4), (2.05, 2, 0.4))]
-    points = {11: 20, 12: 20}
-    detected = all_found(states)[:6]
-    for identity, x in ((111, 1), (112, 2.05)):
-        place = (x, 2.62, 0.4)
-        recognised = motions(states, place, points)
-        detected.append(found(states[6], identity, place, motion_of=recognised))
-    decisions = decide(states, detected)
-    assert summary(decisions)[-2:] == [("new", 0, 111), ("new", 0, 112)]
-    assert 11 in decisions[-2].candidates and 12 in decisions[-1].candidates
 
 
 def test_another_bottle_beside_the_place_of_one_that_is_gone_does_not_get_its_number() -> None:

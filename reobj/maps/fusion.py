@@ -144,6 +144,18 @@ def shapes_of(objects: Sequence[ObjectState] | Sequence[Object]) -> quadrics.Ell
     )
 
 
+def scaled_radius(xyz: Array, shapes: quadrics.Ellipsoids, k: int | IntArray) -> Array:
+    """Return squared distances (N,) of points (N, 3) from the centre of a shape, in half axes.
+
+    Args:
+        k: row of the shape, or (N,) that of each point.
+    """
+    turn = np.broadcast_to(shapes.world_from_obj[k], (len(xyz), 3, 3))
+    offset = xyz - shapes.center_in_world[k]
+    scaled = np.einsum("ni,nij->nj", offset, turn) / shapes.half_axes[k]
+    return np.asarray((scaled**2).sum(1))
+
+
 # ---- Shape -------------------------------------------------------------------------------------
 
 

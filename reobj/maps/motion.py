@@ -16,9 +16,9 @@ import numpy as np
 import quadrics
 from reobj.cameras import Camera, Poses, import_pycolmap
 from reobj.maps.compare import FoundObject, PointMotion
-from reobj.maps.fusion import ObjectState, shapes_of
+from reobj.maps.fusion import ObjectState, scaled_radius, shapes_of
 from reobj.maps.object_points import ObjectView
-from reobj.maps.placement import unit_descriptors
+from reobj.maps.placement import best_features, unit_descriptors
 from reobj.maps.room_map import MapPoints
 from reobj.types import Array, BoolArray, Floats, IntArray
 from reobj.words import merged
@@ -148,7 +148,9 @@ class _Search:
         self.descriptor = unit_descriptors(self.points.descriptor)
         shapes = shapes_of(states)
         # an object that moved has points at its earlier places too: they are of no use
-        inside = _scaled_radius(self.points.xyz, self.owner, shapes) < 1.1**2
+        owned = np.flatnonzero(self.owner >= 0)
+        inside = np.zeros(len(self.owner), bool)
+        inside[owned] = scaled_radius(self.points.xyz[owned], shapes, self.owner[owned]) < 1.1**2
         self.above = _above_bottom(self.points.xyz, self.owner, shapes, up)
         self.own = [np.flatnonzero((self.owner == k) & inside) for k in range(len(states))]
         self.usable = [k for k, rows in enumerate(self.own) if len(rows) >= POINTS]
@@ -201,21 +203,8 @@ class _Search:
         rival = np.maximum(rival, np.where(apart, own, -1.0).max(1))
         angle = np.arccos(value.clip(-1, 1))
         good = np.flatnonzero(angle < RATIO * np.arccos(rival.clip(-1, 1)))
-        nearest = good[np.argsort(angle[good], kind="stable")]
-        _, first = np.unique(best[nearest], return_index=True)
-        feature = np.sort(nearest[first])
+        feature = best_features(good, best, angle)
         return feature, rows[best[feature]]
-
-
-def _scaled_radius(xyz: Array, owner: IntArray, shapes: quadrics.Ellipsoids) -> Array:
-    """Return squared distances (N,) in half axes of the owner; infinite without an owner."""
-    radius = np.full(len(xyz), np.inf)
-    rows = np.flatnonzero(owner >= 0)
-    k = owner[rows]
-    offset = xyz[rows] - shapes.center_in_world[k]
-    scaled = np.einsum("ni,nij->nj", offset, shapes.world_from_obj[k]) / shapes.half_axes[k]
-    radius[rows] = (scaled**2).sum(1)
-    return radius
 
 
 def _above_bottom(

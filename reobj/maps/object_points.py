@@ -16,14 +16,15 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+import quadrics
 from reobj.cameras import Poses, invert_rigid
 from reobj.files import Progress
-from reobj.maps.fusion import shapes_of
+from reobj.maps.fusion import scaled_radius, shapes_of
 from reobj.maps.placement import described_points, of_frames, unit_descriptors
 from reobj.maps.room_map import MapPoints
 from reobj.results.result import Object
 from reobj.sources.video import Video
-from reobj.types import Array, BoolArray, Frame, IntArray, Tracks
+from reobj.types import Array, Frame, IntArray, Tracks
 
 VIEWS = 12  # boxes of each object that are described
 APART_DEG = 15.0  # difference of direction from which on only the size of a box counts
@@ -194,13 +195,7 @@ class _Rays:
 def _points_of(found: Object, views: Sequence[ObjectView], poses: Poses) -> MapPoints:
     """Triangulate the points of one object."""
     rays = _Rays(views, poses)
-    shape = shapes_of([found])
-    scaled = shape.world_from_obj[0] / (INSIDE * shape.half_axes[0])
-
-    def inside(xyz: Array) -> BoolArray:
-        return np.asarray((((xyz - shape.center_in_world[0]) @ scaled) ** 2).sum(-1) < 1)
-
-    first, second = _pairs(rays, inside)
+    first, second = _pairs(rays, shapes_of([found]))
     partners: list[list[int]] = [[] for _ in range(len(rays.view))]
     for i, j in zip(first.tolist(), second.tolist(), strict=True):
         partners[i].append(j)
@@ -219,7 +214,7 @@ def _points_of(found: Object, views: Sequence[ObjectView], poses: Poses) -> MapP
     return _described(found.id, rays, tracks)
 
 
-def _pairs(rays: _Rays, inside: Any) -> tuple[IntArray, IntArray]:
+def _pairs(rays: _Rays, shape: quadrics.Ellipsoids) -> tuple[IntArray, IntArray]:
     """Find pairs of features of two views that may be one point.
 
     Each feature is paired with the most similar one of another view that meets the epipolar
@@ -243,7 +238,8 @@ def _pairs(rays: _Rays, inside: Any) -> tuple[IntArray, IntArray]:
     on_b = rays.start[j] + depth_b[:, None] * b
     gap = np.linalg.norm(on_a - on_b, axis=1) / 2
     near = gap < ERROR_PX * rays.px * np.minimum(depth_a, depth_b)
-    good = usable & near & (np.minimum(depth_a, depth_b) > 0) & inside((on_a + on_b) / 2)
+    good = usable & near & (np.minimum(depth_a, depth_b) > 0)
+    good &= scaled_radius((on_a + on_b) / 2, shape, 0) < INSIDE**2
     i = i[good]
     j = j[good]
     order = np.argsort(-cosine[i, j], kind="stable")

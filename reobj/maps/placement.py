@@ -183,6 +183,17 @@ def unit_descriptors(rows: npt.NDArray[np.generic]) -> Floats:
     return np.asarray(values / np.linalg.norm(values, axis=1, keepdims=True).clip(1e-9))
 
 
+def best_features(rows: IntArray, point: IntArray, angle: Array) -> IntArray:
+    """Choose the feature with the smallest angle for each point that some rows of features match.
+
+    Args:
+        point, angle: (n,) of all features.
+    """
+    nearest = rows[np.argsort(angle[rows], kind="stable")]
+    _, first = np.unique(point[nearest], return_index=True)
+    return np.sort(nearest[first])
+
+
 # ---- Images in the map -------------------------------------------------------------------------
 
 
@@ -239,9 +250,7 @@ class PointMatcher:
         second = np.where(elsewhere, angle, np.inf).min(1)
         second = np.minimum(second, np.where(elsewhere.any(1), np.inf, angle[:, -1]))
         good = np.flatnonzero((angle[:, 0] < RATIO * second) & (angle[:, 0] < 0.9))
-        nearest = good[np.argsort(angle[good, 0], kind="stable")]
-        _, first = np.unique(best[nearest, 0], return_index=True)
-        feature = np.sort(nearest[first])
+        feature = best_features(good, best[:, 0], angle[:, 0])
         return feature, best[feature, 0]
 
     def locate(self, image: ImageFeatures) -> LocatedImage | None:

@@ -23,7 +23,7 @@ from reobj.maps.compare import (
     alignment_jacobian,
     compare,
 )
-from reobj.maps.fusion import ObjectState, object_state, scale_of, shapes_of
+from reobj.maps.fusion import ObjectState, object_state, scale_of, scaled_radius, shapes_of
 from reobj.maps.motion import point_motions
 from reobj.maps.object_points import ObjectView
 from reobj.maps.room_map import (
@@ -290,8 +290,7 @@ def _on_objects(
     shapes = shapes_of(objects)
     best = np.full(len(points), 1.1**2)
     for k, o in enumerate(objects):
-        inside = (points.xyz - shapes.center_in_world[k]) @ shapes.world_from_obj[k]
-        distance = ((inside / shapes.half_axes[k]) ** 2).sum(1)
+        distance = scaled_radius(points.xyz, shapes, k)
         nearer = distance < best
         object_id[nearer] = numbers[o.id]
         best[nearer] = distance[nearer]
