@@ -43,7 +43,7 @@ def state(number: int, name: str, center: Sequence[float], **facts: object) -> O
     known = ObjectState(
         number, name, {name: 10.0}, True, False, "box", np.array(center, float),
         np.array(SIZES[name]), np.array([1.0, 0, 0, 0]), shape_cov(), looks(number),
-        np.empty(0, np.float32), "m", 0.85, 4.0, 1,
+        np.empty(0, np.float32), "m", 0.85, 4.0,
     )  # fmt: skip
     return dataclasses.replace(known, **facts)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -34,7 +35,6 @@ class ObjectState:
         foreground, background: mean unit embeddings of one model (`embedder`); empty: none.
         detection_rate: probability of a detection in a view in which it is expected.
         log_odds: that it is a real object.
-        last_seen: number of the last session in which it was detected.
     """
 
     id: int
@@ -52,7 +52,6 @@ class ObjectState:
     embedder: str
     detection_rate: float
     log_odds: float
-    last_seen: int
 
 
 def object_state(found: MapObject, room: RoomMap) -> ObjectState:
@@ -94,8 +93,15 @@ def object_state(found: MapObject, room: RoomMap) -> ObjectState:
         embedder=embedder,
         detection_rate=_detection_rate(expected, missed),
         log_odds=float(np.clip(sum(o.log_odds for o in observations), -10.0, 10.0)),
-        last_seen=detected[-1].session,
     )
+
+
+def state_before(found: MapObject, session: int, room: RoomMap) -> ObjectState | None:
+    """Return the state of an object before a session; None: it was not known."""
+    rows = tuple(o for o in found.observations if o.session < session)
+    if not any(o.detected for o in rows):
+        return None
+    return object_state(dataclasses.replace(found, observations=rows), room)
 
 
 def _detection_rate(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy as np
 import quadrics
 from reobj import __version__
 from reobj.files import atomic, cut, numbers, rounded, spans, texts_with_sigma
-from reobj.maps.fusion import ObjectState, object_state, scale_of, shapes_of
+from reobj.maps.fusion import ObjectState, object_state, scale_of, shapes_of, state_before
 from reobj.maps.room_map import MapObject, Observation, RoomMap, Session
 from reobj.results.changes import Change, Changes, EarlierSession, Shape
 from reobj.results.export_source import formula_safe
@@ -261,20 +260,12 @@ def _earlier_session(
         if own.picture:
             pictures[found.id] = own.picture
         stayed = own.status == "stayed"
-        before = None if stayed else _state_before(found, session.number, room)
+        before = None if stayed else state_before(found, session.number, room)
         change = _change(found.id, name, own, before, room)
         if not change.fault(own.status):  # without it: the session before was forgotten
             lists[own.status].append(change)
     changes = None if is_first else Changes(str(path), session.name, **lists)
     return EarlierSession(session.name, session.date, tuple(objects), changes, pictures)
-
-
-def _state_before(found: MapObject, session: int, room: RoomMap) -> ObjectState | None:
-    """Return the state of an object before a session; None: it was not known."""
-    rows = tuple(o for o in found.observations if o.session < session)
-    if not any(o.detected for o in rows):
-        return None
-    return object_state(dataclasses.replace(found, observations=rows), room)
 
 
 def _change(

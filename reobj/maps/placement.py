@@ -177,6 +177,25 @@ def described_points(
     )
 
 
+def _largest(values: Floats, count: int, width: int = 64) -> IntArray:
+    """Return the columns (n, count) of the largest of (n, N) values in each row, unordered.
+
+    They lie in the `count` blocks with the largest maxima: the rows are partitioned by block.
+
+    Args:
+        width: columns of a block; has no effect on the result.
+    """
+    missing = -values.shape[1] % width
+    blocks = np.pad(values, ((0, 0), (0, missing)), constant_values=-np.inf)
+    blocks = blocks.reshape(len(values), -1, width)
+    if blocks.shape[1] <= count:
+        return np.argpartition(-values, count, axis=1)[:, :count]
+    chosen = np.argpartition(-blocks.max(2), count, axis=1)[:, :count]  # (n, count)
+    inside = np.take_along_axis(blocks, chosen[:, :, None], 1).reshape(len(values), -1)
+    best = np.argpartition(-inside, count, axis=1)[:, :count]
+    return np.take_along_axis(chosen, best // width, 1) * width + best % width
+
+
 def unit_descriptors(rows: npt.NDArray[np.generic]) -> Floats:
     """Scale descriptors to unit length."""
     values = rows.astype(np.float32)
@@ -237,14 +256,11 @@ class PointMatcher:
         if len(image.xy) < 2 or len(self.points) <= few:
             return np.empty(0, np.int64), np.empty(0, np.int64)
         cosine = unit_descriptors(image.descriptor) @ self.descriptor.T  # (n, N)
-        feature = np.arange(len(cosine))
-        best = np.empty((len(cosine), few), np.int64)
-        value = np.empty((len(cosine), few), np.float32)
-        for k in range(few):  # faster than a sort
-            best[:, k] = cosine.argmax(1)
-            value[:, k] = cosine[feature, best[:, k]]
-            cosine[feature, best[:, k]] = -np.inf
-        angle = np.arccos(value.clip(-1, 1))  # (n, few)
+        best = _largest(cosine, few)  # (n, few)
+        value = np.take_along_axis(cosine, best, 1)
+        order = np.argsort(-value, axis=1)
+        best = np.take_along_axis(best, order, 1)
+        angle = np.arccos(np.take_along_axis(value, order, 1).clip(-1, 1))  # (n, few)
         apart = np.linalg.norm(self.points.xyz[best] - self.points.xyz[best[:, :1]], axis=2)
         elsewhere = apart > ELSEWHERE * self.points.distance[best[:, :1]]
         second = np.where(elsewhere, angle, np.inf).min(1)

@@ -23,7 +23,14 @@ from reobj.maps.compare import (
     alignment_jacobian,
     compare,
 )
-from reobj.maps.fusion import ObjectState, object_state, scale_of, scaled_radius, shapes_of
+from reobj.maps.fusion import (
+    ObjectState,
+    object_state,
+    scale_of,
+    scaled_radius,
+    shapes_of,
+    state_before,
+)
 from reobj.maps.motion import point_motions
 from reobj.maps.object_points import ObjectView
 from reobj.maps.room_map import (
@@ -37,7 +44,7 @@ from reobj.maps.room_map import (
 from reobj.maps.visibility import visibility_of
 from reobj.results.changes import Change, Changes, Shape
 from reobj.results.result import Object, Result
-from reobj.types import Array, Floats, IntArray, unit_rows
+from reobj.types import Array, Embeddings, Floats, IntArray, unit_rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,8 +97,9 @@ def add_recording(room: RoomMap, result: Result, recording: Recording) -> tuple[
     own = {
         o.id: x for o in room.objects for x in o.observations if x.session == number and x.detected
     }
-    states = states_for(room, own)
-    before = _states_before(room, number)
+    states = _states_for(room, own)
+    states_before = {o.id: state_before(o, number, room) for o in room.objects}
+    before = {i: state for i, state in states_before.items() if state is not None}
     objects = [o for o in result.located if o.part == 0]
     found = _with_motions(found_objects(result, objects), states, result, room, recording)
     is_first = not room.sessions
@@ -151,7 +159,7 @@ def add_recording(room: RoomMap, result: Result, recording: Recording) -> tuple[
     return new_room, _renumbered(result, numbers, states, decisions, changes)
 
 
-def states_for(room: RoomMap, own: Mapping[int, Observation]) -> list[ObjectState]:
+def _states_for(room: RoomMap, own: Mapping[int, Observation]) -> list[ObjectState]:
     """Return the states of the map's objects that a recording is compared with.
 
     Args:
@@ -166,16 +174,6 @@ def states_for(room: RoomMap, own: Mapping[int, Observation]) -> list[ObjectStat
             state = dataclasses.replace(object_state(alone, room), class_name=state.class_name)
         states.append(state)
     return states
-
-
-def _states_before(room: RoomMap, session: int) -> dict[int, ObjectState]:
-    """Return the states of the objects that were detected before a session, by number."""
-    known = {}
-    for found in room.objects:
-        rows = tuple(o for o in found.observations if o.session < session)
-        if any(o.detected for o in rows):
-            known[found.id] = object_state(dataclasses.replace(found, observations=rows), room)
-    return known
 
 
 def _as_before(
@@ -387,15 +385,12 @@ def _renumbered(
         )
         for o in result.objects
     ]
-    order = np.array(sorted(range(len(objects)), key=lambda k: objects[k].id), np.int64)
-    order = order[[objects[k].id not in deleted & matched for k in order.tolist()]] \
-        if len(order) else order  # fmt: skip
+    left = [k for k, o in enumerate(objects) if o.id not in deleted & matched]
+    order = np.array(sorted(left, key=lambda k: objects[k].id), np.int64)
     row_of = np.cumsum(kept) - 1
     embedded = kept[result.embedding_row]
-    embeddings = dataclasses.replace(
-        result.embeddings,
-        foreground=result.embeddings.foreground[embedded],
-        background=result.embeddings.background[embedded],
+    embeddings = Embeddings(
+        result.embeddings.foreground[embedded], result.embeddings.background[embedded]
     )
     return dataclasses.replace(
         result,

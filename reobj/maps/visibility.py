@@ -57,7 +57,6 @@ def visibility_of(
     assert poses is not None
     shapes = shapes_of(states)
     nearer = shapes_of(objects)
-    support = [s.support for s in states]
     measured = poses.measured & (poses.part == 0)
     if result.looked is not None:
         measured &= np.isin(poses.frame, result.looked)
@@ -67,22 +66,22 @@ def visibility_of(
     size = (poses.camera.width, poses.camera.height)
     cameras = poses.camera.K @ poses.cam_from_world[rows]
     centre = invert_rigid(poses.cam_from_world[rows])[:, :, 3]
+    whole = quadrics.solid_boxes(shapes, [s.support for s in states], cameras)  # (V, N, 4)
+    boxes = quadrics.clip_boxes(whole, size)
+    area = _area(boxes)
+    large = np.sqrt(area) * 640 / max(size) >= LEAST_PX
+    large &= area >= IN_VIEW * np.maximum(_area(whole), 1e-9)
     visible = VisiblePoints(poses)
     expected = np.zeros((len(rows), len(states)), bool)
     through = np.zeros((len(rows), len(states)), bool)
     around = np.zeros((len(rows), len(states)), bool)
     behind: list[set[int]] = [set() for _ in states]
     for v, row in enumerate(rows.tolist()):
-        whole = quadrics.solid_boxes(shapes, support, cameras[v : v + 1])[0]  # (N, 4)
-        clipped = quadrics.clip_boxes(whole[None], size)[0]
-        ratio = _area(clipped) / np.maximum(_area(whole), 1e-9)
-        sides = np.sqrt(_area(clipped)) * 640 / max(size)
-        with np.errstate(invalid="ignore"):
-            shown = np.flatnonzero((ratio >= IN_VIEW) & (sides >= LEAST_PX))
-        shown = shown[~_behind_objects(shapes[shown], clipped[shown], nearer, cameras[v])]
+        shown = np.flatnonzero(large[v])
+        shown = shown[~_behind_objects(shapes[shown], boxes[v, shown], nearer, cameras[v])]
         points = visible.in_frame(row)
         occluded, beside, seen = _points_around(
-            shapes[shown], clipped[shown], poses.points[points], cameras[v], centre[v]
+            shapes[shown], boxes[v, shown], poses.points[points], cameras[v], centre[v]
         )
         expected[v, shown[~occluded]] = True
         around[v, shown[~occluded & beside]] = True
@@ -95,7 +94,7 @@ def visibility_of(
     cov = cov + jacobian @ alignment_cov @ jacobian.swapaxes(1, 2)
     vague = ~(np.sqrt(np.linalg.eigvalsh(cov)[:, -1]) < MOST_SPREAD * shapes.half_axes.mean(1))
     expected[:, vague] = False
-    best, unlocated = _best_iou(shapes, support, result, poses.frame[rows], cameras, expected)
+    best, unlocated = _best_iou(boxes, result, poses.frame[rows], expected)
     detected = best >= IOU[0]
     accident = np.where(detected, np.interp(best, IOU, np.log(ACCIDENT)), 0.0)
     through &= expected & ~detected
@@ -104,11 +103,18 @@ def visibility_of(
     ray = ray / np.linalg.norm(ray, axis=2, keepdims=True).clip(1e-9)
 
     def independent(mask: BoolArray, value: Array | BoolArray) -> Array:
-        """Add the values of the independent views (N,) among those marked (V, N)."""
-        counts = [
-            _independent(ray[mask[:, k], k], value[mask[:, k], k]) for k in range(len(states))
-        ]
-        return np.array(counts, np.float64)
+        """Add the values of the independent views (N,) among those marked (V, N).
+
+        Of rays less than APART_DEG apart the mean value counts.
+        """
+        total = np.zeros(len(states))
+        for k in range(len(states)):
+            left = mask[:, k].copy()
+            while left.any():
+                near = left & (ray[:, k] @ ray[left.argmax(), k] >= np.cos(np.radians(APART_DEG)))
+                total[k] += float(value[near, k].mean())
+                left &= ~near
+        return total
 
     # one view of its surroundings may show them beside what stands before the object
     seen_through = np.maximum(independent(through, through), independent(around, around) - 1)
@@ -123,12 +129,7 @@ def visibility_of(
 
 
 def _best_iou(
-    shapes: quadrics.Ellipsoids,
-    support: list[str],
-    result: Result,
-    frames: IntArray,
-    cameras: Array,
-    expected: BoolArray,
+    boxes: Array, result: Result, frames: IntArray, expected: BoolArray
 ) -> tuple[Array, Array]:
     """Return the IoU of projections with the best detection that may show the object.
 
@@ -138,7 +139,7 @@ def _best_iou(
     beside it.)
 
     Args:
-        shapes: (N,) of the map, each of its support. frames: (V,) with their cameras (V, 3, 4).
+        boxes: (V, N, 4) projections. frames: (V,) of the recording.
         expected: (V, N) views in which the map's objects are expected.
     Returns:
         (V, N) of any detection; (V, N) of one that belongs to no object with a shape.
@@ -150,14 +151,12 @@ def _best_iou(
     known = np.unique(np.array([o.id for o in result.located], np.int64))  # (M,)
     owner = np.searchsorted(known, detections.track_id)  # (D,)
     owner[~np.isin(detections.track_id, known)] = len(known)
-    best = np.zeros((len(frames), len(known) + 1, len(support)))  # the last: of no such object
+    best = np.zeros((len(frames), len(known) + 1, boxes.shape[1]))  # the last: of no such object
     shown = np.zeros((len(frames), len(known)), np.int64)
     for v, frame in enumerate(frames.tolist()):
         here = np.flatnonzero(detections.frame == frame)
         box = undistort_boxes(detections.xyxy[here], camera)  # (d, 4)
-        projected = quadrics.solid_boxes(shapes, support, cameras[v : v + 1])
-        projected = quadrics.clip_boxes(projected, (camera.width, camera.height))[0]
-        np.maximum.at(best[v], owner[here], quadrics.box_iou(projected, box[:, None]))
+        np.maximum.at(best[v], owner[here], quadrics.box_iou(boxes[v], box[:, None]))
         shown[v, owner[here][owner[here] < len(known)]] = 1
     best *= expected[:, None]
     share = (best[:, :-1] >= IOU[0]).sum(0) / np.maximum(shown.T @ expected, 1)  # (M, N)
@@ -166,9 +165,8 @@ def _best_iou(
 
 
 def _area(box: Array) -> Array:
-    """Return the areas (N,) of boxes (N, 4), 0 for NaN."""
-    side = np.nan_to_num(box[:, 2:] - box[:, :2]).clip(0)
-    return np.asarray(side[:, 0] * side[:, 1])
+    """Return the areas (...) of boxes (..., 4), 0 for NaN."""
+    return np.asarray(np.nan_to_num(box[..., 2:] - box[..., :2]).clip(0).prod(-1))
 
 
 def _behind_objects(
@@ -245,15 +243,3 @@ def _points_around(
         if behind.sum() > others.sum():
             through[k] = inside[behind]
     return occluded, beside, through
-
-
-def _independent(ray: Array, value: Array | BoolArray) -> float:
-    """Add the values of views; those of rays (n, 3) less than APART_DEG apart are averaged."""
-    total = 0.0
-    least = np.cos(np.radians(APART_DEG))
-    while len(ray):
-        near = ray @ ray[0] >= least
-        total += float(value[near].mean())
-        ray = ray[~near]
-        value = value[~near]
-    return total

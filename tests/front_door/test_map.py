@@ -7,6 +7,7 @@ scale.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -20,7 +21,9 @@ from scipy.spatial.transform import Rotation
 
 import reobj_track as rt
 from front_door.room import CAMERA, ROOM, ROOT, SMALL, cli, info, refusal
+from reobj.cameras import invert_rigid
 from reobj.maps.room_map import RoomMap, map_lock
+from reobj.maps.stage import OpenMap, place_recording
 from reobj.results.changes import read_changes
 
 LATER = ROOT / "examples" / "room_later"
@@ -65,7 +68,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("room.mp4", "detections.npz"):
         (base / "later" / name).symlink_to(LATER / name)
     moved_poses(LATER / "poses.txt", base / "later" / "moved.txt", scale=0.4)
-    assert cli(*monday(base)) == 0
+    assert cli(*monday(base), "--set", "map.pictures=true") == 0
     shutil.copy(base / "flat.map", base / "monday.map")
     assert cli(*tuesday(base)) == 0
     return base
@@ -121,6 +124,45 @@ def test_tuesday_has_the_numbers_of_monday(made: Path) -> None:
     assert ids(made / "tuesday", "gone") <= {known[BOTTLE], known[CHAIR]}
     new = ids(made / "tuesday", "new")
     assert number_of(second, BALL) in new and not new & set(first)
+
+
+def test_the_map_has_pictures_on_request(made: Path) -> None:
+    objects = RoomMap.load(made / "monday.map").objects
+    assert len(objects) > 5
+    for found in objects:
+        jpeg = np.frombuffer(found.observations[0].picture, np.uint8)
+        assert max(cv2.imdecode(jpeg, cv2.IMREAD_COLOR).shape) <= 160
+
+
+def test_a_recording_without_images_is_not_placed(made: Path, tmp_path: Path) -> None:
+    """Its boxes and poses are used as without a map."""
+    before = (made / "monday.map").read_bytes()
+    poses = rt.PosesConfig(camera=CAMERA, mode=str(ROOM / "poses.txt"))
+    config = rt.Config(poses=poses, output=rt.OutputConfig(overlay="none", scene=False))
+    config = dataclasses.replace(config, input=rt.InputConfig(every=8, stop=80))
+    given = {"detections": ROOM / "detections.npz", "map": made / "monday.map"}
+    result = rt.run(None, tmp_path, config, **given)
+    assert result.changes.refused == "a recording without images cannot be placed in a map"
+    assert result.located and (made / "monday.map").read_bytes() == before
+
+
+def test_images_between_keyframes_place_a_recording(made: Path) -> None:
+    """One keyframe alone is too few."""
+    video = rt.Video(ROOM / "room.mp4", rt.InputConfig(start=12, stop=24))
+    frames = np.arange(12, 24)
+    rows = np.loadtxt(ROOM / "poses.txt")[frames]
+    rotation = Rotation.from_quat(rows[:, 4:]).as_matrix()
+    truth = invert_rigid(np.concatenate([rotation, rows[:, 1:4, None]], 2))
+    camera = rt.Camera("PINHOLE", *video.size, tuple(map(float, CAMERA.split(","))))
+    poses = rt.Poses(
+        camera, frames, frames / 12, truth, np.full(12, "user"), "user",
+        points=np.zeros((1, 3)), visibility=np.zeros((1, 2), np.int64),
+    )  # fmt: skip
+    opened = OpenMap(made / "monday.map", RoomMap.load(made / "monday.map"), True)
+    placed = place_recording(opened, poses, video)
+    assert placed.placement.refused == "" and len(placed.features) == 12
+    moved = invert_rigid(placed.poses.cam_from_world)[:, :, 3] - rows[:, 1:4]
+    assert np.linalg.norm(moved, axis=1).max() < 0.03  # m
 
 
 def refitted(out: Path, *options: object) -> dict[int, tuple[str, list[int]]]:
