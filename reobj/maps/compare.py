@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from reobj.appearance.reid import SimilarityCalibration
-from reobj.maps.fusion import ObjectState
+from reobj.maps.fusion import ObjectState, alignment_jacobian
 from reobj.types import Array, BoolArray, Floats, IntArray, unit_rows
 from reobj.words import canonical, merged
 
@@ -454,15 +454,6 @@ def _log_normal(difference: Array, cov: Array) -> tuple[Array, Array]:
     solved = np.linalg.solve(cov, difference[..., None])[..., 0]
     square = (difference * solved).sum(-1)
     return -0.5 * (square + np.linalg.slogdet(cov)[1] + 3 * np.log(2 * np.pi)), square
-
-
-def alignment_jacobian(point: Array) -> Array:
-    """Return (M, 3, 7) derivatives of points by rotation vector, translation and log scale."""
-    x, y, z = point.T
-    zero = np.zeros_like(x)
-    rotation = np.array([[zero, z, -y], [-z, zero, x], [y, -x, zero]]).transpose(2, 0, 1)
-    translation = np.broadcast_to(np.eye(3), (len(point), 3, 3))
-    return np.concatenate([rotation, translation, point[:, :, None]], axis=2)
 
 
 def _variance_ratio(square: Array) -> float:

@@ -197,15 +197,22 @@ def observed_shapes(detected: Sequence[Observation], room: RoomMap) -> Shapes:
     alignment = {s.number: s.alignment_cov for s in room.sessions}
     sigma = np.array([alignment[o.session] for o in detected])  # (K, 7, 7)
     jacobian = np.zeros((len(center), 9, 7))
-    jacobian[:, :3, :3] = np.cross(np.eye(3), center[:, None]).swapaxes(1, 2)
-    jacobian[:, :3, 3:6] = np.eye(3)
-    jacobian[:, :3, 6] = center
+    jacobian[:, :3] = alignment_jacobian(center)
     jacobian[:, 3:6, 6] = 1.0
     jacobian[:, 6:, :3] = rot.swapaxes(1, 2)
     cov = _valid(np.array([o.cov for o in detected]))
     cov = cov + jacobian @ sigma @ jacobian.swapaxes(1, 2)
     cov[:, [0, 1, 2], [0, 1, 2]] += (PLACE_SIGMA_M / scale_of(room).value) ** 2
     return Shapes(center, log_half, rot, cov)
+
+
+def alignment_jacobian(point: Array) -> Array:
+    """Return (M, 3, 7) derivatives of points by rotation vector, translation and log scale."""
+    x, y, z = point.T
+    zero = np.zeros_like(x)
+    rotation = np.array([[zero, z, -y], [-z, zero, x], [y, -x, zero]]).transpose(2, 0, 1)
+    translation = np.broadcast_to(np.eye(3), (len(point), 3, 3))
+    return np.concatenate([rotation, translation, point[:, :, None]], axis=2)
 
 
 def _valid(cov: Array) -> Array:

@@ -20,11 +20,11 @@ from reobj.maps.compare import (
     FoundObject,
     PointMotion,
     Visibility,
-    alignment_jacobian,
     compare,
 )
 from reobj.maps.fusion import (
     ObjectState,
+    alignment_jacobian,
     object_state,
     scale_of,
     scaled_radius,

@@ -8,8 +8,8 @@ import numpy as np
 
 import quadrics
 from reobj.cameras import invert_rigid, undistort_boxes
-from reobj.maps.compare import Visibility, alignment_jacobian
-from reobj.maps.fusion import ObjectState, shapes_of
+from reobj.maps.compare import Visibility
+from reobj.maps.fusion import ObjectState, alignment_jacobian, shapes_of
 from reobj.objects.occlusion import entry_depths
 from reobj.results.result import Object, Result
 from reobj.types import Array, BoolArray, IntArray, Tracks

@@ -173,7 +173,10 @@ def refitted(out: Path, *options: object) -> dict[int, tuple[str, list[int]]]:
 
 @pytest.mark.parametrize(
     ("recording", "name", "frozen"),
-    [("monday", "flat.map", 0), ("tuesday", "monday.map", 1)],
+    [
+        pytest.param("monday", "flat.map", 0, marks=pytest.mark.slow),
+        ("tuesday", "monday.map", 1),
+    ],
 )
 def test_refits_keep_all_numbers(desk: Path, recording: str, name: str, frozen: int) -> None:
     """Those of the map, and those of doubtful objects, which the map does not have."""
@@ -230,6 +233,7 @@ def test_places_are_true_in_the_world_of_the_map(made: Path) -> None:
     assert changes.localised_frames == changes.tried_frames == 15 and changes.sigma_m < 0.01
 
 
+@pytest.mark.slow
 def test_a_recording_that_is_run_again_keeps_its_numbers(desk: Path) -> None:
     """Also the chair, whose later place only the user could tell."""
     numbers = true_of(desk / "monday", ROOM)
@@ -248,6 +252,7 @@ def test_a_recording_that_is_run_again_keeps_its_numbers(desk: Path) -> None:
     assert after.next_id == before.next_id and after.next_session == before.next_session
 
 
+@pytest.mark.slow
 def test_a_renamed_copy_of_a_recording_is_its_session(
     desk: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
