@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import multiprocessing
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +12,9 @@ import pytest
 from map_worlds import a_map, a_session, observed, random_map, some_points, true_shape
 
 from reobj.files import load_npz, save_npz
-from reobj.maps.corrections import delete, forget, merge, rename
+from reobj.maps.corrections import forget, merge, rename
 from reobj.maps.fusion import object_state
-from reobj.maps.room_map import MapObject, Observation, RoomMap, map_lock
+from reobj.maps.room_map import MapObject, Observation, RoomMap
 from reobj.types import ReobjError
 
 HERE = true_shape()
@@ -202,46 +201,11 @@ def test_map_that_could_not_be_read_is_not_written(room: RoomMap, saved: Path) -
     assert saved.read_bytes() == content
 
 
-# ---- Lock ----
-
-
-def _try_lock(path: Path, answer: Any) -> None:
-    try:
-        with map_lock(path):
-            answer.put("taken")
-    except ReobjError as error:
-        answer.put(str(error))
-
-
-def test_second_run_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "flat.map"
-    context = multiprocessing.get_context("spawn")
-    answer = context.SimpleQueue()
-
-    def second() -> str:
-        other = context.Process(target=_try_lock, args=(path, answer))
-        other.start()
-        other.join()
-        return str(answer.get())
-
-    with map_lock(path):
-        assert "another run is updating this map; wait for it" in second()
-    assert second() == "taken"
-
-
 # ---- Corrections ----
 
 
 def statuses(found: MapObject) -> list[tuple[int, str]]:
     return [(o.session, o.status) for o in found.observations]
-
-
-def test_forgotten_session_leaves_neither_observations_nor_points(room: RoomMap) -> None:
-    for session in (3, "3", "day3.mp4"):
-        left = forget(room, session)
-        assert [s.number for s in left.sessions] == [1, 2] and left.next_session == 4
-        assert {o.session for found in left.objects for o in found.observations} == {1, 2}
-        assert set(left.points.session) == {1, 2}
 
 
 def test_object_of_the_forgotten_session_alone_disappears(tmp_path: Path) -> None:
@@ -282,17 +246,6 @@ def test_status_after_a_forgotten_session(before: str, session: int, after: str)
     assert " ".join(o.status for o in left.observations) == after
 
 
-def test_unknown_sessions_are_named() -> None:
-    sessions = (a_session(1), a_session(2), a_session(3, name="day1.mp4"))
-    room = RoomMap(sessions=sessions, next_session=4)
-    with pytest.raises(ReobjError, match=r"no session 'x' in the map; it has 1 \(day1.mp4\), 2 \("):
-        forget(room, "x")
-    with pytest.raises(ReobjError, match=r"2 sessions are called 'day1.mp4'; give a number: 1 "):
-        forget(room, "day1.mp4")
-    with pytest.raises(ReobjError, match="it has none"):
-        forget(RoomMap(), 1)
-
-
 def test_merged_object_has_the_observations_of_both() -> None:
     """Seen under another number after it had moved: one object that moved."""
     first = [observed(1, "new", HERE), Observation(2, "gone"), Observation(3, "gone")]
@@ -320,29 +273,3 @@ def test_merged_duplicates_of_one_session() -> None:
     assert found.observations[0].classes == {"chair": 5.0, "sofa": 2.0}
     (other,) = merge(a_map([first, [observed(2, "new", near)]]), 1, 2).objects
     assert statuses(other) == [(1, "new"), (2, "stayed")]  # 2 cm is no move
-
-
-def test_merge_of_unknown_or_same_objects() -> None:
-    made = a_map([[observed(1, "new", HERE)], [observed(1, "new", THERE)]])
-    with pytest.raises(ReobjError, match="no object 7 in the map; it has 1, 2"):
-        merge(made, 1, 7)
-    with pytest.raises(ReobjError, match="objects 2 and 2 are the same"):
-        merge(made, 2, 2)
-    with pytest.raises(ReobjError, match="objects 1 and 2 are the same: 1"):
-        merge(merge(made, 1, 2), 1, 2)
-
-
-def test_renamed_and_deleted_objects(tmp_path: Path) -> None:
-    made = a_map([[observed(1, "new", HERE)], [observed(1, "new", THERE)]])
-    changed = delete(rename(made, 2, " armchair "), 2)
-    changed.save(tmp_path / "a.map")
-    read = RoomMap.load(tmp_path / "a.map")
-    assert [(o.id, o.name, o.deleted) for o in read.objects] == [
-        (1, "", False), (2, "armchair", True),
-    ]  # fmt: skip
-    assert not delete(read, 2, deleted=False).objects[1].deleted
-    for name in ("", "  ", "a\x1bb", "x" * 201):
-        with pytest.raises(ReobjError, match="is no name of an object"):
-            rename(made, 2, name)
-    with pytest.raises(ReobjError, match="no object 3 in the map"):
-        delete(made, 3)

@@ -159,6 +159,8 @@ def test_export_as_ply_has_the_present_objects(path: Path) -> None:
     [
         (("--forget", "sunday"), "no session 'sunday' in the map; it has 1 (monday.mp4), 2 (tue"),
         (("--delete", 1, "--merge", 1, 9), "no object 9 in the map; it has 1, 2, 3, 4"),
+        (("--merge", 2, 2), "objects 2 and 2 are the same"),
+        (("--rename", 1, "a\x1bb"), "is no name of an object"),
         (("--rename", "chair", "x"), "expected the number of an object"),
         (("-o", "a.ply"), "give --export too"),
         (("--export", "csv", "-o", "flat.map"), "is the map; give another file"),
