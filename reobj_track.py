@@ -95,12 +95,9 @@ from reobj.files import (
     shortened,
     wrapped,
 )
-from reobj.maps.corrections import corrected
-from reobj.maps.folder_map import FolderMap
-from reobj.maps.fusion import object_state
-from reobj.maps.known import class_ids, ellipsoid_map_of, embeddings_of
+from reobj.maps.corrections import FolderMap, corrected
+from reobj.maps.fusion import class_ids, ellipsoid_map_of, embeddings_of, object_state
 from reobj.maps.listing import MAP_EXPORTS, export_map, listing
-from reobj.maps.placement import PlacementOptions
 from reobj.maps.room_map import RoomMap, map_lock
 from reobj.maps.stage import (
     MapConfig,
@@ -109,7 +106,6 @@ from reobj.maps.stage import (
     finish_map,
     move_models,
     opened_map,
-    place_objects,
     place_recording,
     session_key,
 )
@@ -133,7 +129,6 @@ from reobj.options import (
     write_config,
 )
 from reobj.poses.estimate import PosesConfig, estimate_poses
-from reobj.poses.intrinsics import parse_camera
 from reobj.poses.stage import (
     checked_poses,
     poses_key,
@@ -1430,20 +1425,18 @@ def run(
         if poses is not None:
             log.info("%s", poses.cameras_text)
         placed = None
-        if room is not None and poses is not None and (poses.known.any() or room.room.sessions):
+        if room is not None and poses is not None and poses.known.any():
             placed, models = _place(job, room, poses, models)
             poses = placed.poses
         if not tracks:
             result = _track_video(job, detected, poses, viewer)
         log.info("identities: %d", len(np.unique(result.tracks.track_id)))
         result = dataclasses.replace(result, poses=poses)
-        fitted: Result | None = None
-        if room is not None and placed is not None:
-            result, placed, models, fitted = _place_by_objects(job, room, result, placed, models)
+        if placed is not None:
+            result = _without_moved_boxes(result, placed)
         warnings = workspace.save_last(result, result.poses, models)
-        result = fitted or result
         result = dataclasses.replace(result, warnings=[*result.warnings, *warnings])
-        result = _finish(job, result, room, placed, fit=fitted is None)
+        result = _finish(job, result, room, placed)
         if viewer is not None:
             viewer.show(result.without_doubtful(), Path("rerun"), images=not viewer.followed)
         return result
@@ -1697,45 +1690,10 @@ def _given_tracks(
 def _place(job: _Job, room: OpenMap, poses: Poses, models: list[Path]) -> tuple[Placed, list[Path]]:
     """Place the cameras, and their COLMAP models, in the world of the map."""
     with job.timed("map"):
-        camera = parse_camera(
-            job.config.poses.camera, job.video.size, job.config.poses.camera_format
-        )
-        options = PlacementOptions(size_px=job.config.poses.size_px)
-        placed = place_recording(room, poses, job.video, options, job.progress, camera)
-        return placed, _moved_models(job, models, poses, placed)
-
-
-def _moved_models(job: _Job, models: list[Path], poses: Poses, placed: Placed) -> list[Path]:
-    """Copy the COLMAP models into the world of the map.
-
-    Args:
-        poses: before they were placed.
-    """
-    folder = job.workspace.path("placed", job.video.fingerprint).with_suffix(".sparse")
-    return move_models(models, poses, placed, lambda k: part_path(folder, k))
-
-
-def _place_by_objects(
-    job: _Job, room: OpenMap, result: Result, placed: Placed, models: list[Path]
-) -> tuple[Result, Placed, list[Path], Result | None]:
-    """Place the cameras by the objects of the recording, if its points match too few images.
-
-    Returns:
-        result, cameras, COLMAP models; the result with fitted objects, None if the cameras moved
-        or points placed them.
-    """
-    if not placed.unmatched:
-        return _without_moved_boxes(result, placed), placed, models, None
-    poses = placed.poses
-    with job.timed("objects"):
-        fitted = _fit_objects(job, result)
-    with job.timed("map"):
-        placed = place_objects(room.room, fitted, _embedder_key(job), placed)
-        models = _moved_models(job, models, poses, placed)
-    if placed.placement is not None and placed.placement.refused:
-        return result, placed, models, fitted
-    moved = dataclasses.replace(result, poses=placed.poses)
-    return _without_moved_boxes(moved, placed), placed, models, None
+        size_px = job.config.poses.size_px
+        placed = place_recording(room, poses, job.video, size_px, job.progress)
+        folder = job.workspace.path("placed", job.video.fingerprint).with_suffix(".sparse")
+        return placed, move_models(models, poses, placed, lambda k: part_path(folder, k))
 
 
 def _without_moved_boxes(result: Result, placed: Placed) -> Result:
@@ -1757,17 +1715,15 @@ def _finish(
     result: Result,
     room: OpenMap | None = None,
     placed: Placed | None = None,
-    fit: bool = True,
     links: Links | None = None,
 ) -> Result:
     """Link tracklets, fit one shape per object, and write the map and the output folder.
 
     Args:
-        fit: False: the result has the objects already. links: of the last result of the folder.
+        links: of the last result of the folder.
     """
-    if fit:
-        with job.timed("objects"):
-            result = _fit_objects(job, result, links)
+    with job.timed("objects"):
+        result = _fit_objects(job, result, links)
     if room is not None:
         with job.timed("map"):
             path = job.workspace.out / OutputFile.CHANGES

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from simulated import CAMERA as WIDE
-from simulated import SIZE, chair_solids, walk
+from simulated import SIZE, walk
 
 import quadrics
 import reobj_track as rt
@@ -15,9 +14,6 @@ from reobj.tracking.ellipsoid_map import (
     iou_within_uncertainty,
     project_depth_intervals,
     project_half_intervals,
-    quick_fit,
-    rough_sizes,
-    usual_size,
 )
 from reobj.types import box_iou, xyxy_from_cxcywh
 from reobj.visible_points import VisiblePoints
@@ -83,19 +79,7 @@ def test_ellipsoids_are_estimated_and_projected() -> None:
         x1, y1, x2, y2 = outline(ellipsoid, view_at(0.3, 8))
         np.testing.assert_allclose(box, [(x1 + x2) / 2, (y1 + y2) / 2, x2 - x1, y2 - y1], atol=3)
     assert np.isnan(projected[2:]).all()
-
-
-def test_ellipsoids_out_of_view_are_not_projected() -> None:
-    """Half outside to the left: clipped, if enough of it is inside; behind the camera: none."""
-    ellipsoids = mapped([ball(0)], WALK)
-    x1, y1, x2, y2 = outline(ball(0), view_at(0, 33.5))
-    assert x1 < -10 and x2 > 20
-    inside = x2 / (x2 - x1)
-    found = ellipsoids.project(view_at(0, 33.5), SIZE, inside - 0.1)[0]
-    np.testing.assert_allclose(found, [x2 / 2, (y1 + y2) / 2, x2, y2 - y1], atol=4)
-    assert np.isnan(ellipsoids.project(view_at(0, 33.5), SIZE, inside + 0.1)[0]).all()
-    for turn in (90, 180):
-        assert np.isnan(ellipsoids.project(view_at(0, turn), SIZE, 0.0)[0]).all()
+    assert np.isnan(ellipsoids.project(view_at(0, 180), SIZE, 0.0)).all()  # behind the camera
 
 
 @pytest.mark.parametrize(("length", "known"), [(0.2, True), (6.0, False)])
@@ -110,16 +94,6 @@ def test_without_parallax_there_is_no_ellipsoid(walked: float, known: bool) -> N
     xs = np.linspace(-walked / 2, walked / 2, 12)
     views = [view_at(x, turn) for x, turn in zip(xs, np.linspace(-10, 10, 12), strict=True)]
     assert bool(mapped([ball(0)], views).known[0]) is known
-
-
-def test_random_boxes_give_no_ellipsoid() -> None:
-    ellipsoids = EllipsoidMap()
-    rng = np.random.default_rng(3)
-    for i, view in enumerate(WALK):
-        corner, side = rng.uniform(0, 400, 2), rng.uniform(10, 80, 2)
-        ellipsoids.add(5 * i, one(), np.concatenate([corner, corner + side])[None], view)
-        ellipsoids.refit(SIZE)
-    assert not ellipsoids.known[0]
 
 
 def test_outlier_views_do_not_move_an_ellipsoid() -> None:
@@ -159,15 +133,7 @@ def test_kept_views_are_bounded_and_cover_all_directions() -> None:
     assert np.diff(frames).max() < 200
 
 
-def test_a_view_without_parallax_is_not_kept() -> None:
-    """A camera that rotates only; at 1 degree of parallax the second view is kept."""
-    ellipsoids = EllipsoidMap()
-    for frame, (x, turn) in enumerate([(0, 0), (0, 3), (0, -3), (0.06, 0), (0.08, 0), (0.1, 0)]):
-        ellipsoids.add(frame, one(), outline(ball(0), view_at(x, turn))[None], view_at(x, turn))
-    assert sorted(f for f in ellipsoids.frame[0].tolist() if f >= 0) == [0, 4]
-
-
-@pytest.mark.parametrize("scale", [1e-3, 0.1, 7.3, 1e3])
+@pytest.mark.parametrize("scale", [1e-3, 7.3])
 def test_the_unit_of_the_world_does_not_matter(scale: float) -> None:
     objects = [ball(-0.5), ball(0.6, (0.3, 0.2, 0.25))]
     ellipsoids = EllipsoidMap()
@@ -178,21 +144,6 @@ def test_the_unit_of_the_world_does_not_matter(scale: float) -> None:
     ellipsoids.refit(SIZE)
     assert ellipsoids.known[:2].all()
     np.testing.assert_allclose(ellipsoids.ends[:2] / scale, own.ends[:2], rtol=1e-4, atol=1e-5)
-
-
-def test_rough_sizes_are_near_the_true_ones() -> None:
-    """Chairs of .6 to .8 m; NaN without parallax or detections."""
-    poses = walk(8)
-    cams = WIDE.K @ poses.cam_from_world
-    boxes = quadrics.solid_boxes(chair_solids(), "box", cams)  # (F, 3, 4)
-    boxes[:, 2] = np.nan
-    found = rough_sizes(boxes, cams)
-    assert ((found[:, :2] > 0.6) & (found[:, :2] < 1.1)).all() and np.isnan(found[:, 2]).all()
-    assert np.isnan(rough_sizes(boxes[:1].repeat(3, 0), cams[:1].repeat(3, 0))).all()
-    assert usual_size(np.full((2, 3), np.nan)) == 1.0
-    fits = quick_fit(boxes[:, :2], cams, SIZE, usual_size(found))
-    error = fits.ellipsoids.center_in_world - chair_solids().center_in_world[:2]
-    assert np.linalg.norm(error, axis=1).max() < 0.1
 
 
 # ---- Depth intervals ----

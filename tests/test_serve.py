@@ -28,8 +28,8 @@ from simulated import SIZE, tracks_of, unlinked, walk
 from test_scene import SCREENSHOTS, complaints
 
 import reobj_track as rt
-from reobj.maps.earlier import earlier_sessions
-from reobj.maps.folder_map import FolderMap
+from reobj.maps.corrections import FolderMap
+from reobj.maps.listing import earlier_sessions
 from reobj.maps.stage import session_key
 from reobj.results.edits import read_edits
 from reobj.results.workspace import Workspace

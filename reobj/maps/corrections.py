@@ -1,4 +1,4 @@
-"""Corrections of a map by the user: forget a session, merge, rename and delete objects.
+"""Corrections of a map: forget a session, merge, rename and delete objects; undo for `serve`.
 
 All functions return a new map.
 """
@@ -6,13 +6,19 @@ All functions return a new map.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import hashlib
+import json
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 
-from reobj.files import spans
-from reobj.maps.fusion import CHI2_3, shapes_of
-from reobj.maps.room_map import MapObject, Observation, RoomMap, Session
+from reobj.files import atomic, spans
+from reobj.maps.fusion import CHI2_3, observed_shapes
+from reobj.maps.listing import earlier_sessions
+from reobj.maps.room_map import MapObject, MapPoints, Observation, RoomMap, Session, map_lock
+from reobj.results.changes import EarlierSession
 from reobj.results.edits import Edits
 from reobj.types import CLASS_NAME_MAX, ReobjError, visible_name
 
@@ -145,7 +151,7 @@ def _joined(a: MapObject, b: MapObject, room: RoomMap) -> tuple[Observation, ...
 
 def _elsewhere(before: Observation, after: Observation, room: RoomMap) -> bool:
     """Test whether the centres of two observations differ by more than 3 sigma."""
-    shapes = shapes_of([before, after], room)
+    shapes = observed_shapes([before, after], room)
     shift = shapes.center[1] - shapes.center[0]
     distance = shift @ np.linalg.solve(shapes.cov[:, :3, :3].sum(0), shift)
     return bool(distance > CHI2_3)
@@ -164,22 +170,15 @@ def rename(room: RoomMap, number: int, name: str) -> RoomMap:
     return _with(room, dataclasses.replace(room.object(number), name=name))
 
 
-def delete(room: RoomMap, number: int) -> RoomMap:
+def delete(room: RoomMap, number: int, deleted: bool = True) -> RoomMap:
     """Mark an object as none: it is matched in later sessions and left out of results.
 
+    Args:
+        deleted: False undoes it.
     Raises:
         ReobjError: no such object.
     """
-    return _with(room, dataclasses.replace(room.object(number), deleted=True))
-
-
-def undelete(room: RoomMap, number: int) -> RoomMap:
-    """Undo `delete`.
-
-    Raises:
-        ReobjError: no such object.
-    """
-    return _with(room, dataclasses.replace(room.object(number), deleted=False))
+    return _with(room, dataclasses.replace(room.object(number), deleted=deleted))
 
 
 def _with(room: RoomMap, changed: MapObject, without: int = 0) -> RoomMap:
@@ -243,10 +242,120 @@ def corrected(
         room = rename(room, number, name)
         found = room.object(number)
         lines.append(f"renamed: object {found.id} is called {found.name}")
-    for number in deleted:
-        room = delete(room, number)
-        lines.append(f"deleted: object {room.object(number).id}")
-    for number in undeleted:
-        room = undelete(room, number)
-        lines.append(f"no longer deleted: object {room.object(number).id}")
+    for text, state, chosen in (
+        ("deleted", True, deleted),
+        ("no longer deleted", False, undeleted),
+    ):
+        for number in chosen:
+            room = delete(room, number, state)
+            lines.append(f"{text}: object {room.object(number).id}")
     return room, lines
+
+
+# ---- Undo of corrections that were saved in the viewer ------------------------------------------
+
+
+class FolderMap:
+    """The map of an output folder, and copies of it from before corrections were saved.
+
+    Beside a copy lies a file of digests (`_digest`): of the map when it was copied, and with the
+    corrections. Undo restores the copy if the map still has one of them: then no other run, and no
+    `map` command, has written it. The recording itself may have been fitted again since.
+
+    Args:
+        path: of the map. recording: key of the recording, as `session_key` returns it.
+        frozen: fits of the folder do not change the map.
+    """
+
+    def __init__(self, path: Path, recording: str, frozen: bool) -> None:
+        self.path = path
+        self.recording = recording
+        self.frozen = frozen
+
+    def others(self) -> Sequence[EarlierSession]:
+        """Return the other recordings that the map has now.
+
+        Raises:
+            ReobjError: the map is missing or damaged.
+        """
+        return earlier_sessions(RoomMap.load(self.path), self.path, self.recording)
+
+    def keep(self, copy: Path, edits: Edits) -> None:
+        """Copy the map before corrections are applied.
+
+        Args:
+            copy: file to write. edits: the corrections; their digest is stored in advance, for a
+                program that is killed after it applied them.
+        Raises:
+            ReobjError: the map is missing or damaged.
+        """
+        before = RoomMap.load(self.path)
+        _write(copy, self.path.read_bytes())
+        self._add(copy, before, with_edits(before, edits))
+
+    def applied(self, copy: Path) -> None:
+        """Store the digest of the map with the corrections that were applied after `copy`."""
+        self._add(copy, RoomMap.load(self.path))
+
+    def restore(self, copy: Path) -> Callable[[], None]:
+        """Replace the map by a copy.
+
+        Returns:
+            a function that undoes it, unless another run has written the map since.
+        Raises:
+            ReobjError: another run writes the map, or has changed it since; it stays as it is.
+        """
+        with map_lock(self.path):
+            after = self.path.read_bytes()
+            if self._digest(RoomMap.load(self.path)) not in _digests(copy):
+                raise ReobjError(
+                    f"{self.path}: another command has changed the map since this save, and undo "
+                    "would lose it; nothing was undone. `map MAP --rename`, `--undelete` correct it"
+                )
+            _write(self.path, copy.read_bytes())
+
+        def put_back() -> None:
+            with map_lock(self.path):
+                if self._digest(RoomMap.load(self.path)) == self._digest(RoomMap.load(copy)):
+                    _write(self.path, after)
+
+        return put_back
+
+    def _add(self, copy: Path, *rooms: RoomMap) -> None:
+        """Add digests of maps to those of a copy."""
+        found = dict.fromkeys([*_digests(copy), *map(self._digest, rooms)])
+        _write(_digests_path(copy), "\n".join(found).encode())
+
+    def _digest(self, room: RoomMap) -> str:
+        """Hash the corrections of a map, and all that its other recordings added, except points.
+
+        A refit of the recording itself does not change it.
+        """
+        corrections = [[o.id, o.name, o.deleted] for o in room.objects if o.name or o.deleted]
+        merged = sorted(room.merged.items())
+        own = room.session_of(self.recording)
+        others = room if own is None else forget(room, own.number)
+        largest = 1 << 30  # free numbers grow with each refit
+        others = dataclasses.replace(
+            others, points=MapPoints.empty(), next_id=largest, next_session=largest, merged={}
+        )
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "others.map"
+            others.save(file)  # the same map gives the same bytes
+            content = file.read_bytes()
+        return hashlib.sha256(content + json.dumps([corrections, merged]).encode()).hexdigest()
+
+
+def _digests_path(copy: Path) -> Path:
+    return copy.with_suffix(".digests")
+
+
+def _digests(copy: Path) -> list[str]:
+    """Read the digests of a copy."""
+    path = _digests_path(copy)
+    return path.read_text(encoding="utf-8").split() if path.is_file() else []
+
+
+def _write(path: Path, content: bytes) -> None:
+    with atomic(path) as part:
+        part.write_bytes(content)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,7 +12,10 @@ from scipy.spatial.transform import Rotation
 import quadrics
 from reobj.cameras import quat_wxyz_from_matrix
 from reobj.maps.room_map import MapObject, Observation, RoomMap, Session
-from reobj.types import Array, BoolArray, Floats, ReobjError, unit_rows
+from reobj.results.result import Object
+from reobj.tracking.ellipsoid_map import EllipsoidMap
+from reobj.types import Array, BoolArray, Embeddings, Floats, IntArray, ReobjError, unit_rows
+from reobj.words import meant
 
 PLACE_SIGMA_M = 0.01  # of a place between sessions: cleaning and leaning shift an object by 1 cm
 CHI2_3 = 14.16  # 3 sigma of a normal variable (99.73 %), for the squared distance in 3 dimensions
@@ -31,7 +35,6 @@ class ObjectState:
         foreground, background: mean unit embeddings of one model (`embedder`); empty: none.
         detection_rate: probability of a detection in a view in which it is expected.
         log_odds: that it is a real object.
-        last_seen: number of the last session in which it was detected.
     """
 
     id: int
@@ -49,7 +52,6 @@ class ObjectState:
     embedder: str
     detection_rate: float
     log_odds: float
-    last_seen: int
 
 
 def object_state(found: MapObject, room: RoomMap) -> ObjectState:
@@ -91,8 +93,15 @@ def object_state(found: MapObject, room: RoomMap) -> ObjectState:
         embedder=embedder,
         detection_rate=_detection_rate(expected, missed),
         log_odds=float(np.clip(sum(o.log_odds for o in observations), -10.0, 10.0)),
-        last_seen=detected[-1].session,
     )
+
+
+def state_before(found: MapObject, session: int, room: RoomMap) -> ObjectState | None:
+    """Return the state of an object before a session; None: it was not known."""
+    rows = tuple(o for o in found.observations if o.session < session)
+    if not any(o.detected for o in rows):
+        return None
+    return object_state(dataclasses.replace(found, observations=rows), room)
 
 
 def _detection_rate(
@@ -130,6 +139,29 @@ def _embeddings(detected: Sequence[Observation], room: RoomMap) -> tuple[str, Fl
     return embedder, mean("foreground"), mean("background")
 
 
+def shapes_of(objects: Sequence[ObjectState] | Sequence[Object]) -> quadrics.Ellipsoids:
+    """Return the ellipsoids of objects, in the world of the map, inscribed in their shapes."""
+    wxyz = np.array([o.quat_wxyz for o in objects]).reshape(-1, 4)
+    axes = Rotation.from_quat(wxyz[:, [1, 2, 3, 0]]).as_matrix() if len(objects) else wxyz
+    return quadrics.Ellipsoids(
+        np.array([o.center for o in objects]).reshape(-1, 3),
+        np.array([o.half_axes for o in objects]).reshape(-1, 3),
+        axes.reshape(-1, 3, 3),
+    )
+
+
+def scaled_radius(xyz: Array, shapes: quadrics.Ellipsoids, k: int | IntArray) -> Array:
+    """Return squared distances (N,) of points (N, 3) from the centre of a shape, in half axes.
+
+    Args:
+        k: row of the shape, or (N,) that of each point.
+    """
+    turn = np.broadcast_to(shapes.world_from_obj[k], (len(xyz), 3, 3))
+    offset = xyz - shapes.center_in_world[k]
+    scaled = np.einsum("ni,nij->nj", offset, turn) / shapes.half_axes[k]
+    return np.asarray((scaled**2).sum(1))
+
+
 # ---- Shape -------------------------------------------------------------------------------------
 
 
@@ -148,7 +180,7 @@ class Shapes:
     cov: Array
 
 
-def shapes_of(detected: Sequence[Observation], room: RoomMap) -> Shapes:
+def observed_shapes(detected: Sequence[Observation], room: RoomMap) -> Shapes:
     """Stack the shapes of K observations and add the uncertainty of their alignment.
 
     A similarity x -> exp(scale) exp([rotation]) x + translation about the origin of the world acts
@@ -165,15 +197,22 @@ def shapes_of(detected: Sequence[Observation], room: RoomMap) -> Shapes:
     alignment = {s.number: s.alignment_cov for s in room.sessions}
     sigma = np.array([alignment[o.session] for o in detected])  # (K, 7, 7)
     jacobian = np.zeros((len(center), 9, 7))
-    jacobian[:, :3, :3] = np.cross(np.eye(3), center[:, None]).swapaxes(1, 2)
-    jacobian[:, :3, 3:6] = np.eye(3)
-    jacobian[:, :3, 6] = center
+    jacobian[:, :3] = alignment_jacobian(center)
     jacobian[:, 3:6, 6] = 1.0
     jacobian[:, 6:, :3] = rot.swapaxes(1, 2)
     cov = _valid(np.array([o.cov for o in detected]))
     cov = cov + jacobian @ sigma @ jacobian.swapaxes(1, 2)
     cov[:, [0, 1, 2], [0, 1, 2]] += (PLACE_SIGMA_M / scale_of(room).value) ** 2
     return Shapes(center, log_half, rot, cov)
+
+
+def alignment_jacobian(point: Array) -> Array:
+    """Return (M, 3, 7) derivatives of points by rotation vector, translation and log scale."""
+    x, y, z = point.T
+    zero = np.zeros_like(x)
+    rotation = np.array([[zero, z, -y], [-z, zero, x], [y, -x, zero]]).transpose(2, 0, 1)
+    translation = np.broadcast_to(np.eye(3), (len(point), 3, 3))
+    return np.concatenate([rotation, translation, point[:, :, None]], axis=2)
 
 
 def _valid(cov: Array) -> Array:
@@ -215,7 +254,7 @@ def _fused(detected: Sequence[Observation], room: RoomMap) -> tuple[str, Shapes]
     last = [o for o, at_place in zip(detected, here, strict=True) if at_place]
     support = max(last, key=lambda o: o.views).support
     same = np.array([o.support == support for o in detected])
-    shapes = shapes_of(detected, room)
+    shapes = observed_shapes(detected, room)
     turning = np.einsum("kii->k", shapes.cov[:, 6:, 6:])
     ref = int(np.where(here & same, turning, np.inf).argmin())
     upright = room.up is not None or support == "cylinder"
@@ -353,3 +392,45 @@ def _scale_variance(session: Session) -> float:
     At least (1e-6)^2: exact poses have sigma 0.
     """
     return max(session.scale_rel_sigma**2 + float(session.alignment_cov[6, 6]), 1e-12)
+
+
+# ---- For a tracker that starts from a map -------------------------------------------------------
+
+
+def class_ids(states: Sequence[ObjectState], class_names: Sequence[str]) -> IntArray:
+    """Return the class id (N,) of each object: of its likeliest class in the names, -1: none."""
+    found = [[k for word in (s.class_name, *s.classes) for k in meant(word, class_names)[:1]]
+             for s in states]  # fmt: skip
+    return np.array([ids[0] if ids else -1 for ids in found], np.int64)
+
+
+def ellipsoid_map_of(states: Sequence[ObjectState]) -> EllipsoidMap:
+    """Return the ellipsoids of objects, inscribed in their shapes; unknown of objects now gone."""
+    made = EllipsoidMap()
+    if states:
+        shapes = shapes_of(states)
+        present = np.array([s.present for s in states])
+        center = np.where(present[:, None], shapes.center_in_world, np.nan)
+        ellipsoids = quadrics.Ellipsoids(center, shapes.half_axes, shapes.world_from_obj)
+        made.give(ellipsoids, np.array([s.cov[:3, :3] for s in states]))
+    return made
+
+
+def embeddings_of(states: Sequence[ObjectState], embedder: str) -> tuple[IntArray, Embeddings]:
+    """Return the mean embeddings of the objects that have some of an embedder.
+
+    Args:
+        embedder: key of the model. "": none.
+    Returns:
+        rows (n,) of the objects, and their embeddings; zeros for a background that is missing.
+    """
+    rows = [k for k, s in enumerate(states) if embedder and s.embedder == embedder]
+    rows = [k for k in rows if states[k].foreground.size]
+    fore = [states[k].foreground for k in rows]
+    if not rows:
+        return np.empty(0, np.int64), Embeddings.empty()
+    width = max(states[k].background.size for k in rows)
+    back = np.zeros((len(rows), width), np.float32)
+    for row, k in enumerate(rows):
+        back[row, : states[k].background.size] = states[k].background
+    return np.array(rows, np.int64), Embeddings(np.array(fore, np.float32), back)

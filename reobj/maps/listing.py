@@ -1,4 +1,4 @@
-"""What a map holds: as text for the terminal, and as PLY, CSV and JSON."""
+"""What a map holds: as text, as PLY, CSV and JSON, and its earlier recordings for the viewer."""
 
 from __future__ import annotations
 
@@ -9,15 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 import quadrics
 from reobj import __version__
 from reobj.files import atomic, cut, numbers, rounded, spans, texts_with_sigma
-from reobj.maps.fusion import ObjectState, object_state, scale_of
-from reobj.maps.room_map import MapObject, RoomMap
+from reobj.maps.fusion import ObjectState, object_state, scale_of, shapes_of, state_before
+from reobj.maps.room_map import MapObject, Observation, RoomMap, Session
+from reobj.results.changes import Change, Changes, EarlierSession, Shape
 from reobj.results.export_source import formula_safe
 from reobj.results.ply import write_ply
+from reobj.results.result import Object
 from reobj.types import Array, ReobjError, visible_name
 
 NAME_WIDTH = 24  # characters of a name in a table, as in the overlay
@@ -129,14 +130,7 @@ def export_map(room: RoomMap, to: str, path: Path) -> Path:
 def _write_ply(room: RoomMap, path: Path) -> None:
     """Write the shapes of the present objects as one mesh, world of the map."""
     states = [s for s in _states(room) if s.present and not s.deleted]
-    quat = np.array([s.quat_wxyz for s in states]).reshape(-1, 4)
-    rot = Rotation.from_quat(quat[:, [1, 2, 3, 0]]).as_matrix() if states else np.empty((0, 3, 3))
-    solids = quadrics.Ellipsoids(
-        np.array([s.center for s in states]).reshape(-1, 3),
-        np.array([s.half_axes for s in states]).reshape(-1, 3),
-        rot,
-    )
-    write_ply(path, solids, [s.id for s in states], [s.support for s in states])
+    write_ply(path, shapes_of(states), [s.id for s in states], [s.support for s in states])
 
 
 def _entry(found: MapObject, state: ObjectState, scale: quadrics.Scale) -> dict[str, Any]:
@@ -221,3 +215,90 @@ MAP_EXPORTS: dict[str, Callable[[RoomMap, Path], None]] = {
     "json": _write_json,
     "ply": _write_ply,
 }
+
+
+# ---- For the viewer ----------------------------------------------------------------------------
+
+
+def earlier_sessions(
+    room: RoomMap, path: Path, fingerprint: str, most: int = 20
+) -> tuple[EarlierSession, ...]:
+    """List the sessions of a map other than that of one video, in their order.
+
+    Objects that the user deleted are left out. Classes are those that the map has now.
+
+    Args:
+        path: of the map, for the summaries. most: sessions, the latest; an object takes 1.2 kB of
+            the page in each, without its picture.
+    """
+    shown = [(o, object_state(o, room).class_name) for o in room.objects if not o.deleted]
+    first = min((s.number for s in room.sessions), default=0)
+    others = [session for session in room.sessions if session.fingerprint != fingerprint]
+    return tuple(
+        _earlier_session(session, shown, room, path, session.number == first)
+        for session in others[-most:]
+    )
+
+
+def _earlier_session(
+    session: Session, shown: list[tuple[MapObject, str]], room: RoomMap, path: Path, is_first: bool
+) -> EarlierSession:
+    """Describe a session.
+
+    Args:
+        shown: objects and their classes. is_first: nothing can have changed.
+    """
+    objects = []
+    pictures = {}
+    lists: dict[str, Any] = {kind: [] for kind in Changes.KINDS}
+    for found, name in shown:
+        own = next((o for o in found.observations if o.session == session.number), None)
+        if own is None:
+            continue
+        if own.detected:
+            objects.append(_object(found.id, name, own, room))
+        if own.picture:
+            pictures[found.id] = own.picture
+        stayed = own.status == "stayed"
+        before = None if stayed else state_before(found, session.number, room)
+        change = _change(found.id, name, own, before, room)
+        if not change.fault(own.status):  # without it: the session before was forgotten
+            lists[own.status].append(change)
+    changes = None if is_first else Changes(str(path), session.name, **lists)
+    return EarlierSession(session.name, session.date, tuple(objects), changes, pictures)
+
+
+def _change(
+    number: int, name: str, own: Observation, before: ObjectState | None, room: RoomMap
+) -> Change:
+    """Describe what a session found out about an object."""
+    after = own.center if own.detected else None
+    if before is None:
+        return Change(number, name, None, after)
+    scale = scale_of(room)
+    distance = None
+    if after is not None and scale.source != "none":
+        distance = scale.value * float(np.linalg.norm(after - before.center))
+    shape = Shape(before.support, before.half_axes, before.quat_wxyz)
+    return Change(number, name, before.center, after, distance, before_shape=shape)
+
+
+def _object(number: int, name: str, own: Observation, room: RoomMap) -> Object:
+    """Return an object as a session saw it."""
+    scale = scale_of(room)
+    size = 2 * own.half_axes
+    return Object(
+        number,
+        name,
+        score=0.0,
+        status="ok",
+        reason="",
+        support=own.support,
+        center=own.center,
+        half_axes=own.half_axes,
+        quat_wxyz=own.quat_wxyz,
+        size=size,
+        size_m=None if scale.source == "none" else size * scale.value,
+        size_rel_sigma=np.sqrt(np.diag(own.cov)[3:6] + scale.rel_sigma**2),
+        cov=own.cov,
+    )

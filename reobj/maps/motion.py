@@ -16,50 +16,33 @@ import numpy as np
 import quadrics
 from reobj.cameras import Camera, Poses, import_pycolmap
 from reobj.maps.compare import FoundObject, PointMotion
-from reobj.maps.fusion import ObjectState
+from reobj.maps.fusion import ObjectState, scaled_radius, shapes_of
 from reobj.maps.object_points import ObjectView
-from reobj.maps.placement import unit_descriptors
+from reobj.maps.placement import best_features, unit_descriptors
 from reobj.maps.room_map import MapPoints
-from reobj.maps.visibility import shapes_of
 from reobj.types import Array, BoolArray, Floats, IntArray
 from reobj.words import merged
 
-
-@dataclass(frozen=True, slots=True)
-class MotionOptions:
-    """When points of a map object that are recognised give its motion.
-
-    Attributes:
-        ratio: largest ratio of the angles to the best point of the map object and to the best other
-            point: of the background, of an object of another class, or of the same object at
-            another place of it. (Objects of the same class do not compete: the points of identical
-            instances have the same descriptors.)
-        angle: largest angle between descriptors, radians.
-        same_point: cells of this share of the largest half axis hold one point.
-        own_spread: of the largest half axis: points of an object nearer to each other do not
-            compete.
-        error_px: largest error of an inlier, px of an image 640 px wide. (With 6 px, as in the
-            placement, any few points fit on a small object.)
-        points: least different points of a map object. inliers: least in an image that agrees.
-        agreeing: least images that agree.
-        trials: of RANSAC; enough for 15 % of inliers (1 - .15^3)^2000 = .1 %.
-        tilt_deg: an object that is turned over more than this needs `tilted` points.
-        bottom: share of the height over the lower end of the object, below which its points may
-            belong to what it stands on.
-    """
-
-    ratio: float = 0.85
-    angle: float = 0.6
-    same_point: float = 0.05
-    own_spread: float = 0.25
-    error_px: float = 3.0
-    points: int = 5
-    inliers: int = 2
-    agreeing: int = 2
-    trials: int = 2000
-    tilt_deg: float = 25.0
-    tilted: int = 12
-    bottom: float = 0.15
+# Largest ratio of the angles to the best point of the map object and to the best other point: of
+# the background, of an object of another class, or of the same object at another place of it.
+# (Objects of the same class do not compete: the points of identical instances have the same
+# descriptors.)
+RATIO = 0.85
+ANGLE = 0.6  # largest angle between descriptors, radians
+SAME_POINT = 0.05  # cells of this share of the largest half axis hold one point
+OWN_SPREAD = 0.25  # of the largest half axis: points of an object nearer than this do not compete
+# Largest error of an inlier, px of an image 640 px wide. (With 6 px, as in the placement, any few
+# points fit on a small object.)
+ERROR_PX = 3.0
+POINTS = 5  # least different points of a map object
+INLIERS = 2  # least in an image that agrees
+AGREEING = 2  # least images that agree
+TRIALS = 2000  # of RANSAC; enough for 15 % of inliers: (1 - .15^3)^2000 = .1 %
+TILT_DEG = 25.0  # an object that is turned over more than this needs TILTED points
+TILTED = 12
+# Share of the height over the lower end of the object, below which its points may belong to what
+# it stands on
+BOTTOM = 0.15
 
 
 def point_motions(
@@ -69,7 +52,6 @@ def point_motions(
     views: Sequence[ObjectView],
     poses: Poses,
     up: Array | None,
-    options: MotionOptions | None = None,
 ) -> list[dict[int, PointMotion]]:
     """Find the motions of map objects by their points.
 
@@ -80,8 +62,7 @@ def point_motions(
     Returns:
         for each found object, the motions of map objects onto it, by their number.
     """
-    options = options or MotionOptions()
-    search = _Search(points, states, up, options)
+    search = _Search(points, states, up)
     motions: list[dict[int, PointMotion]] = [{} for _ in found]
     in_place = _in_place(states, found)
     search.usable = [k for k in search.usable if not in_place[k].any()]
@@ -93,7 +74,7 @@ def point_motions(
         for k, match in search.match(view, poses) if view.identity in row_of else ():
             matches.setdefault((k, row_of[view.identity]), []).append(match)
     for (k, j), of_pair in sorted(matches.items()):
-        motion = _motion(states[k], found[j], of_pair, poses.camera, up, options)
+        motion = _motion(states[k], found[j], of_pair, poses.camera, up)
         if motion is not None:
             motions[j][states[k].id] = motion
     return motions
@@ -157,9 +138,7 @@ class _Search:
         points: MapPoints,
         states: Sequence[ObjectState],
         up: Array | None,
-        options: MotionOptions,
     ) -> None:
-        self.options = options
         row_of = {s.id: k for k, s in enumerate(states)}
         owner = np.array([row_of.get(int(i), -1) for i in points.object_id], np.int64)
         order = np.argsort(owner, kind="stable")
@@ -169,24 +148,26 @@ class _Search:
         self.descriptor = unit_descriptors(self.points.descriptor)
         shapes = shapes_of(states)
         # an object that moved has points at its earlier places too: they are of no use
-        inside = _scaled_radius(self.points.xyz, self.owner, shapes) < 1.1**2
-        self.above = _above_bottom(self.points.xyz, self.owner, shapes, up, options.bottom)
+        owned = np.flatnonzero(self.owner >= 0)
+        inside = np.zeros(len(self.owner), bool)
+        inside[owned] = scaled_radius(self.points.xyz[owned], shapes, self.owner[owned]) < 1.1**2
+        self.above = _above_bottom(self.points.xyz, self.owner, shapes, up)
         self.own = [np.flatnonzero((self.owner == k) & inside) for k in range(len(states))]
-        self.usable = [k for k, rows in enumerate(self.own) if len(rows) >= options.points]
+        self.usable = [k for k, rows in enumerate(self.own) if len(rows) >= POINTS]
         names = [merged(s.classes).keys() for s in states]
         self.group, self.first = np.unique(self.owner, return_index=True)
         self.rivals = np.array(
             [[g < 0 or not names[k] & names[g] for g in self.group] for k in range(len(states))]
         ).reshape(len(states), len(self.group))  # fmt: skip
-        self.apart = options.own_spread * np.array([s.half_axes.max() for s in states])
+        self.apart = OWN_SPREAD * np.array([s.half_axes.max() for s in states])
 
     def match(self, view: ObjectView, poses: Poses) -> list[tuple[int, _View]]:
         """Match the features in a box; return rows of map objects and their matches."""
         unit = unit_descriptors(view.descriptor)
-        least = float(np.cos(self.options.angle))
+        least = float(np.cos(ANGLE))
         on_objects = unit @ self.descriptor[self.tagged :].T  # (n, tagged)
         similar = np.flatnonzero(on_objects.max(1, initial=-1.0) > least)
-        if len(similar) < self.options.inliers:
+        if len(similar) < INLIERS:
             return []
         unit = unit[similar]
         cosine = np.hstack([unit @ self.descriptor[: self.tagged].T, on_objects[similar]])  # (n, N)
@@ -196,15 +177,15 @@ class _Search:
         for k in self.usable:
             of_object = cosine[:, self.own[k]]
             rows = np.flatnonzero(of_object.max(1) > least)
-            if len(rows) < self.options.inliers:
+            if len(rows) < INLIERS:
                 continue
             rival = best_of_group[np.ix_(rows, np.flatnonzero(self.rivals[k]))].max(1, initial=-1.0)
             feature, point = self._of_object(k, of_object[rows], rival)
-            if len(feature) < self.options.inliers:
+            if len(feature) < INLIERS:
                 continue
             xyz = self.points.xyz[point]
             xy = view.xy[similar[rows[feature]]]
-            still = _errors(xyz, xy, pose, poses.camera) < _limit(poses.camera, self.options)
+            still = _errors(xyz, xy, pose, poses.camera) < _limit(poses.camera)
             matches.append((k, _View(pose, xy, point, xyz, still, self.above[point])))
         return matches
 
@@ -221,28 +202,15 @@ class _Search:
         apart = np.linalg.norm(xyz[best, None] - xyz[None], axis=2) > self.apart[k]  # (n, P)
         rival = np.maximum(rival, np.where(apart, own, -1.0).max(1))
         angle = np.arccos(value.clip(-1, 1))
-        good = np.flatnonzero(angle < self.options.ratio * np.arccos(rival.clip(-1, 1)))
-        nearest = good[np.argsort(angle[good], kind="stable")]
-        _, first = np.unique(best[nearest], return_index=True)
-        feature = np.sort(nearest[first])
+        good = np.flatnonzero(angle < RATIO * np.arccos(rival.clip(-1, 1)))
+        feature = best_features(good, best, angle)
         return feature, rows[best[feature]]
 
 
-def _scaled_radius(xyz: Array, owner: IntArray, shapes: quadrics.Ellipsoids) -> Array:
-    """Return squared distances (N,) in half axes of the owner; infinite without an owner."""
-    radius = np.full(len(xyz), np.inf)
-    rows = np.flatnonzero(owner >= 0)
-    k = owner[rows]
-    offset = xyz[rows] - shapes.center_in_world[k]
-    scaled = np.einsum("ni,nij->nj", offset, shapes.world_from_obj[k]) / shapes.half_axes[k]
-    radius[rows] = (scaled**2).sum(1)
-    return radius
-
-
 def _above_bottom(
-    xyz: Array, owner: IntArray, shapes: quadrics.Ellipsoids, up: Array | None, share: float
+    xyz: Array, owner: IntArray, shapes: quadrics.Ellipsoids, up: Array | None
 ) -> BoolArray:
-    """Mark points (N,) that are above a share of the height of their object; all without `up`."""
+    """Mark points (N,) that are above BOTTOM of the height of their object; all without `up`."""
     above = np.ones(len(xyz), bool)
     if up is None:
         return above
@@ -251,7 +219,7 @@ def _above_bottom(
     height = (xyz[rows] - shapes.center_in_world[k]) @ up
     axes = np.einsum("i,nij->nj", up, shapes.world_from_obj) * shapes.half_axes
     half = np.linalg.norm(axes, axis=1)[k]  # of the ellipsoid along `up`
-    above[rows] = height > (2 * share - 1) * half
+    above[rows] = height > (2 * BOTTOM - 1) * half
     return above
 
 
@@ -262,9 +230,9 @@ def _errors(xyz: Array, xy: Array, cam_from_map: Array, camera: Camera) -> Array
     return np.asarray(np.nan_to_num(error, nan=np.inf))
 
 
-def _limit(camera: Camera, options: MotionOptions) -> float:
+def _limit(camera: Camera) -> float:
     """Return the largest error of an inlier in native pixels."""
-    return options.error_px * max(max(camera.width, camera.height) / 640, 1.0)
+    return ERROR_PX * max(max(camera.width, camera.height) / 640, 1.0)
 
 
 # ---- Motion ------------------------------------------------------------------------------------
@@ -276,14 +244,13 @@ def _motion(
     views: Sequence[_View],
     camera: Camera,
     up: Array | None,
-    options: MotionOptions,
 ) -> PointMotion | None:
     """Return the motion of a map object that most points follow; None: no images agree."""
-    still = _stayed(state, found, views, camera, options)
-    moved = _moved(state, found, views, camera, options)
-    if moved is not None and up is not None and moved.inliers < options.tilted:
+    still = _stayed(state, found, views, camera)
+    moved = _moved(state, found, views, camera)
+    if moved is not None and up is not None and moved.inliers < TILTED:
         upright = float(up @ moved.new_from_old[:, :3] @ up)
-        moved = moved if upright > np.cos(np.radians(options.tilt_deg)) else None
+        moved = moved if upright > np.cos(np.radians(TILT_DEG)) else None
     if still is None or moved is None:
         return still or moved
     return max(still, moved, key=lambda m: m.inliers)
@@ -294,20 +261,19 @@ def _stayed(
     found: FoundObject,
     views: Sequence[_View],
     camera: Camera,
-    options: MotionOptions,
 ) -> PointMotion | None:
     """Count the points of an object that are where they were."""
     of_view = [v.xyz[v.still & v.above] for v in views]
-    of_view = [xyz for xyz in of_view if len(xyz) >= options.inliers]
-    if len(of_view) < options.agreeing or not _coincide(state.center, state, found, 1.0):
+    of_view = [xyz for xyz in of_view if len(xyz) >= INLIERS]
+    if len(of_view) < AGREEING or not _coincide(state.center, state, found, 1.0):
         return None
-    count = _distinct(np.concatenate(of_view), state, options)
-    if count < options.points:
+    count = _distinct(np.concatenate(of_view), state)
+    if count < POINTS:
         return None
     camera_at = np.array([-v.pose[:, :3].T @ v.pose[:, 3] for v in views])
     distance = float(np.median(np.linalg.norm(camera_at - state.center, axis=1)))
     # a smaller displacement cannot be measured: uniform within the limit of the error
-    sigma = _limit(camera, options) / camera.K[0, 0] * distance / np.sqrt(3)
+    sigma = _limit(camera) / camera.K[0, 0] * distance / np.sqrt(3)
     return PointMotion(
         count, len(of_view), np.eye(3, 4), np.zeros(3), float(sigma) ** 2 * np.eye(3)
     )
@@ -318,7 +284,6 @@ def _moved(
     found: FoundObject,
     views: Sequence[_View],
     camera: Camera,
-    options: MotionOptions,
 ) -> PointMotion | None:
     """Find the motion of the points that are not where they were, from all images at once.
 
@@ -326,18 +291,18 @@ def _moved(
     their old place is the motion.
     """
     pc = import_pycolmap()
-    kept = [view for view in views if (~view.still).sum() >= options.inliers]
-    if len(kept) < options.agreeing:
+    kept = [view for view in views if (~view.still).sum() >= INLIERS]
+    if len(kept) < AGREEING:
         return None
     moving = [~view.still for view in kept]
     image = np.repeat(np.arange(len(kept)), [int(m.sum()) for m in moving])  # (n,)
     point = np.concatenate([v.point[m] for v, m in zip(kept, moving, strict=True)])
-    if len(np.unique(point)) < options.points:
+    if len(np.unique(point)) < POINTS:
         return None
     xyz = np.concatenate([v.xyz[m] for v, m in zip(kept, moving, strict=True)])
     xy = np.concatenate([v.xy[m] for v, m in zip(kept, moving, strict=True)])
-    ransac = {"max_error": _limit(camera, options), "random_seed": 0,
-              "max_num_trials": options.trials}  # fmt: skip
+    ransac = {"max_error": _limit(camera), "random_seed": 0,
+              "max_num_trials": TRIALS}  # fmt: skip
     estimate = pc.estimate_and_refine_generalized_absolute_pose(
         xy, xyz - state.center, image,
         [pc.Rigid3d(v.pose) for v in kept], [camera.to_pycolmap()] * len(kept),
@@ -351,9 +316,9 @@ def _moved(
     if not np.isfinite(motion).all() or not _coincide(moved, state, found, 0.5):
         return None
     inlier = np.asarray(estimate["inlier_mask"], bool)
-    agrees = np.bincount(image[inlier], minlength=len(kept)) >= options.inliers  # (L,)
-    count = _distinct(xyz[inlier & agrees[image]], state, options)
-    if agrees.sum() < options.agreeing or count < options.points:
+    agrees = np.bincount(image[inlier], minlength=len(kept)) >= INLIERS  # (L,)
+    count = _distinct(xyz[inlier & agrees[image]], state)
+    if agrees.sum() < AGREEING or count < POINTS:
         return None
     error = np.concatenate([
         _errors(v.xyz[m], v.xy[m], _composed(v.pose, motion), camera)
@@ -366,9 +331,9 @@ def _moved(
     return PointMotion(count, int(agrees.sum()), motion, moved - state.center, cov)
 
 
-def _distinct(xyz: Array, state: ObjectState, options: MotionOptions) -> int:
+def _distinct(xyz: Array, state: ObjectState) -> int:
     """Count different places of points (n, 3): the map may have a point several times."""
-    cell = options.same_point * float(state.half_axes.max())
+    cell = SAME_POINT * float(state.half_axes.max())
     return len(np.unique(np.round((xyz - state.center) / cell), axis=0))
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,43 +16,29 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+import quadrics
 from reobj.cameras import Poses, invert_rigid
 from reobj.files import Progress
-from reobj.maps.placement import unit_descriptors
+from reobj.maps.fusion import scaled_radius, shapes_of
+from reobj.maps.placement import described_points, of_frames, unit_descriptors
 from reobj.maps.room_map import MapPoints
-from reobj.maps.visibility import shapes_of
 from reobj.results.result import Object
 from reobj.sources.video import Video
-from reobj.types import Array, BoolArray, Floats, Image, IntArray, Tracks
+from reobj.types import Array, Frame, IntArray, Tracks
 
-
-@dataclass(frozen=True, slots=True)
-class ObjectPointOptions:
-    """Features in the boxes of objects, and when they become points.
-
-    Attributes:
-        views: boxes of each object that are described. apart_deg: difference of direction from
-            which on only the size of a box counts in their choice.
-        side_px: longer side to which a small box is enlarged, by `enlarge` at most; larger ones
-            are shrunk to twice of it.
-        contrast: of SIFT (OpenCV's default: .04). most: features of a box, the strongest.
-        angle: largest angle between descriptors of one point, radians.
-        error_px: largest reprojection error, px of an image 640 px wide.
-        least_views: of a point. parallax_deg: least largest angle between its rays.
-        inside: of the half axes; points farther out are of something else.
-    """
-
-    views: int = 12
-    apart_deg: float = 15.0
-    side_px: float = 160.0
-    enlarge: float = 4.0
-    contrast: float = 0.01
-    most: int = 150
-    angle: float = 0.7
-    error_px: float = 1.5
-    least_views: int = 3
-    parallax_deg: float = 3.0
-    inside: float = 1.2
+VIEWS = 12  # boxes of each object that are described
+APART_DEG = 15.0  # difference of direction from which on only the size of a box counts
+# Longer side to which a small box is enlarged, by ENLARGE at most; larger ones are shrunk to twice
+# of it
+SIDE_PX = 160.0
+ENLARGE = 4.0
+CONTRAST = 0.01  # of SIFT (OpenCV's default: .04)
+MOST = 150  # features of a box, the strongest
+ANGLE = 0.7  # largest angle between descriptors of one point, radians
+ERROR_PX = 1.5  # largest reprojection error, px of an image 640 px wide
+LEAST_VIEWS = 3  # of a point
+PARALLAX_DEG = 3.0  # least largest angle between the rays of a point
+INSIDE = 1.2  # of the half axes; points farther out are of something else
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,14 +66,12 @@ def object_views(
     tracks: Tracks,
     video: Video,
     line: Progress,
-    options: ObjectPointOptions | None = None,
 ) -> list[ObjectView]:
     """Describe some boxes of each object, large ones from different directions.
 
     Args:
         objects: with a shape, in the world of the poses; `tracks` has their boxes, native pixels.
     """
-    options = options or ObjectPointOptions()
     usable = np.flatnonzero(poses.measured & (poses.part == 0)).tolist()
     row_of = {int(poses.frame[k]): k for k in usable}
     centre = invert_rigid(poses.cam_from_world)[:, :, 3]
@@ -100,37 +83,28 @@ def object_views(
             continue
         boxes = tracks.xyxy[rows]
         ray = centre[[row_of[int(f)] for f in tracks.frame[rows]]] - o.center
-        for k in _spread(ray, np.sqrt(np.prod(boxes[:, 2:] - boxes[:, :2], axis=1)), options):
+        for k in _spread(ray, np.sqrt(np.prod(boxes[:, 2:] - boxes[:, :2], axis=1))):
             of_frame.setdefault(int(tracks.frame[rows[k]]), []).append((o.id, boxes[k]))
 
-    def describe(item: tuple[int, Image]) -> list[ObjectView]:
-        frame, image = item
-        gray = np.asarray(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_BGR2GRAY), np.uint8)
+    def describe(frame: Frame) -> list[ObjectView]:
+        image = np.ascontiguousarray(frame.image)
+        gray = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
         return [
-            ObjectView(row_of[frame], identity, box, *_features(gray, box, options))
-            for identity, box in of_frame[frame]
+            ObjectView(row_of[frame.index], identity, box, *_features(gray, box))
+            for identity, box in of_frame[frame.index]
         ]
 
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    views = list[ObjectView]()
-    images = ((frame.index, frame.image) for frame in video if frame.index in of_frame)
-    with ThreadPoolExecutor(2) as pool:
-        while batch := list(itertools.islice(images, 8)):
-            views += itertools.chain.from_iterable(pool.map(describe, batch))
-            line.step(len(batch))
-    cv2.setNumThreads(threads)
-    return views
+    return list(itertools.chain.from_iterable(of_frames(video, of_frame, describe, line)))
 
 
-def _spread(ray: Array, size: Array, options: ObjectPointOptions) -> list[int]:
+def _spread(ray: Array, size: Array) -> list[int]:
     """Choose views by rays (n, 3) to the cameras and sizes (n,), one after the other."""
     ray = ray / np.linalg.norm(ray, axis=1, keepdims=True).clip(1e-9)
     chosen = [int(size.argmax())]
     nearest = np.full(len(ray), np.inf)
-    while len(chosen) < min(options.views, len(ray)):
+    while len(chosen) < min(VIEWS, len(ray)):
         nearest = np.minimum(nearest, np.arccos((ray @ ray[chosen[-1]]).clip(-1, 1)))
-        worth = np.minimum(nearest, np.radians(options.apart_deg)) * size
+        worth = np.minimum(nearest, np.radians(APART_DEG)) * size
         best = int(worth.argmax())
         if worth[best] <= 0:
             break
@@ -138,13 +112,11 @@ def _spread(ray: Array, size: Array, options: ObjectPointOptions) -> list[int]:
     return chosen
 
 
-def _features(
-    gray: npt.NDArray[np.uint8], box: Array, options: ObjectPointOptions
-) -> tuple[Array, npt.NDArray[np.uint8]]:
+def _features(gray: npt.NDArray[np.uint8], box: Array) -> tuple[Array, npt.NDArray[np.uint8]]:
     """Return positions (n, 2) in native pixels and RootSIFT descriptors (n, 128) in a box."""
     side = float(max(box[2] - box[0], box[3] - box[1], 1.0))
-    scale = float(np.clip(options.side_px / side, 1.0, options.enlarge))
-    scale = min(scale, 2 * options.side_px / side)
+    scale = float(np.clip(SIDE_PX / side, 1.0, ENLARGE))
+    scale = min(scale, 2 * SIDE_PX / side)
     margin = 6.0  # px, for the surroundings of features near the border
     limit = np.array(gray.shape[::-1])
     low = np.floor((box[:2] - margin).clip(0)).astype(int)
@@ -155,7 +127,7 @@ def _features(
     crop = gray[low[1] : high[1], low[0] : high[0]]
     size = np.maximum(np.round((high - low) * scale), 1).astype(int)
     sampling = cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA
-    sift: Any = cv2.SIFT.create(nfeatures=options.most, contrastThreshold=options.contrast)
+    sift: Any = cv2.SIFT.create(nfeatures=MOST, contrastThreshold=CONTRAST)
     keypoints, found = sift.detectAndCompute(
         cv2.resize(crop, size.tolist(), interpolation=sampling), None
     )
@@ -174,19 +146,17 @@ def triangulated(
     objects: Sequence[Object],
     views: Sequence[ObjectView],
     poses: Poses,
-    options: ObjectPointOptions | None = None,
 ) -> MapPoints:
     """Triangulate features that the views of an object have in common.
 
     Returns:
         points with the identity of their object, in the world of the poses; session 0.
     """
-    options = options or ObjectPointOptions()
     tables = [MapPoints.empty()]
     for o in objects:
         of_object = [v for v in views if v.identity == o.id and len(v.xy)]
-        if len(of_object) >= options.least_views:
-            tables.append(_points_of(o, of_object, poses, options))
+        if len(of_object) >= LEAST_VIEWS:
+            tables.append(_points_of(o, of_object, poses))
     return MapPoints.joined(tables)
 
 
@@ -222,18 +192,10 @@ class _Rays:
         return off / np.maximum(depth, 1e-9) / self.px, depth
 
 
-def _points_of(
-    found: Object, views: Sequence[ObjectView], poses: Poses, options: ObjectPointOptions
-) -> MapPoints:
+def _points_of(found: Object, views: Sequence[ObjectView], poses: Poses) -> MapPoints:
     """Triangulate the points of one object."""
     rays = _Rays(views, poses)
-    shape = shapes_of([found])
-    scaled = shape.world_from_obj[0] / (options.inside * shape.half_axes[0])
-
-    def inside(xyz: Array) -> BoolArray:
-        return np.asarray((((xyz - shape.center_in_world[0]) @ scaled) ** 2).sum(-1) < 1)
-
-    first, second = _pairs(rays, inside, options)
+    first, second = _pairs(rays, shapes_of([found]))
     partners: list[list[int]] = [[] for _ in range(len(rays.view))]
     for i, j in zip(first.tolist(), second.tolist(), strict=True):
         partners[i].append(j)
@@ -243,30 +205,30 @@ def _points_of(
     for seed in np.argsort([-len(p) for p in partners], kind="stable").tolist():
         rows = np.array([seed, *partners[seed]])
         rows = rows[free[rows]]
-        if not free[seed] or len(rows) < options.least_views:
+        if not free[seed] or len(rows) < LEAST_VIEWS:
             continue
-        track = _track(rays, rows, options)
+        track = _track(rays, rows)
         if track is not None:
             free[track[1]] = False
             tracks.append(track)
     return _described(found.id, rays, tracks)
 
 
-def _pairs(rays: _Rays, inside: Any, options: ObjectPointOptions) -> tuple[IntArray, IntArray]:
+def _pairs(rays: _Rays, shape: quadrics.Ellipsoids) -> tuple[IntArray, IntArray]:
     """Find pairs of features of two views that may be one point.
 
     Each feature is paired with the most similar one of another view that meets the epipolar
     constraint inside the object, if the choice is mutual.
     """
     cosine = rays.unit @ rays.unit.T
-    similar = cosine > np.cos(options.angle)
+    similar = cosine > np.cos(ANGLE)
     i, j = np.nonzero(similar & (rays.view[:, None] < rays.view))
     a = rays.direction[i]
     b = rays.direction[j]
     between = rays.start[j] - rays.start[i]
     cross = (a * b).sum(1)
     sine = 1 - cross**2
-    usable = sine > np.sin(np.radians(options.parallax_deg / 2)) ** 2
+    usable = sine > np.sin(np.radians(PARALLAX_DEG / 2)) ** 2
     sine = np.where(usable, sine, 1.0)
     of_a = (between * a).sum(1)
     of_b = (between * b).sum(1)
@@ -275,8 +237,9 @@ def _pairs(rays: _Rays, inside: Any, options: ObjectPointOptions) -> tuple[IntAr
     on_a = rays.start[i] + depth_a[:, None] * a
     on_b = rays.start[j] + depth_b[:, None] * b
     gap = np.linalg.norm(on_a - on_b, axis=1) / 2
-    near = gap < options.error_px * rays.px * np.minimum(depth_a, depth_b)
-    good = usable & near & (np.minimum(depth_a, depth_b) > 0) & inside((on_a + on_b) / 2)
+    near = gap < ERROR_PX * rays.px * np.minimum(depth_a, depth_b)
+    good = usable & near & (np.minimum(depth_a, depth_b) > 0)
+    good &= scaled_radius((on_a + on_b) / 2, shape, 0) < INSIDE**2
     i = i[good]
     j = j[good]
     order = np.argsort(-cosine[i, j], kind="stable")
@@ -289,9 +252,7 @@ def _pairs(rays: _Rays, inside: Any, options: ObjectPointOptions) -> tuple[IntAr
     return i[mutual], j[mutual]
 
 
-def _track(
-    rays: _Rays, rows: IntArray, options: ObjectPointOptions
-) -> tuple[Array, IntArray] | None:
+def _track(rays: _Rays, rows: IntArray) -> tuple[Array, IntArray] | None:
     """Triangulate rows of features that may be one point; None: they are none."""
     for _ in range(3):
         direction = rays.direction[rows]
@@ -299,16 +260,16 @@ def _track(
         start = np.einsum("kij,kj->i", across, rays.start[rows])
         point = np.linalg.solve(across.sum(0) + 1e-12 * np.eye(3), start)
         error, depth = rays.errors(point, rows)
-        good = (error < options.error_px) & (depth > 0)
+        good = (error < ERROR_PX) & (depth > 0)
         if good.all():
             break
         rows = rows[good]
-        if len(rows) < options.least_views:
+        if len(rows) < LEAST_VIEWS:
             return None
     else:
         return None
     widest = float((rays.direction[rows] @ rays.direction[rows].T).min())
-    if widest > np.cos(np.radians(options.parallax_deg)):
+    if widest > np.cos(np.radians(PARALLAX_DEG)):
         return None
     return point, rows
 
@@ -317,21 +278,12 @@ def _described(identity: int, rays: _Rays, tracks: Sequence[tuple[Array, IntArra
     """Return points with mean descriptors."""
     if not tracks:
         return MapPoints.empty()
-    descriptor: list[Floats] = []
-    ray = []
-    distance = []
-    for point, rows in tracks:
-        descriptor.append(rays.unit[rows].mean(0))
-        ray.append(rays.direction[rows].mean(0))
-        distance.append(float(np.median(np.linalg.norm(point - rays.start[rows], axis=1))))
-    mean = unit_descriptors(np.array(descriptor)) * 512
-    rows = np.array(ray)
-    count = len(tracks)
-    return MapPoints(
+    rows = [rows for _, rows in tracks]
+    distance = [np.median(np.linalg.norm(p - rays.start[rows], axis=1)) for p, rows in tracks]
+    return described_points(
         np.array([point for point, _ in tracks]),
-        np.minimum(mean, 255).astype(np.uint8),
-        np.zeros(count, np.int64),
-        np.full(count, identity),
-        rows / np.linalg.norm(rows, axis=1, keepdims=True).clip(1e-9),
+        np.array([rays.unit[k].mean(0) for k in rows]),
+        np.array([rays.direction[k].mean(0) for k in rows]),
         np.array(distance),
+        identity,
     )

@@ -3,16 +3,18 @@
 Each chosen image is matched to the points of the map (one descriptor a point) and located by PnP.
 The images of a component of the trajectory must agree on one similarity transform from its world
 to that of the map; the component is then moved as a whole. Its cameras relative to each other stay
-as they are.
+as they are. Axes: N points of the map, L located images, H hypotheses.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -26,46 +28,30 @@ from reobj.files import Progress
 from reobj.maps.room_map import MapPoints
 from reobj.poses.features import root_sift
 from reobj.sources.video import Video, shrunk
-from reobj.types import Array, BoolArray, Floats, Image, IntArray
+from reobj.types import Array, BoolArray, Floats, Frame, IntArray
 
+T = TypeVar("T")
 
-@dataclass(frozen=True, slots=True)
-class PlacementOptions:
-    """When images, components and recordings are placed in a map.
-
-    Attributes:
-        size_px: longer side of the images for features, as in the reconstruction.
-        images: of a component that are matched to the map; more take longer.
-        points: of the map that are matched, first those on no object; more take longer.
-        ratio: largest ratio of angles to the best and to the second best point of the map that
-            lies elsewhere (Lowe, IJCV 2004).
-        elsewhere: distance of such a point, over that of the best one from the camera.
-        error_px: largest error of an inlier of PnP, px of the shrunk image (COLMAP: 4; 12 for
-            localisation: two reconstructions deform differently).
-        inliers: least of an image that counts. (Of 7,728 images against the maps of other rooms 3
-            had 8, and no two agreed. In the right room wrong images had up to 9.)
-        frames: least images that agree on one similarity; of few images, half.
-        turn_deg, shift: largest difference of the camera's orientation and position (over the
-            median depth of its points) between PnP and the similarity.
-        shown: points of the map that an image should show again, to count as a view of it.
-        confirmed: least fraction of these images that agree. (Of recordings of the room .6 to 1
-            did, of one with mirrored images .03.)
-        rival: fraction of the images that agree, in another placement, that makes both ambiguous.
-    """
-
-    size_px: int = 640
-    images: int = 40
-    points: int = 15_000
-    ratio: float = 0.8
-    elsewhere: float = 0.03
-    error_px: float = 6.0
-    inliers: int = 8
-    frames: int = 5
-    turn_deg: float = 5.0
-    shift: float = 0.1
-    shown: int = 50
-    confirmed: float = 0.25
-    rival: float = 0.5
+COMPARED = 40  # images of a component that are matched to the map; more take longer
+MATCHED_POINTS = 15_000  # of the map, first those on no object; more take longer
+RATIO = 0.8  # of angles to the best point and to the best one elsewhere (Lowe, IJCV 2004)
+ELSEWHERE = 0.03  # distance of such a point, over that of the best one from the camera
+# Largest error of an inlier of PnP, px of an image of 640 px (COLMAP: 4; 12 for localisation: two
+# reconstructions deform differently)
+ERROR_PX = 6.0
+# Least inliers of an image. (Of 7,728 images against the maps of other rooms 3 had 8, and no two
+# agreed. In the right room wrong images had up to 9.)
+INLIERS = 8
+AGREEING = 5  # least images that agree on one similarity; of few images, half
+# Largest difference between PnP and the similarity: of the orientation, of the position over the
+# median depth of the points
+TURN_DEG = 5.0
+SHIFT = 0.1
+SHOWN = 50  # points of the map that an image should show again, to count as a view of it
+# Least fraction of these images that agree. (Of recordings of the room .6 to 1 did, of one with
+# mirrored images .03.)
+CONFIRMED = 0.25
+RIVAL = 0.5  # fraction of the images that agree, elsewhere, that makes both positions ambiguous
 
 
 # ---- Features ----------------------------------------------------------------------------------
@@ -84,14 +70,7 @@ class ImageFeatures:
     descriptor: npt.NDArray[np.uint8]
 
 
-def keyframe_features(
-    poses: Poses, video: Video, options: PlacementOptions, line: Progress, most: int = 200
-) -> list[ImageFeatures]:
-    """Extract RootSIFT features of the frames of `keyframe_rows`."""
-    return image_features(poses, video, keyframe_rows(poses, options, most), options, line)
-
-
-def keyframe_rows(poses: Poses, options: PlacementOptions, most: int = 200) -> IntArray:
+def keyframe_rows(poses: Poses, most: int = 200) -> IntArray:
     """Choose every second keyframe, all of few; return their rows in the poses.
 
     Every second one shows .95 to .98 of the sparse points (measured on four recordings). Without
@@ -102,50 +81,45 @@ def keyframe_rows(poses: Poses, options: PlacementOptions, most: int = 200) -> I
     """
     rows = np.unique(poses.visibility[:, 0])
     rows = rows[poses.measured[rows]] if len(rows) else np.arange(len(poses.frame))
-    step = max(2 if len(rows) > options.images else 1, -(-len(rows) // most))
+    step = max(2 if len(rows) > COMPARED else 1, -(-len(rows) // most))
     return np.asarray(rows[::step], np.int64)
 
 
-def compared_rows(poses: Poses, rows: IntArray, options: PlacementOptions) -> IntArray:
-    """Return the rows that `place` compares with the map, of those that have features."""
-    chosen = [np.empty(0, np.int64)]
-    for part in range(poses.part_count):
-        of_part = rows[(poses.part[rows] == part) & poses.known[rows]]
-        chosen.append(of_part[:: max(1, -(-len(of_part) // options.images))])
-    return np.sort(np.concatenate(chosen))
+def of_frames(
+    video: Video, frames: Collection[int], work: Callable[[Frame], T], line: Progress
+) -> Iterator[T]:
+    """Apply a function to some frames of a video, in their order, in two threads."""
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    chosen = (frame for frame in video if frame.index in frames)
+    with ThreadPoolExecutor(2) as pool:
+        while batch := list(itertools.islice(chosen, 8)):
+            yield from pool.map(work, batch)
+            line.step(len(batch))
+    cv2.setNumThreads(threads)
 
 
 def image_features(
-    poses: Poses, video: Video, rows: IntArray, options: PlacementOptions, line: Progress
+    poses: Poses, video: Video, rows: IntArray, size_px: int, line: Progress
 ) -> list[ImageFeatures]:
-    """Extract RootSIFT features of the frames in given rows of the poses."""
+    """Extract RootSIFT features of the frames in given rows of the poses.
+
+    Args:
+        size_px: longer side of the images for features, as in the reconstruction.
+    """
     row_of = {int(poses.frame[row]): int(row) for row in rows}
     size = np.array(video.size, np.float64)
 
-    def describe(pair: tuple[int, Image]) -> ImageFeatures:
-        row, image = pair
+    def describe(frame: Frame) -> ImageFeatures:
+        image = shrunk(frame.image, size_px)
         xy, descriptor = root_sift(image, np.empty((0, 4)))
-        return ImageFeatures(row, xy * (size / image.shape[1::-1]), descriptor)
+        return ImageFeatures(row_of[frame.index], xy * (size / image.shape[1::-1]), descriptor)
 
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    found = list[ImageFeatures]()
-    images = (
-        (row_of[frame.index], shrunk(frame.image, options.size_px))
-        for frame in video
-        if frame.index in row_of
-    )
-    with ThreadPoolExecutor(2) as pool:
-        while batch := list(itertools.islice(images, 8)):
-            found += pool.map(describe, batch)
-            line.step(len(batch))
-    line.close()
-    cv2.setNumThreads(threads)
-    return found
+    return list(of_frames(video, row_of, describe, line))
 
 
 def points_with_descriptors(
-    poses: Poses, features: Sequence[ImageFeatures], session: int, most: int = 20_000
+    poses: Poses, features: Sequence[ImageFeatures], most: int = 20_000
 ) -> MapPoints:
     """Describe the sparse points of a recording by the mean descriptor of their keypoints.
 
@@ -153,7 +127,9 @@ def points_with_descriptors(
     it.
 
     Args:
-        session: number. most: points; those in most images are kept.
+        most: points; those in most images are kept.
+    Returns:
+        points of session 0, on no object.
     """
     count = len(poses.points)
     sums = np.zeros((count, 128), np.float32)
@@ -165,21 +141,17 @@ def points_with_descriptors(
     centre = invert_rigid(poses.cam_from_world)[:, :, 3]
     near_px = 1.5 * max(poses.camera.width, poses.camera.height) / 640
     for image in features:
-        if not len(image.xy):
-            continue
         first, last = np.searchsorted(frame_row, (image.row, image.row + 1))
         seen = point[first:last]
         pose = poses.cam_from_world[image.row]
         xy = poses.camera.project(poses.points[seen] @ pose[:, :3].T + pose[:, 3])
         shown = np.isfinite(xy).all(1)
         seen = seen[shown]
-        xy = xy[shown]
-        if not len(seen):
+        if not len(seen) or not len(image.xy):
             continue
-        gap, keypoint = cKDTree(image.xy).query(xy)
+        gap, keypoint = cKDTree(image.xy).query(xy[shown])
         seen = seen[gap < near_px]
-        keypoint = keypoint[gap < near_px]
-        sums[seen] += unit_descriptors(image.descriptor[keypoint])
+        sums[seen] += unit_descriptors(image.descriptor[keypoint[gap < near_px]])
         away = poses.points[seen] - centre[image.row]
         length = np.linalg.norm(away, axis=1)
         ray[seen] += away / length[:, None]
@@ -187,19 +159,25 @@ def points_with_descriptors(
         number[seen] += 1
     kept = np.argsort(-number, kind="stable")[:most]
     kept = np.sort(kept[number[kept] > 0])
-    mean = unit_descriptors(sums[kept]) * 512
-    rays = ray[kept] / np.linalg.norm(ray[kept], axis=1, keepdims=True).clip(1e-9)
+    mean = distance[kept] / number[kept]
+    return described_points(poses.points[kept], sums[kept], ray[kept], mean, 0)
+
+
+def described_points(
+    xyz: Array, descriptor: Floats, ray: Array, distance: Array, object_id: int
+) -> MapPoints:
+    """Return points (n) of session 0 from sums of unit descriptors (n, 128) and rays (n, 3)."""
     return MapPoints(
-        poses.points[kept],
-        np.minimum(mean, 255).astype(np.uint8),
-        np.full(len(kept), session),
-        np.zeros(len(kept), np.int64),
-        rays,
-        distance[kept] / number[kept],
+        xyz,
+        np.minimum(unit_descriptors(descriptor) * 512, 255).astype(np.uint8),
+        np.zeros(len(xyz), np.int64),
+        np.full(len(xyz), object_id),
+        ray / np.linalg.norm(ray, axis=1, keepdims=True).clip(1e-9),
+        distance,
     )
 
 
-def largest(values: Floats, count: int, width: int = 64) -> IntArray:
+def _largest(values: Floats, count: int, width: int = 64) -> IntArray:
     """Return the columns (n, count) of the largest of (n, N) values in each row, unordered.
 
     They lie in the `count` blocks with the largest maxima: the rows are partitioned by block.
@@ -224,6 +202,17 @@ def unit_descriptors(rows: npt.NDArray[np.generic]) -> Floats:
     return np.asarray(values / np.linalg.norm(values, axis=1, keepdims=True).clip(1e-9))
 
 
+def best_features(rows: IntArray, point: IntArray, angle: Array) -> IntArray:
+    """Choose the feature with the smallest angle for each point that some rows of features match.
+
+    Args:
+        point, angle: (n,) of all features.
+    """
+    nearest = rows[np.argsort(angle[rows], kind="stable")]
+    _, first = np.unique(point[nearest], return_index=True)
+    return np.sort(nearest[first])
+
+
 # ---- Images in the map -------------------------------------------------------------------------
 
 
@@ -234,9 +223,7 @@ class LocatedImage:
     Attributes:
         row: of the frame in the poses. cam_from_map: (3, 4).
         xy: (n, 2) native pixels of its inliers. point: (n,) rows of the map's points.
-        depth: median depth of the inliers. focal: focal length with which it was located, px.
-        matches: before PnP. in_view: points of the map that the image should show again: in it,
-            seen from a similar direction and distance before.
+        depth: median depth of the inliers.
     """
 
     row: int
@@ -244,21 +231,19 @@ class LocatedImage:
     xy: Array
     point: IntArray
     depth: float
-    focal: float
-    matches: int
-    in_view: int
 
 
 class PointMatcher:
-    """Matches the features of an image to the points of a map.
+    """Matches the features of images to the points of a map, and locates the images by PnP.
 
     Args:
-        points: N, of the map.
+        points: N, of the map. camera: of the images. error_px: largest error of an inlier of PnP.
     """
 
-    def __init__(self, points: MapPoints, options: PlacementOptions) -> None:
+    def __init__(self, points: MapPoints, camera: Camera, error_px: float) -> None:
         self.points = points
-        self.options = options
+        self.camera = camera
+        self.error_px = error_px
         self.descriptor = unit_descriptors(points.descriptor)
 
     def match(self, image: ImageFeatures) -> tuple[IntArray, IntArray]:
@@ -271,76 +256,50 @@ class PointMatcher:
         if len(image.xy) < 2 or len(self.points) <= few:
             return np.empty(0, np.int64), np.empty(0, np.int64)
         cosine = unit_descriptors(image.descriptor) @ self.descriptor.T  # (n, N)
-        best = largest(cosine, few)  # (n, few)
+        best = _largest(cosine, few)  # (n, few)
         value = np.take_along_axis(cosine, best, 1)
         order = np.argsort(-value, axis=1)
         best = np.take_along_axis(best, order, 1)
         angle = np.arccos(np.take_along_axis(value, order, 1).clip(-1, 1))  # (n, few)
         apart = np.linalg.norm(self.points.xyz[best] - self.points.xyz[best[:, :1]], axis=2)
-        elsewhere = apart > self.options.elsewhere * self.points.distance[best[:, :1]]
+        elsewhere = apart > ELSEWHERE * self.points.distance[best[:, :1]]
         second = np.where(elsewhere, angle, np.inf).min(1)
         second = np.minimum(second, np.where(elsewhere.any(1), np.inf, angle[:, -1]))
-        good = np.flatnonzero((angle[:, 0] < self.options.ratio * second) & (angle[:, 0] < 0.9))
-        nearest = good[np.argsort(angle[good, 0], kind="stable")]
-        _, first = np.unique(best[nearest, 0], return_index=True)
-        feature = np.sort(nearest[first])
+        good = np.flatnonzero((angle[:, 0] < RATIO * second) & (angle[:, 0] < 0.9))
+        feature = best_features(good, best[:, 0], angle[:, 0])
         return feature, best[feature, 0]
 
-    def locate(self, image: ImageFeatures, camera: Camera) -> LocatedImage | None:
+    def locate(self, image: ImageFeatures) -> LocatedImage | None:
         """Locate an image by PnP on its matches; None with too few inliers."""
-        return self.solve(image, *self.match(image), camera)
-
-    def solve(
-        self,
-        image: ImageFeatures,
-        feature: IntArray,
-        point: IntArray,
-        camera: Camera,
-        free_focal: bool = False,
-    ) -> LocatedImage | None:
-        """Locate an image by PnP on given matches; None with too few inliers.
-
-        Args:
-            feature, point: (n,) rows of features and points, from `match`.
-            free_focal: estimate the focal length too; that of the camera is not used.
-        """
-        options = self.options
-        if len(feature) < options.inliers:
+        feature, point = self.match(image)
+        if len(feature) < INLIERS:
             return None
         xy = image.xy[feature]
         xyz = self.points.xyz[point]
-        scale = max(camera.width, camera.height) / options.size_px
-        ransac = {"max_error": options.error_px * max(scale, 1.0), "random_seed": 0}
-        lens = camera.to_pycolmap()
         estimate = import_pycolmap().estimate_and_refine_absolute_pose(
-            xy,
-            xyz,
-            lens,  # gets the estimated focal length
-            estimation_options={"ransac": ransac, "estimate_focal_length": free_focal},
-            refinement_options={"refine_focal_length": free_focal},
-        )
+            xy, xyz, self.camera.to_pycolmap(),
+            estimation_options={"ransac": {"max_error": self.error_px, "random_seed": 0}},
+        )  # fmt: skip
         if estimate is None:
             return None
-        focal = float(lens.mean_focal_length())
         pose = np.asarray(estimate["cam_from_world"].matrix(), np.float64)
         inlier = np.asarray(estimate["inlier_mask"], bool)
         depth = xyz @ pose[2, :3] + pose[2, 3]
         away = xyz - invert_rigid(pose)[:, 3]  # a surface is seen from one side only
         inlier &= (depth > 0) & ((away * self.points.viewing_ray[point]).sum(1) > 0)
-        if inlier.sum() < options.inliers or not np.isfinite(pose).all():
+        if inlier.sum() < INLIERS or not np.isfinite(pose).all():
             return None
-        return LocatedImage(
-            image.row, pose, xy[inlier], point[inlier], float(np.median(depth[inlier])), focal,
-            len(feature), int(self.in_view(pose, camera).sum()),
-        )  # fmt: skip
+        middle = float(np.median(depth[inlier]))
+        return LocatedImage(image.row, pose, xy[inlier], point[inlier], middle)
 
-    def in_view(self, cam_from_map: Array, camera: Camera) -> BoolArray:
+    def in_view(self, cam_from_map: Array) -> BoolArray:
         """Mark points (N,) in an image that were seen from a similar direction and distance.
 
         Similar: less than 30 degrees and a factor 1.5 apart, where SIFT is repeatable
         (Mikolajczyk et al., IJCV 2005).
         """
         points = self.points
+        camera = self.camera
         in_cam = points.xyz @ cam_from_map[:, :3].T + cam_from_map[:, 3]
         length = np.linalg.norm(in_cam, axis=1)
         z = np.where(in_cam[:, 2] > 1e-9, in_cam[:, 2], np.nan)
@@ -386,62 +345,48 @@ class ComponentPlacement:
 
     Attributes:
         similarity: None: refused. images: that agree. tried: images compared. reason: of a refusal.
-        support: fraction of the points in view that were found again, median over the images.
-        unmatched: refused as too few images match points of the map, which contradicts no place.
     """
 
     similarity: Similarity | None
     images: tuple[LocatedImage, ...]
     tried: int
     reason: str = ""
-    support: float = 0.0
-    unmatched: bool = False
 
 
 def place_component(
-    poses: Poses,
-    features: Sequence[ImageFeatures],
-    matcher: PointMatcher,
-    options: PlacementOptions,
+    poses: Poses, tried: Sequence[ImageFeatures], matcher: PointMatcher
 ) -> ComponentPlacement:
     """Place a component of the trajectory in the map.
 
     Args:
-        poses: of the whole recording. features: of images of this component.
+        poses: of the whole recording. tried: features of images of this component.
     """
-    step = max(1, -(-len(features) // options.images))
-    tried = features[::step]
     with ThreadPoolExecutor(2) as pool:
-        found = list(pool.map(lambda image: matcher.locate(image, poses.camera), tried))
-    located = [image for image in found if image is not None]
-    needed = max(2, min(options.frames, -(-len(tried) // 2)))
+        located = [image for image in pool.map(matcher.locate, tried) if image is not None]
+    needed = max(2, min(AGREEING, -(-len(tried) // 2)))
+    refused = partial(ComponentPlacement, None, (), len(tried))
     if len(located) < needed:
-        reason = (
+        return refused(
             f"{len(located)} of {len(tried)} images match points of the map, {needed} are needed"
         )
-        return ComponentPlacement(None, tuple(located), len(tried), reason, unmatched=True)
-    guess, agrees, rival = _agreement(poses, located, options)
-    agreeing = [image for image, good in zip(located, agrees, strict=True) if good]
+    guess, agrees, rival = _agreement(poses, located)
+    agreeing = tuple(image for image, good in zip(located, agrees, strict=True) if good)
     count = f"{len(agreeing)} of {len(tried)} images agree on a position in the map"
     if guess is not None and len(agreeing) >= needed:
         cam_from_map = guess.poses(poses.cam_from_world[[image.row for image in tried]])
-        in_view = [int(matcher.in_view(pose, poses.camera).sum()) for pose in cam_from_map]
-        shows = sum(number >= options.shown for number in in_view)
+        shows = sum(matcher.in_view(pose).sum() >= SHOWN for pose in cam_from_map)
         count += f", where {shows} should show points of it"
-        needed = max(needed, int(np.ceil(options.confirmed * shows)))
+        needed = max(needed, int(np.ceil(CONFIRMED * shows)))
     if guess is None or len(agreeing) < needed:
-        reason = f"{count}, {needed} are needed"
-        return ComponentPlacement(None, tuple(agreeing), len(tried), reason)
-    if rival >= max(2, options.rival * len(agreeing)):
-        reason = f"two positions in the map are alike ({len(agreeing)} and {rival} images)"
-        return ComponentPlacement(None, tuple(agreeing), len(tried), reason)
+        return refused(f"{count}, {needed} are needed")
+    if rival >= max(2, RIVAL * len(agreeing)):
+        return refused(f"two positions in the map are alike ({len(agreeing)} and {rival} images)")
     similarity = refine_similarity(guess, poses, agreeing, matcher.points.xyz)
-    support = float(np.median([len(im.point) / max(im.in_view, 1) for im in agreeing]))
-    return ComponentPlacement(similarity, tuple(agreeing), len(tried), support=support)
+    return ComponentPlacement(similarity, agreeing, len(tried))
 
 
 def _agreement(
-    poses: Poses, images: Sequence[LocatedImage], options: PlacementOptions
+    poses: Poses, images: Sequence[LocatedImage]
 ) -> tuple[Similarity | None, BoolArray, int]:
     """Find the similarity on which most images agree.
 
@@ -463,16 +408,12 @@ def _agreement(
     length_a = np.linalg.norm(a[i] - a[j], axis=1)
     length_b = np.linalg.norm(b[i] - b[j], axis=1)
     usable = (length_b > 0.02 * depth[i]) & (length_a > 0)  # a shorter baseline gives no scale
-    i = i[usable]
-    j = j[usable]
-    if not len(i):
-        return None, np.zeros(len(images), bool), 0
     chosen = np.flatnonzero(usable)
+    if not len(chosen):
+        return None, np.zeros(len(images), bool), 0
     if len(chosen) > 3000:  # hypotheses; more take longer
-        spread = np.linspace(0, len(chosen) - 1, 3000).astype(int)
-        chosen = chosen[spread]
-        i = i[spread]
-        j = j[spread]
+        chosen = chosen[np.linspace(0, len(chosen) - 1, 3000).astype(int)]
+    i = i[chosen]
     length_a = length_a[chosen]
     length_b = length_b[chosen]
     scale = length_b / length_a  # (H,)
@@ -481,8 +422,8 @@ def _agreement(
     predicted = scale[:, None, None] * np.einsum("hij,lj->hli", rotation, a) + shift[:, None]
     off = np.linalg.norm(predicted - b, axis=2) / depth  # (H, L)
     cosine = (np.einsum("hij,lij->hl", rotation, turn) - 1) / 2
-    good = (off < options.shift) & (cosine > np.cos(np.radians(options.turn_deg)))
-    best = int(np.argmax(good.sum(1) - 0.5 * np.where(good, off / options.shift, 0).mean(1)))
+    good = (off < SHIFT) & (cosine > np.cos(np.radians(TURN_DEG)))
+    best = int(np.argmax(good.sum(1) - 0.5 * np.where(good, off / SHIFT, 0).mean(1)))
     middle = predicted[best]
     apart = np.linalg.norm(predicted - middle, axis=2).min(1) / np.median(depth) > 0.2
     other_turn = (np.einsum("hij,ij->h", rotation, rotation[best]) - 1) / 2 < np.cos(0.3)
@@ -572,62 +513,55 @@ class Placement:
     Attributes:
         poses: placed components are one component, the first, in the world of the map; the others
             follow as they are. components: how each was placed, in their order before.
-        refused: why no component was placed; "": some was. by: "points" or "objects".
+        refused: why no component was placed; "": some was.
     """
 
     poses: Poses
     components: tuple[ComponentPlacement, ...]
     refused: str = ""
-    by: str = "points"
-
-    @property
-    def unmatched(self) -> bool:
-        """True if it was refused only as too few images match points of the map."""
-        tried = [c for c in self.components if c.tried]
-        return bool(self.refused and tried) and all(c.unmatched for c in tried)
 
     @property
     def best(self) -> ComponentPlacement:
         """The placed component with most images that agree."""
-        placed = [c for c in self.components if c.similarity is not None]
-        return max(placed, key=lambda c: len(c.images))
+        return max(self.components, key=lambda c: len(c.images))
 
 
 def place(
     poses: Poses,
     features: Sequence[ImageFeatures],
     points: MapPoints,
-    options: PlacementOptions | None = None,
+    size_px: int = 640,
+    most: int = COMPARED,
     report: Callable[[int], None] = lambda _: None,
 ) -> Placement:
     """Place the components of a recording in a map.
 
     Args:
         features: of some images of each component. points: of the map.
-        report: gets the number of images that were compared.
+        size_px: longer side of the images that have the features. most: images of a component
+            that are compared. report: gets the number of images that were compared.
     """
-    options = options or PlacementOptions()
-    matcher = PointMatcher(_matched(points, options.points), options)
+    camera = poses.camera
+    error_px = ERROR_PX * max(max(camera.width, camera.height) / size_px, 1.0)
+    matcher = PointMatcher(_matched(points), camera, error_px)
     components = list[ComponentPlacement]()
     for part in range(poses.part_count):
         of_part = [im for im in features if poses.part[im.row] == part and poses.known[im.row]]
-        if of_part:
-            components.append(place_component(poses, of_part, matcher, options))
-        else:
-            components.append(ComponentPlacement(None, (), 0, "no image has points"))
-        report(components[-1].tried)
+        tried = of_part[:: max(1, -(-len(of_part) // most))]
+        components.append(place_component(poses, tried, matcher))
+        report(len(tried))
     placed = [k for k, found in enumerate(components) if found.similarity is not None]
     if not placed:
         return Placement(poses, tuple(components), components[0].reason)
     return Placement(joined(poses, components, placed), tuple(components))
 
 
-def _matched(points: MapPoints, most: int) -> MapPoints:
-    """Choose at most `most` points, spread over the map: those on no object, then the others."""
+def _matched(points: MapPoints) -> MapPoints:
+    """Choose MATCHED_POINTS spread over the map: those on no object, then the others."""
     on_object = points.object_id > 0
     chosen = list[IntArray]()
     for rows in (np.flatnonzero(~on_object), np.flatnonzero(on_object)):
-        left = most - sum(map(len, chosen))
+        left = MATCHED_POINTS - sum(map(len, chosen))
         chosen.append(rows[np.linspace(0, len(rows) - 1, min(left, len(rows))).astype(int)])
     return points[np.sort(np.concatenate(chosen))]
 

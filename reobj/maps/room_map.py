@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import uuid
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -23,7 +24,6 @@ import quadrics
 from reobj import __version__
 from reobj.cameras import Camera
 from reobj.files import LockedError, columns_of, load_npz, locked, save_npz
-from reobj.results.entries import decode
 from reobj.types import (
     Array,
     FiniteFloat,
@@ -38,16 +38,17 @@ from reobj.types import (
 )
 
 HEADER = {"format": "reobj-map", "version": 1}
-# Dtypes in the file, and shapes of a row. float16 of a direction: 3e-4 rad; of a covariance it
+# Dtypes in the file (and shapes of a row). float16 of a direction: 3e-4 rad; of a covariance it
 # would lose sigmas below 2e-4 and, by rounded correlations, the small variances.
-POINTS: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {
-    "xyz": (np.dtype(np.float32), (3,)),
-    "descriptor": (np.dtype(np.uint8), (128,)),
-    "session": (np.dtype(np.int32), ()),
-    "object_id": (np.dtype(np.int32), ()),
-    "viewing_ray": (np.dtype(np.float16), (3,)),
-    "distance": (np.dtype(np.float32), ()),
+POINTS: dict[str, np.dtype[Any]] = {
+    "xyz": np.dtype(np.float32),
+    "descriptor": np.dtype(np.uint8),
+    "session": np.dtype(np.int32),
+    "object_id": np.dtype(np.int32),
+    "viewing_ray": np.dtype(np.float16),
+    "distance": np.dtype(np.float32),
 }
+IN_MEMORY = {"f": np.float64, "i": np.int64, "u": np.uint8}
 OBSERVATIONS: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {
     "center": (np.dtype(np.float64), (3,)),
     "half_axes": (np.dtype(np.float32), (3,)),
@@ -59,9 +60,6 @@ CONCATENATED: dict[str, np.dtype[Any]] = {
     "picture": np.dtype(np.uint8),
 }  # fmt: skip
 LOWER = np.tril_indices(9)  # entries of a covariance in the file
-UNIT = 1.001  # largest component of a unit vector, rounded to float16
-JPEG_START = b"\xff\xd8\xff"
-PICTURE_MAX = 1 << 16  # bytes; a JPEG of 160 px has 13 kB even if it is noise
 Number = Annotated[int, msgspec.Meta(ge=1, lt=2**31)]  # of an object or a session
 
 
@@ -100,9 +98,6 @@ class Observation:
     missed: Int32 = 0
     log_odds: FiniteFloat = 0.0
     picture: bytes = b""
-
-    ARRAYS = ("center", "half_axes", "quat_wxyz", "cov")
-    EMBEDDINGS = ("foreground", "background")
 
     @property
     def detected(self) -> bool:
@@ -157,6 +152,11 @@ class Session:
     tried_frames: Int32 = 0
 
     ARRAYS = ("cam_from_map", "alignment_cov")
+
+    @property
+    def scale(self) -> quadrics.Scale:
+        """Metres per unit of the map as this session measured it."""
+        return quadrics.Scale(self.metres_per_unit, self.scale_rel_sigma, self.scale_source)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -224,10 +224,6 @@ class RoomMap:
     next_session: Number = 1
     merged: dict[Number, Number] = field(default_factory=dict)
 
-    def session(self, number: int) -> Session:
-        """Return a session by number."""
-        return next(s for s in self.sessions if s.number == number)
-
     def session_of(self, fingerprint: str) -> Session | None:
         """Return the session of a video, if it is in the map."""
         return next((s for s in self.sessions if s.fingerprint == fingerprint), None)
@@ -246,8 +242,10 @@ class RoomMap:
         raise ReobjError(f"no object {number} in the map; it has {known or 'none'}")
 
     def save(self, path: str | Path) -> None:
-        """Write the file, atomically."""
-        save_map(Path(path), self)
+        """Write the file, atomically; the same map gives the same bytes."""
+        arrays, facts = _encoded(self)
+        _decoded(arrays, facts)  # what could not be read again is not written
+        save_npz(Path(path), arrays, **facts)
 
     @staticmethod
     def load(path: str | Path) -> RoomMap:
@@ -256,208 +254,29 @@ class RoomMap:
         Raises:
             ReobjError: missing, damaged, another kind of file, or of a newer version.
         """
-        return load_map(Path(path))
-
-
-# ---- Checks ------------------------------------------------------------------------------------
-
-
-def check_map(room: RoomMap) -> None:
-    """Refuse a map whose content is inconsistent or not finite; `_decoded` checks types.
-
-    Raises:
-        ValueError: names the fault.
-    """
-    _expect(room.up is None or _unit(room.up), f"up {room.up}")
-    for session in room.sessions:
-        _check_session(session, room.next_session)
-    numbers = [session.number for session in room.sessions]
-    _expect(len(set(numbers)) == len(numbers), f"two sessions of one number: {numbers}")
-    for found in room.objects:
-        _check_object(found, set(numbers), room.next_id)
-    ids = [found.id for found in room.objects]
-    _expect(len(set(ids)) == len(ids), "two objects of one number")
-    for old, kept in room.merged.items():
-        known = old < room.next_id and old not in ids and kept in ids
-        _expect(known, f"object {old} merged into {kept}")
-    _check_points(room.points, numbers, ids)
-
-
-def _expect(valid: bool, fault: str) -> None:
-    if not valid:
-        raise ValueError(fault)
-
-
-def _unit(vector: Array) -> bool:
-    """Test for a vector of length 1, up to the rounding of float32."""
-    return bool(abs(np.linalg.norm(vector) - 1) < 1e-5)
-
-
-def _bounded(values: npt.NDArray[Any], most: float = 1e30) -> bool:
-    """Test for finite numbers of at most `most`; default: float32 holds them."""
-    return bool((np.abs(values) <= most).all())  # False for NaN
-
-
-def _is_cov(cov: Array, size: int) -> bool:
-    """Test for a finite square matrix whose diagonal is not negative."""
-    right = np.shape(cov) == (size, size) and _bounded(cov)
-    return right and bool((np.diag(cov) >= 0).all())
-
-
-def _check_session(session: Session, next_session: int) -> None:
-    """Refuse an invalid session."""
-    where = f"session {session.number}: "
-    _expect(session.number < next_session, f"{where}next is {next_session}")
-    camera = session.camera
-    right = min(camera.width, camera.height) > 0 and _bounded(np.array(camera.params))
-    _expect(right, f"{where}camera {camera}")
-    cameras = session.cam_from_map
-    right = cameras.ndim == 3 and cameras.shape[1:] == (3, 4) and _bounded(cameras)
-    _expect(right, f"{where}cam_from_map {cameras.shape}")
-    _expect(_is_cov(session.alignment_cov, 7), f"{where}alignment_cov")
-
-
-def _check_object(found: MapObject, sessions: set[int], next_id: int) -> None:
-    """Refuse an invalid object."""
-    where = f"object {found.id}: "
-    _expect(found.id < next_id, f"{where}next_id is {next_id}")
-    _expect(found.name.isprintable(), f"{where}name")
-    _expect(any(o.detected for o in found.observations), f"{where}never detected")
-    seen = [o.session for o in found.observations]
-    _expect(len(set(seen)) == len(seen), f"{where}two observations in a session")
-    for o in found.observations:
-        _expect(o.session in sessions, f"{where}no session {o.session}")
-        _check_observation(o, f"{where}session {o.session}: ")
-
-
-def _check_observation(o: Observation, where: str) -> None:
-    """Refuse an invalid observation."""
-    kinds = quadrics.SUPPORTS if o.status in ("new", "stayed", "moved") else ("",)
-    _expect(o.support in kinds, f"{where}{o.status}, shape {o.support!r}")
-    if o.detected:
-        _expect(_bounded(o.center), f"{where}center")
-        _expect(_bounded(o.half_axes) and bool((o.half_axes > 0).all()), f"{where}half_axes")
-        _expect(_unit(o.quat_wxyz), f"{where}quat_wxyz")
-        _expect(_is_cov(o.cov, 9), f"{where}cov")
-    _expect("".join(o.classes).isprintable(), f"{where}classes")
-    _expect(o.missed <= o.expected, f"{where}missed {o.missed} of {o.expected}")
-    jpeg = o.picture.startswith(JPEG_START) and len(o.picture) <= PICTURE_MAX
-    _expect(not o.picture or (o.detected and jpeg), f"{where}picture")
-    for name in Observation.EMBEDDINGS:
-        _expect(_bounded(getattr(o, name), UNIT), f"{where}{name}")
-
-
-def _check_points(points: MapPoints, sessions: Sequence[int], ids: Sequence[int]) -> None:
-    """Refuse invalid points."""
-    for name, (kind, _) in POINTS.items():
-        values = getattr(points, name)
-        _expect(len(values) == len(points), f"points: {name} is an array {values.shape}")
-        most = UNIT if name == "viewing_ray" else 1e30
-        _expect(kind.kind != "f" or _bounded(values, most), f"points: {name} out of range")
-    _expect(bool(np.isin(points.session, sessions).all()), "points of unknown sessions")
-    _expect(bool(np.isin(points.object_id, [0, *ids]).all()), "points of unknown objects")
+        path = Path(path)
+        if path.is_dir():
+            raise ReobjError(f"{path}: is a folder, but a map is a file")
+        if not path.is_file():
+            raise ReobjError(f"{path}: no such map; `run VIDEO -o OUT --map {path}` makes it")
+        _check_kind(path)
+        try:
+            arrays, facts = load_npz(path, sealed=True)
+        except ReobjError:
+            _check_header(path, load_npz(path)[1])
+            raise
+        _check_header(path, facts)
+        try:
+            return _decoded(arrays, facts)
+        except (LookupError, TypeError, ValueError, msgspec.ValidationError) as error:
+            raise ReobjError(
+                f"{path}: damaged ({one_line(str(error))}); use a copy of it"
+            ) from error
 
 
 # ---- File --------------------------------------------------------------------------------------
 
-
-def save_map(path: Path, room: RoomMap) -> None:
-    """Write a map as npz, atomically; for the content see `RoomMap`. Same map, same bytes.
-
-    Raises:
-        ValueError: the file could not be read again.
-    """
-    origin = _origin(room.points.xyz)
-    columns = columns_of(room.points)
-    columns["xyz"] = columns["xyz"] - origin
-    arrays: dict[str, Any] = {"points_origin": origin}
-    arrays |= {f"points_{name}": columns[name].astype(POINTS[name][0]) for name in POINTS}
-    objects = sorted(room.objects, key=lambda found: found.id)
-    rows = [o for found in objects for o in sorted(found.observations, key=lambda o: o.session)]
-    for name, (kind, shape) in OBSERVATIONS.items():
-        values = np.array([getattr(o, name) for o in rows], np.float64).reshape(-1, *shape)
-        values = values[:, LOWER[0], LOWER[1]] if name == "cov" else values
-        arrays[f"observation_{name}"] = values.astype(kind)
-    for name, kind in CONCATENATED.items():
-        parts = [np.array(list(getattr(o, name)), kind) for o in rows]
-        if name in Observation.EMBEDDINGS or any(map(len, parts)):
-            arrays[f"observation_{name}"] = np.concatenate([np.empty(0, kind), *parts])
-            arrays[f"observation_{name}_length"] = np.array([*map(len, parts)], np.int32)
-    sessions = sorted(room.sessions, key=lambda session: session.number)
-    for session in sessions:
-        for name in Session.ARRAYS:
-            arrays[f"session{session.number}_{name}"] = np.asarray(
-                getattr(session, name), np.float64
-            )
-    facts = {
-        **HEADER,
-        "reobj_track": __version__,
-        "map_id": room.map_id,
-        "metric": room.metric,
-        "up": None if room.up is None else room.up.tolist(),
-        "next_id": room.next_id,
-        "next_session": room.next_session,
-        "merged": {str(old): room.merged[old] for old in sorted(room.merged)},
-        "sessions": [_without_arrays(s, Session.ARRAYS) for s in sessions],
-        "objects": [
-            {
-                "id": found.id, "name": found.name, "deleted": found.deleted,
-                "observations": len(found.observations),
-            }
-            for found in objects
-        ],
-        "observations": [
-            _without_arrays(o, (*Observation.ARRAYS, *Observation.EMBEDDINGS, "picture"))
-            for o in rows
-        ],
-    }  # fmt: skip
-    check_map(_decoded(arrays, facts))
-    save_npz(path, arrays, **facts)
-
-
-def _origin(xyz: Array) -> Array:
-    """Return the point (3,) to which the stored points are relative: a multiple of 1024.
-
-    In float32 coordinates of a map projection have a resolution of .5 m. The origin of a room near
-    that of its world is 0.
-    """
-    middle = np.median(xyz, 0) if len(xyz) else np.zeros(3)
-    return np.asarray(np.round(middle / 1024) * 1024 + 0.0)  # + 0: no -0
-
-
-def _without_arrays(record: Any, arrays: Sequence[str]) -> dict[str, Any]:
-    """Return the fields of a dataclass that are not stored as arrays."""
-    kept = {k: v for k, v in columns_of(record).items() if k not in arrays}
-    if "classes" in kept:
-        kept["classes"] = dict(sorted(kept["classes"].items()))
-    return {k: dataclasses.asdict(v) if isinstance(v, Camera) else v for k, v in kept.items()}
-
-
 ANOTHER_FILE = "not a map of reobj_track; another file was given"
-
-
-def load_map(path: Path) -> RoomMap:
-    """Read a map; for the errors see `RoomMap.load`."""
-    if path.is_dir():
-        raise ReobjError(f"{path}: is a folder, but a map is a file")
-    if not path.is_file():
-        raise ReobjError(f"{path}: no such map; `run VIDEO -o OUT --map {path}` makes it")
-    _check_kind(path)
-    try:
-        arrays, facts = load_npz(path, sealed=True)
-    except ReobjError:
-        _, facts = load_npz(path)
-        _check_header(path, facts)
-        raise
-    _check_header(path, facts)
-    try:
-        room = _decoded(arrays, facts)
-        check_map(room)
-    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        missing = "no " if isinstance(error, KeyError) else ""
-        fault = one_line(f"{missing}{error}")
-        raise ReobjError(f"{path}: damaged ({fault}); use a copy of it") from error
-    return room
 
 
 def _check_kind(path: Path) -> None:
@@ -479,83 +298,102 @@ def _check_header(path: Path, facts: dict[str, Any]) -> None:
         )
 
 
+def _encoded(room: RoomMap) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the arrays of a map's file, and its JSON."""
+    origin = _origin(room.points.xyz)
+    columns = columns_of(room.points) | {"xyz": room.points.xyz - origin}
+    arrays: dict[str, Any] = {"points_origin": origin}
+    arrays |= {f"points_{name}": columns[name].astype(kind) for name, kind in POINTS.items()}
+    objects = sorted(room.objects, key=lambda found: found.id)
+    rows = [o for found in objects for o in sorted(found.observations, key=lambda o: o.session)]
+    for name, (kind, shape) in OBSERVATIONS.items():
+        values = np.array([getattr(o, name) for o in rows], np.float64).reshape(-1, *shape)
+        values = values[:, LOWER[0], LOWER[1]] if name == "cov" else values
+        arrays[f"observation_{name}"] = values.astype(kind)
+    for name, kind in CONCATENATED.items():
+        parts = [np.array(list(getattr(o, name)), kind) for o in rows]
+        if name != "picture" or any(map(len, parts)):
+            arrays[f"observation_{name}"] = np.concatenate([np.empty(0, kind), *parts])
+            arrays[f"observation_{name}_length"] = np.array([*map(len, parts)], np.int32)
+    sessions = sorted(room.sessions, key=lambda session: session.number)
+    for s in sessions:
+        for name in Session.ARRAYS:
+            arrays[f"session{s.number}_{name}"] = np.asarray(getattr(s, name), np.float64)
+    facts = {
+        **HEADER,
+        "reobj_track": __version__,
+        "map_id": room.map_id,
+        "metric": room.metric,
+        "up": None if room.up is None else room.up.tolist(),
+        "next_id": room.next_id,
+        "next_session": room.next_session,
+        "merged": {str(old): room.merged[old] for old in sorted(room.merged)},
+        "sessions": [
+            _without(s, *Session.ARRAYS) | {"camera": dataclasses.asdict(s.camera)}
+            for s in sessions
+        ],
+        "objects": [columns_of(o) | {"observations": len(o.observations)} for o in objects],
+        "observations": [
+            _without(o, *OBSERVATIONS, *CONCATENATED) | {"classes": dict(sorted(o.classes.items()))}
+            for o in rows
+        ],
+    }
+    return arrays, facts
+
+
+def _origin(xyz: Array) -> Array:
+    """Return the point (3,) to which the stored points are relative: a multiple of 1024.
+
+    In float32 coordinates of a map projection have a resolution of .5 m. The origin of a room near
+    that of its world is 0.
+    """
+    middle = np.median(xyz, 0) if len(xyz) else np.zeros(3)
+    return np.asarray(np.round(middle / 1024) * 1024 + 0.0)  # + 0: no -0
+
+
+def _without(record: Any, *names: str) -> dict[str, Any]:
+    """Return the fields of a dataclass other than some."""
+    return {name: value for name, value in columns_of(record).items() if name not in names}
+
+
 def _decoded(arrays: dict[str, Any], facts: dict[str, Any]) -> RoomMap:
     """Build a map from the content of its file."""
-    columns = {}
-    for name, (stored, shape) in POINTS.items():
-        kind = {"f": np.float64, "i": np.int64, "u": np.uint8}[stored.kind]
-        columns[name] = _column(arrays, f"points_{name}", stored, shape).astype(kind)
-    columns["xyz"] += _column(arrays, "points_origin", np.dtype(np.float64), ())
-    sessions = [
-        _known(Session, entry)
-        | {name: arrays[f"session{entry['number']}_{name}"] for name in Session.ARRAYS}
-        for entry in facts["sessions"]
-    ]
-    objects = _decoded_objects(facts["objects"], _decoded_observations(arrays, facts))
-    content = facts | {"sessions": sessions, "objects": objects, "points": columns}
-    room: RoomMap = decode(RoomMap, content)
-    return room
+    points = {
+        name: arrays[f"points_{name}"].astype(IN_MEMORY[k.kind]) for name, k in POINTS.items()
+    }
+    points["xyz"] += arrays["points_origin"]
+    columns: dict[str, Any] = {
+        name: arrays[f"observation_{name}"].astype(np.float64) for name in OBSERVATIONS
+    }
+    lower = columns["cov"]
+    cov = columns["cov"] = np.empty((len(lower), 9, 9))
+    cov[:, LOWER[0], LOWER[1]] = lower
+    cov[:, LOWER[1], LOWER[0]] = lower
+    for name in CONCATENATED:
+        if f"observation_{name}" in arrays:
+            ends = np.cumsum(arrays[f"observation_{name}_length"])
+            parts = np.split(arrays[f"observation_{name}"], ends)[:-1]
+            is_picture = name == "picture"
+            columns[name] = [p.tobytes() if is_picture else p.astype(np.float32) for p in parts]
+    of_file = zip(facts["observations"], *columns.values(), strict=True)
+    rows = iter([row | dict(zip(columns, values, strict=True)) for row, *values in of_file])
+    content = facts | {
+        "points": points,
+        "sessions": [
+            s | {name: arrays[f"session{s['number']}_{name}"] for name in Session.ARRAYS}
+            for s in facts["sessions"]
+        ],
+        "objects": [
+            o | {"observations": list(itertools.islice(rows, o["observations"]))}
+            for o in facts["objects"]
+        ],
+    }
+    return msgspec.convert(content, RoomMap, dec_hook=_array, str_keys=True)
 
 
-def _known(kind: type, entry: dict[str, Any]) -> dict[str, Any]:
-    """Return an entry that has no other keys than the fields of a dataclass."""
-    unknown = set(entry) - {f.name for f in dataclasses.fields(kind)}
-    _expect(not unknown, f"unknown field {sorted(unknown)}")
-    return entry
-
-
-def _column(
-    arrays: dict[str, Any], name: str, kind: np.dtype[Any], shape: tuple[int, ...]
-) -> npt.NDArray[Any]:
-    """Return an array of the file (N, *shape), of the dtype it is written with."""
-    values = arrays[name]
-    if values.dtype != kind or values.shape[1:] != shape or values.ndim != 1 + len(shape):
-        raise ValueError(f"{name} is an array {values.shape} of {values.dtype}")
-    return np.asarray(values)
-
-
-def _split_column(arrays: dict[str, Any], name: str) -> list[npt.NDArray[Any]]:
-    """Return a value (n,) of each observation; in the file they are concatenated."""
-    column = _column(arrays, f"observation_{name}", CONCATENATED[name], ())
-    length = _column(arrays, f"observation_{name}_length", np.dtype(np.int32), ())
-    right = not (length < 0).any() and length.sum() == len(column)
-    _expect(right, f"{len(column)} values of {name}, {length.sum()} expected")
-    return np.split(column, np.cumsum(length))[:-1]
-
-
-def _decoded_observations(arrays: dict[str, Any], facts: dict[str, Any]) -> list[dict[str, Any]]:
-    """Build the observations of all objects, in the order of the file."""
-    values: dict[str, Any] = {}
-    for name, (kind, shape) in OBSERVATIONS.items():
-        stored = (len(LOWER[0]),) if name == "cov" else shape
-        values[name] = _column(arrays, f"observation_{name}", kind, stored).astype(np.float64)
-    cov = np.empty((len(values["cov"]), 9, 9))
-    cov[:, LOWER[0], LOWER[1]] = values["cov"]
-    cov[:, LOWER[1], LOWER[0]] = values["cov"]
-    values["cov"] = cov
-    for name in Observation.EMBEDDINGS:
-        values[name] = [mean.astype(np.float32) for mean in _split_column(arrays, name)]
-    if "observation_picture" in arrays:
-        values["picture"] = [picture.tobytes() for picture in _split_column(arrays, "picture")]
-    count = len(facts["observations"])
-    right = all(len(column) == count for column in values.values())
-    _expect(right, f"arrays of other lengths than {count} observations")
-    rows = (dict(zip(values, row, strict=True)) for row in zip(*values.values(), strict=True))
-    return [_known(Observation, f) | r for f, r in zip(facts["observations"], rows, strict=True)]
-
-
-def _decoded_objects(
-    entries: list[dict[str, Any]], observations: list[dict[str, Any]]
-) -> list[dict[str, Any]]:
-    """Distribute the observations to the objects."""
-    ends = np.cumsum([entry["observations"] for entry in entries]).tolist()
-    count = ends[-1] if ends else 0
-    _expect(count == len(observations), f"{len(observations)} observations, {count} expected")
-    return [
-        _known(MapObject, entry)
-        | {"observations": tuple(observations[end - entry["observations"] : end])}
-        for entry, end in zip(entries, ends, strict=True)
-    ]
+def _array(_: Any, value: Any) -> Any:
+    """Convert a list to an array."""
+    return np.array(value) if isinstance(value, list) else value
 
 
 @contextlib.contextmanager

@@ -7,30 +7,27 @@ import dataclasses
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 import quadrics
-from reobj.cameras import Camera, Poses, import_pycolmap
+from reobj.cameras import Poses, import_pycolmap
 from reobj.files import Progress
 from reobj.maps.corrections import with_edits
-from reobj.maps.earlier import earlier_sessions
 from reobj.maps.fusion import scale_of
-from reobj.maps.object_placement import place_by_objects
+from reobj.maps.listing import earlier_sessions
 from reobj.maps.object_points import object_views, triangulated
 from reobj.maps.placement import (
     ImageFeatures,
     Placement,
-    PlacementOptions,
-    compared_rows,
     image_features,
     keyframe_rows,
     place,
     points_with_descriptors,
 )
-from reobj.maps.room_map import RoomMap, Session, map_lock
-from reobj.maps.single_frames import locate_frames, locate_rest
+from reobj.maps.room_map import MapPoints, RoomMap, map_lock
 from reobj.maps.update import Recording, add_recording
 from reobj.results.changes import Changes
 from reobj.results.entries import recording_name
@@ -105,6 +102,9 @@ def opened_map(config: MapConfig, must_exist: bool = False) -> Iterator[OpenMap 
         yield OpenMap(path, room, False, config.pictures)
 
 
+MORE_IMAGES = 200  # compared where fewer do not place a recording; more take longer
+
+
 @dataclass(frozen=True, slots=True)
 class Placed:
     """Cameras of a recording in the world of its map.
@@ -121,54 +121,41 @@ class Placed:
     placement: Placement | None
     scale: quadrics.Scale | None = None
 
-    @property
-    def unmatched(self) -> bool:
-        """True if the images of the recording match too few points of the map."""
-        if self.placement is None or not self.poses.known.any():
-            return False
-        return self.placement.unmatched
-
 
 def place_recording(
     opened: OpenMap,
     poses: Poses,
     video: Video,
-    options: PlacementOptions | None = None,
+    size_px: int = 640,
     progress: Callable[[str, int], Progress] = Progress,
-    camera: Camera | None = None,
 ) -> Placed:
     """Place the cameras of a recording in a map; the first recording defines the map's world.
 
-    The frames of a recording without poses are located in the map one by one.
-
     Args:
-        camera: intrinsics that the user gave; None: unknown.
+        size_px: longer side of the images for features.
     """
-    options = options or PlacementOptions()
+    room = opened.room
     if not video.has_images:
         return Placed(poses, (), None)
-    room = opened.room
-    rows = keyframe_rows(poses, options)
-    if opened.frozen and poses.known.any():  # a map that learns needs features of all of them
-        rows = compared_rows(poses, rows, options)
-    line = progress("map features", 0)
-    features = tuple(image_features(poses, video, rows, options, line))
+    rows = keyframe_rows(poses)
+    with progress("map features", 0) as line:
+        features = image_features(poses, video, rows, size_px, line)
     if not room.sessions:
-        return Placed(dataclasses.replace(poses, map_id=room.map_id), features, None)
-    points = room.points
+        return Placed(dataclasses.replace(poses, map_id=room.map_id), tuple(features), None)
     with progress("map", 0) as line:
-        if poses.known.any():
-            placement = place(poses, features, points, options, line.step)
-        else:
-            placement = locate_frames(poses, features, points, camera, options, report=line.step)
-    if placement.refused and poses.known.any():
-        features = _denser(features, poses, video, options, progress)
-        every = dataclasses.replace(options, images=len(features))
+        placement = place(poses, features, room.points, size_px, report=line.step)
+    if placement.refused:  # the mapped part of the room may be in view for a short time
+        rows = np.flatnonzero(poses.known)
+        rows = np.union1d(rows[:: -(-len(rows) // MORE_IMAGES)], keyframe_rows(poses))
+        rows = np.setdiff1d(rows, [image.row for image in features])
+        with progress("map features", 0) as line:
+            features += image_features(poses, video, rows, size_px, line)
+        features.sort(key=lambda image: image.row)
         with progress("map", 0) as line:
-            placement = place(poses, features, points, every, line.step)
-    if not placement.refused and placement.poses.source == "map":
-        placement = _all_frames(placement, video, progress)
-    return _placed(room, poses, features, placement)
+            placement = place(poses, features, room.points, size_px, len(features), line.step)
+    if placement.refused:
+        return Placed(poses, tuple(features), placement)
+    return _placed(room, poses, tuple(features), placement)
 
 
 def _placed(
@@ -177,18 +164,15 @@ def _placed(
     """Give the cameras of a recording that was placed the units and gravity of the map.
 
     Args:
-        poses: before. placement: refused ones leave them as they are.
+        poses: before.
     """
-    if placement.refused:
-        return Placed(poses, features, placement)
     known = scale_of(room)
     scale = None
     if poses.metric and not room.metric:
         best = placement.best
         assert best.similarity is not None
         sigma = float(np.sqrt(best.similarity.cov[6, 6]))
-        scale = quadrics.Scale(1 / best.similarity.scale, sigma, "poses")
-        known = scale
+        known = scale = quadrics.Scale(1 / best.similarity.scale, sigma, "poses")
     moved = dataclasses.replace(
         placement.poses,
         metric=room.metric and placement.poses.part_count == 1,
@@ -197,55 +181,6 @@ def _placed(
         map_id=room.map_id,
     )
     return Placed(moved, features, placement, scale)
-
-
-def place_objects(room: RoomMap, result: Result, embedder: str, placed: Placed) -> Placed:
-    """Place a recording by its objects, as too few points of its images match.
-
-    Args:
-        result: with the objects of the recording, in its own world. embedder: of the recording.
-        placed: refused, by points.
-    """
-    assert placed.placement is not None
-    placement = place_by_objects(room, result, embedder, placed.placement)
-    return _placed(room, placed.poses, placed.features, placement)
-
-
-def _denser(
-    features: Sequence[ImageFeatures],
-    poses: Poses,
-    video: Video,
-    options: PlacementOptions,
-    progress: Callable[[str, int], Progress],
-    most: int = 200,
-) -> tuple[ImageFeatures, ...]:
-    """Add features of frames between: the mapped part of the room may be in view for a short time.
-
-    Args:
-        most: images, spread over the frames with a pose; more find shorter times and take longer.
-    """
-    rows = np.flatnonzero(poses.known)
-    rows = np.union1d(rows[:: -(-len(rows) // most)], keyframe_rows(poses, options))
-    rows = np.setdiff1d(rows, [image.row for image in features])
-    added = image_features(poses, video, rows, options, progress("map features", 0))
-    return tuple(sorted([*features, *added], key=lambda image: image.row))
-
-
-def _all_frames(
-    placement: Placement, video: Video, progress: Callable[[str, int], Progress]
-) -> Placement:
-    """Locate the frames between the images that were located one by one; say how many there are."""
-    with progress("pnp", len(placement.poses.frame)) as line:
-        poses = locate_rest(placement, video, line)
-    (component,) = placement.components
-    message = (
-        "the recording alone could not be reconstructed: "
-        f"{len(component.images)} of {component.tried} images were located in the map one by one"
-    )
-    between = int(poses.known.sum()) - len(component.images)
-    if between:
-        message += f", and {between} frames between them"
-    return dataclasses.replace(placement, poses=dataclasses.replace(poses, messages=(message,)))
 
 
 def move_models(
@@ -265,27 +200,26 @@ def move_models(
     if placement is None or placement.refused or not models:
         return list(models)
     pc = import_pycolmap()
-    found = list[Path]()
     others = list[Path]()
-    most = 0
+    placed_models = list[tuple[int, int]]()  # frames, component
     for k, model in enumerate(models):
-        similarity = placement.components[k].similarity
-        if similarity is None:
+        if placement.components[k].similarity is None:
             others.append(model)
-            continue
-        count = int((poses.part == k).sum())
-        if not model.is_dir() or count <= most:
-            continue
-        most = count
-        target = folder(k)
-        shutil.rmtree(target, ignore_errors=True)
-        target.mkdir(parents=True)
-        reconstruction = pc.Reconstruction(str(model))
-        rotation = pc.Rotation3d(similarity.rotation)
-        reconstruction.transform(pc.Sim3d(similarity.scale, rotation, similarity.translation))
-        reconstruction.write(str(target))
-        found = [target]
-    return [*found, *others]
+        elif model.is_dir():
+            placed_models.append((int((poses.part == k).sum()), -k))
+    if not placed_models:
+        return others
+    largest = -max(placed_models)[1]
+    similarity = placement.components[largest].similarity
+    assert similarity is not None
+    target = folder(largest)
+    shutil.rmtree(target, ignore_errors=True)
+    target.mkdir(parents=True)
+    reconstruction = pc.Reconstruction(str(models[largest]))
+    rotation = pc.Rotation3d(similarity.rotation)
+    reconstruction.transform(pc.Sim3d(similarity.scale, rotation, similarity.translation))
+    reconstruction.write(str(target))
+    return [target, *others]
 
 
 def finish_map(
@@ -305,24 +239,12 @@ def finish_map(
         placed: None: the cameras are those of the last run, with the points that the map has.
         before: of the last run if `placed` is None; a frozen map does not have its alignment.
     """
-    room = opened.room
-    name = session_name(video)
     if refused := _refusal(opened, result.poses, video, placed):
-        text = f"map {opened.path}: {refused}; the map is unchanged, the objects lack its numbers"
-        if not room.sessions:
-            text = f"map {opened.path}: not made: {refused}"
-        tried = 0
-        if placed is not None and placed.placement is not None:
-            tried = sum(c.tried for c in placed.placement.components)
-        return dataclasses.replace(
-            result,
-            changes=Changes(str(opened.path), name, refused=refused, tried_frames=tried),
-            warnings=[*result.warnings, text],
-        )
+        return _refused(opened, result, video, placed, refused)
+    room = opened.room
     if result.edits is not None:
         room = with_edits(room, result.edits)
-    recording = _recording(opened, result, video, name, embedder, placed)
-    recording = _as_placed_before(recording, before, room)
+    recording = _recording(opened, result, video, embedder, placed, before)
     if placed is not None and video.has_images:
         recording = _with_object_points(recording, result, video, progress, opened.frozen)
     if opened.pictures and not opened.frozen:
@@ -331,28 +253,20 @@ def finish_map(
             pictures = best_pictures(result, video, progress("map pictures", video.expected))
         recording = dataclasses.replace(recording, pictures=pictures)
     new_room, numbered = add_recording(room, result, recording)
+    warnings = list(numbered.warnings)
+    old = room.session_of(recording.fingerprint)
+    if old is not None and placed is not None:  # perhaps a copy under another name
+        replaced = "" if opened.frozen else ", which is replaced"
+        text = f"it has this recording as session {old.number} ({old.name}){replaced}"
+        warnings.append(f"{NOTE_START}map {opened.path}: {text}")
+    if not opened.frozen:
+        try:
+            new_room.save(opened.path)
+        except ReobjError as error:
+            text = f"map {error}; the results are complete, but the map lacks this recording"
+            warnings.append(text)
     earlier = earlier_sessions(new_room, opened.path, recording.fingerprint)
-    numbered = dataclasses.replace(numbered, earlier=earlier)
-    warnings = [*numbered.warnings, *_notes_of_known(opened, recording, placed)]
-    numbered = dataclasses.replace(numbered, warnings=warnings)
-    if opened.frozen:
-        return numbered
-    try:
-        new_room.save(opened.path)
-    except ReobjError as error:
-        text = f"map {error}; the results are complete, but the map lacks this recording"
-        return dataclasses.replace(numbered, warnings=[*numbered.warnings, text])
-    return numbered
-
-
-def _notes_of_known(opened: OpenMap, recording: Recording, placed: Placed | None) -> list[str]:
-    """Say that the map has this recording, perhaps as a copy under another name; [] of a refit."""
-    old = opened.room.session_of(recording.fingerprint)
-    if old is None or placed is None:
-        return []
-    replaced = "" if opened.frozen else ", which is replaced"
-    text = f"it has this recording as session {old.number} ({old.name}){replaced}"
-    return [f"{NOTE_START}map {opened.path}: {text}"]
+    return dataclasses.replace(numbered, earlier=earlier, warnings=warnings)
 
 
 def _with_object_points(
@@ -367,11 +281,8 @@ def _with_object_points(
     objects = [o for o in result.located if o.part == 0]
     with progress("object features", 0) as line:
         views = object_views(objects, result.poses, result.tracks, video, line)
-    recording = dataclasses.replace(recording, views=tuple(views))
-    if frozen:
-        return recording
-    points = triangulated(objects, views, result.poses)
-    return dataclasses.replace(recording, object_points=points)
+    points = MapPoints.empty() if frozen else triangulated(objects, views, result.poses)
+    return dataclasses.replace(recording, views=tuple(views), object_points=points)
 
 
 def _refusal(opened: OpenMap, poses: Poses | None, video: Video, placed: Placed | None) -> str:
@@ -388,6 +299,23 @@ def _refusal(opened: OpenMap, poses: Poses | None, video: Video, placed: Placed 
     if poses.map_id != opened.room.map_id:
         return "its cameras were not placed in this map; run the video again with --map"
     return ""
+
+
+def _refused(
+    opened: OpenMap, result: Result, video: Video, placed: Placed | None, refused: str
+) -> Result:
+    """Return the result of a recording that is not in the world of the map."""
+    text = f"map {opened.path}: {refused}; the map is unchanged, the objects lack its numbers"
+    if not opened.room.sessions:
+        text = f"map {opened.path}: not made: {refused}"
+    tried = 0
+    if placed is not None and placed.placement is not None:
+        tried = sum(c.tried for c in placed.placement.components)
+    return dataclasses.replace(
+        result,
+        changes=Changes(str(opened.path), session_name(video), refused, 0, tried),
+        warnings=[*result.warnings, text],
+    )
 
 
 def session_name(video: Video) -> str:
@@ -408,83 +336,56 @@ def _recording(
     opened: OpenMap,
     result: Result,
     video: Video,
-    name: str,
     embedder: str,
     placed: Placed | None,
+    before: Changes | None,
 ) -> Recording:
-    """Collect the facts of a recording; those of a refitted one are in the map."""
-    old = opened.room.session_of(session_key(video))
-    none = quadrics.Scale(1.0, np.inf, "none")
-    if placed is None:
-        scale = none
-        if old is not None:
-            scale = quadrics.Scale(old.metres_per_unit, old.scale_rel_sigma, old.scale_source)
-        return Recording(
-            opened.path, name, session_key(video), embedder,
-            np.zeros((7, 7)) if old is None else old.alignment_cov,
-            0 if old is None else old.localised_frames, 0 if old is None else old.tried_frames,
-            scale, None, placed_by=_placed_by(opened.room, old),
-        )  # fmt: skip
-    poses = placed.poses
-    points = None  # of a recording located by the map's points: it has no others
-    by_objects = placed.placement is not None and placed.placement.by == "objects"
-    if poses.source != "map" and not by_objects:  # objects do not locate points well enough
-        points = points_with_descriptors(poses.of_part(0), _of_first_component(placed), 0)
-    if placed.placement is None:
-        own = result.world.scale or none
-        scale = quadrics.Scale(1.0, 0.0, "poses") if poses.metric else own
-        count = len(placed.features)
-        cov = np.zeros((7, 7))
-        return Recording(
-            opened.path, name, session_key(video), embedder, cov, count, count, scale, points
-        )
-    best = placed.placement.best
-    assert best.similarity is not None
-    made_the_map = old is not None and not _placed_by(opened.room, old)
-    if old is not None and placed.scale is None:
-        scale = quadrics.Scale(old.metres_per_unit, old.scale_rel_sigma, old.scale_source)
-    else:
-        scale = placed.scale or none
-    return Recording(
-        opened.path, name, session_key(video), embedder, best.similarity.cov,
-        len(best.images), best.tried, scale, points,
-        placed_by="" if made_the_map else placed.placement.by,
-    )  # fmt: skip
-
-
-def _as_placed_before(recording: Recording, before: Changes | None, room: RoomMap) -> Recording:
-    """Return a recording that the map does not have, with the placement of its last run.
+    """Collect the facts of a recording; those of a refitted one are in the map.
 
     Args:
-        before: of the last run; of the covariance of the placement it has that of the shift. None:
-            the recording was placed in this run.
+        before: of the last run; of the covariance of the placement it has that of the shift.
     """
-    if before is None or room.session_of(recording.fingerprint) is not None:
-        return recording
-    sigma = (before.sigma_m or 0.0) / scale_of(room).value  # of a vector
-    return dataclasses.replace(
-        recording,
-        alignment_cov=np.diag([0, 0, 0, 1, 1, 1, 0]) * sigma**2 / 3,
-        localised_frames=before.localised_frames,
-        tried_frames=before.tried_frames,
-        placed_by=before.placed_by,
-        moved=before.moved,
-    )
-
-
-def _placed_by(room: RoomMap, session: Session | None) -> str:
-    """Say by what a session of the map was placed; "": it made the map, or is not in it."""
-    if session is None or session.number == min(s.number for s in room.sessions):
-        return ""
-    return "points" if session.localised_frames else "objects"
-
-
-def _of_first_component(placed: Placed) -> list[ImageFeatures]:
-    """Return the features of images of the first component, by their row in it."""
-    rows = np.flatnonzero(placed.poses.part == 0)
-    row_of = {int(row): k for k, row in enumerate(rows)}
-    return [
-        dataclasses.replace(image, row=row_of[image.row])
-        for image in placed.features
-        if image.row in row_of
+    room = opened.room
+    key = session_key(video)
+    old = room.session_of(key)
+    first = min((s.number for s in room.sessions), default=0)
+    recording = Recording(
+        opened.path, session_name(video), key, embedder, np.zeros((7, 7)), 0, 0,
+        quadrics.Scale(1.0, np.inf, "none"), None,
+        placed_by="" if not first or (old is not None and old.number == first) else "points",
+    )  # fmt: skip
+    changed = partial(dataclasses.replace, recording)
+    if placed is None:
+        if old is not None:
+            return changed(
+                alignment_cov=old.alignment_cov, localised_frames=old.localised_frames,
+                tried_frames=old.tried_frames, scale=old.scale,
+            )  # fmt: skip
+        if before is None:
+            return recording
+        sigma = (before.sigma_m or 0.0) / scale_of(room).value  # of a vector
+        return changed(
+            alignment_cov=np.diag([0, 0, 0, 1, 1, 1, 0]) * sigma**2 / 3,
+            localised_frames=before.localised_frames, tried_frames=before.tried_frames,
+            placed_by=before.placed_by, moved=before.moved,
+        )  # fmt: skip
+    poses = placed.poses
+    row_of = {int(row): k for k, row in enumerate(np.flatnonzero(poses.part == 0))}
+    features = [
+        dataclasses.replace(f, row=row_of[f.row]) for f in placed.features if f.row in row_of
     ]
+    points = points_with_descriptors(poses.of_part(0), features)
+    count = len(placed.features)
+    if placed.placement is None:
+        scale = quadrics.Scale(1.0, 0.0, "poses") if poses.metric else result.world.scale
+        return changed(
+            localised_frames=count, tried_frames=count, points=points,
+            scale=scale or recording.scale,
+        )  # fmt: skip
+    best = placed.placement.best
+    assert best.similarity is not None
+    return changed(
+        alignment_cov=best.similarity.cov, localised_frames=len(best.images),
+        tried_frames=best.tried, points=points,
+        scale=placed.scale or (recording.scale if old is None else old.scale),
+    )  # fmt: skip

@@ -15,22 +15,36 @@ from scipy.spatial import cKDTree
 import quadrics
 from reobj.cameras import Poses
 from reobj.maps.compare import (
-    CompareOptions,
+    ENOUGH_INLIERS,
     Decision,
     FoundObject,
     PointMotion,
     Visibility,
-    alignment_jacobian,
     compare,
 )
-from reobj.maps.fusion import ObjectState, object_state, scale_of
+from reobj.maps.fusion import (
+    ObjectState,
+    alignment_jacobian,
+    object_state,
+    scale_of,
+    scaled_radius,
+    shapes_of,
+    state_before,
+)
 from reobj.maps.motion import point_motions
 from reobj.maps.object_points import ObjectView
-from reobj.maps.room_map import MapObject, MapPoints, Observation, RoomMap, Session
-from reobj.maps.visibility import MapDetections, shapes_of, visibility_of
+from reobj.maps.room_map import (
+    OBSERVATIONS,
+    MapObject,
+    MapPoints,
+    Observation,
+    RoomMap,
+    Session,
+)
+from reobj.maps.visibility import visibility_of
 from reobj.results.changes import Change, Changes, Shape
 from reobj.results.result import Object, Result
-from reobj.types import Array, Floats, IntArray, Tracks, unit_rows
+from reobj.types import Array, Embeddings, Floats, IntArray, unit_rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,14 +97,13 @@ def add_recording(room: RoomMap, result: Result, recording: Recording) -> tuple[
     own = {
         o.id: x for o in room.objects for x in o.observations if x.session == number and x.detected
     }
-    states = states_for(room, own)
-    before = _states_before(room, number)
+    states = _states_for(room, own)
+    states_before = {o.id: state_before(o, number, room) for o in room.objects}
+    before = {i: state for i, state in states_before.items() if state is not None}
     objects = [o for o in result.located if o.part == 0]
     found = _with_motions(found_objects(result, objects), states, result, room, recording)
     is_first = not room.sessions
-    detections = _all_detections(result, states, recording.alignment_cov)
-    nearer = shapes_of(objects)
-    visibility = visibility_of(states, result.poses, nearer, result.looked, detections)
+    visibility = visibility_of(states, result, objects, recording.alignment_cov)
     metres = scale_of(room).value if room.sessions else recording.scale.value
     given = frozenset[int]()
     if result.links is not None:
@@ -109,14 +122,16 @@ def add_recording(room: RoomMap, result: Result, recording: Recording) -> tuple[
     numbers = _numbers(result, decisions, room, is_first, {o.id for o in objects})
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     session = _session(number, recording, result.poses, now if old is None else old.date)
-    observations = _observations(number, decisions, found, states, visibility)
+    sessions = (*(s for s in room.sessions if s.number != number), session)
     pictures = recording.pictures
     if pictures is None:
         pictures = {i: own[n].picture for i, n in numbers.items() if n in own}
-    observations = [
-        (n, i, dataclasses.replace(o, picture=pictures.get(i, b""))) for n, i, o in observations
-    ]
-    sessions = (*(s for s in room.sessions if s.number != number), session)
+    observations = {
+        d.map_id or numbers[d.found_id]: _observation(
+            number, d, found, states, visibility, pictures
+        )
+        for d in decisions
+    }
     points = room.points
     if recording.points is not None:
         marked = _on_objects(recording.points, result, objects, numbers)
@@ -126,7 +141,7 @@ def add_recording(room: RoomMap, result: Result, recording: Recording) -> tuple[
         marked = MapPoints.joined([marked, of_objects])
         marked = dataclasses.replace(marked, session=np.full(len(marked), number))
         points = _with_new_points(points[points.session != number], marked)
-    map_objects = _with_observations(room, number, observations, numbers, own)
+    map_objects = _with_observations(room, number, observations, own)
     known = np.isin(points.object_id, [o.id for o in map_objects])
     points = dataclasses.replace(points, object_id=np.where(known, points.object_id, 0))
     new_room = dataclasses.replace(
@@ -144,19 +159,7 @@ def add_recording(room: RoomMap, result: Result, recording: Recording) -> tuple[
     return new_room, _renumbered(result, numbers, states, decisions, changes)
 
 
-def _all_detections(
-    result: Result, states: Sequence[ObjectState], alignment_cov: Array
-) -> MapDetections:
-    """Collect the detections of all tracks and those that the tracker did not use."""
-    tracked = result.tracks[result.tracks.detection_index >= 0]
-    rows = Tracks.joined([tracked, result.untracked])
-    located = np.array([o.id for o in result.located], np.int64)
-    jacobian = alignment_jacobian(np.array([s.center for s in states]).reshape(-1, 3))
-    cov = np.array([s.cov[:3, :3] for s in states]).reshape(-1, 3, 3)
-    return MapDetections(rows, located, cov + jacobian @ alignment_cov @ jacobian.swapaxes(1, 2))
-
-
-def states_for(room: RoomMap, own: Mapping[int, Observation]) -> list[ObjectState]:
+def _states_for(room: RoomMap, own: Mapping[int, Observation]) -> list[ObjectState]:
     """Return the states of the map's objects that a recording is compared with.
 
     Args:
@@ -171,16 +174,6 @@ def states_for(room: RoomMap, own: Mapping[int, Observation]) -> list[ObjectStat
             state = dataclasses.replace(object_state(alone, room), class_name=state.class_name)
         states.append(state)
     return states
-
-
-def _states_before(room: RoomMap, session: int) -> dict[int, ObjectState]:
-    """Return the states of the objects that were detected before a session, by number."""
-    known = {}
-    for found in room.objects:
-        rows = tuple(o for o in found.observations if o.session < session)
-        if any(o.detected for o in rows):
-            known[found.id] = object_state(dataclasses.replace(found, observations=rows), room)
-    return known
 
 
 def _as_before(
@@ -221,9 +214,9 @@ def found_objects(result: Result, objects: Sequence[Object]) -> list[FoundObject
                 o.id,
                 {name: count * share for name, share in o.classes.items()} or {o.class_name: count},
                 str(o.support),
-                _array(o.center, 3),
-                _array(o.half_axes, 3),
-                _array(o.quat_wxyz, 4),
+                np.asarray(o.center),
+                np.asarray(o.half_axes),
+                np.asarray(o.quat_wxyz),
                 np.full((9, 9), np.nan) if o.cov is None else o.cov,
                 _mean_unit(result.embeddings.foreground[rows]),
                 _mean_unit(result.embeddings.background[rows]),
@@ -272,16 +265,11 @@ def _known_motions(
         shift = change.after - change.before
         sigma = (change.sigma_m or 0.0) / metres_per_unit
         motion = PointMotion(
-            CompareOptions().enough_inliers, 0, np.column_stack([np.eye(3), shift]), shift,
+            ENOUGH_INLIERS, 0, np.column_stack([np.eye(3), shift]), shift,
             sigma**2 / 3 * np.eye(3),
         )  # fmt: skip
         motions.setdefault(nearest.id, {})[change.id] = motion
     return motions
-
-
-def _array(values: Array | None, length: int) -> Array:
-    """Return the values of a located object, NaN for None."""
-    return np.full(length, np.nan) if values is None else values
 
 
 def _mean_unit(rows: Floats) -> Floats:
@@ -300,8 +288,7 @@ def _on_objects(
     shapes = shapes_of(objects)
     best = np.full(len(points), 1.1**2)
     for k, o in enumerate(objects):
-        inside = (points.xyz - shapes.center_in_world[k]) @ shapes.world_from_obj[k]
-        distance = ((inside / shapes.half_axes[k]) ** 2).sum(1)
+        distance = scaled_radius(points.xyz, shapes, k)
         nearer = distance < best
         object_id[nearer] = numbers[o.id]
         best[nearer] = distance[nearer]
@@ -398,15 +385,12 @@ def _renumbered(
         )
         for o in result.objects
     ]
-    order = np.array(sorted(range(len(objects)), key=lambda k: objects[k].id), np.int64)
-    order = order[[objects[k].id not in deleted & matched for k in order.tolist()]] \
-        if len(order) else order  # fmt: skip
+    left = [k for k, o in enumerate(objects) if o.id not in deleted & matched]
+    order = np.array(sorted(left, key=lambda k: objects[k].id), np.int64)
     row_of = np.cumsum(kept) - 1
     embedded = kept[result.embedding_row]
-    embeddings = dataclasses.replace(
-        result.embeddings,
-        foreground=result.embeddings.foreground[embedded],
-        background=result.embeddings.background[embedded],
+    embeddings = Embeddings(
+        result.embeddings.foreground[embedded], result.embeddings.background[embedded]
     )
     return dataclasses.replace(
         result,
@@ -422,18 +406,13 @@ def _renumbered(
 
 def _chosen(fits: quadrics.ObjectFits, order: IntArray) -> quadrics.ObjectFits:
     """Select fits by object."""
-    columns = ("size", "cov", "support", "rms_px", "status", "parallax_deg", "prior_share")
-    chosen = {name: getattr(fits, name)[order] for name in columns}
+    columns = ("ellipsoids", "size", "cov", "support", "rms_px", "status", "parallax_deg",
+               "prior_share")  # fmt: skip
     return dataclasses.replace(
         fits,
-        ellipsoids=quadrics.Ellipsoids(
-            fits.ellipsoids.center_in_world[order],
-            fits.ellipsoids.half_axes[order],
-            fits.ellipsoids.world_from_obj[order],
-        ),
         inlier=fits.inlier[:, order],
         reason=[fits.reason[k] for k in order.tolist()],
-        **chosen,
+        **{name: getattr(fits, name)[order] for name in columns},
     )
 
 
@@ -462,60 +441,47 @@ def _session(number: int, recording: Recording, poses: Poses, date: str) -> Sess
     )
 
 
-def _observations(
+def _observation(
     session: int,
-    decisions: Sequence[Decision],
+    decision: Decision,
     found: Sequence[FoundObject],
     states: Sequence[ObjectState],
     visibility: Visibility,
-) -> list[tuple[int, int, Observation]]:
-    """Return (number in the map, identity in the recording, observation) of every decision."""
-    found_of = {o.id: o for o in found}
-    row_of = {s.id: k for k, s in enumerate(states)}
-    rows = []
-    for d in decisions:
-        expected = int(visibility.expected[row_of[d.map_id]]) if d.map_id in row_of else 0
-        if not d.found_id:
-            unseen = Observation(session, d.kind, expected=expected, missed=expected)
-            rows.append((d.map_id, 0, unseen))
-            continue
-        o = found_of[d.found_id]
-        confidence = float(np.clip(o.confidence, 0.01, 0.99))
-        rows.append((
-            d.map_id,
-            d.found_id,
-            Observation(
-                session,
-                d.kind,
-                o.support,
-                o.center,
-                o.half_axes,
-                o.quat_wxyz,
-                o.cov,
-                o.classes,
-                o.foreground,
-                o.background,
-                o.views if len(o.foreground) else 0,
-                o.views,
-                expected=expected,
-                log_odds=float(np.log(confidence / (1 - confidence))),
-            ),
-        ))  # fmt: skip
-    return rows
+    pictures: Mapping[int, bytes],
+) -> Observation:
+    """Return what a session says about the object of a decision."""
+    rows = [k for k, s in enumerate(states) if s.id == decision.map_id]
+    expected = int(visibility.expected[rows[0]]) if rows else 0
+    if not decision.found_id:
+        return Observation(session, decision.kind, expected=expected, missed=expected)
+    o = next(o for o in found if o.id == decision.found_id)
+    confidence = float(np.clip(o.confidence, 0.01, 0.99))
+    shape = {name: getattr(o, name) for name in ("support", *OBSERVATIONS, "classes")}
+    return Observation(
+        session,
+        decision.kind,
+        **shape,
+        foreground=o.foreground,
+        background=o.background,
+        embedded=o.views if len(o.foreground) else 0,
+        views=o.views,
+        expected=expected,
+        log_odds=float(np.log(confidence / (1 - confidence))),
+        picture=pictures.get(o.id, b""),
+    )
 
 
 def _with_observations(
     room: RoomMap,
     session: int,
-    observations: Sequence[tuple[int, int, Observation]],
-    numbers: Mapping[int, int],
+    observations: Mapping[int, Observation],
     own: Mapping[int, Observation],
 ) -> tuple[MapObject, ...]:
     """Return the objects with the observations of a session instead of those that it had.
 
     Args:
-        own: that it had, by number. They are kept for deleted objects that are not detected, as
-            corrections of the recording delete their tracks.
+        observations: by number. own: that it had. They are kept for deleted objects that are not
+            detected, as corrections of the recording delete their tracks.
     """
     objects = {
         o.id: dataclasses.replace(
@@ -523,8 +489,7 @@ def _with_observations(
         )
         for o in room.objects
     }
-    for map_id, identity, observation in observations:
-        number = map_id or numbers[identity]
+    for number, observation in observations.items():
         before = objects.get(number, MapObject(number, ()))
         if before.deleted and number in own and not observation.detected:
             observation = own[number]
@@ -600,18 +565,14 @@ def _displacement(
     if state is None or found is None or metres is None:
         return None, None
     motion = found.motion_of.get(state.id)
-    if motion is not None and motion.inliers >= CompareOptions().enough_inliers:
+    if motion is not None and motion.inliers >= ENOUGH_INLIERS:
         offset = motion.shift
         own = motion.cov
     else:
         offset = found.center - state.center
         own = state.cov[:3, :3] + found.cov[:3, :3]
     distance = float(np.linalg.norm(offset))
-    x, y, z = found.center
-    J = np.zeros((3, 7))
-    J[:, :3] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
-    J[:, 3:6] = np.eye(3)
-    J[:, 6] = found.center
+    (J,) = alignment_jacobian(found.center[None])
     cov = own + J @ alignment_cov @ J.T
     along = offset / distance if distance > 0 else np.array([1.0, 0, 0])
     sigma = float(np.sqrt(along @ cov @ along)) if np.isfinite(cov).all() else None

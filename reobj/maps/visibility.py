@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 import quadrics
-from reobj.cameras import Poses, invert_rigid, undistort_boxes
+from reobj.cameras import invert_rigid, undistort_boxes
 from reobj.maps.compare import Visibility
-from reobj.maps.fusion import ObjectState
+from reobj.maps.fusion import ObjectState, alignment_jacobian, shapes_of
 from reobj.objects.occlusion import entry_depths
-from reobj.results.result import Object
+from reobj.results.result import Object, Result
 from reobj.types import Array, BoolArray, IntArray, Tracks
 from reobj.visible_points import VisiblePoints
 
@@ -25,106 +23,78 @@ ACCIDENT = (0.1, 0.01)
 LEAST_SHARE = 0.75  # of the detections of an object with a shape, to be that object
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MapDetections:
-    """Detections of a recording, for N objects of a map.
-
-    Attributes:
-        rows: in native pixels, of all scores, also those that no track has.
-        located: (M,) identities of objects with a shape.
-        cov: (N, 3, 3) of the centres of the map's objects, as the recording is placed.
-    """
-
-    rows: Tracks
-    located: IntArray
-    cov: Array
-
-
-def shapes_of(states: Sequence[ObjectState] | Sequence[Object]) -> quadrics.Ellipsoids:
-    """Return the ellipsoids of objects, in the world of the map."""
-    wxyz = np.array([s.quat_wxyz for s in states]).reshape(-1, 4)
-    axes = Rotation.from_quat(wxyz[:, [1, 2, 3, 0]]).as_matrix() if len(states) else wxyz
-    return quadrics.Ellipsoids(
-        np.array([s.center for s in states]).reshape(-1, 3),
-        np.array([s.half_axes for s in states]).reshape(-1, 3),
-        axes.reshape(-1, 3, 3),
-    )
+MOST_VIEWS = 60  # spread over the recording; more take longer
+# Least root of the area of the projected box in an image 640 px wide: detectors miss smaller ones
+LEAST_PX = 16.0
+IN_VIEW = 0.7  # fraction of the projected box inside the image
+APART_DEG = 10.0  # views of an object less than this apart fail together and count once
+# Different points behind an object, over all views, that show that it is seen through; one or two
+# may be wrong
+LEAST_POINTS = 3
+# Largest standard deviation of the centre, over the mean half axis: with more, a detection of the
+# object may lie beside its projection
+MOST_SPREAD = 0.5
 
 
 def visibility_of(
     states: Sequence[ObjectState],
-    poses: Poses,
-    nearer: quadrics.Ellipsoids,
-    looked: IntArray | None = None,
-    detections: MapDetections | None = None,
-    most_views: int = 60,
-    least_px: float = 16.0,
-    in_view: float = 0.7,
-    apart_deg: float = 10.0,
-    least_points: int = 3,
-    most_spread: float = 0.5,
+    result: Result,
+    objects: Sequence[Object],
+    alignment_cov: Array,
 ) -> Visibility:
     """Count the independent views in which each object would be seen, was seen, and through it.
 
     An object is expected in an image if most of its projection lies inside, is large enough, and
     neither objects of the recording nor most of the sparse points in its outline lie nearer. Views
-    say nothing about an object whose centre is too uncertain.
+    say nothing about an object whose centre is too uncertain. All detections of frames in which
+    the detector ran count, of all scores, also those that no track has.
 
     Args:
-        states: N objects of the map. poses: placed in the map; only its first component is used.
-        nearer: objects of the recording, which may occlude. looked: frames that the detector was
-            run on; None: all. detections: in these frames; None: there are none.
-        most_views: spread over the recording; more take longer.
-        least_px: root of the area of the projected box in an image 640 px wide; detectors miss
-            smaller objects.
-        in_view: fraction of the projected box inside the image.
-        apart_deg: views of an object less than this apart fail together and count once.
-        least_points: different points behind an object, over all views, that show that it is
-            seen through; one or two may be wrong.
-        most_spread: largest standard deviation of the centre, over the mean half axis: with more,
-            a detection of the object may lie beside its projection.
+        states: N objects of the map. result: its first component is placed in the map.
+        objects: of this component, which may occlude. alignment_cov: (7, 7) of the placement.
     """
+    poses = result.poses
+    assert poses is not None
     shapes = shapes_of(states)
-    support = [s.support for s in states]
+    nearer = shapes_of(objects)
     measured = poses.measured & (poses.part == 0)
-    if looked is not None:
-        measured &= np.isin(poses.frame, looked)
+    if result.looked is not None:
+        measured &= np.isin(poses.frame, result.looked)
     rows = np.flatnonzero(measured)
-    rows = rows[np.unique(np.linspace(0, len(rows) - 1, most_views).round().astype(int))] \
-        if len(rows) else rows  # fmt: skip
+    if len(rows):
+        rows = rows[np.unique(np.linspace(0, len(rows) - 1, MOST_VIEWS).round().astype(int))]
     size = (poses.camera.width, poses.camera.height)
     cameras = poses.camera.K @ poses.cam_from_world[rows]
     centre = invert_rigid(poses.cam_from_world[rows])[:, :, 3]
+    whole = quadrics.solid_boxes(shapes, [s.support for s in states], cameras)  # (V, N, 4)
+    boxes = quadrics.clip_boxes(whole, size)
+    area = _area(boxes)
+    large = np.sqrt(area) * 640 / max(size) >= LEAST_PX
+    large &= area >= IN_VIEW * np.maximum(_area(whole), 1e-9)
     visible = VisiblePoints(poses)
     expected = np.zeros((len(rows), len(states)), bool)
     through = np.zeros((len(rows), len(states)), bool)
     around = np.zeros((len(rows), len(states)), bool)
     behind: list[set[int]] = [set() for _ in states]
     for v, row in enumerate(rows.tolist()):
-        whole = quadrics.solid_boxes(shapes, support, cameras[v : v + 1])[0]  # (N, 4)
-        clipped = quadrics.clip_boxes(whole[None], size)[0]
-        ratio = _area(clipped) / np.maximum(_area(whole), 1e-9)
-        sides = np.sqrt(_area(clipped)) * 640 / max(size)
-        with np.errstate(invalid="ignore"):
-            shown = np.flatnonzero((ratio >= in_view) & (sides >= least_px))
-        shown = shown[~_behind_objects(shapes[shown], clipped[shown], nearer, cameras[v])]
+        shown = np.flatnonzero(large[v])
+        shown = shown[~_behind_objects(shapes[shown], boxes[v, shown], nearer, cameras[v])]
         points = visible.in_frame(row)
         occluded, beside, seen = _points_around(
-            shapes[shown], clipped[shown], poses.points[points], cameras[v], centre[v]
+            shapes[shown], boxes[v, shown], poses.points[points], cameras[v], centre[v]
         )
         expected[v, shown[~occluded]] = True
         around[v, shown[~occluded & beside]] = True
         for k, inside in zip(shown.tolist(), seen, strict=True):
             through[v, k] = bool(len(inside)) and expected[v, k]
             behind[k].update(points[inside].tolist() if expected[v, k] else ())
-    through[:, [len(ids) < least_points for ids in behind]] = False
+    through[:, [len(ids) < LEAST_POINTS for ids in behind]] = False
+    jacobian = alignment_jacobian(shapes.center_in_world)
     cov = np.array([s.cov[:3, :3] for s in states]).reshape(-1, 3, 3)
-    spread = np.linalg.eigvalsh(cov if detections is None else detections.cov)[:, -1]  # (N,)
-    vague = ~(np.sqrt(spread) < most_spread * shapes.half_axes.mean(1))
+    cov = cov + jacobian @ alignment_cov @ jacobian.swapaxes(1, 2)
+    vague = ~(np.sqrt(np.linalg.eigvalsh(cov)[:, -1]) < MOST_SPREAD * shapes.half_axes.mean(1))
     expected[:, vague] = False
-    best, unlocated = np.zeros((2, *expected.shape))
-    if detections is not None and len(states):
-        best, unlocated = _best_iou(shapes, support, poses, rows, detections, expected)
+    best, unlocated = _best_iou(boxes, result, poses.frame[rows], expected)
     detected = best >= IOU[0]
     accident = np.where(detected, np.interp(best, IOU, np.log(ACCIDENT)), 0.0)
     through &= expected & ~detected
@@ -132,19 +102,24 @@ def visibility_of(
     ray = shapes.center_in_world - centre[:, None]  # (V, N, 3)
     ray = ray / np.linalg.norm(ray, axis=2, keepdims=True).clip(1e-9)
 
-    def independent(mask: BoolArray, value: Array | BoolArray | None = None) -> Array:
-        """Count the independent views (N,) among those marked (V, N), or add their mean values."""
-        value = mask if value is None else value
-        counts = [
-            _independent(ray[mask[:, k], k], value[mask[:, k], k], apart_deg)
-            for k in range(len(states))
-        ]
-        return np.array(counts, np.float64)
+    def independent(mask: BoolArray, value: Array | BoolArray) -> Array:
+        """Add the values of the independent views (N,) among those marked (V, N).
+
+        Of rays less than APART_DEG apart the mean value counts.
+        """
+        total = np.zeros(len(states))
+        for k in range(len(states)):
+            left = mask[:, k].copy()
+            while left.any():
+                near = left & (ray[:, k] @ ray[left.argmax(), k] >= np.cos(np.radians(APART_DEG)))
+                total[k] += float(value[near, k].mean())
+                left &= ~near
+        return total
 
     # one view of its surroundings may show them beside what stands before the object
-    seen_through = np.maximum(independent(through), independent(around) - 1)
+    seen_through = np.maximum(independent(through, through), independent(around, around) - 1)
     return Visibility(
-        independent(expected),
+        independent(expected, expected),
         seen_through,
         vague,
         independent(expected, detected),
@@ -154,12 +129,7 @@ def visibility_of(
 
 
 def _best_iou(
-    shapes: quadrics.Ellipsoids,
-    support: list[str],
-    poses: Poses,
-    rows: IntArray,
-    detections: MapDetections,
-    expected: BoolArray,
+    boxes: Array, result: Result, frames: IntArray, expected: BoolArray
 ) -> tuple[Array, Array]:
     """Return the IoU of projections with the best detection that may show the object.
 
@@ -169,23 +139,24 @@ def _best_iou(
     beside it.)
 
     Args:
-        shapes: (N,) of the map, each of its support. rows: (V,) of the poses.
+        boxes: (V, N, 4) projections. frames: (V,) of the recording.
         expected: (V, N) views in which the map's objects are expected.
     Returns:
         (V, N) of any detection; (V, N) of one that belongs to no object with a shape.
     """
-    known = np.unique(detections.located)  # (M,)
-    owner = np.searchsorted(known, detections.rows.track_id)  # (D,)
-    owner[~np.isin(detections.rows.track_id, known)] = len(known)
-    best = np.zeros((len(rows), len(known) + 1, len(support)))  # the last: of no such object
-    shown = np.zeros((len(rows), len(known)), np.int64)
-    for v, row in enumerate(rows.tolist()):
-        here = np.flatnonzero(detections.rows.frame == poses.frame[row])
-        box = undistort_boxes(detections.rows.xyxy[here], poses.camera)  # (d, 4)
-        camera = poses.camera.K @ poses.cam_from_world[row]
-        projected = quadrics.solid_boxes(shapes, support, camera[None])
-        projected = quadrics.clip_boxes(projected, (poses.camera.width, poses.camera.height))[0]
-        np.maximum.at(best[v], owner[here], quadrics.box_iou(projected, box[:, None]))
+    assert result.poses is not None
+    camera = result.poses.camera
+    tracked = result.tracks[result.tracks.detection_index >= 0]
+    detections = Tracks.joined([tracked, result.untracked])
+    known = np.unique(np.array([o.id for o in result.located], np.int64))  # (M,)
+    owner = np.searchsorted(known, detections.track_id)  # (D,)
+    owner[~np.isin(detections.track_id, known)] = len(known)
+    best = np.zeros((len(frames), len(known) + 1, boxes.shape[1]))  # the last: of no such object
+    shown = np.zeros((len(frames), len(known)), np.int64)
+    for v, frame in enumerate(frames.tolist()):
+        here = np.flatnonzero(detections.frame == frame)
+        box = undistort_boxes(detections.xyxy[here], camera)  # (d, 4)
+        np.maximum.at(best[v], owner[here], quadrics.box_iou(boxes[v], box[:, None]))
         shown[v, owner[here][owner[here] < len(known)]] = 1
     best *= expected[:, None]
     share = (best[:, :-1] >= IOU[0]).sum(0) / np.maximum(shown.T @ expected, 1)  # (M, N)
@@ -194,9 +165,8 @@ def _best_iou(
 
 
 def _area(box: Array) -> Array:
-    """Return the areas (N,) of boxes (N, 4), 0 for NaN."""
-    side = np.nan_to_num(box[:, 2:] - box[:, :2]).clip(0)
-    return np.asarray(side[:, 0] * side[:, 1])
+    """Return the areas (...) of boxes (..., 4), 0 for NaN."""
+    return np.asarray(np.nan_to_num(box[..., 2:] - box[..., :2]).clip(0).prod(-1))
 
 
 def _behind_objects(
@@ -273,15 +243,3 @@ def _points_around(
         if behind.sum() > others.sum():
             through[k] = inside[behind]
     return occluded, beside, through
-
-
-def _independent(ray: Array, value: Array | BoolArray, apart_deg: float) -> float:
-    """Add the values of views; those of rays (n, 3) less than some degrees apart are averaged."""
-    total = 0.0
-    least = np.cos(np.radians(apart_deg))
-    while len(ray):
-        near = ray @ ray[0] >= least
-        total += float(value[near].mean())
-        ray = ray[~near]
-        value = value[~near]
-    return total

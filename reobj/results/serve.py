@@ -73,7 +73,7 @@ class Recording:
 
 
 class FolderMap(Protocol):
-    """The map of an output folder: what `reobj.maps.folder_map.FolderMap` does here.
+    """The map of an output folder: what `reobj.maps.corrections.FolderMap` does here.
 
     Attributes:
         frozen: corrections of the folder do not change it.

@@ -7,9 +7,8 @@ scale.
 
 from __future__ import annotations
 
-import errno
+import dataclasses
 import json
-import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -20,11 +19,11 @@ import pytest
 from map_sessions import read_mot, true_objects
 from scipy.spatial.transform import Rotation
 
-import quadrics
-import reobj.maps.room_map as room_map
 import reobj_track as rt
 from front_door.room import CAMERA, ROOM, ROOT, SMALL, cli, info, refusal
+from reobj.cameras import invert_rigid
 from reobj.maps.room_map import RoomMap, map_lock
+from reobj.maps.stage import OpenMap, place_recording
 from reobj.results.changes import read_changes
 
 LATER = ROOT / "examples" / "room_later"
@@ -69,7 +68,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("room.mp4", "detections.npz"):
         (base / "later" / name).symlink_to(LATER / name)
     moved_poses(LATER / "poses.txt", base / "later" / "moved.txt", scale=0.4)
-    assert cli(*monday(base)) == 0
+    assert cli(*monday(base), "--set", "map.pictures=true") == 0
     shutil.copy(base / "flat.map", base / "monday.map")
     assert cli(*tuesday(base)) == 0
     return base
@@ -127,32 +126,43 @@ def test_tuesday_has_the_numbers_of_monday(made: Path) -> None:
     assert number_of(second, BALL) in new and not new & set(first)
 
 
-@pytest.mark.parametrize("score", [0.12, None])
-def test_what_is_still_detected_is_not_gone(desk: Path, score: float | None) -> None:
-    """Nothing moved, but the detector has the bottle as a cup of low score, or not at all."""
-    shutil.copy(desk / "monday.map", desk / "flat.map")
-    folder = desk / "weak"
-    folder.mkdir()
-    for name in ("room.mp4", "poses.txt"):
-        (folder / name).symlink_to(ROOM / name)
-    with np.load(ROOM / "detections.npz") as data:
-        columns = {name: data[name] for name in ("frame", "xyxy", "score", "class_id")}
-        facts = {name: data[name] for name in ("class_names", "image_size")}
-    truth = read_mot(ROOM / "gt_mot.txt")
-    bottle = {int(row[0]) - 1: row[2:] for row in truth if row[1] == BOTTLE}
-    shown = np.array([bottle.get(f, np.zeros(4)) for f in columns["frame"].tolist()])
-    its = quadrics.box_iou(columns["xyxy"], shown) > 0.3
-    assert its.sum() > 20
-    columns["score"] = np.where(its, score or 0.0, columns["score"])
-    columns["class_id"] = np.where(its, rt.COCO_NAMES.index("cup"), columns["class_id"])
-    np.savez(folder / "detections.npz", **columns, **facts)
-    out = desk / "weak_out"
-    assert (
-        cli(*words(folder, out, desk / "flat.map", "--start", 2, "--stop", 62, "--every", 4)) == 0
-    )
-    number = number_of(true_of(desk / "monday", ROOM), BOTTLE)
-    assert (number in ids(out, "gone")) == (score is None)
-    assert (number in ids(out, "not_seen")) == (score is not None)
+def test_the_map_has_pictures_on_request(made: Path) -> None:
+    objects = RoomMap.load(made / "monday.map").objects
+    assert len(objects) > 5
+    for found in objects:
+        jpeg = np.frombuffer(found.observations[0].picture, np.uint8)
+        assert max(cv2.imdecode(jpeg, cv2.IMREAD_COLOR).shape) <= 160
+
+
+def test_a_recording_without_images_is_not_placed(made: Path, tmp_path: Path) -> None:
+    """Its boxes and poses are used as without a map."""
+    before = (made / "monday.map").read_bytes()
+    poses = rt.PosesConfig(camera=CAMERA, mode=str(ROOM / "poses.txt"))
+    config = rt.Config(poses=poses, output=rt.OutputConfig(overlay="none", scene=False))
+    config = dataclasses.replace(config, input=rt.InputConfig(every=8, stop=80))
+    given = {"detections": ROOM / "detections.npz", "map": made / "monday.map"}
+    result = rt.run(None, tmp_path, config, **given)
+    assert result.changes.refused == "a recording without images cannot be placed in a map"
+    assert result.located and (made / "monday.map").read_bytes() == before
+
+
+def test_images_between_keyframes_place_a_recording(made: Path) -> None:
+    """One keyframe alone is too few."""
+    video = rt.Video(ROOM / "room.mp4", rt.InputConfig(start=12, stop=24))
+    frames = np.arange(12, 24)
+    rows = np.loadtxt(ROOM / "poses.txt")[frames]
+    rotation = Rotation.from_quat(rows[:, 4:]).as_matrix()
+    truth = invert_rigid(np.concatenate([rotation, rows[:, 1:4, None]], 2))
+    camera = rt.Camera("PINHOLE", *video.size, tuple(map(float, CAMERA.split(","))))
+    poses = rt.Poses(
+        camera, frames, frames / 12, truth, np.full(12, "user"), "user",
+        points=np.zeros((1, 3)), visibility=np.zeros((1, 2), np.int64),
+    )  # fmt: skip
+    opened = OpenMap(made / "monday.map", RoomMap.load(made / "monday.map"), True)
+    placed = place_recording(opened, poses, video)
+    assert placed.placement.refused == "" and len(placed.features) == 12
+    moved = invert_rigid(placed.poses.cam_from_world)[:, :, 3] - rows[:, 1:4]
+    assert np.linalg.norm(moved, axis=1).max() < 0.03  # m
 
 
 def refitted(out: Path, *options: object) -> dict[int, tuple[str, list[int]]]:
@@ -163,14 +173,17 @@ def refitted(out: Path, *options: object) -> dict[int, tuple[str, list[int]]]:
 
 @pytest.mark.parametrize(
     ("recording", "name", "frozen"),
-    [("monday", "flat.map", 0), ("tuesday", "flat.map", 0), ("tuesday", "monday.map", 1)],
+    [
+        pytest.param("monday", "flat.map", 0, marks=pytest.mark.slow),
+        ("tuesday", "monday.map", 1),
+    ],
 )
 def test_refits_keep_all_numbers(desk: Path, recording: str, name: str, frozen: int) -> None:
     """Those of the map, and those of doubtful objects, which the map does not have."""
     out = desk / recording
     where = ("--set", f"map.path={desk / name}", "--set", f"map.frozen={frozen}")
     before = refitted(out, *where)
-    for options in (("--known-size", "chair=1.2m"), ("--shape", "box"), ("--shape", "auto")):
+    for options in (("--known-size", "chair=1.2m"), ("--shape", "box")):
         assert refitted(out, *options) == before
 
 
@@ -188,7 +201,7 @@ def test_corrections_keep_all_other_numbers(desk: Path) -> None:
     path.write_text(json.dumps({"format": "reobj-edits", "version": 1, "edits": [edit]}))
     highest = RoomMap.load(desk / "flat.map").next_id - 1
     found = []
-    for options in (("--edits", path), (), ("--shape", "box")):
+    for options in (("--edits", path), ("--shape", "box")):
         assert refit(desk, *options) == 0
         now = {o.id: o.tracklet_ids for o in rt.Result.load(out).objects}
         (new,) = now.keys() - before.keys()
@@ -220,6 +233,7 @@ def test_places_are_true_in_the_world_of_the_map(made: Path) -> None:
     assert changes.localised_frames == changes.tried_frames == 15 and changes.sigma_m < 0.01
 
 
+@pytest.mark.slow
 def test_a_recording_that_is_run_again_keeps_its_numbers(desk: Path) -> None:
     """Also the chair, whose later place only the user could tell."""
     numbers = true_of(desk / "monday", ROOM)
@@ -238,6 +252,7 @@ def test_a_recording_that_is_run_again_keeps_its_numbers(desk: Path) -> None:
     assert after.next_id == before.next_id and after.next_session == before.next_session
 
 
+@pytest.mark.slow
 def test_a_renamed_copy_of_a_recording_is_its_session(
     desk: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -308,8 +323,6 @@ def test_another_room_is_refused(
     said = capsys.readouterr()
     why = "this is not the room of flat.map, or nothing in view matches it"
     assert " ".join(said.out.split()).count(why) == 1 and said.err.count(why) == 1
-    whole, steps = re.search(r"\bmap ([\d.]+) \((.*?)\)", said.out).groups()
-    assert sum(map(float, re.findall(r"[\d.]+", steps))) <= float(whole) + 0.2  # rounded
     assert (desk / "flat.map").read_bytes() == before
     changes = read_changes(desk / "other" / "changes.json")
     assert why in changes.refused and changes.tried_frames == 10
@@ -338,11 +351,6 @@ def test_unusable_maps_end_the_run_before_any_work(
 
     assert "flat.map: damaged" in refused(good[:-100])
     assert "flat.map: not a map" in refused((ROOM / "detections.npz").read_bytes())
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(room_map.HEADER, "version", 99)
-        RoomMap().save(desk / "newer.map")
-    text = refused((desk / "newer.map").read_bytes())
-    assert "a map of format 99" in text and "update the tool" in text
     with map_lock(desk / "flat.map"):
         text = refused(good)
     assert "another run is updating this map" in text and "--map-frozen" in text
@@ -384,39 +392,11 @@ def test_corrections_of_the_page_reach_the_map(desk: Path) -> None:
     for kind in KINDS:
         known = [c.id for c in getattr(changes, kind) if c.id != ball]
         assert [c.id for c in getattr(again, kind)] == known, kind
-    difference = again.moved[0].distance_m - changes.moved[0].distance_m
-    assert abs(difference) < 2 * again.moved[0].sigma_m  # without pictures: that of the centres
 
 
 def statuses(room: RoomMap) -> dict[tuple[int, int], str]:
     """What happened, by object and session."""
     return {(o.id, x.session): x.status for o in room.objects for x in o.observations}
-
-
-def test_a_full_disk_loses_no_results(
-    desk: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    before = (desk / "flat.map").read_bytes()
-    numbers = true_of(desk / "tuesday", LATER)
-    replace = Path.replace
-
-    def full(self: Path, target: Path) -> Path:
-        if Path(target).suffix == ".map":
-            raise OSError(errno.ENOSPC, "full")
-        return replace(self, target)
-
-    monkeypatch.setattr(Path, "replace", full)
-    for name in ("objects.json", "tracks.txt", "changes.json"):
-        (desk / "tuesday" / name).unlink()
-    capsys.readouterr()
-    assert refit(desk) == 0
-    said = capsys.readouterr().err.splitlines()
-    (line,) = [text for text in said if "flat.map" in text]
-    assert "No space left on device" in line and "the map lacks this recording" in line
-    assert (desk / "flat.map").read_bytes() == before
-    assert {p.name for p in desk.glob("*map*")} == {"flat.map", "monday.map", ".flat.map.lock"}
-    assert true_of(desk / "tuesday", LATER) == numbers
-    assert line.removeprefix("warning: ") in info(desk / "tuesday")["warnings"]
 
 
 def test_a_missing_map_of_an_output_folder(desk: Path, capsys: pytest.CaptureFixture[str]) -> None:
