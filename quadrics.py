@@ -208,6 +208,17 @@ class Ellipsoids:
         index = np.atleast_1d(np.arange(len(self))[index])
         return Ellipsoids(*(getattr(self, name)[index] for name in self.__slots__))
 
+    @staticmethod
+    def unknown(n: int) -> Ellipsoids:
+        """Return n ellipsoids of NaN."""
+        return Ellipsoids(*(np.full((n, *shape), np.nan) for shape in ((3,), (3,), (3, 3))))
+
+    @staticmethod
+    def concatenate(sets: Sequence[Ellipsoids]) -> Ellipsoids:
+        """Concatenate sets of ellipsoids."""
+        names = Ellipsoids.__slots__
+        return Ellipsoids(*(np.concatenate([getattr(e, name) for e in sets]) for name in names))
+
     def dual_quadrics(self) -> Array:
         """Return (O, 4, 4) dual quadrics with [3, 3] = -1: R diag(a^2) R' - c c', -c, -1."""
         rot = self.world_from_obj
@@ -981,7 +992,7 @@ def fit_sfmo(boxes_xyxy: Array | None, dual_c: Array | None = None) -> SfmoResul
     frames = rich if len(rich) >= 3 else enough
     cams = np.full((len(seen), 2, 4), np.nan)
     if n_obj < 4 or len(frames) < 3:
-        nan = Ellipsoids(*(np.full(s, np.nan) for s in ((n_obj, 3), (n_obj, 3), (n_obj, 3, 3))))
+        nan = Ellipsoids.unknown(n_obj)
         note = "needs at least 3 frames that show the same 4 objects"
         return SfmoResult(nan, nan, cams, np.zeros(n_obj, bool), np.nan, False, note)
     on = seen[frames]
@@ -1240,19 +1251,28 @@ def rotation_vectors(rot: Array) -> Array:
     return np.asarray(quat[:, 1:] * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0))
 
 
-def _state_difference(a: _State, b: _State, code: IntArray) -> Array:
-    """Find the smallest increment (B, 9) from solid b to solid a over permutations of a's axes."""
+def nearest_axes(rot: Array, target: Array, keep_third: BoolArray | bool = False) -> Array:
+    """Find the rotations of axes onto themselves that bring frames nearest to others.
+
+    Args:
+        rot, target: (B, 3, 3) rotations. keep_third: (B,) the third axis keeps its place.
+    Returns:
+        (B, 3, 3): rot @ these are nearest to target.
+    """
     signs = np.array(np.meshgrid([1, -1], [1, -1], [1, -1])).reshape(3, 8).T
     group = np.array([np.eye(3)[:, order] * s for order in AXIS_ORDERS for s in signs])
     group = group[np.linalg.det(group) > 0]  # the 24 rotations of the axes onto themselves
-    turned = a.rot[:, None] @ group  # (B, 24, 3, 3)
-    trace = np.einsum("bij,bgij->bg", b.rot, turned)
+    trace = np.einsum("bij,bgij->bg", target, rot[:, None] @ group)
     keeps_axis = np.abs(group[:, 2, 2]) > 0.5
-    trace = np.where((code == Shape.CYLINDER)[:, None] & ~keeps_axis, -9.0, trace)
-    best = np.argmax(trace, 1)  # (B,)
-    row = np.arange(len(best))
-    rotvec = rotation_vectors(b.rot.transpose(0, 2, 1) @ turned[row, best])
-    half = (np.abs(group[best]).transpose(0, 2, 1) @ a.log_half[..., None])[..., 0]
+    trace = np.where(np.reshape(keep_third, (-1, 1)) & ~keeps_axis, -9.0, trace)
+    return np.asarray(group[np.argmax(trace, 1)])
+
+
+def _state_difference(a: _State, b: _State, code: IntArray) -> Array:
+    """Find the smallest increment (B, 9) from solid b to solid a over permutations of a's axes."""
+    axes = nearest_axes(a.rot, b.rot, code == Shape.CYLINDER)  # (B, 3, 3)
+    rotvec = rotation_vectors(b.rot.transpose(0, 2, 1) @ (a.rot @ axes))
+    half = (np.abs(axes).transpose(0, 2, 1) @ a.log_half[..., None])[..., 0]
     return np.concatenate([a.center - b.center, half - b.log_half, rotvec], 1)
 
 
