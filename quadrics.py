@@ -39,7 +39,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -49,7 +49,7 @@ import numpy.typing as npt
 
 __all__ = [
     "SUPPORTS", "Array", "BoolArray", "Ellipsoids", "FitConfig", "IntArray", "ObjectFits", "Priors",
-    "PsfmoResult", "QuadricsError", "RobustOptions", "Scale", "SfmoResult", "StatusLimits",
+    "PsfmoResult", "QuadricsError", "Scale", "SfmoResult",
     "box_iou", "boxes_from_dual_conics", "camera_up", "clip_boxes", "fit_lfd", "fit_objects",
     "fit_psfmo", "fit_sfmo", "load_priors", "project", "reprojection_iou", "rotation_vectors",
     "rotations", "solid_boxes", "volume_overlap",
@@ -86,71 +86,6 @@ class QuadricsError(ValueError):
 # ---- Configuration --------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RobustOptions:
-    """Losses and outlier tests of the residuals of box edges.
-
-    Positive residuals (the solid extends beyond the box) also arise from occlusion: their losses
-    have a smaller scale than those of negative ones, and they cost less in the evidence.
-
-    Attributes:
-        cauchy, cauchy_hidden: Scale (sigma) of the loss before the inlier test, of negative and of
-            positive residuals.
-        huber, huber_hidden: Scale (sigma) of the loss after the inlier test, likewise.
-        edge_outlier: Residual (sigma) beyond which an edge is an outlier (occlusion).
-        outlier_cap, hidden_cap: Largest cost (sigma^2) of an edge in the evidence, likewise:
-            -2 log(p / 20 sigma / .4), the probability p of an outlier .02, or .2 if hidden.
-    """
-
-    cauchy: float = 3.0
-    cauchy_hidden: float = 2.0
-    huber: float = 3.0
-    huber_hidden: float = 2.5
-    edge_outlier: float = 5.0
-    outlier_cap: float = 12.0
-    hidden_cap: float = 7.4
-
-    def cauchy_loss(self, value: Array) -> tuple[Array, Array]:
-        """Return the loss rho(r^2) of residuals in sigma and its weight drho/dr^2."""
-        square = value * value
-        c2 = np.where(value > 0, self.cauchy_hidden, self.cauchy) ** 2
-        return c2 * np.log1p(square / c2), 1.0 / (1.0 + square / c2)
-
-    def huber_loss(self, value: Array) -> tuple[Array, Array]:
-        """Return the same as `cauchy_loss` for the loss after the inlier test."""
-        size = np.abs(value)
-        k = np.where(value > 0, self.huber_hidden, self.huber)
-        outer = size > k
-        rho = np.where(outer, 2.0 * k * size - k**2, value * value)
-        return rho, np.where(outer, k / np.maximum(size, k), 1.0)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StatusLimits:
-    """Limits of the status of a fit: "rejected", "implausible", "prior_dominated" or "ok".
-
-    Attributes:
-        max_noise: Noise factor above which a fit is rejected: the errors of its boxes are about a
-            third of its size, more than those of one object.
-        min_inlier_share: Fraction of inlier views below which it is rejected.
-        absurd_size: Growth over the size prior (sigma) above which it is rejected.
-        odd_size: Distance from the size prior (sigma) above which `reason` reports the size.
-        implausible_size: The same above which the status is "implausible": the shape is wrong, or
-            the category.
-        loose_size: Sigma of a log axis above which its size counts as not measured: the status is
-            "prior_dominated", and the category is not overruled.
-        min_parallax_deg: Parallax (deg) below which the depth rests on the size prior.
-    """
-
-    max_noise: float = 18.0
-    min_inlier_share: float = 0.4
-    absurd_size: float = 6.0
-    odd_size: float = 3.5
-    implausible_size: float = 4.0
-    loose_size: float = 0.35
-    min_parallax_deg: float = 1.0
-
-
 @dataclass(frozen=True, slots=True)
 class FitConfig:
     """Options of `fit_objects`.
@@ -171,8 +106,6 @@ class FitConfig:
         start_iterations: Optimisation steps of each candidate on those views.
         iterations: Most optimisation steps on all views; a fit that has converged stops earlier.
         wrong_class: Probability that an object's category is wrong; 0: no category is overruled.
-        robust: Losses and outlier tests.
-        limits: Limits of the status.
     """
 
     edge_noise_px: float = 1.0
@@ -185,8 +118,6 @@ class FitConfig:
     start_iterations: int = 7
     iterations: int = 40
     wrong_class: float = 0.05  # measured: .03 to .25 give nearly the same results
-    robust: RobustOptions = field(default_factory=RobustOptions)
-    limits: StatusLimits = field(default_factory=StatusLimits)
 
 
 # ---- Ellipsoids and dual quadrics -----------------------------------------------------------
@@ -429,30 +360,21 @@ def box_iou(a: Array, b: Array) -> Array:
     return np.asarray(np.nan_to_num(inter / union, nan=0.0, posinf=0.0, neginf=0.0))
 
 
-@np.errstate(all="ignore")
 def reprojection_iou(
-    fits: ObjectFits | Ellipsoids,
-    boxes_xyxy: Array,
-    img_from_world: Array,
-    image_size: tuple[float, float],
-    support: str | Sequence[str] | None = None,
+    fits: ObjectFits, boxes_xyxy: Array, img_from_world: Array, image_size: tuple[float, float]
 ) -> Array:
     """Compute the IoU of each fitted solid's projected box, clipped to the image, and its box.
 
     Args:
-        fits: result of `fit_objects`, or solids without their shape.
         boxes_xyxy: (F, O, 4); img_from_world: (F, 3, 4).
-        support: shape of such solids, of all or of each (default: "ellipsoid").
     Returns:
         IoU (F, O); 0 where the object is unseen, behind the camera or outside the image.
     """
-    solids = fits.ellipsoids if isinstance(fits, ObjectFits) else fits
-    if support is None:
-        support = list(fits.support) if isinstance(fits, ObjectFits) else "ellipsoid"
     iou = np.zeros(boxes_xyxy.shape[:2])
     for frames in _chunks(len(boxes_xyxy), 256):  # bounds the memory
-        predicted = clip_boxes(solid_boxes(solids, support, img_from_world[frames]), image_size)
-        iou[frames] = box_iou(predicted, clip_boxes(boxes_xyxy[frames], image_size))
+        solids = solid_boxes(fits.ellipsoids, list(fits.support), img_from_world[frames])
+        clipped = (clip_boxes(boxes, image_size) for boxes in (solids, boxes_xyxy[frames]))
+        iou[frames] = box_iou(*clipped)
     return iou
 
 
@@ -653,8 +575,7 @@ def _select_views(
     Returns:
         (O, V) frame numbers, -1 where an object has fewer; V = the most any object has.
     """
-    frame, obj = np.nonzero(usable)  # (K,)
-    if not len(frame):
+    if not usable.any():
         return np.full((usable.shape[1], 1), -1, np.int64)
     center = np.where(np.isfinite(cams.center), cams.center, 0.0)
     posed = _finite(cams.center, 1)
@@ -663,28 +584,19 @@ def _select_views(
     step = np.minimum(step, leap * np.quantile(step[posed], 0.75))
     # a fifth of the length is time: also a camera that rests gives several views
     step[posed] += 0.2 * step.sum() / max(posed.sum(), 1) + 1e-12
-    path = np.cumsum(step)[frame]  # (K,)
-    if path_where_seen:
-        path = np.cumsum(step[:, None] * usable, 0)[frame, obj]
-    n_obj = usable.shape[1]
-    low = np.full(n_obj, np.inf)
-    high = np.full(n_obj, -np.inf)
-    np.minimum.at(low, obj, path)
-    np.maximum.at(high, obj, path)
-    count = np.bincount(obj, minlength=n_obj)
-    fraction = (path - low[obj]) / np.maximum(high - low, 1e-12)[obj]
-    order = np.lexsort((path, obj))
-    rank = np.empty(len(obj), np.int64)
-    rank[order] = np.arange(len(obj)) - np.repeat(np.cumsum(count) - count, count)
-    bucket = np.minimum((fraction * max_views).astype(np.int64), max_views - 1)
-    bucket = np.where(count[obj] <= max_views, rank, bucket)  # few views: all are used
-    order = np.lexsort((-quality[frame, obj], bucket, obj))
-    chosen = order[_group_starts(obj[order], bucket[order])]  # sorted by object, then bucket
-    per_obj = np.bincount(obj[chosen], minlength=n_obj)
-    out = np.full((n_obj, int(per_obj.max())), -1, np.int64)
-    slot = np.arange(len(chosen)) - np.repeat(np.cumsum(per_obj) - per_obj, per_obj)
-    out[obj[chosen], slot] = frame[chosen]
-    return out
+    whole_path = np.cumsum(step)  # (F,)
+    out = np.full((usable.shape[1], min(int(usable.sum(0).max()), max_views)), -1, np.int64)
+    for o in range(usable.shape[1]):
+        frames = np.flatnonzero(usable[:, o])
+        if len(frames) > max_views:  # the best of each bucket of the path
+            path = np.cumsum(step * usable[:, o]) if path_where_seen else whole_path
+            path = path[frames] - path[frames[0]]
+            fraction = path / np.maximum(path[-1], 1e-12)
+            bucket = np.minimum((fraction * max_views).astype(np.int64), max_views - 1)
+            best_first = np.lexsort((-quality[frames, o], bucket))
+            frames = frames[best_first[_group_starts(bucket[best_first])]]
+        out[o, : len(frames)] = frames
+    return out[:, : max(int((out >= 0).sum(1).max()), 1)]
 
 
 class _Rows:
@@ -1357,7 +1269,35 @@ def _mean_depth(state: _State, edges: _Edges) -> Array:
     return np.asarray(total / np.maximum(seen.sum(1), 1) + 1e-12)
 
 
-_Loss = Callable[[Array], tuple[Array, Array]]  # a method of `RobustOptions`
+_Loss = Callable[[Array], tuple[Array, Array]]  # `_cauchy_loss` or `_huber_loss`
+
+# Losses and outlier tests of residuals. Positive residuals (the solid extends beyond the box) also
+# arise from occlusion: their losses have a smaller scale, and they cost less in the evidence.
+CAUCHY = 3.0  # sigma, scale of the loss before the inlier test; of positive residuals:
+CAUCHY_HIDDEN = 2.0
+HUBER = 3.0  # sigma, scale of the loss after the inlier test; of positive residuals:
+HUBER_HIDDEN = 2.5
+EDGE_OUTLIER = 5.0  # sigma beyond which an edge is an outlier (occlusion)
+# sigma^2, largest cost of an edge in the evidence, of a negative and a positive residual:
+# -2 log(p / 20 sigma / .4), the probability p of an outlier .02, or .2 if hidden
+OUTLIER_CAP = 12.0
+HIDDEN_CAP = 7.4
+
+
+def _cauchy_loss(value: Array) -> tuple[Array, Array]:
+    """Return the loss rho(r^2) of residuals in sigma and its weight drho/dr^2."""
+    square = value * value
+    c2 = np.where(value > 0, CAUCHY_HIDDEN, CAUCHY) ** 2
+    return c2 * np.log1p(square / c2), 1.0 / (1.0 + square / c2)
+
+
+def _huber_loss(value: Array) -> tuple[Array, Array]:
+    """Return the same as `_cauchy_loss` for the loss after the inlier test."""
+    size = np.abs(value)
+    k = np.where(value > 0, HUBER_HIDDEN, HUBER)
+    outer = size > k
+    rho = np.where(outer, 2.0 * k * size - k**2, value * value)
+    return rho, np.where(outer, k / np.maximum(size, k), 1.0)
 
 
 class _Normal(NamedTuple):
@@ -1936,7 +1876,7 @@ def _best_starts(few: _Data, spec: _Spec, cfg: FitConfig) -> _Fit:
     rot = _start_rotations(spec.up)[axis, yaw]
     start = _State(center[hyp], log_half[hyp] + shift[:, None], rot)
     state, cost, hessian = _minimise_all(
-        start, lambda chunk: edges[hyp[chunk]], prob, cfg.robust.cauchy_loss, cfg.start_iterations
+        start, lambda chunk: edges[hyp[chunk]], prob, _cauchy_loss, cfg.start_iterations
     )
     # noise level integrated out (Student t): an absurd size must not win by a slightly better fit
     pull = _size_prior(state, prob)[0]
@@ -2061,22 +2001,20 @@ def _weighted_median(values: Array, weight: Array) -> float:
     return float(values[order][np.searchsorted(total, 0.5 * total[-1])])
 
 
-def _inlier_views(standard: Array, used: BoolArray, robust: RobustOptions) -> BoolArray:
+def _inlier_views(standard: Array, used: BoolArray) -> BoolArray:
     """Classify views (...) as inliers of the solid by their residuals (..., E) in sigma.
 
     Of an inlier three quarters of the edges are inliers; or half of them where all other residuals
     are positive, as of a partly occluded object.
     """
-    close = used & (np.abs(standard) <= robust.edge_outlier)
+    close = used & (np.abs(standard) <= EDGE_OUTLIER)
     fraction = close.sum(-1) / np.maximum(used.sum(-1), 1)
-    occluded = ~(used & (standard < -robust.edge_outlier)).any(-1)
+    occluded = ~(used & (standard < -EDGE_OUTLIER)).any(-1)
     inlier = (fraction >= 0.75) | ((fraction >= 0.5) & occluded)
     return np.asarray(used.any(-1) & inlier)
 
 
-def _log_evidence(
-    fit: _Fit, value: Array, spec: _Spec, data: _Data, robust: RobustOptions
-) -> Array:
+def _log_evidence(fit: _Fit, value: Array, spec: _Spec, data: _Data) -> Array:
     """Compute the Laplace evidence (B,) of each fit, noise integrated out (Student t).
 
     -2 log p = (v + n) log(1 + S / v) + priors of size, tilt, floor + log det(H) + 6 log(depth)
@@ -2089,12 +2027,12 @@ def _log_evidence(
     pull = _prior_terms(fit.state, prob).cost
     noise = _least(fit.noise, fit.obj)
     standard = value / noise[:, None, None]  # (B, V, E)
-    cap = np.where(value > 0, robust.hidden_cap, robust.outlier_cap)
+    cap = np.where(value > 0, HIDDEN_CAP, OUTLIER_CAP)
     cost = np.minimum(standard**2, cap) * used / data.edges.redundancy[fit.obj]
     dof = NOISE_PRIOR_DOF + _count(used, data, fit.obj)
     misfit = dof * np.log1p(cost.sum((1, 2)) / NOISE_PRIOR_DOF)
     stands = np.isfinite(spec.floor_sigma[fit.hyp])
-    above = stands[:, None] & (standard[..., 3] > robust.edge_outlier)  # (B, V), lower edge
+    above = stands[:, None] & (standard[..., 3] > EDGE_OUTLIER)  # (B, V), lower edge
     free = above[..., None] & (value > 0)
     free[..., 1] = False  # upper edge
     occluded = dof * np.log1p(np.where(free, 0.0, cost).sum((1, 2)) / NOISE_PRIOR_DOF)
@@ -2172,23 +2110,22 @@ def _fit_all(data: _Data, spec: _Spec, cfg: FitConfig) -> _Fit:
     """Fit every object: starts, robust fit, noise level, inliers, final fit, model selection."""
     few = data.take_views(cfg.start_views)
     fit = _best_starts(few, spec, cfg)
-    robust = cfg.robust
-    _refit(fit, few, spec, cfg, robust.cauchy_loss)
-    fit.evidence = _log_evidence(fit, _all_residuals(fit, few), spec, few, robust)
+    _refit(fit, few, spec, cfg, _cauchy_loss)
+    fit.evidence = _log_evidence(fit, _all_residuals(fit, few), spec, few)
     # 3 in 1,000 of the winners on all views are lower than this on the first (simulated boxes)
     likely = fit.evidence >= -6.0 - _least(-fit.evidence, fit.obj)
     fit = fit[likely | ~spec.overrules(fit) & (fit.evidence >= _best_of_category(fit, spec))]
     fit.inlier = data.edges.used[fit.obj]
-    _refit(fit, data, spec, cfg, robust.cauchy_loss)
-    for largest in (None, robust.huber):
+    _refit(fit, data, spec, cfg, _cauchy_loss)
+    for largest in (None, HUBER):
         value = _all_residuals(fit, data)
         _update_noise(fit, value, spec, data, largest)
         used = data.edges.used[fit.obj]
         standard = value / fit.noise[:, None, None]  # (B, V, E)
-        fit.views = _inlier_views(standard, used, robust)
-        fit.inlier = used & (np.abs(standard) <= robust.edge_outlier) & fit.views[..., None]
-        _refit(fit, data, spec, cfg, robust.huber_loss)
-    fit.evidence = _log_evidence(fit, _all_residuals(fit, data), spec, data, robust)
+        fit.views = _inlier_views(standard, used)
+        fit.inlier = used & (np.abs(standard) <= EDGE_OUTLIER) & fit.views[..., None]
+        _refit(fit, data, spec, cfg, _huber_loss)
+    fit.evidence = _log_evidence(fit, _all_residuals(fit, data), spec, data)
     fit = _best_fits(fit)
     doubted = fit[spec.overrules(fit) & (fit.evidence > _best_of_category(fit, spec))]
     if len(doubted.obj):
@@ -2220,7 +2157,7 @@ def _with_common_errors(fit: _Fit, data: _Data, spec: _Spec, cfg: FitConfig) -> 
     If all boxes of an object show the same part of it, or the same surroundings, their errors are
     common to all views, and neither the residuals nor the number of views tell how large they are.
     """
-    odd = _size_deviation(fit, spec)[0] > cfg.limits.implausible_size
+    odd = _size_deviation(fit, spec)[0] > IMPLAUSIBLE_SIZE
     if not odd.any():
         return fit
     again = fit[odd]
@@ -2228,9 +2165,9 @@ def _with_common_errors(fit: _Fit, data: _Data, spec: _Spec, cfg: FitConfig) -> 
     again.common = again.common * COMMON_ERRORS
     standard = _all_residuals(again, data) / again.noise[:, None, None]
     used = data.edges.used[again.obj]
-    again.views = _inlier_views(standard, used, cfg.robust)
-    again.inlier = used & (np.abs(standard) <= cfg.robust.edge_outlier) & again.views[..., None]
-    _refit(again, data, spec, cfg, cfg.robust.huber_loss)
+    again.views = _inlier_views(standard, used)
+    again.inlier = used & (np.abs(standard) <= EDGE_OUTLIER) & again.views[..., None]
+    _refit(again, data, spec, cfg, _huber_loss)
     for name in ("hessian", "inlier", "noise", "common", "views"):
         getattr(fit, name)[odd] = getattr(again, name)
     fit.state.put(odd, again.state)
@@ -2257,7 +2194,7 @@ def _log_odds_of_sizes(fit: _Fit, data: _Data, spec: _Spec, cfg: FitConfig) -> A
     -2 log p = log det S + log det(I + S^-1) + m' S^-1 m - b' (I + S^-1)^-1 b, b = I x + S^-1 m.
     The axes of the category may have any order that its uprightness allows.
     """
-    cov = _curved_covariance(fit, data, spec, cfg.robust.huber_loss)[:, 3:6, 3:6]
+    cov = _curved_covariance(fit, data, spec, _huber_loss)[:, 3:6, 3:6]
     inverse = np.linalg.inv(spec.size_cov)  # roundness is of the shape, and the same for both
     own = inverse[fit.hyp]
     mean = _problems(spec, fit.hyp, fit.code, fit.axis).size_mean
@@ -2281,12 +2218,25 @@ def _log_odds_of_sizes(fit: _Fit, data: _Data, spec: _Spec, cfg: FitConfig) -> A
         usual = cost(usual_mean[:, order], inverse[fit.obj][:, order][:, :, order])
         least = np.minimum(least, np.where(same_up & (order[2] != 2), np.inf, usual))
     odds = spec.log_odds[fit.hyp] - spec.log_odds[fit.obj] + np.log(len(SUPPORTS))
-    determined = (np.einsum("bii->bi", cov) < cfg.limits.loose_size**2).all(1)
+    determined = (np.einsum("bii->bi", cov) < LOOSE_SIZE**2).all(1)
     return np.where(determined, np.inf, odds + 0.5 * (least - cost(mean, own)))
 
 
 # ---- fit_objects: scale, gravity, report ----------------------------------------------------
 
+# Limits of the status of a fit. They refuse bad fits: halved or doubled they change nothing on four
+# recordings (benchmarks/RESULTS.md, "Which numbers matter").
+# Noise factor above which a fit is rejected: the errors of its boxes are about a third of its size,
+# more than those of one object
+MAX_NOISE = 18.0
+MIN_INLIER_SHARE = 0.4  # of the views, below which a fit is rejected
+ABSURD_SIZE = 6.0  # sigma of growth over the size prior above which it is rejected
+ODD_SIZE = 3.5  # sigma from the size prior above which `reason` reports the size
+IMPLAUSIBLE_SIZE = 4.0  # the same, above which the shape is wrong, or the category: "implausible"
+# Sigma of a log axis above which its size counts as not measured: the status is "prior_dominated",
+# and the category is not overruled
+LOOSE_SIZE = 0.35
+MIN_PARALLAX_DEG = 1.0  # below it the depth rests on the size prior
 UPRIGHT_TILT_DEG = 1.5  # deg, sigma of an object's vertical axis where gravity is given
 SCALE_MIN_PARALLAX_DEG = 3.0  # deg, least parallax of an object that votes for the scale
 UNKNOWN_SCALE_LOG = 3.0  # log, prior sigma of the global scale where the poses have none
@@ -2507,13 +2457,11 @@ def _inlier_table(
         state = _State(solid.center_in_world, np.log(solid.half_axes), solid.world_from_obj)
         value = _residuals(state, edges, AXIS_GROUPS[codes[o]], jacobian=False)[0]
         standard = value / noise[o, None]
-        inlier[f, o] = _inlier_views(standard, edges.used[:, 0], cfg.robust)
+        inlier[f, o] = _inlier_views(standard, edges.used[:, 0])
     return inlier
 
 
-def _rejection_reasons(
-    fit: _Fit, size_sigma: Array, seen: IntArray, growth: Array, limits: StatusLimits
-) -> list[str]:
+def _rejection_reasons(fit: _Fit, size_sigma: Array, seen: IntArray, growth: Array) -> list[str]:
     """Give the reason to reject each of B fits; empty where it is accepted."""
     finite = _finite(fit.state.center, 1) & _finite(size_sigma, 1)
     reasons = []
@@ -2522,11 +2470,11 @@ def _rejection_reasons(
         why = ""
         if not finite[b]:
             why = "no finite solution"
-        elif noise > limits.max_noise:
+        elif noise > MAX_NOISE:
             why = f"the boxes fit no solid: errors {noise:.1f} times the usual"
-        elif growth[b] > limits.absurd_size:
+        elif growth[b] > ABSURD_SIZE:
             why = f"size is {growth[b]:.1f} sigma above its category's"
-        elif inside < max(1.0, limits.min_inlier_share * seen[b]):
+        elif inside < max(1.0, MIN_INLIER_SHARE * seen[b]):
             why = f"only {inside} of {seen[b]} boxes agree on one solid"
         reasons.append(why)
     return reasons
@@ -2551,9 +2499,8 @@ def _overruled(fit: _Fit, spec: _Spec) -> list[str]:
 
 
 def _status(
-    fit: _Fit, spec: _Spec, posterior: _Posterior, parallax: Array, seen: IntArray,
-    limits: StatusLimits,
-) -> tuple[list[str], list[str]]:  # fmt: skip
+    fit: _Fit, spec: _Spec, posterior: _Posterior, parallax: Array, seen: IntArray
+) -> tuple[list[str], list[str]]:
     """Classify each of B fits and give the reason.
 
     Args:
@@ -2562,12 +2509,12 @@ def _status(
         "ok", "prior_dominated", "implausible" or "rejected", and the reason (empty: none), B each.
     """
     weak = posterior.prior_share > np.sqrt(0.5)  # more information from the prior than from data
-    weak |= posterior.size_sigma > limits.loose_size
+    weak |= posterior.size_sigma > LOOSE_SIZE
     deviation, growth = _size_deviation(fit, spec)
     overruled = _overruled(fit, spec)
     status = []
     reason = []
-    rejections = _rejection_reasons(fit, posterior.size_sigma, seen, growth, limits)
+    rejections = _rejection_reasons(fit, posterior.size_sigma, seen, growth)
     for b, rejection in enumerate(rejections):
         doubt = []
         # where the category is unknown or overruled the sizes of all of them are the prior
@@ -2576,14 +2523,14 @@ def _status(
             names = [("width", "depth", "height")[k] for k in np.flatnonzero(weak[b])]
             guessed = "size" if len(names) == 3 else " and ".join(names)
             doubt.append(f"{guessed} guessed from {source}")
-        if parallax[b] < limits.min_parallax_deg:
+        if parallax[b] < MIN_PARALLAX_DEG:
             doubt.append(f"distance guessed from {source}, parallax {parallax[b]:.1f} deg")
         status.append("prior_dominated" if doubt else "ok")
-        if deviation[b] > limits.implausible_size:
+        if deviation[b] > IMPLAUSIBLE_SIZE:
             status[b] = "implausible"
         if rejection:
             status[b] = "rejected"
-        if deviation[b] > limits.odd_size:
+        if deviation[b] > ODD_SIZE:
             why = "another object?" if growth[b] > 0.7 * deviation[b] else "partly occluded?"
             doubt.append(f"size is {deviation[b]:.1f} sigma from the usual one: {why}")
         if overruled[b]:
@@ -2610,6 +2557,10 @@ class _World(NamedTuple):
     tilt_rad: float  # sigma of an object's vertical axis about `up`
     up_source: str
     floor: Floor | None = None
+
+    def scale(self) -> Scale:
+        """Return the scale as metres per unit."""
+        return Scale(float(np.exp(self.log_scale)), self.scale_sigma, self.scale_source)
 
 
 def _first_world(
@@ -2714,17 +2665,30 @@ def fit_objects(
     sizes = [] if has_scale else _known_sizes(known_size, categories, live, priors)
     is_metric = metric if has_scale else bool(metric is True and not sizes)
     world = _first_world(up, is_metric, cams, floor)
+    n_obj = boxes.shape[1]
+    result = ObjectFits(
+        ellipsoids=Ellipsoids.unknown(n_obj),
+        size=np.full((n_obj, 3), np.nan),
+        cov=np.full((n_obj, 9, 9), np.nan),
+        support=np.full(n_obj, "ellipsoid"),
+        inlier=np.zeros(usable.shape, bool),
+        rms_px=np.full(n_obj, np.nan),
+        status=np.full(n_obj, "rejected", "U15"),  # as long as "prior_dominated"
+        reason=["no usable box in a posed frame"] * n_obj,
+        parallax_deg=np.zeros(n_obj),
+        prior_share=np.ones((n_obj, 3)),
+        scale=world.scale(),
+        up=world.up,
+        up_source=world.up_source,
+    )
     if not len(live):
-        return _none_fitted(usable.shape, world)
+        return result
     measured = _Measured(boxes, one_sided, usable, cams).of(live)
     data = _gather_data(measured, quality[:, live], cfg)
     names = [None if categories is None else categories[int(k)] for k in live]
     given = _Given(names, priors, codes[live], sparse[live], sizes, cfg.wrong_class)
     fit, spec, world = _solve_passes(data, given, world, cfg)
-    posterior = _posterior(fit, spec, data, measured.boxes, cfg)
-    inlier = _inlier_table(posterior.solids, fit.code, fit.noise, measured, cfg)
-    live_fits = _live_fits(fit, spec, data, posterior, inlier, world, cfg.limits)
-    return _with_live(_none_fitted(usable.shape, world), live, live_fits)
+    return _report(fit, spec, data, measured, live, world, cfg, result)
 
 
 def _solve_passes(
@@ -2760,7 +2724,7 @@ class _Posterior:
 
 def _posterior(fit: _Fit, spec: _Spec, data: _Data, boxes: Array, cfg: FitConfig) -> _Posterior:
     """Compute the covariance of the fits to `boxes` (F, L, 4), and the prior's weight in it."""
-    wide = _curved_covariance(fit, data, spec, cfg.robust.huber_loss) + fit.spread
+    wide = _curved_covariance(fit, data, spec, _huber_loss) + fit.spread
     # the noise level is itself estimated: Student's 95 % region for three parameters
     wide *= (1.0 + 3.5 / (OBJECT_NOISE_DOF + _free_dof(fit, spec, data)))[:, None, None]
     if cfg.correlation_deg > 0:  # error common to all boxes of an object, as large as that of one
@@ -2779,129 +2743,66 @@ def _posterior(fit: _Fit, spec: _Spec, data: _Data, boxes: Array, cfg: FitConfig
     return _Posterior(solids, cov, size_sigma * shrink[:, 3:6], np.where(no_gain, 1.0, ratio))
 
 
-def _none_fitted(shape: tuple[int, ...], world: _World) -> ObjectFits:
-    """Make the result of (F, O) `shape` where no object has a usable box."""
-    n = shape[1]
-    return ObjectFits(
-        ellipsoids=Ellipsoids(
-            np.full((n, 3), np.nan), np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan)
-        ),
-        size=np.full((n, 3), np.nan),
-        cov=np.full((n, 9, 9), np.nan),
-        support=np.array(["ellipsoid"] * n, dtype=np.str_),
-        inlier=np.zeros(shape, bool),
-        rms_px=np.full(n, np.nan),
-        status=np.array(["rejected"] * n, dtype=np.str_),
-        reason=["no usable box in a posed frame"] * n,
-        parallax_deg=np.zeros(n),
-        prior_share=np.ones((n, 3)),
-        scale=_scale_of(world),
-        up=world.up,
-        up_source=world.up_source,
-    )
-
-
-def _scale_of(world: _World) -> Scale:
-    return Scale(float(np.exp(world.log_scale)), world.scale_sigma, world.scale_source)
-
-
-def _live_fits(
-    fit: _Fit, spec: _Spec, data: _Data, posterior: _Posterior, inlier: BoolArray, world: _World,
-    limits: StatusLimits,
+def _report(
+    fit: _Fit, spec: _Spec, data: _Data, measured: _Measured, live: IntArray, world: _World,
+    cfg: FitConfig, result: ObjectFits,
 ) -> ObjectFits:  # fmt: skip
-    """Make the result of the L live objects; inlier: (F, L)."""
+    """Put the L live objects into the result of all objects, which has none fitted."""
+    posterior = _posterior(fit, spec, data, measured.boxes, cfg)
+    solids = posterior.solids
     square = (_all_residuals(fit, data) * data.edges.sigma_px) ** 2 * fit.inlier
     parallax = _parallax(fit, data)
-    status, reason = _status(fit, spec, posterior, parallax, (data.index >= 0).sum(1), limits)
-    return ObjectFits(
-        ellipsoids=posterior.solids,
-        size=2.0 * posterior.solids.half_axes,
-        cov=posterior.cov,
-        support=np.array(SUPPORTS)[fit.code],
-        inlier=inlier,
-        rms_px=np.sqrt(square.sum((1, 2)) / np.maximum(fit.inlier.sum((1, 2)), 1)),
-        status=np.array(status, dtype=np.str_),
-        reason=reason,
-        parallax_deg=parallax,
-        prior_share=posterior.prior_share,
-        scale=_scale_of(world),
-        up=world.up,
-        up_source=world.up_source,
-    )
-
-
-def _with_live(fits: ObjectFits, live: IntArray, live_fits: ObjectFits) -> ObjectFits:
-    """Put the results of the live objects into those of all O objects."""
-    for name in ("center_in_world", "half_axes", "world_from_obj"):
-        getattr(fits.ellipsoids, name)[live] = getattr(live_fits.ellipsoids, name)
-    for name in ("size", "cov", "rms_px", "parallax_deg", "prior_share"):
-        getattr(fits, name)[live] = getattr(live_fits, name)
-    fits.inlier[:, live] = live_fits.inlier
-    support = fits.support.tolist()
-    status = fits.status.tolist()
+    status, reason = _status(fit, spec, posterior, parallax, (data.index >= 0).sum(1))
+    values = {
+        "size": 2.0 * solids.half_axes,
+        "cov": posterior.cov,
+        "rms_px": np.sqrt(square.sum((1, 2)) / np.maximum(fit.inlier.sum((1, 2)), 1)),
+        "parallax_deg": parallax,
+        "prior_share": posterior.prior_share,
+        "support": np.array(SUPPORTS)[fit.code],
+        "status": status,
+    }
+    for name in Ellipsoids.__slots__:
+        getattr(result.ellipsoids, name)[live] = getattr(solids, name)
+    for name, value in values.items():
+        getattr(result, name)[live] = value
+    result.inlier[:, live] = _inlier_table(solids, fit.code, fit.noise, measured, cfg)
     for row, k in enumerate(live.tolist()):
-        support[k] = str(live_fits.support[row])
-        status[k] = str(live_fits.status[row])
-        fits.reason[k] = live_fits.reason[row]
-    return replace(
-        fits, support=np.array(support, dtype=np.str_), status=np.array(status, dtype=np.str_)
-    )
+        result.reason[k] = reason[row]
+    return replace(result, scale=world.scale())
 
 
 # ---- Overlap of volumes ---------------------------------------------------------------------
 
 
 @np.errstate(all="ignore")
-def volume_overlap(a: Ellipsoids, b: Ellipsoids, nodes: int = 40) -> Array:
+def volume_overlap(a: Ellipsoids, b: Ellipsoids) -> Array:
     """Measure O3D, the intersection over union of the volumes of ellipsoids, pair by pair.
 
-    In the frame where `a` is the unit ball and `b` has level axes, chords along x are exact and
-    the other two directions are integrated by Gauss-Chebyshev-like rules over the common extent.
+    In the frame where `a` is the unit ball, chords of both along x are exact, and summed over a
+    grid of the other two axes (accurate to 1e-4).
 
     Args:
-        a, b: O ellipsoids each; nodes: of the rules, 40 are accurate to 1e-3.
+        a, b: O ellipsoids each.
     Returns:
         (O,); NaN where an input is not finite.
     """
     if len(a) != len(b):
         raise QuadricsError(f"{len(a)} and {len(b)} ellipsoids: the two lists must pair up")
+    middle = (np.arange(400) + 0.5) / 200.0 - 1.0
+    y, z = (axis.ravel() for axis in np.meshgrid(middle, middle))  # (N,)
+    chord = np.sqrt(np.maximum(1.0 - y**2 - z**2, 0.0))  # half of the ball's
+    to_unit = b.world_from_obj.transpose(0, 2, 1) / b.half_axes[:, :, None]  # (O, 3, 3): b a ball
+    axes = to_unit @ (a.world_from_obj * a.half_axes[:, None])  # (O, 3, 3) of a in that frame
+    shift = (to_unit @ (a.center_in_world - b.center_in_world)[..., None])[..., 0]
     iou = np.empty(len(a))
-    for part in _chunks(len(a), 256):  # pairs, to bound the memory
-        one = a[part]
-        two = b[part]
-        to_unit = one.world_from_obj.transpose(0, 2, 1) / one.half_axes[:, :, None]  # (O, 3, 3)
-        root = to_unit @ (two.world_from_obj * two.half_axes[:, None, :])
-        safe = _finite(root, 1, 2)[:, None, None]
-        axes, half, _ = np.linalg.svd(np.where(safe, root, np.eye(3)))  # (O, 3, 3), (O, 3)
-        shift = to_unit @ (two.center_in_world - one.center_in_world)[..., None]
-        center = (axes.transpose(0, 2, 1) @ shift)[..., 0]  # (O, 3)
-        inter = _ball_ellipsoid_volume(center, half, nodes)
-        volume_b = 4.0 / 3.0 * np.pi * half.prod(1)
-        ratio = inter / (4.0 / 3.0 * np.pi + volume_b - inter)
-        good = safe[:, 0, 0] & _finite(center, 1)
-        iou[part] = np.where(good, np.clip(ratio, 0.0, 1.0), np.nan)
-    return iou
-
-
-def _ball_ellipsoid_volume(center: Array, half: Array, nodes: int) -> Array:
-    """Integrate the volume (O,) common to the unit ball and ellipsoids with level axes."""
-    node, mass = np.polynomial.legendre.leggauss(nodes)
-    t = 0.5 * np.pi * (node + 1.0)  # x = -cos t: for integrands that end in square roots
-    x = -np.cos(t)
-    w = 0.5 * np.pi * mass * np.sin(t)
-    low = np.maximum(-1.0, center[:, 2] - half[:, 2])  # (O,)
-    high = np.minimum(1.0, center[:, 2] + half[:, 2])
-    z = 0.5 * (low + high)[:, None] + 0.5 * (high - low)[:, None] * x  # (O, N)
-    ball = np.sqrt(np.clip(1.0 - z**2, 0.0, None))  # (O, N) radius of the slice
-    rest = 1.0 - ((z - center[:, 2:]) / half[:, 2:]) ** 2
-    slice_b = np.sqrt(np.clip(rest, 0.0, None))  # (O, N) shrink factor of b's slice
-    y_low = np.maximum(-ball, center[:, 1:2] - half[:, 1:2] * slice_b)
-    y_high = np.minimum(ball, center[:, 1:2] + half[:, 1:2] * slice_b)
-    y = 0.5 * (y_low + y_high)[..., None] + 0.5 * (y_high - y_low)[..., None] * x  # (O, N, N)
-    chord = np.sqrt(np.clip(ball[..., None] ** 2 - y**2, 0.0, None))
-    off = (y - center[:, 1, None, None]) / half[:, 1, None, None]
-    chord_b = half[:, 0, None, None] * np.sqrt(np.clip(slice_b[..., None] ** 2 - off**2, 0.0, None))
-    mid = center[:, 0, None, None]
-    length = np.minimum(chord, mid + chord_b) - np.maximum(-chord, mid - chord_b)
-    area = (np.clip(length, 0.0, None) @ w) * 0.5 * np.clip(y_high - y_low, 0.0, None)  # (O, N)
-    return np.asarray((area @ w) * 0.5 * np.clip(high - low, 0.0, None))
+    for k in range(len(a)):
+        at = axes[k, :, 1:] @ np.stack([y, z]) + shift[k, :, None]  # (3, N) where x = 0
+        square = axes[k, :, 0] @ axes[k, :, 0]
+        mid = -(axes[k, :, 0] @ at) / square
+        half = np.sqrt(np.maximum(mid**2 - ((at**2).sum(0) - 1.0) / square, 0.0))
+        common = np.minimum(chord, mid + half) - np.maximum(-chord, mid - half)
+        share = np.maximum(common, 0.0).sum() / (2.0 * chord.sum())  # of the volume of a
+        ratio = b.half_axes[k].prod() / a.half_axes[k].prod()
+        iou[k] = share / (1.0 + ratio - share)
+    return np.asarray(np.clip(iou, 0.0, 1.0))
