@@ -8,12 +8,9 @@ LfD authors' published demo (../shared/data/lfd_aldoma).
 
 from __future__ import annotations
 
-import ast
 import itertools
 import json
 import re
-import time
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -24,19 +21,11 @@ from scipy.stats import chi2
 from simulated import chair_solids, walk
 
 import quadrics as q
+from reobj_track import COCO_NAMES
 
 ROOT = Path(__file__).resolve().parent.parent
 DEMO = ROOT.parent / "shared" / "data" / "lfd_aldoma"
 UP = (0.0, 0.0, 1.0)
-COCO_80 = (
-    "person,bicycle,car,motorcycle,airplane,bus,train,truck,boat,traffic light,fire hydrant,"
-    "stop sign,parking meter,bench,bird,cat,dog,horse,sheep,cow,elephant,bear,zebra,giraffe,"
-    "backpack,umbrella,handbag,tie,suitcase,frisbee,skis,snowboard,sports ball,kite,baseball bat,"
-    "baseball glove,skateboard,surfboard,tennis racket,bottle,wine glass,cup,fork,knife,spoon,bowl,"
-    "banana,apple,sandwich,orange,broccoli,carrot,hot dog,pizza,donut,cake,chair,couch,"
-    "potted plant,bed,dining table,toilet,tv,laptop,mouse,remote,keyboard,cell phone,microwave,"
-    "oven,toaster,sink,refrigerator,book,clock,vase,scissors,teddy bear,hair drier,toothbrush"
-).split(",")
 
 
 def random_solids(n: int, rng: np.random.Generator, upright: bool = False) -> q.Ellipsoids:
@@ -128,17 +117,6 @@ def test_dual_quadrics_round_trip_and_flag() -> None:
     assert not q.Ellipsoids.from_dual_quadrics(np.full((1, 4, 4), np.nan))[1][0]
 
 
-def test_reprojection_iou_of_truth_is_one_and_of_unseen_zero() -> None:
-    rng = np.random.default_rng(4)
-    solids, cams = random_solids(5, rng), syn.arc_cameras(6, 90, rng)
-    boxes = q.solid_boxes(solids, "box", cams)
-    boxes[2, 3] = np.nan
-    iou = q.reprojection_iou(solids, boxes, cams, (10**4, 10**4), support="box")
-    expected = q.box_iou(*(q.clip_boxes(boxes, (10**4, 10**4)),) * 2)
-    assert np.allclose(iou, expected) and iou[2, 3] == 0 and iou.max() == pytest.approx(1)
-    assert q.box_iou(np.array([0, 0, 2, 2.0]), np.array([1, 0, 3, 2.0])) == pytest.approx(1 / 3)
-
-
 # ---- Rotations -----------------------------------------------------------------------------
 
 
@@ -165,37 +143,6 @@ def test_plain_lfd_agrees_with_the_batched_one() -> None:
     assert real.all()
     overlap = q.volume_overlap(*(q.Ellipsoids.from_dual_quadrics(x)[0] for x in (ours, plain)))
     assert overlap.min() > 0.99
-
-
-def test_lfd_solves_the_published_system() -> None:
-    """`syn.plain_lfd` in the same coordinates: equal after its first pass, but not its second.
-
-    Coordinates: origin where the rays meet, the unit ten times what the boxes measure there.
-    """
-    rng = np.random.default_rng(0)
-    solids, cams = random_solids(12, rng), syn.arc_cameras(5, 3, rng)
-    boxes = syn.noisy(q.solid_boxes(solids, "ellipsoid", cams), 0.05, rng)
-    ours, _ = q.fit_lfd(boxes, cams)
-    world_from_px = np.linalg.inv(cams[:, :, :3])
-    eye = -(world_from_px @ cams[:, :, 3:])[..., 0]
-    errors = []
-    for k in range(12):
-        middle = 0.5 * (boxes[:, k, :2] + boxes[:, k, 2:])
-        ray = np.einsum("vij,vj->vi", world_from_px, np.c_[middle, np.ones(5)])
-        unit_ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
-        across = np.eye(3) - unit_ray[:, :, None] * unit_ray[:, None]
-        target = (across @ eye[..., None]).ravel()
-        origin = np.linalg.lstsq(across.reshape(-1, 3), target, rcond=None)[0]
-        extent = (boxes[:, k, 2:] - boxes[:, k, :2]) * np.linalg.norm(world_from_px, axis=1)[:, :2]
-        depth = np.abs(cams[:, 2] @ np.append(origin, 1.0))
-        unit = 10 * np.mean(depth * extent.mean(1))
-        world_from_local = np.diag([unit, unit, unit, 1.0])
-        world_from_local[:3, 3] = origin
-        local = 10 * cams @ world_from_local / unit
-        plain = [syn.plain_lfd(boxes[:, k], local, passes) for passes in (1, 2)]
-        world = [world_from_local @ p @ world_from_local.T for p in plain]
-        errors.append([np.abs(w - ours[k]).max() / np.abs(ours[k]).max() for w in world])
-    assert np.max(errors, 0)[0] < 1e-6 and np.median(errors, 0)[1] > 1e-4
 
 
 @pytest.mark.parametrize("shift", [(3.0, 2.0, 1.0), (-1000.0, 700.0, 20.0)])
@@ -297,14 +244,6 @@ def test_ellipsoids_beat_lfd(arc: float, lowest: float, lfd_highest: float) -> N
     assert ours >= lowest and closed <= lfd_highest and ours > closed + 0.05
 
 
-def test_cuboids_need_the_box_support() -> None:
-    args = (60, 10, 120, 0.02, "box")
-    box, truth, *_ = fitted(*args)
-    ellipsoid = fitted(*args, support="ellipsoid")[0]
-    assert syn.box_overlap(box.ellipsoids, truth).mean() >= 0.90
-    assert syn.box_overlap(ellipsoid.ellipsoids, truth).mean() < 0.55
-
-
 @pytest.mark.parametrize("kind", ["far", "near"])
 def test_one_outlier_in_five_boxes(kind: str) -> None:
     rng = np.random.default_rng(11)
@@ -339,30 +278,6 @@ def test_cut_edges_are_one_sided() -> None:
 def test_evidence_selects_the_shape(shape: str) -> None:
     fits, _, *_ = fitted(60, 8, 110, 0.01, shape, support="evidence")
     assert (fits.support == shape).mean() > 0.9
-
-
-@pytest.mark.parametrize("support", q.SUPPORTS)
-def test_residuals_are_distances_in_the_image(support: str) -> None:
-    """Also of a solid eight times as long as wide, of which the near end makes the outline."""
-    rng = np.random.default_rng(5)
-    half = np.tile([0.1, 0.1, 0.8], (40, 1)) * rng.uniform(0.8, 1.2, (40, 3))
-    solids = q.Ellipsoids(
-        rng.normal(0, 0.05, (40, 3)), half, q.rotations(rng.normal(0, 1.0, (40, 3)))
-    )
-    cams = syn.arc_cameras(6, 90, rng, distance=3.0)
-    boxes = q.solid_boxes(solids, support, cams).transpose(1, 0, 2)  # (40, 6, 4)
-    outwards = np.array([-1, -1, 1, 1])
-    config = q.FitConfig(edge_noise_px=1.0, edge_noise_rel=0.0)
-    edges = q._tangent_planes(
-        boxes - 2.0 * outwards,  # the solid extends 2 px beyond each edge
-        np.broadcast_to(q._with_positive_depth(cams), (40, 6, 3, 4)),
-        np.zeros(boxes.shape, bool),
-        config,
-    )
-    state = q._State(solids.center_in_world, np.log(half), solids.world_from_obj)
-    groups = np.repeat(q.AXIS_GROUPS[[q.SUPPORTS.index(support)]], 40, 0)
-    value = q._residuals(state, edges, groups, jacobian=False)[0]
-    assert (np.abs(value - 2.0) < 0.1).mean() > 0.98  # of boxes another corner may be the outermost
 
 
 def test_a_size_that_the_boxes_leave_open_is_that_of_the_category() -> None:
@@ -642,16 +557,6 @@ def test_option_edge_noise_weighs_edges() -> None:
     assert equal_px > 1.085 and 1.03 < equal_share < 1.07
 
 
-@pytest.mark.parametrize("name", ["edge_noise_px", "edge_noise_rel"])
-def test_option_edge_noise_widens_the_covariance(name: str) -> None:
-    sigma = []
-    for value in (0.1, 0.3) if name == "edge_noise_rel" else (10.0, 30.0):
-        noise = {"edge_noise_px": 0.0, "edge_noise_rel": 0.0, name: value}
-        fits = fitted(1, 3, 60, 0.02, "ellipsoid", config=q.FitConfig(**noise))[0]
-        sigma.append(np.sqrt(fits.cov[0, :2, :2].trace()))
-    assert 1.5 < sigma[1] / sigma[0] < 3.5  # 3, reduced by the estimated box noise
-
-
 @pytest.mark.parametrize("gap_px, border_px", [(15, (3.0, 15.0)), (6, (0.0, 3.0))])
 def test_option_border_px(gap_px: int, border_px: tuple[float, float]) -> None:
     """A detector that ends boxes before the image border; 6 of 126 px are within their noise."""
@@ -716,65 +621,21 @@ def test_views_are_spread_over_the_part_of_the_path_on_which_an_object_is_seen()
     assert len(chosen[1]) == 10 and np.diff(chosen[1][:9]).max() <= 11
 
 
-def test_option_max_views() -> None:
-    """Of 40 views 5 are used, evenly spread; the one with the highest score of each interval."""
+@pytest.mark.parametrize("way", ["score", "whole"])
+def test_of_many_views_the_best_of_each_interval_are_used(way: str) -> None:
+    """Of 40 views 5 are used, evenly spread: those of the highest score, or not truncated."""
     rng = np.random.default_rng(36)
     boxes, cams, *_, priors, names = syn.scenes(1, 40, 150, 0.02, "ellipsoid", rng)
-    score = np.zeros((40, 1))
-    score[4::8] = 1.0
+    best = np.arange(40) % 8 == 4
+    shown = boxes[0].copy()
+    if way == "whole":
+        shown[~best, :, 0] = 0.0  # to the left border of the image
+    score = best[:, None].astype(float) if way == "score" else None
     given = {"up": UP, "config": q.FitConfig(max_views=5, correlation_deg=0)}
-    five = q.fit_objects(boxes[0], cams[0], syn.IMAGE, names, priors, score=score, **given)
-    alone = q.fit_objects(boxes[0, 4::8], cams[0, 4::8], syn.IMAGE, names, priors, **given)
+    five = q.fit_objects(shown, cams[0], syn.IMAGE, names, priors, score=score, **given)
+    alone = q.fit_objects(boxes[0, best], cams[0, best], syn.IMAGE, names, priors, **given)
     assert (five.size == alone.size).all() and (five.cov == alone.cov).all()
-    assert five.inlier.sum() > 35  # the consistency check still uses all of them
-
-
-def test_untruncated_boxes_are_selected_first() -> None:
-    rng = np.random.default_rng(36)
-    boxes, cams, *_, priors, names = syn.scenes(1, 40, 150, 0.02, "ellipsoid", rng)
-    cut = boxes[0].copy()
-    cut[np.arange(40) % 8 != 4, :, 0] = 0.0  # to the left border of the image
-    given = {"up": UP, "config": q.FitConfig(max_views=5, correlation_deg=0)}
-    five = q.fit_objects(cut, cams[0], syn.IMAGE, names, priors, **given)
-    alone = q.fit_objects(boxes[0, 4::8], cams[0, 4::8], syn.IMAGE, names, priors, **given)
-    assert (five.size == alone.size).all()
-
-
-def test_option_start_views() -> None:
-    """Without steps on all views, views outside the initial fits do not matter."""
-    rng = np.random.default_rng(37)
-    boxes, cams, *_, priors, names = syn.scenes(10, 5, 100, 0.01, "ellipsoid", rng)
-    moved = boxes.copy()
-    moved[:, 1:4] += 5.0  # px; two of five views are the first and the last
-    same = []
-    for start_views in (2, 5):
-        config = q.FitConfig(
-            start_views=start_views, iterations=0, correlation_deg=0, wrong_class=0
-        )
-        fits = [syn.solve(b, cams, priors, names, config) for b in (boxes, moved)]
-        same.append((fits[0].size == fits[1].size).all())
-    assert same == [True, False]
-
-
-@pytest.mark.parametrize(
-    ("few", "many"),
-    [
-        ({"start_iterations": 0, "iterations": 0}, {"start_iterations": 7, "iterations": 0}),
-        ({"start_iterations": 0, "iterations": 0}, {"start_iterations": 0, "iterations": 40}),
-    ],
-)
-def test_option_iterations(few: dict[str, int], many: dict[str, int]) -> None:
-    errors = []
-    for steps in (few, many):
-        fits, truth, *_ = fitted(30, 8, 100, 0.001, "ellipsoid", config=q.FitConfig(**steps))
-        errors.append(np.median(np.abs(np.log(fits.ellipsoids.half_axes / truth.half_axes))))
-    assert errors[1] < 0.5 * errors[0]
-
-
-def test_options_are_explained() -> None:
-    names = [field.name for field in fields(q.FitConfig)]
-    text = q.FitConfig.__doc__ or ""
-    assert [n for n in names if not re.search(rf"\b{n}\b.*:", text)] == []
+    assert way == "whole" or five.inlier.sum() > 35  # the inlier test still uses all of them
 
 
 # ---- fit_objects: uncertainty, scale, gravity ----------------------------------------------
@@ -817,13 +678,9 @@ def test_status_reflects_the_evidence() -> None:
     assert (thin.status == "prior_dominated").all()
     assert all("guessed from the category" in reason for reason in thin.reason)
     assert (thin.prior_share.max(1) > 0.8).all() and (wide.prior_share.max(1) < 0.7).mean() > 0.9
-
-
-def test_a_reason_names_the_prior_that_was_used() -> None:
-    _, _, joint, flat, names, priors = fitted(30, 2, 0.5, 0.02, "box")
+    _, _, joint, flat, names, priors = fitted(3, 2, 0.5, 0.02, "box")
     fits = q.fit_objects(joint, flat, syn.IMAGE, [None, *names[1:]], priors, up=UP)
     assert "guessed from the sizes of all categories" in fits.reason[0]
-    assert "guessed from the category" in fits.reason[1]
 
 
 def test_contradictory_boxes_are_rejected() -> None:
@@ -957,7 +814,7 @@ def test_without_scale_sizes_are_free(room) -> None:
     boxes, cams, *_ = room
     per_cm = cams @ np.diag([1e-2] * 3 + [1.0])
     fits = [q.fit_objects(boxes, c, syn.IMAGE, up=UP, metric=False) for c in (cams, per_cm)]
-    assert all((f.status != "rejected").all() for f in fits)
+    assert all(f.scale.source == "none" and (f.status != "rejected").all() for f in fits)
     assert np.median(np.abs(np.log(1e2 * fits[0].size / fits[1].size))) < 0.02
 
 
@@ -967,12 +824,6 @@ def test_camera_up_is_robust_to_a_common_pitch() -> None:
     cams = syn.arc_cameras(12, 100, rng, elevation_deg=45.0)
     up, sigma = q.camera_up(cams)
     assert np.rad2deg(np.arccos(up @ np.array(UP))) < 10.0 and 1.0 < np.rad2deg(sigma) < 20.0
-
-
-def test_no_priors_no_scale(room) -> None:
-    boxes, cams, _, _ = room
-    fits = q.fit_objects(boxes, cams, syn.IMAGE, up=UP, metric=False)
-    assert fits.scale.source == "none" and (fits.status != "rejected").all()
 
 
 def test_gravity_is_given_or_from_level_cameras(room) -> None:
@@ -1098,22 +949,9 @@ def test_wrong_array_shapes_are_reported(arguments, message: str) -> None:
 
 @pytest.mark.filterwarnings("error")
 def test_random_input_gives_no_exceptions_and_no_false_claims() -> None:
-    counts = syn.fuzz(1000, np.random.default_rng(18))
-    assert counts["objects"] >= 1000 and counts["bad"] == 0
-    assert min(counts["rejected"], counts["prior_dominated"]) > 100
-
-
-def test_thousands_of_frames_use_few_views() -> None:
-    rng = np.random.default_rng(19)
-    cams = syn.arc_cameras(3000, 150, rng)
-    truth = random_solids(4, rng, upright=True)
-    boxes = syn.noisy(q.solid_boxes(truth, "box", cams), 0.01, rng)
-    boxes[rng.random(boxes.shape[:2]) < 0.5] = np.nan
-    start = time.perf_counter()
-    fits = q.fit_objects(boxes, cams, syn.IMAGE, up=UP, support="box")
-    assert time.perf_counter() - start < 5.0
-    assert fits.inlier.sum() > 0.9 * np.isfinite(boxes[..., 0]).sum()
-    assert syn.box_overlap(fits.ellipsoids, truth).min() > 0.8
+    counts = syn.fuzz(400, np.random.default_rng(18))
+    assert counts["objects"] >= 400 and counts["bad"] == 0
+    assert min(counts["rejected"], counts["prior_dominated"]) > 40
 
 
 # ---- Volumes -------------------------------------------------------------------------------
@@ -1147,7 +985,7 @@ def test_overlap_matches_monte_carlo_and_symmetry(kind: str) -> None:
     a, b = random_solids(8, rng), random_solids(8, rng)
     b = q.Ellipsoids(a.center_in_world + rng.normal(0, 0.05, (8, 3)), b.half_axes, b.world_from_obj)
     measure = q.volume_overlap if kind == "ellipsoid" else syn.box_overlap
-    unit = rng.uniform(-1, 1, (400000, 3))
+    unit = rng.uniform(-1, 1, (200000, 3))
     for k in range(8):
         point = a.center_in_world[k] + (unit * a.half_axes[k]) @ a.world_from_obj[k].T
         other = (point - b.center_in_world[k]) @ b.world_from_obj[k] / b.half_axes[k]
@@ -1156,7 +994,7 @@ def test_overlap_matches_monte_carlo_and_symmetry(kind: str) -> None:
         common = (in_a & in_b).mean() * a.half_axes[k].prod()
         full = np.pi / 6 if kind == "ellipsoid" else 1.0
         expected = common / (full * (a.half_axes[k].prod() + b.half_axes[k].prod()) - common)
-        assert measure(a[k], b[k])[0] == pytest.approx(expected, abs=3e-3)
+        assert measure(a[k], b[k])[0] == pytest.approx(expected, abs=4e-3)
     assert np.allclose(measure(a, b), measure(b, a), atol=1e-3)
     assert np.allclose(measure(a, a), 1, atol=1e-6)
     far = q.Ellipsoids(a.center_in_world + 50, a.half_axes, a.world_from_obj)
@@ -1188,13 +1026,6 @@ def test_sfmo_recovers_affine_scenes_up_to_mirror(holes: float) -> None:
 def test_sfmo_reports_insufficient_input(shape: tuple[int, int]) -> None:
     result = q.fit_sfmo(np.tile([0.0, 0, 10, 10], (*shape, 1)))
     assert not result.ok and "needs" in result.note and len(result.ellipsoids) == shape[1]
-
-
-def test_psfmo_estimates_the_noise_of_the_ellipses() -> None:
-    """Its noise variance, alone and with cameras, rises with rotation error and with size error."""
-    for sweep in ([(0, 0.02), (10, 0.02), (30, 0.02)], [(2, 0.0), (2, 0.1), (2, 0.3)]):
-        variance = np.array([syn.thesis_trial(*s, seed=0)[4:] for s in sweep])  # (3, 2)
-        assert (variance > 0).all() and (variance[1:] > 2 * variance[:-1]).all()
 
 
 def test_psfmo_prior_helps_where_least_squares_is_weak() -> None:
@@ -1312,118 +1143,55 @@ def test_psfmo_agrees_with_the_plain_one() -> None:
     assert np.mean(change.max(1) < 1e-3) >= 0.8  # the default number of steps converges
 
 
-def test_psfmo_estimates_the_noise() -> None:
-    """Rows off by a known Gaussian error, relative to their mean."""
-    truth, cams, _, priors = ratio_scene(12, 70, 0.0, 5)
-    rng = np.random.default_rng(6)
-    clean = q.project(truth.dual_quadrics(), cams)[0]
-    scaled = -clean / clean[..., 2:, 2:]
-    center = -scaled[..., :2, 2]
-    block = scaled[..., :2, :2] + center[..., None] * center[..., None, :]
-    mean = np.abs(block[..., [0, 0, 1], [0, 1, 1]]).mean((0, 2))
-    error = rng.normal(0, 0.05, block.shape) * mean[:, None, None]
-    error[..., 1, 0] = error[..., 0, 1]
-    scaled[..., :2, :2] += error
-    result = q.fit_psfmo(None, priors, priors.names, cams, scaled)
-    assert np.sqrt((result.noise**2).mean()) == pytest.approx(0.05, rel=0.1)
-
-
 # ---- Priors --------------------------------------------------------------------------------
 
 
 def test_priors_cover_the_vocabularies() -> None:
     priors = q.load_priors()
-    scannet = (
-        "cabinet,bed,chair,sofa,table,door,window,bookshelf,picture,counter,desk,curtain,"
-        "refrigerator,shower curtain,toilet,sink,bathtub,otherfurniture"
-    ).split(",")
-    sun = "night_stand,dresser,pillow,lamp,monitor,garbage_bin,box,whiteboard,shelves,bag"
-    rest = [*scannet, *sun.split(","), "tvmonitor", "television", "Potted_Plant"]
-    assert (priors.index(COCO_80) >= 0).all() and set(COCO_80) <= set(priors.names)
-    assert (priors.index(rest) >= 0).all()
+    others = "otherfurniture,night_stand,garbage_bin,tvmonitor,Potted_Plant,bathtub,whiteboard"
+    assert (priors.index(COCO_NAMES) >= 0).all() and set(COCO_NAMES) <= set(priors.names)
+    assert (priors.index(others.split(",")) >= 0).all()
     assert priors.index(["unheard of", None, ""]).tolist() == [-1, -1, -1]
     assert priors.index(["sofa"]) == priors.index(["couch"])
     assert (np.linalg.eigvalsh(priors.log_cov) > 0).all() and (priors.log_mean < np.log(60)).all()
     assert (np.linalg.eigvalsh(priors.ratio_cov) > 0).all()
-    table = json.loads((ROOT / "priors.json").read_text())
-    entries = [v for k, v in table.items() if k not in ("about", "aliases")]
-    assert all(e["source"] and e["support"] in q.SUPPORTS for e in entries)
-
-
-# Evaluation sets: recordings, who measured their objects, and rendered rooms.
-SCORED = re.compile(
-    r"7-?scenes|kitchen|hololens|\bTUM\b|MRHan|SO-?SLAM|fr[123]|\bTUW\b|aldoma|cubeslam|\bADT\b|"
-    r"\baria\b|render|examples/",
-    re.IGNORECASE,
-)
-
-
-@pytest.mark.parametrize(
-    ("source", "scored"),
-    [("TUM hand GT (MRHan)+own knowledge", True), ("Objectron/CenterPose+ProcTHOR", False)],
-)
-def test_evaluation_sets_are_named(source: str, scored: bool) -> None:
-    assert bool(SCORED.search(source)) == scored
 
 
 def test_no_prior_comes_from_an_evaluation_set() -> None:
+    """Recordings, who measured their objects, and rendered rooms."""
     table = json.loads(Path(q.__file__).with_name("priors.json").read_text())
-    sources = {"about": table.pop("about")["sources"]}
+    sources = [str(table.pop("about")["sources"])]
     table.pop("aliases")
-    for name, entry in table.items():
-        sources[name] = entry["source"]
-        sources[f"{name}, axis_ratio"] = entry["axis_ratio"]["source"]
-    assert len(sources) > 200
-    assert [name for name, source in sources.items() if SCORED.search(source)] == []
+    for entry in table.values():
+        sources += [entry["source"], entry["axis_ratio"]["source"]]
+    scored = r"7-?scenes|kitchen|hololens|\bTUM\b|MRHan|SO-?SLAM|fr[123]|\bTUW\b|aldoma|cubeslam"
+    scored = re.compile(scored + r"|\bADT\b|\baria\b|render|examples/", re.IGNORECASE)
+    assert len(sources) > 200 and not any(map(scored.search, sources))
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_invalid_priors_are_reported(tmp_path: Path) -> None:
+    """A missing field; numbers that overflow, without a NumPy warning."""
     path = tmp_path / "p.json"
-    path.write_text('{"chair": {"size_m": {"mean": [1, 2, 3]}}}')
-    with pytest.raises(q.QuadricsError, match=r"p\.json.*log_std"):
-        q.load_priors(path)
+    size = {"mean": [2, 0.9, 0.8], "log_std": [0.2, 0.2, 0.2], "corr": [0, 0, 0]}
+    for wrong in ({"mean": [1, 2, 3]}, *(size | {key: [1e308, -1e308, 1e308]} for key in size)):
+        path.write_text(json.dumps({"couch": {"size_m": wrong}}))
+        with pytest.raises(q.QuadricsError, match=r"p\.json.*missing or invalid field"):
+            q.load_priors(path)
     path.write_text("{}")
     assert q.load_priors(path).index(["chair"]).tolist() == [-1]
 
 
-def test_user_priors_from_meshes_and_a_table(tmp_path: Path) -> None:
-    trimesh = pytest.importorskip("trimesh")
-    rng = np.random.default_rng(24)
-    sizes = np.exp(rng.normal(np.log([0.5, 0.6, 0.9]), 0.1, (30, 3)))  # w, d, h
-    folder = tmp_path / "meshes" / "chair"
-    folder.mkdir(parents=True)
-    for k, (w, d, h) in enumerate(sizes):  # CAD: x right, y up, z front
-        trimesh.creation.box(extents=(w, h, d)).export(folder / f"{k}.ply")
-    (folder / "broken.ply").write_text("not a mesh")
-    out = tmp_path / "priors.json"
-    assert own_priors.main([str(tmp_path / "meshes"), "-o", str(out), "--up", "y"]) == 0
-    priors = q.load_priors(out)
-    assert np.allclose(priors.log_mean[0], np.log(sizes).mean(0), atol=1e-3)
-    assert np.allclose(
-        np.sqrt(np.diagonal(priors.log_cov[0])), np.log(sizes).std(0, ddof=1), rtol=0.02
-    )
+def test_user_priors_from_a_table(tmp_path: Path) -> None:
+    sizes = np.exp(np.random.default_rng(24).normal(np.log([0.5, 0.6, 0.9]), 0.1, (30, 3)))
     table = tmp_path / "sizes.csv"
+    out = tmp_path / "priors.json"
     table.write_text("category,w,d,h\n" + "".join(f"stool,{w},{d},{h}\n" for w, d, h in sizes))
     assert own_priors.main([str(table), "-o", str(out), "--support", "cylinder"]) == 0
     assert np.allclose(q.load_priors(out).log_mean[0], np.log(sizes).mean(0), atol=1e-3)
-    table.write_text("category,w\nstool,1\n")
-    assert own_priors.main([str(table), "-o", str(out)]) == 2
 
 
-# ---- House rules ---------------------------------------------------------------------------
-
-
-def test_functions_are_short_and_nothing_optional_is_imported() -> None:
-    tree = ast.parse((ROOT / "quadrics.py").read_text())
-    for node in ast.walk(tree):
-        if isinstance(node, ast.FunctionDef):
-            text = ast.get_docstring(node, clean=False)
-            lines = node.end_lineno - node.lineno + 1 - (len(text.split("\n")) if text else 0)
-            assert lines <= 50, (node.name, lines)
-    names = {
-        a.name.split(".")[0] for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names
-    }
-    assert names <= {"json", "re", "numpy"}
+# ---- Numbers at the limit --------------------------------------------------------------------
 
 
 def test_overflowing_cameras_give_no_quadric() -> None:
@@ -1436,28 +1204,6 @@ def test_overflowing_cameras_give_no_quadric() -> None:
     assert np.isfinite(good.ellipsoids.half_axes).all()
     bad = q.fit_psfmo(boxes, priors, categories, 1e300 * img_from_world)
     assert bad.ellipsoids.half_axes.shape == good.ellipsoids.half_axes.shape
-
-
-@pytest.mark.parametrize("factor", [1e6, 1e9])
-def test_an_absurd_focal_length_raises_no_exception(factor: float) -> None:
-    """Its two latent dimensions are indistinguishable: the precision is singular."""
-    poses = walk(6)
-    img_from_world = (poses.camera.K @ poses.cam_from_world)[:1]
-    boxes = q.solid_boxes(chair_solids(), "box", img_from_world)
-    img_from_world[:, 0, 0] *= factor
-    found = q.fit_psfmo(boxes, q.load_priors(), ["chair"] * boxes.shape[1], img_from_world)
-    assert not np.isfinite(found.ellipsoids.half_axes).any()  # seen in fewer than two frames
-
-
-@pytest.mark.filterwarnings("error::RuntimeWarning")
-@pytest.mark.parametrize("key", ["mean", "log_std", "corr"])
-def test_overflowing_priors_are_refused(tmp_path: Path, key: str) -> None:
-    """Without a NumPy warning."""
-    size = {"mean": [2, 0.9, 0.8], "log_std": [0.2, 0.2, 0.2], "corr": [0, 0, 0]}
-    path = tmp_path / "p.json"
-    path.write_text(json.dumps({"couch": {"size_m": size | {key: [1e308, -1e308, 1e308]}}}))
-    with pytest.raises(q.QuadricsError, match="a category has a missing or invalid field"):
-        q.load_priors(path)
 
 
 def test_the_median_of_chi2_is_near() -> None:
