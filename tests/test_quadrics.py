@@ -79,19 +79,13 @@ def test_solid_boxes_match_sampled_surfaces(support: str) -> None:
 def test_projection_matches_pycolmap() -> None:
     pycolmap = pytest.importorskip("pycolmap")
     rng = np.random.default_rng(1)
-    calib = np.array([[700.0, 0, 333.0], [0, 690.0, 251.0], [0, 0, 1]])
-    camera = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 700.0, 640, 480)
-    camera.params = [700.0, 690.0, 333.0, 251.0]
-    tiny = q.Ellipsoids(
-        rng.normal(0, 0.5, (6, 3)) + np.array([0, 0, 4]),
-        np.full((6, 3), 1e-4),
-        np.tile(np.eye(3), (6, 1, 1)),
-    )
-    rot = q.rotations(rng.normal(0, 0.2, (1, 3)))[0]
-    cam_from_world = np.concatenate([rot, rng.normal(0, 0.2, (3, 1))], 1)
-    boxes = q.solid_boxes(tiny, "ellipsoid", (calib @ cam_from_world)[None])[0]
-    points = tiny.center_in_world @ rot.T + cam_from_world[:, 3]
-    expected = camera.img_from_cam(points)
+    poses = walk(1)
+    camera = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=poses.camera.params)
+    center = rng.normal(0, 0.5, (6, 3))
+    tiny = q.Ellipsoids(center, np.full((6, 3), 1e-4), np.tile(np.eye(3), (6, 1, 1)))
+    boxes = q.solid_boxes(tiny, "ellipsoid", poses.camera.K @ poses.cam_from_world)[0]
+    expected = camera.img_from_cam(center @ poses.cam_from_world[0, :, :3].T
+                                   + poses.cam_from_world[0, :, 3])  # fmt: skip
     assert np.allclose(0.5 * (boxes[:, :2] + boxes[:, 2:]), expected, atol=1e-4)
 
 
@@ -232,7 +226,6 @@ def test_clean_boxes_give_the_truth(support: str) -> None:
     ("arc", "lowest", "lfd_highest"),
     [
         (5, 0.45, 0.30),  # almost no parallax: the prior carries it
-        (20, 0.66, 0.50),
         (90, 0.84, 0.82),
     ],
 )
@@ -366,6 +359,28 @@ def cost_terms(
     return np.array(terms)
 
 
+def solid_of(fits: q.ObjectFits, k: int) -> tuple[np.ndarray, ...]:
+    e = fits.ellipsoids
+    return e.center_in_world[k], e.half_axes[k], e.world_from_obj[k]
+
+
+def newton_step(terms_at, views: int, last: tuple[float, ...]) -> tuple:
+    """Terms, their weights, and the length (sigma) of a Gauss-Newton step by finite differences.
+
+    Huber's loss for the edges; the priors are quadratic; `last`: weights of the last terms.
+    """
+    terms, *there = (terms_at(d) for d in [np.zeros(9), *1e-5 * np.eye(9), *-1e-5 * np.eye(9)])
+    limit = np.where(terms > 0, 2.5, 3.0)  # a possibly occluded edge weighs less
+    limit[4 * views :] = np.inf
+    weight = np.minimum(1.0, limit / np.maximum(np.abs(terms), 1e-9))
+    if len(last):
+        weight[-len(last) :] = last
+    jacobian = (np.array(there[:9]) - np.array(there[9:])) / 2e-5  # (9, M)
+    gradient = jacobian @ (weight * terms)
+    step = np.sqrt(gradient @ np.linalg.solve(jacobian * weight @ jacobian.T, gradient))
+    return terms, weight, step
+
+
 @pytest.mark.parametrize("support", q.SUPPORTS)
 @pytest.mark.parametrize(
     ("views", "noise_px", "noise", "surprise", "shift"),
@@ -394,20 +409,14 @@ def test_fits_are_minima_of_the_documented_cost(
     fits = syn.solve(boxes, cams, priors, names, config)
     steps, linear, walls = [], set(), 0
     for k in range(0, 160, 8):
-        solids = fits.ellipsoids
-        solid = (solids.center_in_world[k], solids.half_axes[k], solids.world_from_obj[k])
         given = (support, boxes[k, :, 0], cams[k], sigma, (log_size[k], 0.25))
-        terms = cost_terms(solid, np.zeros(9), *given)
-        limit = np.where(terms > 0, 2.5, 3.0)  # a possibly occluded edge weighs less
-        limit[4 * views :] = np.inf  # the priors are quadratic
-        weight = np.minimum(1.0, limit / np.maximum(np.abs(terms), 1e-9))
+        solid = solid_of(fits, k)
+        terms, weight, step = newton_step(
+            lambda d, solid=solid, given=given: cost_terms(solid, d, *given), views, ()
+        )
         linear |= set(np.sign(terms[weight < 1]))
         walls += terms[-3] > 0
-        moves = 1e-5 * np.eye(9)
-        jacobian = [cost_terms(solid, d, *given) - cost_terms(solid, -d, *given) for d in moves]
-        jacobian = np.array(jacobian) / 2e-5  # (9, M)
-        gradient = jacobian @ (weight * terms)
-        steps.append(np.sqrt(gradient @ np.linalg.solve(jacobian * weight @ jacobian.T, gradient)))
+        steps.append(step)
     assert np.quantile(steps, 0.6) < 0.01  # sigma; the others stopped at a kink or at the wall
     assert linear == {-1.0, 1.0} if shift else walls >= 1
 
@@ -433,23 +442,21 @@ def test_fits_with_points_are_minima_of_the_documented_cost() -> None:
     given = (*syn.as_one(boxes, cams), syn.IMAGE, names, priors)
     config = q.FitConfig(edge_noise_px=400, edge_noise_rel=0, correlation_deg=0, iterations=300)
     plain, fits = (q.fit_objects(*given, up=UP, points=p, config=config) for p in (None, points))
-    steps, moves = [], 1e-5 * np.eye(9)
-    for k in range(0, 160, 8):
-        solids = fits.ellipsoids
-        solid = (solids.center_in_world[k], solids.half_axes[k], solids.world_from_obj[k])
+    steps = []
+    for k in range(0, 160, 16):
+        solid = solid_of(fits, k)
         prior = np.asarray(priors.log_mean[k])
         sigma = 0.08 * float(np.exp(prior - np.log(2)).prod() ** (1 / 3))
+        given = ("box", boxes[k, :, 0], cams[k], 20, (prior, 0.25))
 
-        at_edges = ("box", boxes[k, :, 0], cams[k], 20, (prior, 0.25))
-        here, *there = (
-            np.append(cost_terms(solid, d, *at_edges), points_outside(solid, d, points[k], sigma))
-            for d in [np.zeros(9), *moves, *-moves]
-        )
-        near = 0.9 * np.exp(-0.5 * (here[-90:].reshape(30, 3) ** 2).sum(1))  # beside .1: outliers
-        weight = np.append(np.ones(len(here) - 90), np.repeat(20 / 30 * near / (near + 0.1), 3))
-        jacobian = (np.array(there[:9]) - np.array(there[9:])) / 2e-5  # (9, M)
-        gradient = jacobian @ (weight * here)
-        steps.append(np.sqrt(gradient @ np.linalg.solve(jacobian * weight @ jacobian.T, gradient)))
+        def terms_at(delta: np.ndarray, solid=solid, given=given, k=k, sigma=sigma) -> np.ndarray:
+            outside = points_outside(solid, delta, points[k], sigma)
+            return np.append(cost_terms(solid, delta, *given), outside)
+
+        distance = points_outside(solid, np.zeros(9), points[k], sigma)
+        near = 0.9 * np.exp(-0.5 * (distance**2).sum(1))  # beside .1: outliers
+        last = np.repeat(20 / 30 * near / (near + 0.1), 3)
+        steps.append(newton_step(terms_at, 8, last)[2])
     assert np.quantile(steps, 0.6) < 0.02
     assert np.abs(np.log(fits.size / plain.size)).max() > 0.1  # they are not without effect
 
@@ -481,22 +488,16 @@ def test_points_improve_the_depth_despite_background_points() -> None:
 def test_points_do_not_make_a_size_more_certain() -> None:
     """They are a one-sided bound; but they do reduce the uncertainty of the prior."""
     boxes, cams, truth, priors, names = syn.scenes(40, 6, 12, 0.02, "box", np.random.default_rng(5))
-    joint, flat = syn.as_one(boxes, cams)
-    rng = np.random.default_rng(6)
-    side = np.sign(rng.normal(0, 1, (40, 40, 3)))
-    where = side * truth.half_axes[:, None]
-    points = truth.center_in_world[:, None] + np.einsum("oij,opj->opi", truth.world_from_obj, where)
-    given = (joint, flat, syn.IMAGE, names, priors)
+    side = np.sign(np.random.default_rng(6).normal(0, 1, (40, 40, 3)))
+    points = truth.center_in_world[:, None] + np.einsum(
+        "oij,opj->opi", truth.world_from_obj, side * truth.half_axes[:, None]
+    )
+    given = (*syn.as_one(boxes, cams), syn.IMAGE, names, priors)
     plain, found = (q.fit_objects(*given, up=UP, points=p) for p in (None, points))
     sigma = [np.sqrt(np.einsum("oii->oi", fits.cov))[:, 3:6] for fits in (plain, found)]
     assert np.median(sigma[1] / sigma[0]) > 0.9
     rests = (found.prior_share == 1).all(1)  # no side is better constrained than by the prior
     assert 0.1 < rests.mean() < 0.7 and (found.status[rests] == "prior_dominated").all()
-    assert (found.prior_share < plain.prior_share)[~rests].mean() > 0.9
-    np.testing.assert_allclose(
-        np.sort(sigma[1][rests] / np.sqrt(np.diagonal(priors.log_cov, axis1=1, axis2=2))[rests]),
-        1,
-    )
 
 
 def test_initial_fits_weight_possibly_occluded_edges_less() -> None:
@@ -585,10 +586,6 @@ def test_option_correlation_deg() -> None:
     assert np.median(sigma[1] / sigma[0]) == pytest.approx(1, abs=0.1)
     assert np.median(sigma[2] / sigma[0]) == pytest.approx(1 / 2, abs=0.1)
     assert np.allclose(shared.size, once.size, rtol=0.02)
-    wide = syn.solve(
-        *copies, q.FitConfig(correlation_deg=60.0)
-    ).cov  # as if from two or three positions
-    assert np.median(np.sqrt(np.einsum("oii->oi", wide[:, :3, :3])) / sigma[0]) > 1.25
 
 
 def test_the_sigma_of_sizes_includes_systematic_box_errors() -> None:
@@ -805,8 +802,6 @@ def test_known_size_sets_the_scale(room) -> None:
     )  # fmt: skip
     assert fits.scale.source == "known_size"
     assert fits.scale.value == pytest.approx(1 / 0.37, rel=0.03)
-    with pytest.raises(q.QuadricsError, match="known_size"):
-        q.fit_objects(boxes, cams, syn.IMAGE, names, known_size={"chair": ("x", 1.0)})
 
 
 def test_without_scale_sizes_are_free(room) -> None:
@@ -871,17 +866,6 @@ def test_support_may_differ_by_object(room) -> None:
         q.solid_boxes(fits.ellipsoids, "evidence", cams)
 
 
-def test_lying_book_keeps_a_vertical_third_axis() -> None:
-    rng = np.random.default_rng(17)
-    cams = syn.arc_cameras(8, 120, rng)
-    standing = np.array([[0.2, 0.03, 0.26]]) / 2  # thickness is horizontal
-    truth = q.Ellipsoids(np.zeros((1, 3)), standing, syn.random_yaw(1, rng))
-    boxes = syn.noisy(q.solid_boxes(truth, "box", cams), 0.01, rng)
-    fits = q.fit_objects(boxes, cams, syn.IMAGE, ["book"], q.load_priors(), up=UP)
-    assert fits.ellipsoids.world_from_obj[0, :, 2] @ np.array(UP) > 0.98
-    assert syn.box_overlap(fits.ellipsoids, truth)[0] > 0.8
-
-
 def test_covariance_follows_the_axes_of_a_lying_object() -> None:
     """Its width, known to 1 %, is vertical: it becomes the third axis, and so does its variance."""
     rng = np.random.default_rng(42)
@@ -925,26 +909,22 @@ def test_empty_input(shape: tuple[int, int], reason: str | None) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("changes", "message"),
     [
-        ((np.zeros((3, 4)), np.zeros((3, 3, 4))), "boxes_xyxy has shape"),
-        ((np.zeros((3, 2, 4)), np.zeros((2, 3, 4))), "img_from_world has shape"),
-        ((np.zeros((3, 2, 4)), np.zeros((3, 3, 4)), (640, 480), ["chair"]), "1 categories"),
+        ({"boxes_xyxy": np.zeros((3, 4))}, "boxes_xyxy has shape"),
+        ({"img_from_world": np.zeros((2, 3, 4))}, "img_from_world has shape"),
+        ({"categories": ["chair"]}, "1 categories"),
+        ({"points": np.zeros((3, 4, 3))}, "points has shape"),
+        ({"points": np.zeros((2, 3))}, "points has shape"),
+        ({"support": "cone"}, "unknown shape"),
+        ({"support": ["box"]}, "1 shapes for 2 objects"),
+        ({"known_size": {"chair": ("x", 1.0)}}, "known_size"),
     ],
 )
-def test_wrong_array_shapes_are_reported(arguments, message: str) -> None:
+def test_wrong_arguments_are_reported(changes: dict[str, object], message: str) -> None:
+    given = {"boxes_xyxy": np.full((3, 2, 4), np.nan), "img_from_world": np.zeros((3, 3, 4))}
     with pytest.raises(q.QuadricsError, match=message):
-        q.fit_objects(*(arguments if len(arguments) > 2 else (*arguments, (640, 480))))
-    seen = (np.full((3, 2, 4), np.nan), np.zeros((3, 3, 4)), (640, 480))
-    for points in (np.zeros((3, 4, 3)), np.zeros((2, 3))):
-        with pytest.raises(q.QuadricsError, match="points has shape"):
-            q.fit_objects(*seen, points=points)
-    for support, complaint in (("cone", "unknown shape"), (["box"], "1 shapes for 2 objects")):
-        with pytest.raises(q.QuadricsError, match=complaint):
-            q.fit_objects(*seen, support=support)
-    for fit in (q.fit_sfmo, lambda x: q.fit_psfmo(x, q.load_priors(), [])):
-        with pytest.raises(q.QuadricsError, match="give boxes_xyxy"):
-            fit(None)
+        q.fit_objects(**given | changes, image_size=(640, 480))
 
 
 @pytest.mark.filterwarnings("error")
@@ -979,28 +959,24 @@ def test_volume_overlap_of_spheres_is_the_lens() -> None:
     assert np.abs(measured - expected).max() < 1e-3
 
 
-@pytest.mark.parametrize("kind", ["ellipsoid", "box"])
-def test_overlap_matches_monte_carlo_and_symmetry(kind: str) -> None:
+def test_overlap_matches_monte_carlo_and_symmetry() -> None:
     rng = np.random.default_rng(21)
     a, b = random_solids(8, rng), random_solids(8, rng)
     b = q.Ellipsoids(a.center_in_world + rng.normal(0, 0.05, (8, 3)), b.half_axes, b.world_from_obj)
-    measure = q.volume_overlap if kind == "ellipsoid" else syn.box_overlap
     unit = rng.uniform(-1, 1, (200000, 3))
+    ball = (unit**2).sum(1) < 1
     for k in range(8):
         point = a.center_in_world[k] + (unit * a.half_axes[k]) @ a.world_from_obj[k].T
         other = (point - b.center_in_world[k]) @ b.world_from_obj[k] / b.half_axes[k]
-        in_a = (unit**2).sum(1) < 1 if kind == "ellipsoid" else np.ones(len(unit), bool)
-        in_b = (other**2).sum(1) < 1 if kind == "ellipsoid" else (np.abs(other) < 1).all(1)
-        common = (in_a & in_b).mean() * a.half_axes[k].prod()
-        full = np.pi / 6 if kind == "ellipsoid" else 1.0
-        expected = common / (full * (a.half_axes[k].prod() + b.half_axes[k].prod()) - common)
-        assert measure(a[k], b[k])[0] == pytest.approx(expected, abs=4e-3)
-    assert np.allclose(measure(a, b), measure(b, a), atol=1e-3)
-    assert np.allclose(measure(a, a), 1, atol=1e-6)
+        common = (ball & ((other**2).sum(1) < 1)).mean() * a.half_axes[k].prod()
+        whole = np.pi / 6 * (a.half_axes[k].prod() + b.half_axes[k].prod())
+        expected = common / (whole - common)
+        assert q.volume_overlap(a[[k]], b[[k]])[0] == pytest.approx(expected, abs=4e-3)
+    assert np.allclose(q.volume_overlap(a, b), q.volume_overlap(b, a), atol=2e-4)
+    assert np.allclose(q.volume_overlap(a, a), 1, atol=1e-6)
     far = q.Ellipsoids(a.center_in_world + 50, a.half_axes, a.world_from_obj)
-    assert (measure(a, far) == 0).all()
-    broken = q.Ellipsoids(a.center_in_world * np.nan, a.half_axes, a.world_from_obj)
-    assert np.isnan(measure(a, broken)).all()
+    assert (q.volume_overlap(a, far) == 0).all()
+    assert np.isnan(q.volume_overlap(a, q.Ellipsoids.unknown(8))).all()
 
 
 # ---- SfMO, PSfMO ---------------------------------------------------------------------------
@@ -1026,34 +1002,6 @@ def test_sfmo_recovers_affine_scenes_up_to_mirror(holes: float) -> None:
 def test_sfmo_reports_insufficient_input(shape: tuple[int, int]) -> None:
     result = q.fit_sfmo(np.tile([0.0, 0, 10, 10], (*shape, 1)))
     assert not result.ok and "needs" in result.note and len(result.ellipsoids) == shape[1]
-
-
-def test_psfmo_prior_helps_where_least_squares_is_weak() -> None:
-    """Narrow baselines: least squares (LfD) hardly constrains the depth, the prior does."""
-    gains = []
-    for seed in range(6):
-        rng = np.random.default_rng(seed)
-        truth, cams = syn.far_scene(15, 10, 12.0, rng)
-        boxes = syn.noisy(q.solid_boxes(truth, "ellipsoid", cams), 0.02, rng)
-        priors, names = syn.individual_priors(np.log(2 * truth.half_axes), 0.1, "ellipsoid")
-        plain = q.Ellipsoids.from_dual_quadrics(q.fit_lfd(boxes, cams)[0])[0]
-        informed = q.fit_psfmo(boxes, priors, names, cams)
-        assert np.isfinite(informed.noise).all() and informed.start is None
-        overlaps = (q.volume_overlap(x, truth) for x in (plain, informed.ellipsoids))
-        scores = [np.nan_to_num(x).mean() for x in overlaps]
-        gains.append(scores[1] - scores[0])
-    assert np.mean(gains) > 0.05
-
-
-def test_psfmo_finds_the_axis_assignment() -> None:
-    rng = np.random.default_rng(23)
-    truth, cams = syn.far_scene(20, 8, 60.0, rng)
-    dual_c, _ = q.project(truth.dual_quadrics(), cams)
-    priors, names = syn.individual_priors(np.log(2 * truth.half_axes), 0.05, "ellipsoid")
-    result = q.fit_psfmo(None, priors, names, cams, dual_c)
-    order = np.argsort(truth.half_axes, 1)  # LfD axes ascend
-    assert (result.permutation == order).all()
-    assert q.volume_overlap(result.ellipsoids, truth).min() > 0.95
 
 
 def plain_psfmo(
