@@ -66,7 +66,7 @@ from synthetic_quadrics import table, write_table
 
 import quadrics
 import reobj_track as rt
-from reobj.objects.confidence import LOW_CONFIDENCE
+from reobj.objects.description import LOW_CONFIDENCE
 from reobj.objects.fit import link_and_fit
 from reobj.objects.observations import Views
 from reobj.results.evaluation_3d import align_with_truth, fraction_within_2_sigma, sizes_in_sigma
@@ -155,28 +155,29 @@ def untracked(rows: rt.Tracks) -> BoolArray:
 
 # Ablations by name: replacements of values and functions of modules, and of defaults of options.
 LIKELIHOOD = "reobj.objects.likelihood"
-ASSOCIATION = "reobj.objects.association.AssociationOptions"
+ASSOCIATION = "reobj.objects.association"
+OBSERVATIONS = "reobj.objects.observations"
 COMPONENT = "reobj.objects.component"
 WITHOUT: dict[str, dict[str, Any]] = {
     "hidden edges": {f"{LIKELIHOOD}.OCCLUDED_EDGES": 0.0},
     "hidden edges in the fit": {
-        "quadrics.RobustOptions.cauchy_hidden": quadrics.RobustOptions().cauchy,
-        "quadrics.RobustOptions.huber_hidden": quadrics.RobustOptions().huber,
-        "quadrics.RobustOptions.hidden_cap": quadrics.RobustOptions().outlier_cap,
+        "quadrics.CAUCHY_HIDDEN": quadrics.CAUCHY,
+        "quadrics.HUBER_HIDDEN": quadrics.HUBER,
+        "quadrics.HIDDEN_CAP": quadrics.OUTLIER_CAP,
     },
-    "edges behind nearer objects": {"reobj.objects.occlusion._occluded_by_nearer": all_visible},
-    "edges above the floor": {"reobj.objects.occlusion.ABOVE_FLOOR": np.inf},
-    "widening": {f"{ASSOCIATION}.widening_rounds": 0},
+    "edges behind nearer objects": {f"{OBSERVATIONS}._occluded_by_nearer": all_visible},
+    "edges above the floor": {f"{OBSERVATIONS}.ABOVE_FLOOR": np.inf},
+    "widening": {f"{ASSOCIATION}.WIDENING_ROUNDS": 0},
     "limit of a box": {f"{LIKELIHOOD}.MAX_BOX_EXISTENCE": 8.0},
     "classes": {f"{LIKELIHOOD}.CLASS_KEPT": 0.0},
-    "sizes": {"reobj.objects.categories.SIZE_SIGMAS": 0.0},
-    "missed frames": {f"{ASSOCIATION}.missed": 0.0},
-    "tracklets": {f"{ASSOCIATION}.same_tracklet": 0.0},
+    "sizes": {f"{LIKELIHOOD}.SIZE_SIGMAS": 0.0},
+    "missed frames": {f"{ASSOCIATION}.MISSED": 0.0},
+    "tracklets": {f"{ASSOCIATION}.SAME_TRACKLET": 0.0},
     "untracked detections": {f"{COMPONENT}._duplicates": untracked},
-    "clear detections in refits": {f"{ASSOCIATION}.unambiguous_margin": -1e3},
-    "alternation": {f"{ASSOCIATION}.max_rounds": 0},
-    "merging": {f"{ASSOCIATION}.merge_distance": 0.0},
-    "distances along rays": {"reobj.objects.hypotheses.DEPTHS": np.empty(0)},
+    "clear detections in refits": {f"{ASSOCIATION}.UNAMBIGUOUS_MARGIN": -1e3},
+    "alternation": {f"{ASSOCIATION}.MAX_ROUNDS": 0},
+    "merging": {f"{ASSOCIATION}.MERGE_DISTANCE": 0.0},
+    "distances along rays": {f"{COMPONENT}.DEPTHS": np.empty(0)},
     "floor": {
         f"{COMPONENT}.find_floor": nothing,
         "reobj.objects.fit.find_floor": nothing,
@@ -185,11 +186,11 @@ WITHOUT: dict[str, dict[str, Any]] = {
     "points in the fit": {"reobj.objects.fit.points_on": nothing},
     "seen through": {f"{COMPONENT}.see_through_ratio": never_seen_through},
     "duplicate boxes": {f"{COMPONENT}.DUPLICATE_IOU": 2.0},
-    "classes that differ": {f"{ASSOCIATION}.similar_log_size": 0.0},
-    "same position": {f"{ASSOCIATION}.same_position": 0.0},
-    "limit of a proposal's gain": {f"{ASSOCIATION}.max_box_gain": np.inf},
-    "boxes at the border": {"reobj.objects.hypotheses.BORDER_WEIGHT": 1.0},
-    "heights of standing objects": {"reobj.objects.hypotheses.STANDING_HEIGHTS": (0.0, 1e6)},
+    "classes that differ": {f"{ASSOCIATION}.SIMILAR_LOG_SIZE": 0.0},
+    "same position": {f"{ASSOCIATION}.SAME_POSITION": 0.0},
+    "limit of a proposal's gain": {f"{ASSOCIATION}.MAX_BOX_GAIN": np.inf},
+    "boxes at the border": {f"{COMPONENT}.BORDER_WEIGHT": 1.0},
+    "heights of standing objects": {f"{COMPONENT}.STANDING_HEIGHTS": (0.0, 1e6)},
     "quartic size prior": {"quadrics.SIZE_WALL": 1e3},
     "tie of round objects": {"quadrics.ROUND_LOG": 1e3},
     "lower part occluded": {"quadrics.OCCLUDED_BELOW": 1e-12},
@@ -307,14 +308,14 @@ def shake(seed: int) -> None:
     """Add noise to all boxes before objects are made of them, in this process."""
 
     def shaken(
-        result: rt.Result, config: rt.ObjectsConfig, phases: Any = None, last: Any = None
+        result: rt.Result, config: rt.ObjectsConfig, last: Any = None
     ) -> rt.Result:
         rng = np.random.default_rng(seed)
         for name in ("tracks", "untracked"):
             rows = getattr(result, name)
             xyxy = rows.xyxy + rng.normal(0, NOISE_PX, rows.xyxy.shape)
             result = dataclasses.replace(result, **{name: dataclasses.replace(rows, xyxy=xyxy)})
-        return link_and_fit(result, config, phases, last)
+        return link_and_fit(result, config, last)
 
     rt.link_and_fit = shaken  # type: ignore[attr-defined]
 

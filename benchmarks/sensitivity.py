@@ -44,8 +44,8 @@ MODULES = (
     *(
         f"reobj.objects.{name}"
         for name in (
-            "association", "categories", "component", "confidence", "description", "fit",
-            "hypotheses", "likelihood", "observations", "occlusion",
+            "association", "component", "config", "description", "fit", "likelihood",
+            "observations",
         )
     ),
 )  # fmt: skip

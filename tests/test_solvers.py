@@ -12,8 +12,8 @@ from simulated import CUP, looking_at, unlinked, walk
 
 import quadrics
 import reobj_track as rt
+from reobj.objects.config import solve_again
 from reobj.objects.fit import link_and_fit
-from reobj.objects.published import solve_again
 
 CAMERA = rt.Camera("PINHOLE", 640, 480, (2600.0, 2600.0, 320.0, 240.0))
 

@@ -2,7 +2,7 @@
 
 A row is a box in the world of the supplied cameras, seen in the frame of its time stamp. Its
 projection is a detection like any other; the boxes themselves are measurements of the objects'
-shapes (`objects.given_boxes`).
+shapes (`objects.config`).
 
 Ref: github.com/facebookresearch/boxer, utils/file_io.py (`ObbCsvWriter2`): z up, full extents,
 quaternions w first.
