@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -361,28 +360,6 @@ def test_a_part_of_an_object_is_no_separate_object(
     for pair in ([solid, other], [other, solid]):
         found = association._coincide(Shapes.concatenate(pair))
         assert found[0, 1] == found[1, 0] == one
-
-
-def test_two_boxes_of_an_object_per_frame_give_one_object() -> None:
-    """Its upper half is detected as well, as often and with the same score."""
-    poses = walk(40)
-    table = table_of(poses)
-    half = table[table.detection_index == 0]
-    box = half.xyxy.copy()
-    box[:, 3] -= 0.5 * (box[:, 3] - box[:, 1])
-    half = dataclasses.replace(half, xyxy=box, score=half.score)
-    both = rt.Tracks.joined([table, half])
-    both = both[np.argsort(both.frame, kind="stable")]
-    three = chairs()
-    top = dataclasses.replace(
-        three.ellipsoids,
-        center_in_world=three.ellipsoids.center_in_world
-        + three.ellipsoids.world_from_obj[:, :, 2] * three.ellipsoids.half_axes[:, [2]] / 2,
-        half_axes=three.ellipsoids.half_axes * [1, 1, 0.5],
-    )
-    many = Shapes.concatenate([three, dataclasses.replace(three, ellipsoids=top)])
-    made = Associator(detected_in(both, poses), Mock(), lambda s: np.zeros(len(s)))
-    assert sorted(made._select_greedily(made._unassigned(many, 0.0)).tolist()) == [0, 1, 2]
 
 
 def test_greedy_selection_adds_the_largest_marginal_gain() -> None:

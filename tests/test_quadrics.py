@@ -250,23 +250,6 @@ def test_one_outlier_in_five_boxes(kind: str) -> None:
     assert flagged[wrong].mean() > 0.95 and flagged[~wrong].mean() < 0.01
 
 
-def test_cut_edges_are_one_sided() -> None:
-    """Boxes cut by the image border: counting the cut edges would shrink and move the object."""
-    rng = np.random.default_rng(12)
-    boxes, cams, truth, priors, names = syn.scenes(60, 8, 100, 0.005, "box", rng)
-    joint, flat = syn.as_one(boxes, cams)
-    middle = np.nanmedian(joint[..., [0, 2]].mean(-1))
-    size = (middle, syn.IMAGE[1])  # the image border cuts the objects
-    cut = q.clip_boxes(joint, size)
-    one_sided = q.fit_objects(cut, flat, size, names, priors, up=UP)
-    naive = q.fit_objects(cut, flat, (10**6, 10**6), names, priors, up=UP)
-    live = np.isfinite(one_sided.size).all(1) & (np.isfinite(cut[..., 0]).sum(0) >= 5)
-    gain = [
-        np.nanmean(syn.box_overlap(f.ellipsoids[live], truth[live])) for f in (one_sided, naive)
-    ]
-    assert gain[0] > gain[1] + 0.1
-
-
 @pytest.mark.parametrize("shape", q.SUPPORTS)
 def test_evidence_selects_the_shape(shape: str) -> None:
     fits, _, *_ = fitted(60, 8, 110, 0.01, shape, support="evidence")
@@ -538,26 +521,6 @@ def test_evidence_is_robust_to_occluded_edges() -> None:
 # ---- Options -------------------------------------------------------------------------------
 
 
-def spheres_near_and_far(config: q.FitConfig) -> float:
-    """Diameter of a ball of 1 m whose boxes are 10 % too large nearby and exact far away."""
-    rng = np.random.default_rng(33)
-    ball = q.Ellipsoids(np.zeros((1, 3)), np.full((1, 3), 0.5), np.eye(3)[None])
-    near, far = syn.arc_cameras(5, 120, rng, 3.0), syn.arc_cameras(5, 120, rng, 12.0)
-    boxes = q.solid_boxes(ball, "ellipsoid", np.concatenate([near, far]))
-    middle = 0.5 * (boxes[:5, :, :2] + boxes[:5, :, 2:])
-    boxes[:5] = np.tile(middle, 2) + 1.1 * (boxes[:5] - np.tile(middle, 2))
-    cams = np.concatenate([near, far])
-    fits = q.fit_objects(boxes, cams, (9000, 9000), up=UP, support="ellipsoid", config=config)
-    return float(fits.size.mean())
-
-
-def test_option_edge_noise_weighs_edges() -> None:
-    """Constant px noise: near views weigh more; noise relative to the box: all weigh the same."""
-    equal_px = spheres_near_and_far(q.FitConfig(edge_noise_px=5, edge_noise_rel=0))
-    equal_share = spheres_near_and_far(q.FitConfig(edge_noise_px=0, edge_noise_rel=0.05))
-    assert equal_px > 1.085 and 1.03 < equal_share < 1.07
-
-
 @pytest.mark.parametrize("gap_px, border_px", [(15, (3.0, 15.0)), (6, (0.0, 3.0))])
 def test_option_border_px(gap_px: int, border_px: tuple[float, float]) -> None:
     """A detector that ends boxes before the image border; 6 of 126 px are within their noise."""
@@ -740,7 +703,7 @@ def corridor(rng: np.random.Generator, noise: float):
     return q.clip_boxes(boxes, syn.IMAGE), cams, truth
 
 
-@pytest.mark.parametrize("way", ["flies off", "jumps about", "elsewhere"])
+@pytest.mark.parametrize("way", ["flies off", "elsewhere"])
 def test_wrong_cameras_affect_only_the_objects_they_observe(way: str) -> None:
     """50 of 240 cameras are wrong: others and those with enough good views are kept."""
     rng = np.random.default_rng(51)
@@ -749,8 +712,6 @@ def test_wrong_cameras_affect_only_the_objects_they_observe(way: str) -> None:
     step = np.eye(4)[None].repeat(len(bad), 0)
     if way == "flies off":  # and returns
         step[:, 0, 3] = 500.0 * np.sin(np.linspace(0, np.pi, len(bad) + 2)[1:-1])
-    elif way == "jumps about":
-        step[:, :3, 3] = rng.normal(0, 1.0, (len(bad), 3))
     else:
         step[:, :3, :3] = q.rotations(np.array([[0.2, 0.3, 0.9]]))
         step[:, :3, 3] = [2.0, 1.0, -1.0]
