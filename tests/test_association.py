@@ -255,7 +255,8 @@ def test_occluded_chairs_get_the_width_of_their_unoccluded_views() -> None:
     seen = dataclasses.replace(table, xyxy=np.where(back[:, None], half, table.xyxy))
     width = []
     for points, visibility in ((ground, observed), (ground[:0], observed[:0])):
-        world = dataclasses.replace(poses, points=points, visibility=visibility)
+        colors = np.zeros(points.shape, np.uint8)
+        world = dataclasses.replace(poses, points=points, colors=colors, visibility=visibility)
         fit, priors = make_fit(rt.ObjectsConfig(), world, NAMES), quadrics.load_priors()
         found = associate_component(seen, NAMES, world, fit, priors)
         assert (found.floor is not None) == bool(len(points))
