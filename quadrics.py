@@ -212,6 +212,26 @@ class ObjectFits:
     def __len__(self) -> int:
         return len(self.status)
 
+    @staticmethod
+    def unfitted(shape: tuple[int, ...], reason: str) -> ObjectFits:
+        """Return the result of (F, O) `shape` where all objects are rejected for one reason."""
+        n = shape[1]
+        return ObjectFits(
+            ellipsoids=Ellipsoids.unknown(n),
+            size=np.full((n, 3), np.nan),
+            cov=np.full((n, 9, 9), np.nan),
+            support=np.full(n, "ellipsoid"),
+            inlier=np.zeros(shape, bool),
+            rms_px=np.full(n, np.nan),
+            status=np.full(n, "rejected", "U15"),  # as long as "prior_dominated"
+            reason=[reason] * n,
+            parallax_deg=np.zeros(n),
+            prior_share=np.ones((n, 3)),
+            scale=Scale(1.0, np.inf, "none"),
+            up=np.zeros(3),
+            up_source="none",
+        )
+
 
 # ---- fit_objects ---------------------------------------------------------------------------
 
@@ -281,18 +301,8 @@ def fit_objects(
     sizes = [] if has_scale else _known_sizes(known_size, categories, live, priors)
     is_metric = metric if has_scale else bool(metric is True and not sizes)
     world = _first_world(up, is_metric, cams, floor)
-    n_obj = boxes.shape[1]
-    result = ObjectFits(
-        ellipsoids=Ellipsoids.unknown(n_obj),
-        size=np.full((n_obj, 3), np.nan),
-        cov=np.full((n_obj, 9, 9), np.nan),
-        support=np.full(n_obj, "ellipsoid"),
-        inlier=np.zeros(usable.shape, bool),
-        rms_px=np.full(n_obj, np.nan),
-        status=np.full(n_obj, "rejected", "U15"),  # as long as "prior_dominated"
-        reason=["no usable box in a posed frame"] * n_obj,
-        parallax_deg=np.zeros(n_obj),
-        prior_share=np.ones((n_obj, 3)),
+    result = replace(
+        ObjectFits.unfitted(usable.shape, "no usable box in a posed frame"),
         scale=world.scale(),
         up=world.up,
         up_source=world.up_source,
@@ -421,7 +431,7 @@ def camera_up(img_from_world: Array) -> tuple[Array, float]:
     ray = ray[_finite(ray, 1, 2)]  # (F, 3, 3)
     if not len(ray):
         return np.zeros(3), np.inf
-    x, up = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (ray[:, :, 0], -ray[:, :, 1]))
+    x, up = (_unit(v) for v in (ray[:, :, 0], -ray[:, :, 1]))
     mean = up.mean(0)
     if np.linalg.norm(mean) < 0.3:
         return np.zeros(3), np.inf
@@ -696,7 +706,7 @@ def _rays(boxes: Array, cams: _Cameras, index: IntArray) -> tuple[Array, Array]:
 
 def _ray_point(center: Array, ray: Array, weight: Array) -> Array:
     """Intersect rays (O, V, 3) from `center` (O, V, 3) by weighted least squares: points (O, 3)."""
-    unit = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
+    unit = _unit(ray)
     across = np.eye(3) - unit[..., :, None] * unit[..., None, :]  # (O, V, 3, 3)
     lhs = np.einsum("ov,ovij->oij", weight, across) + 1e-9 * np.eye(3)
     shift = np.einsum("ov,ovi->oi", weight, center) / np.maximum(weight.sum(1), 1e-12)[:, None]
@@ -949,7 +959,7 @@ def _prior_spec(given: _Given, world: _World) -> _Spec:
         cov[known] = priors.log_cov[pick]
         natural[known] = priors.support[pick]
         round_[known] = priors.yaw_symmetric[pick] & ~flat[known]
-        sigma = np.sqrt(np.einsum("oii->oi", cov[flat]))
+        sigma = np.sqrt(_diagonal(cov[flat]))
         cov[flat] = (FREE_CORR + (1.0 - FREE_CORR) * np.eye(3)) * sigma[:, :, None] * sigma[:, None]
         upright[known] = priors.upright[pick]
     cov = cov + world.scale_sigma**2
@@ -1035,7 +1045,7 @@ def _problems(spec: _Spec, hyp: IntArray, code: IntArray, axis: IntArray) -> _Pr
     info = np.linalg.inv(spec.size_cov)[hyp] + round_[:, None, None] * tie
     level = 0.5 * (mean[:, [0, 0, 2]] + mean[:, [1, 1, 2]])
     mean = np.where(round_[:, None], level, mean)
-    var = np.maximum(np.einsum("oii->oi", spec.size_cov), SIZE_WALL_LOG**2)
+    var = np.maximum(_diagonal(spec.size_cov), SIZE_WALL_LOG**2)
     # without a category the axes' errors are common: their mean square counts, not the sum
     var = np.where(spec.kind[:, None] < 0, 3.0 * var, var)[hyp]
     return _Problem(
@@ -1278,7 +1288,7 @@ def _start_points(data: _Data, spec: _Spec) -> tuple[Array, Array, BoolArray]:
 def _pair_points(cam_center: Array, ray: Array) -> Array:
     """Find the midpoints (O, S (S - 1) / 2, 3) of the shortest segments between pairs of rays."""
     i, j = np.triu_indices(ray.shape[1], 1)
-    unit = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
+    unit = _unit(ray)
     a = unit[:, i]
     b = unit[:, j]
     base = cam_center[:, j] - cam_center[:, i]
@@ -1315,7 +1325,7 @@ def _refine_start(
     Returns:
         centres (O, 3) and their depths (O, S).
     """
-    unit = data.ray / np.linalg.norm(data.ray, axis=-1, keepdims=True)
+    unit = _unit(data.ray)
     along = unit[..., :, None] * unit[..., None, :]  # (O, S, 3, 3)
     extent = np.maximum(data.extent.mean(-1), 1e-12)
     z = np.abs(_ray_misfit(data, center[:, None])[1][:, 0]) + 1e-9  # (O, S)
@@ -1528,7 +1538,7 @@ def _log_odds_of_sizes(fit: _Fit, data: _Data, spec: _Spec, cfg: FitConfig) -> A
         usual = cost(usual_mean[:, order], inverse[fit.obj][:, order][:, :, order])
         least = np.minimum(least, np.where(same_up & (order[2] != 2), np.inf, usual))
     odds = spec.log_odds[fit.hyp] - spec.log_odds[fit.obj] + np.log(len(SUPPORTS))
-    determined = (np.einsum("bii->bi", cov) < LOOSE_SIZE**2).all(1)
+    determined = (_diagonal(cov) < LOOSE_SIZE**2).all(1)
     return np.where(determined, np.inf, odds + 0.5 * (least - cost(mean, own)))
 
 
@@ -1690,7 +1700,7 @@ def _step(normal: _Normal, damping: Array, reach: Array) -> Array:
 
     Limits: a third of the mean depth `reach` (B,), a factor 4 in size, 0.7 rad in rotation.
     """
-    diag = np.einsum("bii->bi", normal.hessian)  # (B, 9)
+    diag = _diagonal(normal.hessian)  # (B, 9)
     scale = 1.0 / np.sqrt(np.maximum(diag, 1e-12 * (1e-300 + diag.max(1, keepdims=True))))
     scale[:, 6:] = np.minimum(scale[:, 6:], 30.0)
     system = normal.hessian * scale[:, :, None] * scale[:, None, :]
@@ -1880,8 +1890,8 @@ def _posterior(fit: _Fit, spec: _Spec, data: _Data, boxes: Array, cfg: FitConfig
         edge = fit.noise * np.hypot(cfg.edge_noise_px / size_px, cfg.edge_noise_rel)
         wide[:, [3, 4, 5], [3, 4, 5]] += 2.0 * edge[:, None] ** 2  # opposite edges, of the size
     solids, cov, order = _vertical_axis_last(fit, wide)
-    prior = np.sqrt(np.einsum("bii->bi", spec.size_cov))[fit.hyp[:, None], order]
-    size_sigma = np.sqrt(np.einsum("bii->bi", cov)[:, 3:6])
+    prior = np.sqrt(_diagonal(spec.size_cov))[fit.hyp[:, None], order]
+    size_sigma = np.sqrt(_diagonal(cov)[:, 3:6])
     shrink = np.ones((len(cov), 9))
     shrink[:, 3:6] = np.minimum(1.0, prior / size_sigma)  # data never make a size less certain
     cov *= shrink[:, :, None] * shrink[:, None]
@@ -1908,7 +1918,7 @@ def _curved_covariance(fit: _Fit, data: _Data, spec: _Spec, loss: _Loss) -> Arra
         batch = (fit.state[rows], _inlier_edges(fit, data, rows), prob[rows])
         # the support function is smoothed over about the variation of m near its kink
         info = _normal_equations(*batch, loss, 0.05).hessian + ROTATION_CAP
-        scale = 1.0 / np.sqrt(np.maximum(np.einsum("bii->bi", info), 1e-30))  # (B, 9)
+        scale = 1.0 / np.sqrt(np.maximum(_diagonal(info), 1e-30))  # (B, 9)
         value, vector = _eigh(info * scale[:, :, None] * scale[:, None, :])
         axes = scale[:, :, None] * vector / np.sqrt(np.maximum(value, 1e-10))[:, None]  # (B, 9, 9)
         cov[rows] = _second_moment(*batch, loss, axes)
@@ -1944,7 +1954,7 @@ def _second_moment(state: _State, edges: _Edges, prob: _Problem, loss: _Loss, ax
 
 def _safe_inverse(hessian: Array) -> Array:
     """Invert information matrices (B, 9, 9) by scaled eigenvalues, at least 1e-10."""
-    scale = 1.0 / np.sqrt(np.maximum(np.einsum("bii->bi", hessian), 1e-30))  # (B, 9)
+    scale = 1.0 / np.sqrt(np.maximum(_diagonal(hessian), 1e-30))  # (B, 9)
     value, vector = _eigh(hessian * scale[:, :, None] * scale[:, None, :])
     inverse = (vector / np.maximum(value, 1e-10)[:, None]) @ vector.transpose(0, 2, 1)
     return np.asarray(inverse * scale[:, :, None] * scale[:, None, :])
@@ -2339,7 +2349,7 @@ def rotations(rotvec: Array) -> Array:
 
 def rotation_vectors(rot: Array) -> Array:
     """Convert rotation matrices (B, 3, 3) to vectors (B, 3) by quaternions: accurate near pi."""
-    diag = np.einsum("bii->bi", rot)
+    diag = _diagonal(rot)
     trace = diag.sum(1)
     square = np.concatenate([1.0 + trace[:, None], 1.0 + 2.0 * diag - trace[:, None]], 1)  # (B, 4)
     big = np.argmax(square, 1)  # the largest of 4 w^2, 4 x^2, 4 y^2, 4 z^2
@@ -2355,6 +2365,16 @@ def rotation_vectors(rot: Array) -> Array:
     sine = np.linalg.norm(quat[:, 1:], axis=1, keepdims=True)
     angle = 2.0 * np.arctan2(sine, quat[:, :1])
     return np.asarray(quat[:, 1:] * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0))
+
+
+def _diagonal(matrix: Array) -> Array:
+    """Return the diagonals (B, n) of matrices (B, n, n)."""
+    return np.asarray(np.einsum("bii->bi", matrix))
+
+
+def _unit(v: Array) -> Array:
+    """Scale vectors (..., 3) to length 1."""
+    return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
 
 
 def _skew(v: Array) -> Array:

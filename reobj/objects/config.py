@@ -284,7 +284,7 @@ def _solved(
     known = quadrics.fit_psfmo(views.boxes, priors, names, views.img_from_world).ellipsoids
     if solver == Solver.PSFMO:
         return known, "PSfMO found no ellipsoid"
-    seen_twice = np.isfinite(known.half_axes).all(1)
+    seen_twice = np.all(np.isfinite(known.half_axes), 1)
     return _sfmo(views, np.where(seen_twice[:, None], known.center_in_world, np.nan))
 
 
@@ -336,22 +336,18 @@ def _as_fits(
     Args:
         reason: why the others have no ellipsoid.
     """
-    n = len(ellipsoids)
-    axes = ellipsoids.world_from_obj.reshape(n, 9)
+    none = quadrics.ObjectFits.unfitted(views.boxes.shape[:2], reason)
+    axes = ellipsoids.world_from_obj.reshape(-1, 9)
     values = np.hstack([ellipsoids.center_in_world, ellipsoids.half_axes, axes])  # (O, 15)
-    good: BoolArray = np.isfinite(values).all(1) & (ellipsoids.half_axes > 0).all(1)  # (O,)
-    return quadrics.ObjectFits(
+    good = np.all(np.isfinite(values), 1) & np.all(ellipsoids.half_axes > 0, 1)  # (O,)
+    return dataclasses.replace(
+        none,
         ellipsoids=ellipsoids,
         size=2 * ellipsoids.half_axes,
-        cov=np.full((n, 9, 9), np.nan),
-        support=np.full(n, "ellipsoid"),
-        inlier=np.ones(views.boxes.shape[:2], bool),
-        rms_px=np.full(n, np.nan),
+        inlier=np.ones_like(none.inlier),
         status=np.where(good, "ok", "rejected"),
         reason=["" if g else reason for g in good.tolist()],
         parallax_deg=parallax,
-        prior_share=np.full((n, 3), np.nan),
-        scale=scale or quadrics.Scale(1.0, 0.0, "none"),
-        up=np.zeros(3),
-        up_source="none",
+        prior_share=np.full_like(none.prior_share, np.nan),
+        scale=scale or none.scale,
     )
