@@ -304,11 +304,11 @@ def _cached_fit(
 # ---- Hypotheses ----
 
 # Depths that are tried, over the depth at which a box shows an object of the usual size of its
-# class: smaller if a part is occluded (chosen; a step of a fifth is less than a chair's depth at
-# 3 m)
+# class: smaller if a part is occluded (a step of a fifth is less than a chair's depth at 3 m)
 DEPTHS = np.geomspace(0.4, 1.6, 8)
 # Weight of the area of a box at the image border, to choose the best view: it may be truncated, but
-# a much larger one still shows the object better (1: within the noise, benchmarks/RESULTS.md)
+# a much larger one still shows the object better (with 1 the scores of
+# 25 of 38 refitted recordings change within their noise)
 BORDER_WEIGHT = 0.3
 # Heights of floor-standing objects, over the usual height (without: .7 more false chairs a run of
 # the kitchen, benchmarks/RESULTS.md)

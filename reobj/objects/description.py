@@ -163,7 +163,7 @@ def _verdict(
     return str(fits.status[i]), str(fits.reason[i]), str(fits.support[i])
 
 
-MOST_DISTANCES = 10.0  # sigma of a centre, in distances of the object from the cameras (chosen)
+MOST_DISTANCES = 10.0  # sigma of a centre, in distances of the object: beyond it none is known
 # of a rotation about an axis: that of a uniform distribution over the full turn
 MOST_TURN = np.pi / np.sqrt(3)
 MOST_LOG_SIZE = quadrics.UNKNOWN_SCALE_LOG
@@ -308,7 +308,7 @@ def components_message(poses: Poses) -> list[str]:
 CONFIDENCE = (-1.0, 1.5, 1.8, -1.5)
 FITTED_TO = "YOLOv8s, deimv2-femto, rendered rooms"
 FITTED_SCORES = (0.13, 0.87)  # lowest and highest median score of the recordings it was fitted to
-FAR_OFF = 1.0  # in log odds, beyond which a median is reported (chosen)
+FAR_OFF = 1.0  # in log odds, beyond the fitted range at which a median is reported
 USUAL_HIT_RATE = 0.75  # if it should be visible in no frame, as an always truncated table (mean)
 NO_SHAPE = -1.9  # instead of the intercept for identities without a 3D object (8 of 89 were real)
 # Number and least fraction of an object's detections that its score is taken from: most views of a

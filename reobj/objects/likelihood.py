@@ -20,7 +20,7 @@ import numpy.typing as npt
 import quadrics
 from reobj.types import Array, BoolArray, IntArray, box_area
 
-# Chosen on hololens_kitchen and redkitchen unless a source is given (benchmarks/RESULTS.md).
+# Measured on hololens_kitchen and redkitchen unless a source is given (benchmarks/RESULTS.md).
 EDGE_SIGMA = 0.08  # of an edge of a box, over the size of the box
 # Fraction of edges that are occluded (measured on hololens_kitchen's chairs: .29 of the upper ones,
 # .53 of the lower), and of edges that are outliers (as in quadrics.py)
@@ -201,7 +201,7 @@ def logit(score: Array) -> Array:
 def _overlapping(a: Array, b: Array) -> BoolArray:
     """Mark pairs (A, B) of boxes whose overlap is more than a quarter of the smaller one.
 
-    (The least overlap saves the time of comparing the others; chosen.)
+    (The least overlap saves the time of comparing the others.)
     """
     (ax, ay, ax2, ay2), (bx, by, bx2, by2) = a.T[..., None], b.T  # (A, 1), (B,) each
     width = np.minimum(ax2, bx2) - np.maximum(ax, bx)  # (A, B)
@@ -232,7 +232,7 @@ def _box_log_odds(projected: Array, box: Array, image_size: tuple[int, int]) -> 
 
 # ---- Sizes ----
 
-SIZE_SIGMAS = 6.0  # limit on the deviation of a size (chosen: a class may be wrong)
+SIZE_SIGMAS = 6.0  # limit on the deviation of a size: a class may be wrong (3 and 12 are alike)
 
 
 def name_of(class_names: Sequence[str], class_id: int) -> str:

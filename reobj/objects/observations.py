@@ -91,7 +91,7 @@ def gather_views(
 # Least fraction of the views that observe a point in which it is inside the box: boxes are cut off
 # where the object is occluded (.95 is alike: benchmarks/LOG.md)
 INSIDE_FRACTION = 0.8
-MIN_POINTS = 5  # per object (chosen: fewer may all belong to another object)
+MIN_POINTS = 5  # per object: fewer may all belong to another object
 
 
 def points_on(
@@ -247,10 +247,10 @@ def only_frames(poses: Poses, frames: IntArray) -> Poses:
 # ---- Occlusion ----
 
 # Offsets from the edge, over the size of the box: outside, where an occluder must be, and inside,
-# where none may be (chosen: the outline of the occluder is not known better)
+# where none may be: the outline of the occluder is not known better
 BESIDE_EDGE = (0.1, -0.2)
 # Fraction of its height that a box may end above the lower edge of its object and still show all of
-# it (chosen on hololens_kitchen, where .05 to .2 are alike)
+# it (on hololens_kitchen .05 to .2 are alike)
 ABOVE_FLOOR = 0.1
 
 
