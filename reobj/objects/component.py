@@ -307,8 +307,8 @@ def _cached_fit(
 # class: smaller if a part is occluded (a step of a fifth is less than a chair's depth at 3 m)
 DEPTHS = np.geomspace(0.4, 1.6, 8)
 # Weight of the area of a box at the image border, to choose the best view: it may be truncated, but
-# a much larger one still shows the object better (with 1 the scores of
-# 25 of 38 refitted recordings change within their noise)
+# a much larger one still shows the object better (with 1 the shapes of 25 of 38 refitted recordings
+# change, their scores within the noise)
 BORDER_WEIGHT = 0.3
 # Heights of floor-standing objects, over the usual height (without: .7 more false chairs a run of
 # the kitchen, benchmarks/RESULTS.md)
