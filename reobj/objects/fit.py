@@ -557,21 +557,18 @@ def join_fits(
     inlier = np.zeros((int(poses.known.sum()), len(order)), bool)
     for k, fit in made:
         inlier[np.ix_(poses.part[poses.known] == k, component_of_object == k)] = fit.inlier
-    columns: dict[str, Any] = {"inlier": inlier}
-    ellipsoids = [fit.ellipsoids for _, fit in made]
-    names = [f.name for f in dataclasses.fields(quadrics.Ellipsoids)]
-    arrays = (np.concatenate([getattr(e, name) for e in ellipsoids])[order] for name in names)
-    columns["ellipsoids"] = quadrics.Ellipsoids(*arrays)
     reasons = [reason for _, fit in made for reason in fit.reason]
-    columns["reason"] = [reasons[i] for i in order]
-    of_the_world = ("scale", "up", "up_source")  # the other columns are per object
-    for name in {f.name for f in dataclasses.fields(quadrics.ObjectFits)} - {*columns}:
-        values = [getattr(fit, name) for _, fit in made]
-        columns[name] = values[0] if name in of_the_world else np.concatenate(values)[order]
-    if fits[0] is None:  # the scale of the largest component is unknown
-        none = quadrics.Scale(1.0, np.inf, "none")
-        columns |= {"scale": none, "up": np.zeros(3), "up_source": "none"}
-    return quadrics.ObjectFits(**columns)
+    per_object = ("size", "cov", "support", "rms_px", "status", "parallax_deg", "prior_share")
+    columns: dict[str, Any] = {
+        name: np.concatenate([getattr(fit, name) for _, fit in made])[order] for name in per_object
+    }
+    return dataclasses.replace(
+        quadrics.ObjectFits.unfitted(inlier.shape, "") if fits[0] is None else fits[0],
+        ellipsoids=quadrics.Ellipsoids.concatenate([fit.ellipsoids for _, fit in made])[order],
+        inlier=inlier,
+        reason=[reasons[i] for i in order],
+        **columns,
+    )
 
 
 # ---- Interpolation -----------------------------------------------------------------------------
