@@ -307,9 +307,7 @@ NOISE_PX = 0.5  # standard deviation of the edges
 def shake(seed: int) -> None:
     """Add noise to all boxes before objects are made of them, in this process."""
 
-    def shaken(
-        result: rt.Result, config: rt.ObjectsConfig, last: Any = None
-    ) -> rt.Result:
+    def shaken(result: rt.Result, config: rt.ObjectsConfig, last: Any = None) -> rt.Result:
         rng = np.random.default_rng(seed)
         for name in ("tracks", "untracked"):
             rows = getattr(result, name)

@@ -305,11 +305,21 @@ def test_a_duplicate_object_is_pruned_and_its_detections_reassigned() -> None:
 
 
 def test_ambiguous_detections_are_excluded_from_refits() -> None:
-    _, found = association_of(chairs(), walk(30))
+    made, found = association_of(chairs(), walk(30))
     assert found.unambiguous().all()
     slipped = np.flatnonzero(found.label == 0)[:4]
     found.label[slipped] = 1  # four boxes of a chair are given to the next one
     np.testing.assert_array_equal(np.flatnonzero(~found.unambiguous()), slipped)
+    score = np.random.default_rng(0).random(len(found.label))
+    kind = np.random.default_rng(1).integers(-1, 4, len(found.label))
+    made.detections = dataclasses.replace(made.detections, score=score, class_id=kind)
+    found.label[found.label == 2] = -1
+    made.fit_shapes = Mock(return_value=found.shapes)
+    made._refit(found)
+    rows, _, classes, _ = made.fit_shapes.call_args.args
+    np.testing.assert_array_equal(rows, np.flatnonzero(found.unambiguous()))
+    own = [(found.label == obj)[:, None] & (kind.clip(0)[:, None] == range(4)) for obj in (0, 1)]
+    assert classes.tolist() == [*((score @ w).argmax() for w in own), CHAIR]  # none: unchanged
 
 
 def test_a_duplicate_without_unambiguous_detections_is_fitted_to_all() -> None:
@@ -390,6 +400,34 @@ def test_greedy_selection_adds_the_largest_marginal_gain() -> None:
         own = (seen.obj == expected[-1]) & (value > 0)
         np.maximum.at(explained, seen.row[own], value[own])
     assert len(expected) > 1 and made._select_greedily(of).tolist() == expected
+
+
+def test_the_gain_of_a_merge_uses_all_rows_of_both() -> None:
+    """Computed by loops: each object's summed log odds, with one hit per frame at its best row."""
+    three = chairs()
+    made, found = association_of(three, walk(12))
+    rng = np.random.default_rng(1)
+    label = found.label.copy()
+    label[rng.random(len(label)) < 0.3] = 0  # several rows of an object in one frame
+    strong = np.array([0, 1])
+    weak = np.array([2, 0])
+    fitted = three[[0, 1]]
+    seen = made._unassigned(fitted).evidence
+    view = made.detections.view
+    expected = -made._unassigned(fitted).costs()
+    for k in range(2):
+        best: dict[int, tuple[float, int]] = {}
+        rows = [n for n in range(len(seen.row)) if seen.obj[n] == k]
+        rows = [n for n in rows if label[seen.row[n]] in (strong[k], weak[k])]
+        for n in rows:
+            frame = int(view[seen.row[n]])
+            best[frame] = max(best.get(frame, (-np.inf, -n)), (float(seen.existence[n]), -n))
+        for n in rows:
+            frame = int(view[seen.row[n]])
+            hit = MISSED * seen.expected[frame, k] * (best[frame][1] == -n)
+            expected[k] += max(seen.existence[n] + hit, 0.0)
+    assert any(np.bincount(view[label == 0]) > 1)
+    np.testing.assert_allclose(made._joint_gains(label, strong, weak, fitted), expected)
 
 
 def test_a_size_is_compared_with_the_prior_per_axis() -> None:
