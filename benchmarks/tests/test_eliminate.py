@@ -59,7 +59,7 @@ def test_constants_are_scaled_by_kind() -> None:
     assert se.scaled(0.875, 2.0) == 0.9375 and se.scaled(0.875, 0.5) == 0.75
     np.testing.assert_array_equal(se.scaled(np.array([1.0, 2]), 0.5), [0.5, 1])
     names = set(se.constants("quadrics"))
-    assert {"SMOOTH", "FitConfig.edge_noise_px"} <= names
+    assert {"SMOOTH", "HUBER"} <= names
     assert not names & {"AXIS_ORDERS", "SUPPORTS"}
-    assert quadrics.FitConfig().edge_noise_px == 1.0
+    assert quadrics.HUBER == 3.0
     assert "NEW_OBJECT" in set(se.constants("reobj.objects.association"))
