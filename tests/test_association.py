@@ -16,7 +16,12 @@ from reobj.objects import association, likelihood
 from reobj.objects.association import MAX_BOX_GAIN, MISSED, Association, Associator
 from reobj.objects.component import associate_component, propose
 from reobj.objects.config import make_fit
-from reobj.objects.description import existence_probability, log_best_odds
+from reobj.objects.description import (
+    USUAL_HIT_RATE,
+    existence_probability,
+    log_best_odds,
+    objects_confidence,
+)
 from reobj.objects.likelihood import EXPECTED, Categories, PosedDetections, Shapes, gather_evidence
 from reobj.objects.observations import Scene, gather_views
 from reobj.tracking.interpolation import fill_from_objects
@@ -470,6 +475,16 @@ def test_the_score_of_an_object_comes_from_its_best_views() -> None:
     np.testing.assert_allclose(np.exp(found), [9, 4, 0, few])
     mixed = log_best_odds(np.r_[np.full(160, 0.2), np.full(40, 0.9)], np.zeros(200, int), 1)
     np.testing.assert_allclose(np.exp(mixed), (40 * 9 + 10 * 0.25) / 50)  # its best quarter
+
+
+def test_without_frames_that_should_show_it_the_hit_rate_is_the_usual_one() -> None:
+    """A large table is truncated in every view: the absence of expected frames is no evidence."""
+    made, found = association_of(chairs(), walk(10))
+    nowhere = dataclasses.replace(found.evidence, expected=found.evidence.expected & False)
+    found = dataclasses.replace(found, evidence=nowhere)
+    score = log_best_odds(made.detections.score, found.label, 3)
+    certain = objects_confidence(found, made.detections, np.zeros(3))
+    np.testing.assert_allclose(certain, existence_probability(score, np.full(3, USUAL_HIT_RATE)))
 
 
 # ---- After the association ----
