@@ -109,12 +109,9 @@ from reobj.maps.stage import (
     place_recording,
     session_key,
 )
-from reobj.objects.confidence import scores_far_off
-from reobj.objects.config import ObjectsConfig
-from reobj.objects.description import components_message
+from reobj.objects.config import ObjectsConfig, solve_again
+from reobj.objects.description import components_message, scores_far_off
 from reobj.objects.fit import fill, link_and_fit
-from reobj.objects.phases import PhasesOfFit
-from reobj.objects.published import solve_again
 from reobj.options import (
     as_config,
     changed_options,
@@ -1743,12 +1740,11 @@ def _fit_objects(job: _Job, result: Result, links: Links | None = None) -> Resul
     """Link and fit; gaps of tracks are filled with the default solver's shapes."""
     config = job.config
     edits = result.edits or kept_edits(job.workspace.out)
-    with job.progress("objects", PhasesOfFit.TOTAL, counted=False) as line:
-        phases = PhasesOfFit(line, result.poses)
+    with job.progress("objects"):
         views, warnings = _views_once(result.poses, job.video)
         result = dataclasses.replace(result, edits=edits, warnings=[*result.warnings, *warnings])
         once = dataclasses.replace(result, poses=views)
-        fitted = link_and_fit(once, config.objects, phases, links)
+        fitted = link_and_fit(once, config.objects, links)
         gap = 0 if result.identities_given else config.output.fill_gaps
         tracks = fill(fitted, job.video.size, gap)
         detected = np.flatnonzero(tracks.detection_index >= 0)  # rows that were not filled in

@@ -25,30 +25,29 @@ def nothing(*_: Any) -> None:
 
 
 LIKELIHOOD = "reobj.objects.likelihood"
-ASSOCIATION = "reobj.objects.association.AssociationOptions"
+ASSOCIATION = "reobj.objects.association"
 COMPONENT = "reobj.objects.component"
-ROBUST = quadrics.RobustOptions()
-# By name: replacements of values and functions of modules, and of defaults of options.
+# By name: replacements of values and functions of modules.
 WITHOUT: dict[str, dict[str, Any]] = {
     "occluded edges": {f"{LIKELIHOOD}.OCCLUDED_EDGES": 0.0},
     "occluded edges in the fit": {
-        "quadrics.RobustOptions.cauchy_hidden": ROBUST.cauchy,
-        "quadrics.RobustOptions.huber_hidden": ROBUST.huber,
-        "quadrics.RobustOptions.hidden_cap": ROBUST.outlier_cap,
+        "quadrics.CAUCHY_HIDDEN": quadrics.CAUCHY,
+        "quadrics.HUBER_HIDDEN": quadrics.HUBER,
+        "quadrics.HIDDEN_CAP": quadrics.OUTLIER_CAP,
     },
-    "edges above the floor": {"reobj.objects.occlusion.ABOVE_FLOOR": np.inf},
-    "widening": {f"{ASSOCIATION}.widening_rounds": 0},
+    "edges above the floor": {"reobj.objects.observations.ABOVE_FLOOR": np.inf},
+    "widening": {f"{ASSOCIATION}.WIDENING_ROUNDS": 0},
     "limit of a box": {f"{LIKELIHOOD}.MAX_BOX_EXISTENCE": 8.0},
     "classes": {f"{LIKELIHOOD}.CLASS_KEPT": 0.0},
-    "missed frames": {f"{ASSOCIATION}.missed": 0.0},
-    "tracklets": {f"{ASSOCIATION}.same_tracklet": 0.0},
-    "clear detections in refits": {f"{ASSOCIATION}.unambiguous_margin": -1e3},
-    "alternation": {f"{ASSOCIATION}.max_rounds": 0},
-    "merging": {f"{ASSOCIATION}.merge_distance": 0.0},
-    "distances along rays": {"reobj.objects.hypotheses.DEPTHS": np.empty(0)},
+    "missed frames": {f"{ASSOCIATION}.MISSED": 0.0},
+    "tracklets": {f"{ASSOCIATION}.SAME_TRACKLET": 0.0},
+    "clear detections in refits": {f"{ASSOCIATION}.UNAMBIGUOUS_MARGIN": -1e3},
+    "alternation": {f"{ASSOCIATION}.MAX_ROUNDS": 0},
+    "merging": {f"{ASSOCIATION}.MERGE_DISTANCE": 0.0},
+    "distances along rays": {"reobj.objects.component.DEPTHS": np.empty(0)},
     "points in the fit": {"reobj.objects.fit.points_on": nothing},
     "duplicate boxes": {f"{COMPONENT}.DUPLICATE_IOU": 2.0},
-    "same position": {f"{ASSOCIATION}.same_position": 0.0},
+    "same position": {f"{ASSOCIATION}.SAME_POSITION": 0.0},
     "quartic size prior": {"quadrics.SIZE_WALL": 1e3},
     "tie of round objects": {"quadrics.ROUND_LOG": 1e3},
     "pooled noise": {"quadrics.OBJECT_NOISE_DOF": 1e-3},
@@ -59,10 +58,7 @@ def leave_out(name: str) -> None:
     """Switch a mechanism off, in this process."""
     for path, value in WITHOUT[name].items():
         owner, _, attribute = path.rpartition(".")
-        found = pkgutil.resolve_name(owner)
-        values: dict[str, Any] = vars(found)
-        if isinstance(found, type):  # keyword-only fields of a dataclass
-            values = values["__init__"].__kwdefaults__
+        values: dict[str, Any] = vars(pkgutil.resolve_name(owner))
         if attribute not in values:
             raise SystemExit(f"error: {name}: {path} is no longer there")
         values[attribute] = value

@@ -49,8 +49,7 @@ GROUPS = {
         "Errors, command line": "ReobjError main",
     },
     "quadrics": {
-        "Objects from boxes": "fit_objects ObjectFits Ellipsoids Scale FitConfig RobustOptions "
-        "StatusLimits",
+        "Objects from boxes": "fit_objects ObjectFits Ellipsoids Scale FitConfig",
         "Size priors": "Priors load_priors SUPPORTS",
         "Published methods": "fit_lfd fit_sfmo SfmoResult fit_psfmo PsfmoResult",
         "Projection and overlap": "project boxes_from_dual_conics solid_boxes clip_boxes box_iou "

@@ -693,7 +693,7 @@ def rows_by(group: IntArray) -> list[IntArray]:
 
 
 class Existence(float):
-    """Probability that an object exists, with its evidence (`objects.confidence`).
+    """Probability that an object exists, with its evidence (`objects.description`).
 
     Attributes:
         score: log odds of the best detections. hit_rate: over the frames where it should be

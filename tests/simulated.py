@@ -73,7 +73,7 @@ def fitted(
         group = np.searchsorted(list(classes), tracks.track_id)
         views = gather_views(tracks, poses, group, len(classes), MIN_SCORE)
         fits = make_fit(config, poses, names)(views, list(classes.values()), Scene())
-    objects = describe_objects(tracks, names, fits, views, config)
+    objects = describe_objects(tracks, names, fits, views, config.min_views, config.moving_classes)
     video = VideoInfo("walk.mp4", *SIZE, 30.0)
     world = describe_world(poses, [fits], [])
     return rt.Result(tracks, names, video, objects, world, poses, fits)
@@ -138,8 +138,7 @@ def with_fitted_covariance(result: rt.Result, variance: float) -> rt.Result:
     views = gather_views(result.tracks, result.poses, group, len(classes), MIN_SCORE)
     cov = np.tile(variance * np.eye(9), (len(classes), 1, 1))
     fits = dataclasses.replace(result.fits, cov=cov)
-    names, config = result.class_names, rt.ObjectsConfig()
-    objects = describe_objects(result.tracks, names, fits, views, config)
+    objects = describe_objects(result.tracks, result.class_names, fits, views)
     return dataclasses.replace(result, objects=objects, fits=fits)
 
 

@@ -17,7 +17,7 @@ import quadrics
 import reobj_track as rt
 from reobj.objects import fit as fitting
 from reobj.objects.fit import link_and_fit
-from reobj.objects.occlusion import occluded_edges
+from reobj.objects.observations import occluded_edges
 from reobj.results.edits import apply_edits, read_edits
 from reobj.results.workspace import Workspace
 

@@ -9,7 +9,7 @@ from simulated import CAMERA, chair_solids, looking_at, tracks_of, unlinked
 
 import reobj_track as rt
 from reobj.objects.fit import fill, link_and_fit
-from reobj.objects.frames import FrameOptions, informative_frames, only_frames
+from reobj.objects.observations import FrameOptions, informative_frames, only_frames
 
 STEP = 30
 FEW = FrameOptions(all_of=20, longest_step=STEP)  # so that short videos count as long

@@ -11,8 +11,13 @@ from test_linking import CHAIR, NAMES, SIZE, chair_solids, table_of, walk
 import quadrics
 import reobj_track as rt
 from reobj.objects.config import make_fit
-from reobj.objects.observations import Scene, Views, gather_views
-from reobj.objects.occlusion import occluded_edges, see_through_ratio
+from reobj.objects.observations import (
+    Scene,
+    Views,
+    gather_views,
+    occluded_edges,
+    see_through_ratio,
+)
 
 LEFT, UPPER, RIGHT, LOWER = range(4)
 ELSEWHERE = np.array([False, False])  # neither stands on the floor

@@ -25,7 +25,7 @@ from pose_worlds import arc
 from scipy.spatial.transform import Rotation
 
 import quadrics
-import reobj.objects.confidence
+import reobj.objects.description
 import reobj.poses.estimate as estimate
 import reobj.poses.sfm as sfm
 import reobj.poses.stage as stage
@@ -1134,7 +1134,7 @@ def _(lab: Lab) -> None:
     """All are below a confidence of 1.1: in the file and the viewer; in the overlay on request."""
     for value, count in ((False, 0), (True, 2)):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(reobj.objects.confidence, "LOW_CONFIDENCE", 1.1)
+            patch.setattr(reobj.objects.description, "LOW_CONFIDENCE", 1.1)
             shown = Mock(return_value=[])
             patch.setattr(rt, "write_pictures", shown)
             assert {found.status for found in lab.refit(value).objects} == {"doubtful"}

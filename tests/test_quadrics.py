@@ -8,12 +8,9 @@ LfD authors' published demo (../shared/data/lfd_aldoma).
 
 from __future__ import annotations
 
-import ast
 import itertools
 import json
 import re
-import time
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -24,19 +21,11 @@ from scipy.stats import chi2
 from simulated import chair_solids, walk
 
 import quadrics as q
+from reobj_track import COCO_NAMES
 
 ROOT = Path(__file__).resolve().parent.parent
 DEMO = ROOT.parent / "shared" / "data" / "lfd_aldoma"
 UP = (0.0, 0.0, 1.0)
-COCO_80 = (
-    "person,bicycle,car,motorcycle,airplane,bus,train,truck,boat,traffic light,fire hydrant,"
-    "stop sign,parking meter,bench,bird,cat,dog,horse,sheep,cow,elephant,bear,zebra,giraffe,"
-    "backpack,umbrella,handbag,tie,suitcase,frisbee,skis,snowboard,sports ball,kite,baseball bat,"
-    "baseball glove,skateboard,surfboard,tennis racket,bottle,wine glass,cup,fork,knife,spoon,bowl,"
-    "banana,apple,sandwich,orange,broccoli,carrot,hot dog,pizza,donut,cake,chair,couch,"
-    "potted plant,bed,dining table,toilet,tv,laptop,mouse,remote,keyboard,cell phone,microwave,"
-    "oven,toaster,sink,refrigerator,book,clock,vase,scissors,teddy bear,hair drier,toothbrush"
-).split(",")
 
 
 def random_solids(n: int, rng: np.random.Generator, upright: bool = False) -> q.Ellipsoids:
@@ -90,19 +79,13 @@ def test_solid_boxes_match_sampled_surfaces(support: str) -> None:
 def test_projection_matches_pycolmap() -> None:
     pycolmap = pytest.importorskip("pycolmap")
     rng = np.random.default_rng(1)
-    calib = np.array([[700.0, 0, 333.0], [0, 690.0, 251.0], [0, 0, 1]])
-    camera = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 700.0, 640, 480)
-    camera.params = [700.0, 690.0, 333.0, 251.0]
-    tiny = q.Ellipsoids(
-        rng.normal(0, 0.5, (6, 3)) + np.array([0, 0, 4]),
-        np.full((6, 3), 1e-4),
-        np.tile(np.eye(3), (6, 1, 1)),
-    )
-    rot = q.rotations(rng.normal(0, 0.2, (1, 3)))[0]
-    cam_from_world = np.concatenate([rot, rng.normal(0, 0.2, (3, 1))], 1)
-    boxes = q.solid_boxes(tiny, "ellipsoid", (calib @ cam_from_world)[None])[0]
-    points = tiny.center_in_world @ rot.T + cam_from_world[:, 3]
-    expected = camera.img_from_cam(points)
+    poses = walk(1)
+    camera = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=poses.camera.params)
+    center = rng.normal(0, 0.5, (6, 3))
+    tiny = q.Ellipsoids(center, np.full((6, 3), 1e-4), np.tile(np.eye(3), (6, 1, 1)))
+    boxes = q.solid_boxes(tiny, "ellipsoid", poses.camera.K @ poses.cam_from_world)[0]
+    expected = camera.img_from_cam(center @ poses.cam_from_world[0, :, :3].T
+                                   + poses.cam_from_world[0, :, 3])  # fmt: skip
     assert np.allclose(0.5 * (boxes[:, :2] + boxes[:, 2:]), expected, atol=1e-4)
 
 
@@ -126,17 +109,6 @@ def test_dual_quadrics_round_trip_and_flag() -> None:
     hyperboloid = solids.dual_quadrics()[:1] - 0.5 * np.diag([1.0, 0, 0, 0])
     assert not q.Ellipsoids.from_dual_quadrics(hyperboloid)[1][0]
     assert not q.Ellipsoids.from_dual_quadrics(np.full((1, 4, 4), np.nan))[1][0]
-
-
-def test_reprojection_iou_of_truth_is_one_and_of_unseen_zero() -> None:
-    rng = np.random.default_rng(4)
-    solids, cams = random_solids(5, rng), syn.arc_cameras(6, 90, rng)
-    boxes = q.solid_boxes(solids, "box", cams)
-    boxes[2, 3] = np.nan
-    iou = q.reprojection_iou(solids, boxes, cams, (10**4, 10**4), support="box")
-    expected = q.box_iou(*(q.clip_boxes(boxes, (10**4, 10**4)),) * 2)
-    assert np.allclose(iou, expected) and iou[2, 3] == 0 and iou.max() == pytest.approx(1)
-    assert q.box_iou(np.array([0, 0, 2, 2.0]), np.array([1, 0, 3, 2.0])) == pytest.approx(1 / 3)
 
 
 # ---- Rotations -----------------------------------------------------------------------------
@@ -165,37 +137,6 @@ def test_plain_lfd_agrees_with_the_batched_one() -> None:
     assert real.all()
     overlap = q.volume_overlap(*(q.Ellipsoids.from_dual_quadrics(x)[0] for x in (ours, plain)))
     assert overlap.min() > 0.99
-
-
-def test_lfd_solves_the_published_system() -> None:
-    """`syn.plain_lfd` in the same coordinates: equal after its first pass, but not its second.
-
-    Coordinates: origin where the rays meet, the unit ten times what the boxes measure there.
-    """
-    rng = np.random.default_rng(0)
-    solids, cams = random_solids(12, rng), syn.arc_cameras(5, 3, rng)
-    boxes = syn.noisy(q.solid_boxes(solids, "ellipsoid", cams), 0.05, rng)
-    ours, _ = q.fit_lfd(boxes, cams)
-    world_from_px = np.linalg.inv(cams[:, :, :3])
-    eye = -(world_from_px @ cams[:, :, 3:])[..., 0]
-    errors = []
-    for k in range(12):
-        middle = 0.5 * (boxes[:, k, :2] + boxes[:, k, 2:])
-        ray = np.einsum("vij,vj->vi", world_from_px, np.c_[middle, np.ones(5)])
-        unit_ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
-        across = np.eye(3) - unit_ray[:, :, None] * unit_ray[:, None]
-        target = (across @ eye[..., None]).ravel()
-        origin = np.linalg.lstsq(across.reshape(-1, 3), target, rcond=None)[0]
-        extent = (boxes[:, k, 2:] - boxes[:, k, :2]) * np.linalg.norm(world_from_px, axis=1)[:, :2]
-        depth = np.abs(cams[:, 2] @ np.append(origin, 1.0))
-        unit = 10 * np.mean(depth * extent.mean(1))
-        world_from_local = np.diag([unit, unit, unit, 1.0])
-        world_from_local[:3, 3] = origin
-        local = 10 * cams @ world_from_local / unit
-        plain = [syn.plain_lfd(boxes[:, k], local, passes) for passes in (1, 2)]
-        world = [world_from_local @ p @ world_from_local.T for p in plain]
-        errors.append([np.abs(w - ours[k]).max() / np.abs(ours[k]).max() for w in world])
-    assert np.max(errors, 0)[0] < 1e-6 and np.median(errors, 0)[1] > 1e-4
 
 
 @pytest.mark.parametrize("shift", [(3.0, 2.0, 1.0), (-1000.0, 700.0, 20.0)])
@@ -285,7 +226,6 @@ def test_clean_boxes_give_the_truth(support: str) -> None:
     ("arc", "lowest", "lfd_highest"),
     [
         (5, 0.45, 0.30),  # almost no parallax: the prior carries it
-        (20, 0.66, 0.50),
         (90, 0.84, 0.82),
     ],
 )
@@ -295,14 +235,6 @@ def test_ellipsoids_beat_lfd(arc: float, lowest: float, lfd_highest: float) -> N
     closed = np.nan_to_num(q.volume_overlap(lfd, truth)).mean()
     ours = q.volume_overlap(fits.ellipsoids, truth).mean()
     assert ours >= lowest and closed <= lfd_highest and ours > closed + 0.05
-
-
-def test_cuboids_need_the_box_support() -> None:
-    args = (60, 10, 120, 0.02, "box")
-    box, truth, *_ = fitted(*args)
-    ellipsoid = fitted(*args, support="ellipsoid")[0]
-    assert syn.box_overlap(box.ellipsoids, truth).mean() >= 0.90
-    assert syn.box_overlap(ellipsoid.ellipsoids, truth).mean() < 0.55
 
 
 @pytest.mark.parametrize("kind", ["far", "near"])
@@ -318,51 +250,10 @@ def test_one_outlier_in_five_boxes(kind: str) -> None:
     assert flagged[wrong].mean() > 0.95 and flagged[~wrong].mean() < 0.01
 
 
-def test_cut_edges_are_one_sided() -> None:
-    """Boxes cut by the image border: counting the cut edges would shrink and move the object."""
-    rng = np.random.default_rng(12)
-    boxes, cams, truth, priors, names = syn.scenes(60, 8, 100, 0.005, "box", rng)
-    joint, flat = syn.as_one(boxes, cams)
-    middle = np.nanmedian(joint[..., [0, 2]].mean(-1))
-    size = (middle, syn.IMAGE[1])  # the image border cuts the objects
-    cut = q.clip_boxes(joint, size)
-    one_sided = q.fit_objects(cut, flat, size, names, priors, up=UP)
-    naive = q.fit_objects(cut, flat, (10**6, 10**6), names, priors, up=UP)
-    live = np.isfinite(one_sided.size).all(1) & (np.isfinite(cut[..., 0]).sum(0) >= 5)
-    gain = [
-        np.nanmean(syn.box_overlap(f.ellipsoids[live], truth[live])) for f in (one_sided, naive)
-    ]
-    assert gain[0] > gain[1] + 0.1
-
-
 @pytest.mark.parametrize("shape", q.SUPPORTS)
 def test_evidence_selects_the_shape(shape: str) -> None:
     fits, _, *_ = fitted(60, 8, 110, 0.01, shape, support="evidence")
     assert (fits.support == shape).mean() > 0.9
-
-
-@pytest.mark.parametrize("support", q.SUPPORTS)
-def test_residuals_are_distances_in_the_image(support: str) -> None:
-    """Also of a solid eight times as long as wide, of which the near end makes the outline."""
-    rng = np.random.default_rng(5)
-    half = np.tile([0.1, 0.1, 0.8], (40, 1)) * rng.uniform(0.8, 1.2, (40, 3))
-    solids = q.Ellipsoids(
-        rng.normal(0, 0.05, (40, 3)), half, q.rotations(rng.normal(0, 1.0, (40, 3)))
-    )
-    cams = syn.arc_cameras(6, 90, rng, distance=3.0)
-    boxes = q.solid_boxes(solids, support, cams).transpose(1, 0, 2)  # (40, 6, 4)
-    outwards = np.array([-1, -1, 1, 1])
-    config = q.FitConfig(edge_noise_px=1.0, edge_noise_rel=0.0)
-    edges = q._tangent_planes(
-        boxes - 2.0 * outwards,  # the solid extends 2 px beyond each edge
-        np.broadcast_to(q._with_positive_depth(cams), (40, 6, 3, 4)),
-        np.zeros(boxes.shape, bool),
-        config,
-    )
-    state = q._State(solids.center_in_world, np.log(half), solids.world_from_obj)
-    groups = np.repeat(q.AXIS_GROUPS[[q.SUPPORTS.index(support)]], 40, 0)
-    value = q._residuals(state, edges, groups, jacobian=False)[0]
-    assert (np.abs(value - 2.0) < 0.1).mean() > 0.98  # of boxes another corner may be the outermost
 
 
 def test_a_size_that_the_boxes_leave_open_is_that_of_the_category() -> None:
@@ -451,6 +342,28 @@ def cost_terms(
     return np.array(terms)
 
 
+def solid_of(fits: q.ObjectFits, k: int) -> tuple[np.ndarray, ...]:
+    e = fits.ellipsoids
+    return e.center_in_world[k], e.half_axes[k], e.world_from_obj[k]
+
+
+def newton_step(terms_at, views: int, last: tuple[float, ...]) -> tuple:
+    """Terms, their weights, and the length (sigma) of a Gauss-Newton step by finite differences.
+
+    Huber's loss for the edges; the priors are quadratic; `last`: weights of the last terms.
+    """
+    terms, *there = (terms_at(d) for d in [np.zeros(9), *1e-5 * np.eye(9), *-1e-5 * np.eye(9)])
+    limit = np.where(terms > 0, 2.5, 3.0)  # a possibly occluded edge weighs less
+    limit[4 * views :] = np.inf
+    weight = np.minimum(1.0, limit / np.maximum(np.abs(terms), 1e-9))
+    if len(last):
+        weight[-len(last) :] = last
+    jacobian = (np.array(there[:9]) - np.array(there[9:])) / 2e-5  # (9, M)
+    gradient = jacobian @ (weight * terms)
+    step = np.sqrt(gradient @ np.linalg.solve(jacobian * weight @ jacobian.T, gradient))
+    return terms, weight, step
+
+
 @pytest.mark.parametrize("support", q.SUPPORTS)
 @pytest.mark.parametrize(
     ("views", "noise_px", "noise", "surprise", "shift"),
@@ -479,20 +392,14 @@ def test_fits_are_minima_of_the_documented_cost(
     fits = syn.solve(boxes, cams, priors, names, config)
     steps, linear, walls = [], set(), 0
     for k in range(0, 160, 8):
-        solids = fits.ellipsoids
-        solid = (solids.center_in_world[k], solids.half_axes[k], solids.world_from_obj[k])
         given = (support, boxes[k, :, 0], cams[k], sigma, (log_size[k], 0.25))
-        terms = cost_terms(solid, np.zeros(9), *given)
-        limit = np.where(terms > 0, 2.5, 3.0)  # a possibly occluded edge weighs less
-        limit[4 * views :] = np.inf  # the priors are quadratic
-        weight = np.minimum(1.0, limit / np.maximum(np.abs(terms), 1e-9))
+        solid = solid_of(fits, k)
+        terms, weight, step = newton_step(
+            lambda d, solid=solid, given=given: cost_terms(solid, d, *given), views, ()
+        )
         linear |= set(np.sign(terms[weight < 1]))
         walls += terms[-3] > 0
-        moves = 1e-5 * np.eye(9)
-        jacobian = [cost_terms(solid, d, *given) - cost_terms(solid, -d, *given) for d in moves]
-        jacobian = np.array(jacobian) / 2e-5  # (9, M)
-        gradient = jacobian @ (weight * terms)
-        steps.append(np.sqrt(gradient @ np.linalg.solve(jacobian * weight @ jacobian.T, gradient)))
+        steps.append(step)
     assert np.quantile(steps, 0.6) < 0.01  # sigma; the others stopped at a kink or at the wall
     assert linear == {-1.0, 1.0} if shift else walls >= 1
 
@@ -518,23 +425,21 @@ def test_fits_with_points_are_minima_of_the_documented_cost() -> None:
     given = (*syn.as_one(boxes, cams), syn.IMAGE, names, priors)
     config = q.FitConfig(edge_noise_px=400, edge_noise_rel=0, correlation_deg=0, iterations=300)
     plain, fits = (q.fit_objects(*given, up=UP, points=p, config=config) for p in (None, points))
-    steps, moves = [], 1e-5 * np.eye(9)
-    for k in range(0, 160, 8):
-        solids = fits.ellipsoids
-        solid = (solids.center_in_world[k], solids.half_axes[k], solids.world_from_obj[k])
+    steps = []
+    for k in range(0, 160, 16):
+        solid = solid_of(fits, k)
         prior = np.asarray(priors.log_mean[k])
         sigma = 0.08 * float(np.exp(prior - np.log(2)).prod() ** (1 / 3))
+        given = ("box", boxes[k, :, 0], cams[k], 20, (prior, 0.25))
 
-        at_edges = ("box", boxes[k, :, 0], cams[k], 20, (prior, 0.25))
-        here, *there = (
-            np.append(cost_terms(solid, d, *at_edges), points_outside(solid, d, points[k], sigma))
-            for d in [np.zeros(9), *moves, *-moves]
-        )
-        near = 0.9 * np.exp(-0.5 * (here[-90:].reshape(30, 3) ** 2).sum(1))  # beside .1: outliers
-        weight = np.append(np.ones(len(here) - 90), np.repeat(20 / 30 * near / (near + 0.1), 3))
-        jacobian = (np.array(there[:9]) - np.array(there[9:])) / 2e-5  # (9, M)
-        gradient = jacobian @ (weight * here)
-        steps.append(np.sqrt(gradient @ np.linalg.solve(jacobian * weight @ jacobian.T, gradient)))
+        def terms_at(delta: np.ndarray, solid=solid, given=given, k=k, sigma=sigma) -> np.ndarray:
+            outside = points_outside(solid, delta, points[k], sigma)
+            return np.append(cost_terms(solid, delta, *given), outside)
+
+        distance = points_outside(solid, np.zeros(9), points[k], sigma)
+        near = 0.9 * np.exp(-0.5 * (distance**2).sum(1))  # beside .1: outliers
+        last = np.repeat(20 / 30 * near / (near + 0.1), 3)
+        steps.append(newton_step(terms_at, 8, last)[2])
     assert np.quantile(steps, 0.6) < 0.02
     assert np.abs(np.log(fits.size / plain.size)).max() > 0.1  # they are not without effect
 
@@ -566,22 +471,16 @@ def test_points_improve_the_depth_despite_background_points() -> None:
 def test_points_do_not_make_a_size_more_certain() -> None:
     """They are a one-sided bound; but they do reduce the uncertainty of the prior."""
     boxes, cams, truth, priors, names = syn.scenes(40, 6, 12, 0.02, "box", np.random.default_rng(5))
-    joint, flat = syn.as_one(boxes, cams)
-    rng = np.random.default_rng(6)
-    side = np.sign(rng.normal(0, 1, (40, 40, 3)))
-    where = side * truth.half_axes[:, None]
-    points = truth.center_in_world[:, None] + np.einsum("oij,opj->opi", truth.world_from_obj, where)
-    given = (joint, flat, syn.IMAGE, names, priors)
+    side = np.sign(np.random.default_rng(6).normal(0, 1, (40, 40, 3)))
+    points = truth.center_in_world[:, None] + np.einsum(
+        "oij,opj->opi", truth.world_from_obj, side * truth.half_axes[:, None]
+    )
+    given = (*syn.as_one(boxes, cams), syn.IMAGE, names, priors)
     plain, found = (q.fit_objects(*given, up=UP, points=p) for p in (None, points))
     sigma = [np.sqrt(np.einsum("oii->oi", fits.cov))[:, 3:6] for fits in (plain, found)]
     assert np.median(sigma[1] / sigma[0]) > 0.9
     rests = (found.prior_share == 1).all(1)  # no side is better constrained than by the prior
     assert 0.1 < rests.mean() < 0.7 and (found.status[rests] == "prior_dominated").all()
-    assert (found.prior_share < plain.prior_share)[~rests].mean() > 0.9
-    np.testing.assert_allclose(
-        np.sort(sigma[1][rests] / np.sqrt(np.diagonal(priors.log_cov, axis1=1, axis2=2))[rests]),
-        1,
-    )
 
 
 def test_initial_fits_weight_possibly_occluded_edges_less() -> None:
@@ -622,36 +521,6 @@ def test_evidence_is_robust_to_occluded_edges() -> None:
 # ---- Options -------------------------------------------------------------------------------
 
 
-def spheres_near_and_far(config: q.FitConfig) -> float:
-    """Diameter of a ball of 1 m whose boxes are 10 % too large nearby and exact far away."""
-    rng = np.random.default_rng(33)
-    ball = q.Ellipsoids(np.zeros((1, 3)), np.full((1, 3), 0.5), np.eye(3)[None])
-    near, far = syn.arc_cameras(5, 120, rng, 3.0), syn.arc_cameras(5, 120, rng, 12.0)
-    boxes = q.solid_boxes(ball, "ellipsoid", np.concatenate([near, far]))
-    middle = 0.5 * (boxes[:5, :, :2] + boxes[:5, :, 2:])
-    boxes[:5] = np.tile(middle, 2) + 1.1 * (boxes[:5] - np.tile(middle, 2))
-    cams = np.concatenate([near, far])
-    fits = q.fit_objects(boxes, cams, (9000, 9000), up=UP, support="ellipsoid", config=config)
-    return float(fits.size.mean())
-
-
-def test_option_edge_noise_weighs_edges() -> None:
-    """Constant px noise: near views weigh more; noise relative to the box: all weigh the same."""
-    equal_px = spheres_near_and_far(q.FitConfig(edge_noise_px=5, edge_noise_rel=0))
-    equal_share = spheres_near_and_far(q.FitConfig(edge_noise_px=0, edge_noise_rel=0.05))
-    assert equal_px > 1.085 and 1.03 < equal_share < 1.07
-
-
-@pytest.mark.parametrize("name", ["edge_noise_px", "edge_noise_rel"])
-def test_option_edge_noise_widens_the_covariance(name: str) -> None:
-    sigma = []
-    for value in (0.1, 0.3) if name == "edge_noise_rel" else (10.0, 30.0):
-        noise = {"edge_noise_px": 0.0, "edge_noise_rel": 0.0, name: value}
-        fits = fitted(1, 3, 60, 0.02, "ellipsoid", config=q.FitConfig(**noise))[0]
-        sigma.append(np.sqrt(fits.cov[0, :2, :2].trace()))
-    assert 1.5 < sigma[1] / sigma[0] < 3.5  # 3, reduced by the estimated box noise
-
-
 @pytest.mark.parametrize("gap_px, border_px", [(15, (3.0, 15.0)), (6, (0.0, 3.0))])
 def test_option_border_px(gap_px: int, border_px: tuple[float, float]) -> None:
     """A detector that ends boxes before the image border; 6 of 126 px are within their noise."""
@@ -680,10 +549,6 @@ def test_option_correlation_deg() -> None:
     assert np.median(sigma[1] / sigma[0]) == pytest.approx(1, abs=0.1)
     assert np.median(sigma[2] / sigma[0]) == pytest.approx(1 / 2, abs=0.1)
     assert np.allclose(shared.size, once.size, rtol=0.02)
-    wide = syn.solve(
-        *copies, q.FitConfig(correlation_deg=60.0)
-    ).cov  # as if from two or three positions
-    assert np.median(np.sqrt(np.einsum("oii->oi", wide[:, :3, :3])) / sigma[0]) > 1.25
 
 
 def test_the_sigma_of_sizes_includes_systematic_box_errors() -> None:
@@ -716,65 +581,21 @@ def test_views_are_spread_over_the_part_of_the_path_on_which_an_object_is_seen()
     assert len(chosen[1]) == 10 and np.diff(chosen[1][:9]).max() <= 11
 
 
-def test_option_max_views() -> None:
-    """Of 40 views 5 are used, evenly spread; the one with the highest score of each interval."""
+@pytest.mark.parametrize("way", ["score", "whole"])
+def test_of_many_views_the_best_of_each_interval_are_used(way: str) -> None:
+    """Of 40 views 5 are used, evenly spread: those of the highest score, or not truncated."""
     rng = np.random.default_rng(36)
     boxes, cams, *_, priors, names = syn.scenes(1, 40, 150, 0.02, "ellipsoid", rng)
-    score = np.zeros((40, 1))
-    score[4::8] = 1.0
+    best = np.arange(40) % 8 == 4
+    shown = boxes[0].copy()
+    if way == "whole":
+        shown[~best, :, 0] = 0.0  # to the left border of the image
+    score = best[:, None].astype(float) if way == "score" else None
     given = {"up": UP, "config": q.FitConfig(max_views=5, correlation_deg=0)}
-    five = q.fit_objects(boxes[0], cams[0], syn.IMAGE, names, priors, score=score, **given)
-    alone = q.fit_objects(boxes[0, 4::8], cams[0, 4::8], syn.IMAGE, names, priors, **given)
+    five = q.fit_objects(shown, cams[0], syn.IMAGE, names, priors, score=score, **given)
+    alone = q.fit_objects(boxes[0, best], cams[0, best], syn.IMAGE, names, priors, **given)
     assert (five.size == alone.size).all() and (five.cov == alone.cov).all()
-    assert five.inlier.sum() > 35  # the consistency check still uses all of them
-
-
-def test_untruncated_boxes_are_selected_first() -> None:
-    rng = np.random.default_rng(36)
-    boxes, cams, *_, priors, names = syn.scenes(1, 40, 150, 0.02, "ellipsoid", rng)
-    cut = boxes[0].copy()
-    cut[np.arange(40) % 8 != 4, :, 0] = 0.0  # to the left border of the image
-    given = {"up": UP, "config": q.FitConfig(max_views=5, correlation_deg=0)}
-    five = q.fit_objects(cut, cams[0], syn.IMAGE, names, priors, **given)
-    alone = q.fit_objects(boxes[0, 4::8], cams[0, 4::8], syn.IMAGE, names, priors, **given)
-    assert (five.size == alone.size).all()
-
-
-def test_option_start_views() -> None:
-    """Without steps on all views, views outside the initial fits do not matter."""
-    rng = np.random.default_rng(37)
-    boxes, cams, *_, priors, names = syn.scenes(10, 5, 100, 0.01, "ellipsoid", rng)
-    moved = boxes.copy()
-    moved[:, 1:4] += 5.0  # px; two of five views are the first and the last
-    same = []
-    for start_views in (2, 5):
-        config = q.FitConfig(
-            start_views=start_views, iterations=0, correlation_deg=0, wrong_class=0
-        )
-        fits = [syn.solve(b, cams, priors, names, config) for b in (boxes, moved)]
-        same.append((fits[0].size == fits[1].size).all())
-    assert same == [True, False]
-
-
-@pytest.mark.parametrize(
-    ("few", "many"),
-    [
-        ({"start_iterations": 0, "iterations": 0}, {"start_iterations": 7, "iterations": 0}),
-        ({"start_iterations": 0, "iterations": 0}, {"start_iterations": 0, "iterations": 40}),
-    ],
-)
-def test_option_iterations(few: dict[str, int], many: dict[str, int]) -> None:
-    errors = []
-    for steps in (few, many):
-        fits, truth, *_ = fitted(30, 8, 100, 0.001, "ellipsoid", config=q.FitConfig(**steps))
-        errors.append(np.median(np.abs(np.log(fits.ellipsoids.half_axes / truth.half_axes))))
-    assert errors[1] < 0.5 * errors[0]
-
-
-def test_options_are_explained() -> None:
-    names = [field.name for field in fields(q.FitConfig)]
-    text = q.FitConfig.__doc__ or ""
-    assert [n for n in names if not re.search(rf"\b{n}\b.*:", text)] == []
+    assert way == "whole" or five.inlier.sum() > 35  # the inlier test still uses all of them
 
 
 # ---- fit_objects: uncertainty, scale, gravity ----------------------------------------------
@@ -817,13 +638,9 @@ def test_status_reflects_the_evidence() -> None:
     assert (thin.status == "prior_dominated").all()
     assert all("guessed from the category" in reason for reason in thin.reason)
     assert (thin.prior_share.max(1) > 0.8).all() and (wide.prior_share.max(1) < 0.7).mean() > 0.9
-
-
-def test_a_reason_names_the_prior_that_was_used() -> None:
-    _, _, joint, flat, names, priors = fitted(30, 2, 0.5, 0.02, "box")
+    _, _, joint, flat, names, priors = fitted(3, 2, 0.5, 0.02, "box")
     fits = q.fit_objects(joint, flat, syn.IMAGE, [None, *names[1:]], priors, up=UP)
     assert "guessed from the sizes of all categories" in fits.reason[0]
-    assert "guessed from the category" in fits.reason[1]
 
 
 def test_contradictory_boxes_are_rejected() -> None:
@@ -886,7 +703,7 @@ def corridor(rng: np.random.Generator, noise: float):
     return q.clip_boxes(boxes, syn.IMAGE), cams, truth
 
 
-@pytest.mark.parametrize("way", ["flies off", "jumps about", "elsewhere"])
+@pytest.mark.parametrize("way", ["flies off", "elsewhere"])
 def test_wrong_cameras_affect_only_the_objects_they_observe(way: str) -> None:
     """50 of 240 cameras are wrong: others and those with enough good views are kept."""
     rng = np.random.default_rng(51)
@@ -895,8 +712,6 @@ def test_wrong_cameras_affect_only_the_objects_they_observe(way: str) -> None:
     step = np.eye(4)[None].repeat(len(bad), 0)
     if way == "flies off":  # and returns
         step[:, 0, 3] = 500.0 * np.sin(np.linspace(0, np.pi, len(bad) + 2)[1:-1])
-    elif way == "jumps about":
-        step[:, :3, 3] = rng.normal(0, 1.0, (len(bad), 3))
     else:
         step[:, :3, :3] = q.rotations(np.array([[0.2, 0.3, 0.9]]))
         step[:, :3, 3] = [2.0, 1.0, -1.0]
@@ -948,8 +763,6 @@ def test_known_size_sets_the_scale(room) -> None:
     )  # fmt: skip
     assert fits.scale.source == "known_size"
     assert fits.scale.value == pytest.approx(1 / 0.37, rel=0.03)
-    with pytest.raises(q.QuadricsError, match="known_size"):
-        q.fit_objects(boxes, cams, syn.IMAGE, names, known_size={"chair": ("x", 1.0)})
 
 
 def test_without_scale_sizes_are_free(room) -> None:
@@ -957,7 +770,7 @@ def test_without_scale_sizes_are_free(room) -> None:
     boxes, cams, *_ = room
     per_cm = cams @ np.diag([1e-2] * 3 + [1.0])
     fits = [q.fit_objects(boxes, c, syn.IMAGE, up=UP, metric=False) for c in (cams, per_cm)]
-    assert all((f.status != "rejected").all() for f in fits)
+    assert all(f.scale.source == "none" and (f.status != "rejected").all() for f in fits)
     assert np.median(np.abs(np.log(1e2 * fits[0].size / fits[1].size))) < 0.02
 
 
@@ -967,12 +780,6 @@ def test_camera_up_is_robust_to_a_common_pitch() -> None:
     cams = syn.arc_cameras(12, 100, rng, elevation_deg=45.0)
     up, sigma = q.camera_up(cams)
     assert np.rad2deg(np.arccos(up @ np.array(UP))) < 10.0 and 1.0 < np.rad2deg(sigma) < 20.0
-
-
-def test_no_priors_no_scale(room) -> None:
-    boxes, cams, _, _ = room
-    fits = q.fit_objects(boxes, cams, syn.IMAGE, up=UP, metric=False)
-    assert fits.scale.source == "none" and (fits.status != "rejected").all()
 
 
 def test_gravity_is_given_or_from_level_cameras(room) -> None:
@@ -1020,17 +827,6 @@ def test_support_may_differ_by_object(room) -> None:
         q.solid_boxes(fits.ellipsoids, "evidence", cams)
 
 
-def test_lying_book_keeps_a_vertical_third_axis() -> None:
-    rng = np.random.default_rng(17)
-    cams = syn.arc_cameras(8, 120, rng)
-    standing = np.array([[0.2, 0.03, 0.26]]) / 2  # thickness is horizontal
-    truth = q.Ellipsoids(np.zeros((1, 3)), standing, syn.random_yaw(1, rng))
-    boxes = syn.noisy(q.solid_boxes(truth, "box", cams), 0.01, rng)
-    fits = q.fit_objects(boxes, cams, syn.IMAGE, ["book"], q.load_priors(), up=UP)
-    assert fits.ellipsoids.world_from_obj[0, :, 2] @ np.array(UP) > 0.98
-    assert syn.box_overlap(fits.ellipsoids, truth)[0] > 0.8
-
-
 def test_covariance_follows_the_axes_of_a_lying_object() -> None:
     """Its width, known to 1 %, is vertical: it becomes the third axis, and so does its variance."""
     rng = np.random.default_rng(42)
@@ -1074,46 +870,29 @@ def test_empty_input(shape: tuple[int, int], reason: str | None) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("changes", "message"),
     [
-        ((np.zeros((3, 4)), np.zeros((3, 3, 4))), "boxes_xyxy has shape"),
-        ((np.zeros((3, 2, 4)), np.zeros((2, 3, 4))), "img_from_world has shape"),
-        ((np.zeros((3, 2, 4)), np.zeros((3, 3, 4)), (640, 480), ["chair"]), "1 categories"),
+        ({"boxes_xyxy": np.zeros((3, 4))}, "boxes_xyxy has shape"),
+        ({"img_from_world": np.zeros((2, 3, 4))}, "img_from_world has shape"),
+        ({"categories": ["chair"]}, "1 categories"),
+        ({"points": np.zeros((3, 4, 3))}, "points has shape"),
+        ({"points": np.zeros((2, 3))}, "points has shape"),
+        ({"support": "cone"}, "unknown shape"),
+        ({"support": ["box"]}, "1 shapes for 2 objects"),
+        ({"known_size": {"chair": ("x", 1.0)}}, "known_size"),
     ],
 )
-def test_wrong_array_shapes_are_reported(arguments, message: str) -> None:
+def test_wrong_arguments_are_reported(changes: dict[str, object], message: str) -> None:
+    given = {"boxes_xyxy": np.full((3, 2, 4), np.nan), "img_from_world": np.zeros((3, 3, 4))}
     with pytest.raises(q.QuadricsError, match=message):
-        q.fit_objects(*(arguments if len(arguments) > 2 else (*arguments, (640, 480))))
-    seen = (np.full((3, 2, 4), np.nan), np.zeros((3, 3, 4)), (640, 480))
-    for points in (np.zeros((3, 4, 3)), np.zeros((2, 3))):
-        with pytest.raises(q.QuadricsError, match="points has shape"):
-            q.fit_objects(*seen, points=points)
-    for support, complaint in (("cone", "unknown shape"), (["box"], "1 shapes for 2 objects")):
-        with pytest.raises(q.QuadricsError, match=complaint):
-            q.fit_objects(*seen, support=support)
-    for fit in (q.fit_sfmo, lambda x: q.fit_psfmo(x, q.load_priors(), [])):
-        with pytest.raises(q.QuadricsError, match="give boxes_xyxy"):
-            fit(None)
+        q.fit_objects(**given | changes, image_size=(640, 480))
 
 
 @pytest.mark.filterwarnings("error")
 def test_random_input_gives_no_exceptions_and_no_false_claims() -> None:
-    counts = syn.fuzz(1000, np.random.default_rng(18))
-    assert counts["objects"] >= 1000 and counts["bad"] == 0
-    assert min(counts["rejected"], counts["prior_dominated"]) > 100
-
-
-def test_thousands_of_frames_use_few_views() -> None:
-    rng = np.random.default_rng(19)
-    cams = syn.arc_cameras(3000, 150, rng)
-    truth = random_solids(4, rng, upright=True)
-    boxes = syn.noisy(q.solid_boxes(truth, "box", cams), 0.01, rng)
-    boxes[rng.random(boxes.shape[:2]) < 0.5] = np.nan
-    start = time.perf_counter()
-    fits = q.fit_objects(boxes, cams, syn.IMAGE, up=UP, support="box")
-    assert time.perf_counter() - start < 5.0
-    assert fits.inlier.sum() > 0.9 * np.isfinite(boxes[..., 0]).sum()
-    assert syn.box_overlap(fits.ellipsoids, truth).min() > 0.8
+    counts = syn.fuzz(400, np.random.default_rng(18))
+    assert counts["objects"] >= 400 and counts["bad"] == 0
+    assert min(counts["rejected"], counts["prior_dominated"]) > 40
 
 
 # ---- Volumes -------------------------------------------------------------------------------
@@ -1141,28 +920,24 @@ def test_volume_overlap_of_spheres_is_the_lens() -> None:
     assert np.abs(measured - expected).max() < 1e-3
 
 
-@pytest.mark.parametrize("kind", ["ellipsoid", "box"])
-def test_overlap_matches_monte_carlo_and_symmetry(kind: str) -> None:
+def test_overlap_matches_monte_carlo_and_symmetry() -> None:
     rng = np.random.default_rng(21)
     a, b = random_solids(8, rng), random_solids(8, rng)
     b = q.Ellipsoids(a.center_in_world + rng.normal(0, 0.05, (8, 3)), b.half_axes, b.world_from_obj)
-    measure = q.volume_overlap if kind == "ellipsoid" else syn.box_overlap
-    unit = rng.uniform(-1, 1, (400000, 3))
+    unit = rng.uniform(-1, 1, (200000, 3))
+    ball = (unit**2).sum(1) < 1
     for k in range(8):
         point = a.center_in_world[k] + (unit * a.half_axes[k]) @ a.world_from_obj[k].T
         other = (point - b.center_in_world[k]) @ b.world_from_obj[k] / b.half_axes[k]
-        in_a = (unit**2).sum(1) < 1 if kind == "ellipsoid" else np.ones(len(unit), bool)
-        in_b = (other**2).sum(1) < 1 if kind == "ellipsoid" else (np.abs(other) < 1).all(1)
-        common = (in_a & in_b).mean() * a.half_axes[k].prod()
-        full = np.pi / 6 if kind == "ellipsoid" else 1.0
-        expected = common / (full * (a.half_axes[k].prod() + b.half_axes[k].prod()) - common)
-        assert measure(a[k], b[k])[0] == pytest.approx(expected, abs=3e-3)
-    assert np.allclose(measure(a, b), measure(b, a), atol=1e-3)
-    assert np.allclose(measure(a, a), 1, atol=1e-6)
+        common = (ball & ((other**2).sum(1) < 1)).mean() * a.half_axes[k].prod()
+        whole = np.pi / 6 * (a.half_axes[k].prod() + b.half_axes[k].prod())
+        expected = common / (whole - common)
+        assert q.volume_overlap(a[[k]], b[[k]])[0] == pytest.approx(expected, abs=4e-3)
+    assert np.allclose(q.volume_overlap(a, b), q.volume_overlap(b, a), atol=2e-4)
+    assert np.allclose(q.volume_overlap(a, a), 1, atol=1e-6)
     far = q.Ellipsoids(a.center_in_world + 50, a.half_axes, a.world_from_obj)
-    assert (measure(a, far) == 0).all()
-    broken = q.Ellipsoids(a.center_in_world * np.nan, a.half_axes, a.world_from_obj)
-    assert np.isnan(measure(a, broken)).all()
+    assert (q.volume_overlap(a, far) == 0).all()
+    assert np.isnan(q.volume_overlap(a, q.Ellipsoids.unknown(8))).all()
 
 
 # ---- SfMO, PSfMO ---------------------------------------------------------------------------
@@ -1188,41 +963,6 @@ def test_sfmo_recovers_affine_scenes_up_to_mirror(holes: float) -> None:
 def test_sfmo_reports_insufficient_input(shape: tuple[int, int]) -> None:
     result = q.fit_sfmo(np.tile([0.0, 0, 10, 10], (*shape, 1)))
     assert not result.ok and "needs" in result.note and len(result.ellipsoids) == shape[1]
-
-
-def test_psfmo_estimates_the_noise_of_the_ellipses() -> None:
-    """Its noise variance, alone and with cameras, rises with rotation error and with size error."""
-    for sweep in ([(0, 0.02), (10, 0.02), (30, 0.02)], [(2, 0.0), (2, 0.1), (2, 0.3)]):
-        variance = np.array([syn.thesis_trial(*s, seed=0)[4:] for s in sweep])  # (3, 2)
-        assert (variance > 0).all() and (variance[1:] > 2 * variance[:-1]).all()
-
-
-def test_psfmo_prior_helps_where_least_squares_is_weak() -> None:
-    """Narrow baselines: least squares (LfD) hardly constrains the depth, the prior does."""
-    gains = []
-    for seed in range(6):
-        rng = np.random.default_rng(seed)
-        truth, cams = syn.far_scene(15, 10, 12.0, rng)
-        boxes = syn.noisy(q.solid_boxes(truth, "ellipsoid", cams), 0.02, rng)
-        priors, names = syn.individual_priors(np.log(2 * truth.half_axes), 0.1, "ellipsoid")
-        plain = q.Ellipsoids.from_dual_quadrics(q.fit_lfd(boxes, cams)[0])[0]
-        informed = q.fit_psfmo(boxes, priors, names, cams)
-        assert np.isfinite(informed.noise).all() and informed.start is None
-        overlaps = (q.volume_overlap(x, truth) for x in (plain, informed.ellipsoids))
-        scores = [np.nan_to_num(x).mean() for x in overlaps]
-        gains.append(scores[1] - scores[0])
-    assert np.mean(gains) > 0.05
-
-
-def test_psfmo_finds_the_axis_assignment() -> None:
-    rng = np.random.default_rng(23)
-    truth, cams = syn.far_scene(20, 8, 60.0, rng)
-    dual_c, _ = q.project(truth.dual_quadrics(), cams)
-    priors, names = syn.individual_priors(np.log(2 * truth.half_axes), 0.05, "ellipsoid")
-    result = q.fit_psfmo(None, priors, names, cams, dual_c)
-    order = np.argsort(truth.half_axes, 1)  # LfD axes ascend
-    assert (result.permutation == order).all()
-    assert q.volume_overlap(result.ellipsoids, truth).min() > 0.95
 
 
 def plain_psfmo(
@@ -1312,118 +1052,55 @@ def test_psfmo_agrees_with_the_plain_one() -> None:
     assert np.mean(change.max(1) < 1e-3) >= 0.8  # the default number of steps converges
 
 
-def test_psfmo_estimates_the_noise() -> None:
-    """Rows off by a known Gaussian error, relative to their mean."""
-    truth, cams, _, priors = ratio_scene(12, 70, 0.0, 5)
-    rng = np.random.default_rng(6)
-    clean = q.project(truth.dual_quadrics(), cams)[0]
-    scaled = -clean / clean[..., 2:, 2:]
-    center = -scaled[..., :2, 2]
-    block = scaled[..., :2, :2] + center[..., None] * center[..., None, :]
-    mean = np.abs(block[..., [0, 0, 1], [0, 1, 1]]).mean((0, 2))
-    error = rng.normal(0, 0.05, block.shape) * mean[:, None, None]
-    error[..., 1, 0] = error[..., 0, 1]
-    scaled[..., :2, :2] += error
-    result = q.fit_psfmo(None, priors, priors.names, cams, scaled)
-    assert np.sqrt((result.noise**2).mean()) == pytest.approx(0.05, rel=0.1)
-
-
 # ---- Priors --------------------------------------------------------------------------------
 
 
 def test_priors_cover_the_vocabularies() -> None:
     priors = q.load_priors()
-    scannet = (
-        "cabinet,bed,chair,sofa,table,door,window,bookshelf,picture,counter,desk,curtain,"
-        "refrigerator,shower curtain,toilet,sink,bathtub,otherfurniture"
-    ).split(",")
-    sun = "night_stand,dresser,pillow,lamp,monitor,garbage_bin,box,whiteboard,shelves,bag"
-    rest = [*scannet, *sun.split(","), "tvmonitor", "television", "Potted_Plant"]
-    assert (priors.index(COCO_80) >= 0).all() and set(COCO_80) <= set(priors.names)
-    assert (priors.index(rest) >= 0).all()
+    others = "otherfurniture,night_stand,garbage_bin,tvmonitor,Potted_Plant,bathtub,whiteboard"
+    assert (priors.index(COCO_NAMES) >= 0).all() and set(COCO_NAMES) <= set(priors.names)
+    assert (priors.index(others.split(",")) >= 0).all()
     assert priors.index(["unheard of", None, ""]).tolist() == [-1, -1, -1]
     assert priors.index(["sofa"]) == priors.index(["couch"])
     assert (np.linalg.eigvalsh(priors.log_cov) > 0).all() and (priors.log_mean < np.log(60)).all()
     assert (np.linalg.eigvalsh(priors.ratio_cov) > 0).all()
-    table = json.loads((ROOT / "priors.json").read_text())
-    entries = [v for k, v in table.items() if k not in ("about", "aliases")]
-    assert all(e["source"] and e["support"] in q.SUPPORTS for e in entries)
-
-
-# Evaluation sets: recordings, who measured their objects, and rendered rooms.
-SCORED = re.compile(
-    r"7-?scenes|kitchen|hololens|\bTUM\b|MRHan|SO-?SLAM|fr[123]|\bTUW\b|aldoma|cubeslam|\bADT\b|"
-    r"\baria\b|render|examples/",
-    re.IGNORECASE,
-)
-
-
-@pytest.mark.parametrize(
-    ("source", "scored"),
-    [("TUM hand GT (MRHan)+own knowledge", True), ("Objectron/CenterPose+ProcTHOR", False)],
-)
-def test_evaluation_sets_are_named(source: str, scored: bool) -> None:
-    assert bool(SCORED.search(source)) == scored
 
 
 def test_no_prior_comes_from_an_evaluation_set() -> None:
+    """Recordings, who measured their objects, and rendered rooms."""
     table = json.loads(Path(q.__file__).with_name("priors.json").read_text())
-    sources = {"about": table.pop("about")["sources"]}
+    sources = [str(table.pop("about")["sources"])]
     table.pop("aliases")
-    for name, entry in table.items():
-        sources[name] = entry["source"]
-        sources[f"{name}, axis_ratio"] = entry["axis_ratio"]["source"]
-    assert len(sources) > 200
-    assert [name for name, source in sources.items() if SCORED.search(source)] == []
+    for entry in table.values():
+        sources += [entry["source"], entry["axis_ratio"]["source"]]
+    scored = r"7-?scenes|kitchen|hololens|\bTUM\b|MRHan|SO-?SLAM|fr[123]|\bTUW\b|aldoma|cubeslam"
+    scored = re.compile(scored + r"|\bADT\b|\baria\b|render|examples/", re.IGNORECASE)
+    assert len(sources) > 200 and not any(map(scored.search, sources))
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_invalid_priors_are_reported(tmp_path: Path) -> None:
+    """A missing field; numbers that overflow, without a NumPy warning."""
     path = tmp_path / "p.json"
-    path.write_text('{"chair": {"size_m": {"mean": [1, 2, 3]}}}')
-    with pytest.raises(q.QuadricsError, match=r"p\.json.*log_std"):
-        q.load_priors(path)
+    size = {"mean": [2, 0.9, 0.8], "log_std": [0.2, 0.2, 0.2], "corr": [0, 0, 0]}
+    for wrong in ({"mean": [1, 2, 3]}, *(size | {key: [1e308, -1e308, 1e308]} for key in size)):
+        path.write_text(json.dumps({"couch": {"size_m": wrong}}))
+        with pytest.raises(q.QuadricsError, match=r"p\.json.*missing or invalid field"):
+            q.load_priors(path)
     path.write_text("{}")
     assert q.load_priors(path).index(["chair"]).tolist() == [-1]
 
 
-def test_user_priors_from_meshes_and_a_table(tmp_path: Path) -> None:
-    trimesh = pytest.importorskip("trimesh")
-    rng = np.random.default_rng(24)
-    sizes = np.exp(rng.normal(np.log([0.5, 0.6, 0.9]), 0.1, (30, 3)))  # w, d, h
-    folder = tmp_path / "meshes" / "chair"
-    folder.mkdir(parents=True)
-    for k, (w, d, h) in enumerate(sizes):  # CAD: x right, y up, z front
-        trimesh.creation.box(extents=(w, h, d)).export(folder / f"{k}.ply")
-    (folder / "broken.ply").write_text("not a mesh")
-    out = tmp_path / "priors.json"
-    assert own_priors.main([str(tmp_path / "meshes"), "-o", str(out), "--up", "y"]) == 0
-    priors = q.load_priors(out)
-    assert np.allclose(priors.log_mean[0], np.log(sizes).mean(0), atol=1e-3)
-    assert np.allclose(
-        np.sqrt(np.diagonal(priors.log_cov[0])), np.log(sizes).std(0, ddof=1), rtol=0.02
-    )
+def test_user_priors_from_a_table(tmp_path: Path) -> None:
+    sizes = np.exp(np.random.default_rng(24).normal(np.log([0.5, 0.6, 0.9]), 0.1, (30, 3)))
     table = tmp_path / "sizes.csv"
+    out = tmp_path / "priors.json"
     table.write_text("category,w,d,h\n" + "".join(f"stool,{w},{d},{h}\n" for w, d, h in sizes))
     assert own_priors.main([str(table), "-o", str(out), "--support", "cylinder"]) == 0
     assert np.allclose(q.load_priors(out).log_mean[0], np.log(sizes).mean(0), atol=1e-3)
-    table.write_text("category,w\nstool,1\n")
-    assert own_priors.main([str(table), "-o", str(out)]) == 2
 
 
-# ---- House rules ---------------------------------------------------------------------------
-
-
-def test_functions_are_short_and_nothing_optional_is_imported() -> None:
-    tree = ast.parse((ROOT / "quadrics.py").read_text())
-    for node in ast.walk(tree):
-        if isinstance(node, ast.FunctionDef):
-            text = ast.get_docstring(node, clean=False)
-            lines = node.end_lineno - node.lineno + 1 - (len(text.split("\n")) if text else 0)
-            assert lines <= 50, (node.name, lines)
-    names = {
-        a.name.split(".")[0] for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names
-    }
-    assert names <= {"json", "re", "numpy"}
+# ---- Numbers at the limit --------------------------------------------------------------------
 
 
 def test_overflowing_cameras_give_no_quadric() -> None:
@@ -1436,28 +1113,6 @@ def test_overflowing_cameras_give_no_quadric() -> None:
     assert np.isfinite(good.ellipsoids.half_axes).all()
     bad = q.fit_psfmo(boxes, priors, categories, 1e300 * img_from_world)
     assert bad.ellipsoids.half_axes.shape == good.ellipsoids.half_axes.shape
-
-
-@pytest.mark.parametrize("factor", [1e6, 1e9])
-def test_an_absurd_focal_length_raises_no_exception(factor: float) -> None:
-    """Its two latent dimensions are indistinguishable: the precision is singular."""
-    poses = walk(6)
-    img_from_world = (poses.camera.K @ poses.cam_from_world)[:1]
-    boxes = q.solid_boxes(chair_solids(), "box", img_from_world)
-    img_from_world[:, 0, 0] *= factor
-    found = q.fit_psfmo(boxes, q.load_priors(), ["chair"] * boxes.shape[1], img_from_world)
-    assert not np.isfinite(found.ellipsoids.half_axes).any()  # seen in fewer than two frames
-
-
-@pytest.mark.filterwarnings("error::RuntimeWarning")
-@pytest.mark.parametrize("key", ["mean", "log_std", "corr"])
-def test_overflowing_priors_are_refused(tmp_path: Path, key: str) -> None:
-    """Without a NumPy warning."""
-    size = {"mean": [2, 0.9, 0.8], "log_std": [0.2, 0.2, 0.2], "corr": [0, 0, 0]}
-    path = tmp_path / "p.json"
-    path.write_text(json.dumps({"couch": {"size_m": size | {key: [1e308, -1e308, 1e308]}}}))
-    with pytest.raises(q.QuadricsError, match="a category has a missing or invalid field"):
-        q.load_priors(path)
 
 
 def test_the_median_of_chi2_is_near() -> None:

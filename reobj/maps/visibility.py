@@ -10,7 +10,7 @@ import quadrics
 from reobj.cameras import invert_rigid, undistort_boxes
 from reobj.maps.compare import Visibility
 from reobj.maps.fusion import ObjectState, alignment_jacobian, shapes_of
-from reobj.objects.occlusion import entry_depths
+from reobj.objects.observations import entry_depths
 from reobj.results.result import Object, Result
 from reobj.types import Array, BoolArray, IntArray, Tracks
 from reobj.visible_points import VisiblePoints

@@ -25,50 +25,29 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from reobj.objects.likelihood import Evidence, PosedDetections, Shapes, gather_evidence
-from reobj.objects.phases import Reach, ignore
 from reobj.types import Array, BoolArray, IntArray
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AssociationOptions:
-    """Weights and limits of the association.
-
-    Log odds unless a unit is given. Without another source they were chosen on hololens_kitchen and
-    redkitchen (benchmarks/RESULTS.md).
-
-    Attributes:
-        missed: against an object, for each frame in which it is expected and not detected.
-        new_object: against each object: at least three frames must support it.
-        same_tracklet: for the object of the previous or next detection of the tracklet.
-        min_log_odds: of a pair of an object and a detection that is kept: below it the detection is
-            not assigned, even if both of its neighbours in the tracklet are.
-        max_box_gain: largest gain by a better box in step 1: else a compromise between two objects
-            is selected first.
-        unambiguous_margin: over the runner-up, that a detection needs to take part in refitting
-            (1 and 4 gain less, benchmarks/LOG.md).
-        merge_distance: largest distance of centres to merge, over the sum of the mean half widths.
-        same_position: half extents of an object, along its axes; one with its centre nearer than
-            this is a duplicate or a part of it, whatever the evidence for two (.4 to .6 are alike
-            but for deimv2-femto).
-        similar_log_size: largest difference of mean log sizes to merge objects of different classes
-            (laptop and tv).
-        min_detections: of an object; fewer do not determine it.
-        max_rounds: of steps 2 to 5, if no state is repeated before; bounds the time.
-        widening_rounds: of step 6: more, and wide shapes take over neighbours (benchmarks/LOG.md).
-    """
-
-    missed: float = 0.5
-    new_object: float = 10.0
-    same_tracklet: float = 2.5
-    min_log_odds: float = -6.0
-    max_box_gain: float = 1.5
-    unambiguous_margin: float = 2.0
-    merge_distance: float = 1.5
-    same_position: float = 0.5
-    similar_log_size: float = float(np.log(1.4))
-    min_detections: int = 3
-    max_rounds: int = 10
-    widening_rounds: int = 2
+# Log odds unless a unit is given; measured on hololens_kitchen and redkitchen
+# (benchmarks/RESULTS.md).
+MISSED = 0.5  # against an object, for each frame in which it is expected and not detected
+NEW_OBJECT = 10.0  # against each object: at least three frames must support it
+SAME_TRACKLET = 2.5  # for the object of the previous or next detection of the tracklet
+# Of a pair of an object and a detection that is kept: below it the detection is not assigned, even
+# if both of its neighbours in the tracklet are
+MIN_LOG_ODDS = -6.0
+# Largest gain by a better box in step 1: without it a compromise between two objects goes first
+MAX_BOX_GAIN = 1.5
+# Over the runner-up, that a detection needs to take part in refitting (1 and 4 gain less)
+UNAMBIGUOUS_MARGIN = 2.0
+MERGE_DISTANCE = 1.5  # of the centres to merge, over the sum of the mean half widths
+# Half extents of an object, along its axes; one with its centre nearer than this is a duplicate or
+# a part of it, whatever the evidence for two (.4 to .6 are alike but for deimv2-femto)
+SAME_POSITION = 0.5
+# Largest difference of mean log sizes to merge objects of different classes (laptop and tv)
+SIMILAR_LOG_SIZE = float(np.log(1.4))
+MIN_DETECTIONS = 3  # of an object; fewer do not determine it
+MAX_ROUNDS = 10  # of steps 2 to 5, if no state is repeated before; bounds the time
+WIDENING_ROUNDS = 2  # of step 6: more, and wide shapes take over neighbours
 
 
 # detections (K,), the object of each (K,), the classes (O,) of the objects, their current shapes if
@@ -84,14 +63,12 @@ class Association:
     Attributes:
         shapes: of O objects. label: (N,) object of each detection, or -1.
         evidence: of the objects. size_log_odds: (O,) by the categories.
-        options: of the associator.
     """
 
     shapes: Shapes
     label: IntArray
     evidence: Evidence
     size_log_odds: Array
-    options: AssociationOptions
 
     @property
     def count(self) -> IntArray:
@@ -108,7 +85,7 @@ class Association:
         pairs = self.assigned_pairs
         obj = self.evidence.obj[pairs]
         row = self.evidence.row[pairs]
-        hit = self.options.missed * self.evidence.expected[detections.view[row], obj]
+        hit = MISSED * self.evidence.expected[detections.view[row], obj]
         gain = np.bincount(obj, self.evidence.existence[pairs] + hit, len(self.shapes))
         return np.asarray(gain - self.costs())
 
@@ -123,74 +100,54 @@ class Association:
         best, runner_up = np.full((2, len(assigned)), -np.inf)
         best[evidence.row[pairs]] = evidence.assignment[pairs]
         np.maximum.at(runner_up, evidence.row[~pairs], evidence.assignment[~pairs])
-        clear = assigned & (runner_up < best - self.options.unambiguous_margin)
+        clear = assigned & (runner_up < best - UNAMBIGUOUS_MARGIN)
         count = np.bincount(self.label[clear], minlength=len(self.shapes) + 1)
-        few = count < self.options.min_detections
+        few = count < MIN_DETECTIONS
         return np.asarray(clear | assigned & few[self.label])
 
     def costs(self) -> Array:
         """Return the log odds (O,) against each object without any detection."""
-        missed = self.options.missed * self.evidence.expected.sum(0)
-        return np.asarray(missed + self.options.new_object - self.size_log_odds)
+        missed = MISSED * self.evidence.expected.sum(0)
+        return np.asarray(missed + NEW_OBJECT - self.size_log_odds)
 
 
+@dataclass(slots=True)
 class Associator:
     """Estimate the objects of a scene and assign the detections to them.
 
     Args:
         detections: of all frames. fit_shapes: fits shapes to detections. size_log_odds: of shapes
-            by the size priors of their categories. options: None: the defaults.
-        reach: reports the progress.
+            by the size priors of their categories.
     """
 
-    def __init__(
-        self,
-        detections: PosedDetections,
-        fit_shapes: FitShapes,
-        size_log_odds: SizeLogOdds,
-        options: AssociationOptions | None = None,
-        reach: Reach = ignore,
-    ) -> None:
-        self.detections = detections
-        self.fit_shapes = fit_shapes
-        self.size_log_odds = size_log_odds
-        self.options = options or AssociationOptions()
-        self.reach = reach
+    detections: PosedDetections
+    fit_shapes: FitShapes
+    size_log_odds: SizeLogOdds
 
     def run(self, hypotheses: Shapes, floor_known: bool) -> Association:
         """Select among hypotheses, then alternate between assignment and shapes."""
-        selected = self._select_greedily(self._unassigned(hypotheses, 0.0, self.reach))
-        self.reach("hypotheses", 1.0)
+        selected = self._select_greedily(self._unassigned(hypotheses, 0.0))
         current = self.assign(hypotheses[selected], np.full(len(self.detections.view), -1))
         visited = {current.label.tobytes()}
-        for done in range(self.options.max_rounds):
+        for _ in range(MAX_ROUNDS):
             for step in (self._refit, self._prune, self._merge):
                 current = step(current)
-            self.reach("rounds", (done + 1) / (self.options.max_rounds + 1))
             if (state := current.label.tobytes()) in visited:
                 break
             visited.add(state)
         # last, as wide shapes take over the detections of their neighbours
-        for _ in range(self.options.widening_rounds if floor_known else 0):
+        for _ in range(WIDENING_ROUNDS if floor_known else 0):
             current = self._refit(current, widen=True)
-        self.reach("rounds", 1.0)
         return current
 
-    def _unassigned(
-        self, shapes: Shapes, min_log_odds: float | None = None, reach: Reach = ignore
-    ) -> Association:
-        """Gather the evidence of shapes without any assigned detection.
-
-        Args:
-            min_log_odds: None: that of the options. reach: reports the progress.
-        """
-        limit = self.options.min_log_odds if min_log_odds is None else min_log_odds
-        evidence = gather_evidence(shapes, self.detections, limit, reach=reach)
+    def _unassigned(self, shapes: Shapes, min_log_odds: float = MIN_LOG_ODDS) -> Association:
+        """Gather the evidence of shapes without any assigned detection."""
+        evidence = gather_evidence(shapes, self.detections, min_log_odds)
         return self._association(shapes, np.full_like(self.detections.view, -1), evidence)
 
     def _association(self, shapes: Shapes, label: IntArray, evidence: Evidence) -> Association:
         """Make the association of shapes with this label of each detection."""
-        return Association(shapes, label, evidence, self.size_log_odds(shapes), self.options)
+        return Association(shapes, label, evidence, self.size_log_odds(shapes))
 
     def _select_greedily(self, hypotheses: Association) -> IntArray:
         """Select hypotheses one by one: each adds most to those before.
@@ -201,7 +158,7 @@ class Associator:
         view = self.detections.view
         evidence = hypotheses.evidence
         cost = hypotheses.costs()
-        value = np.minimum(evidence.assignment, evidence.existence + self.options.max_box_gain)
+        value = np.minimum(evidence.assignment, evidence.existence + MAX_BOX_GAIN)
         positive = value > 0
         obj = evidence.obj[positive]
         row = evidence.row[positive]
@@ -217,7 +174,7 @@ class Associator:
             best = np.zeros(len(expected))
             np.maximum.at(best, view[rows], log_odds[start[k] : start[k + 1]] - explained[rows])
             hits = np.count_nonzero(expected[best > 0, k])
-            return float(best.sum() + self.options.missed * hits - cost[k])
+            return float(best.sum() + MISSED * hits - cost[k])
 
         # The marginal gain only decreases as others are selected: a hypothesis that still leads
         # after its gain was updated is the best (lazy greedy, Minoux 1978).
@@ -242,11 +199,11 @@ class Associator:
             label: (N,) initial object of each detection, or -1.
         """
         detections = self.detections
-        evidence = gather_evidence(shapes, detections, self.options.min_log_odds)
+        evidence = gather_evidence(shapes, detections, MIN_LOG_ODDS)
         has_evidence = np.bincount(evidence.row, minlength=len(label)) > 0
         label = np.where(has_evidence, label, -1)
         expected = evidence.expected[detections.view[evidence.row], evidence.obj]
-        value = evidence.assignment + self.options.missed * expected
+        value = evidence.assignment + MISSED * expected
         order = np.argsort(evidence.row, kind="stable")
         starts = np.searchsorted(evidence.row[order], detections.start_of_view)
         for low, high in itertools.pairwise(starts):
@@ -256,7 +213,7 @@ class Associator:
             gain = value[pairs]
             for neighbour in (detections.before[row], detections.after[row]):
                 same = (neighbour >= 0) & (label[neighbour] == obj)
-                gain = gain + self.options.same_tracklet * same
+                gain = gain + SAME_TRACKLET * same
             label[row] = -1
             unique_obj, i = np.unique(obj, return_inverse=True)
             unique_row, j = np.unique(row, return_inverse=True)
@@ -304,7 +261,7 @@ class Associator:
         row = evidence.row[other]
         obj = evidence.obj[other]
         missed = evidence.expected & ~shown
-        hit = self.options.missed * missed[view[row], obj]
+        hit = MISSED * missed[view[row], obj]
 
         def best_of_others(value: Array) -> Array:
             """Return what the best others would gain by the detections of each object, (O,)."""
@@ -316,7 +273,7 @@ class Associator:
         marginal = current.gains(self.detections) - best_of_others(evidence.existence)  # (O,)
         fit = np.bincount(evidence.obj[pairs], evidence.assignment[pairs], len(current.shapes))
         advantage = fit - best_of_others(evidence.assignment)  # (O,)
-        weak = np.flatnonzero((marginal < 0) | (current.count < self.options.min_detections))
+        weak = np.flatnonzero((marginal < 0) | (current.count < MIN_DETECTIONS))
         worst = weak[np.argsort(advantage[weak])][: (len(weak) + 1) // 2]
         return self._remove(current, worst) if len(worst) else current
 
@@ -330,13 +287,13 @@ class Associator:
     def _merge(self, current: Association) -> Association:
         """Merge pairs of nearby objects if one object explains the detections of both."""
         gain = current.gains(self.detections)
-        strong, weak = _near_pairs(current.shapes, gain, self.options)
+        strong, weak = _near_pairs(current.shapes, gain)
         if not len(strong):
             return current
         row, pair = self._joint_rows(current.label, strong, weak)
         fitted = self.fit_shapes(row, pair, current.shapes.class_id[strong], None)
         more = self._joint_gains(current.label, strong, weak, fitted) - gain[strong] - gain[weak]
-        duplicate = _coincide(current.shapes, self.options.same_position)[strong, weak]
+        duplicate = _coincide(current.shapes)[strong, weak]
         more[duplicate & np.isfinite(more)] = np.inf
         pick = np.arange(len(current.shapes))
         removed = set[int]()
@@ -384,32 +341,27 @@ class Associator:
         order = np.lexsort((-log_odds, key))
         best_of_frame = np.zeros(len(key), bool)  # of its object
         best_of_frame[order] = np.append(True, np.diff(key[order]) != 0)[: len(key)]
-        hit = self.options.missed * evidence.expected[view[row], obj]
+        hit = MISSED * evidence.expected[view[row], obj]
         worth = log_odds + hit * best_of_frame
         gain = np.bincount(obj, worth.clip(0), len(strong)) - joint.costs()
         return np.where(np.isfinite(fitted.ellipsoids.center_in_world).all(1), gain, -np.inf)
 
 
-def _coincide(shapes: Shapes, same_position: float) -> BoolArray:
+def _coincide(shapes: Shapes) -> BoolArray:
     """Mark pairs (O, O) of shapes in one position, where no two objects can be.
 
     The smaller has its centre in the middle of the larger: a part of the object, or a duplicate.
-
-    Args:
-        same_position: half extents of this middle, over those of the larger.
     """
     centre = shapes.ellipsoids.center_in_world
     half = shapes.ellipsoids.half_axes
     a_in_b = np.einsum("abi,bij->abj", centre[:, None] - centre, shapes.ellipsoids.world_from_obj)
-    inside = (np.abs(a_in_b) < same_position * half).all(2)  # (O, O) a's centre in the middle of b
+    inside = (np.abs(a_in_b) < SAME_POSITION * half).all(2)  # (O, O) a's centre in the middle of b
     volume = half.prod(1)
     inside &= volume[:, None] <= volume
     return np.asarray(inside | inside.T, bool)
 
 
-def _near_pairs(
-    shapes: Shapes, gain: Array, options: AssociationOptions
-) -> tuple[IntArray, IntArray]:
+def _near_pairs(shapes: Shapes, gain: Array) -> tuple[IntArray, IntArray]:
     """List pairs (P,) of nearby shapes, the one of larger gain first.
 
     They have one class, or similar sizes and one position.
@@ -418,10 +370,10 @@ def _near_pairs(
     half = shapes.ellipsoids.half_axes
     distance = np.linalg.norm(centre[:, None] - centre, axis=2)  # (O, O)
     width = half[:, :2].mean(1)
-    near = distance < options.merge_distance * (width[:, None] + width)
+    near = distance < MERGE_DISTANCE * (width[:, None] + width)
     size = np.log(half).mean(1)
-    similar = np.abs(size[:, None] - size) < options.similar_log_size
-    similar &= _coincide(shapes, options.same_position)
+    similar = np.abs(size[:, None] - size) < SIMILAR_LOG_SIZE
+    similar &= _coincide(shapes)
     same_class = shapes.class_id[:, None] == shapes.class_id
     a, b = np.nonzero(np.triu(near & (same_class | similar), 1))
     first = gain[a] >= gain[b]

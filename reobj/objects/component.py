@@ -2,6 +2,10 @@
 
 Classes that move, and detections that no object explains, are left to the linking by appearance
 (`reobj.tracking.linking`).
+
+The association chooses from hypotheses: the shapes fitted to the boxes of each tracklet fragment
+and, as few views do not determine the depth, shapes at several depths along the rays of its best
+boxes and of untracked detections. Wrong hypotheses are rejected by later observations.
 """
 
 from __future__ import annotations
@@ -15,27 +19,27 @@ import numpy.typing as npt
 
 import quadrics
 from reobj.cameras import Poses, place_of, undistort_boxes
-from reobj.objects import confidence
-from reobj.objects.association import (
-    Association,
-    AssociationOptions,
-    Associator,
-    FitShapes,
-)
-from reobj.objects.categories import Categories
-from reobj.objects.frames import informative_frames, only_frames
-from reobj.objects.hypotheses import propose, propose_along_rays
+from reobj.objects.association import Association, Associator, FitShapes
+from reobj.objects.description import objects_confidence
 from reobj.objects.likelihood import (
     DEPTH_QUANTILES,
     INNER_BOX,
     MIN_POINTS,
     NO_SHAPES,
+    Categories,
     PosedDetections,
     Shapes,
 )
-from reobj.objects.observations import Fit, Scene, Views, gather_views
-from reobj.objects.occlusion import edges_above_floor, see_through_ratio
-from reobj.objects.phases import Reach, ignore
+from reobj.objects.observations import (
+    Fit,
+    Scene,
+    Views,
+    edges_above_floor,
+    gather_views,
+    informative_frames,
+    only_frames,
+    see_through_ratio,
+)
 from reobj.poses.floor import floor_of
 from reobj.tracking.linking import DUPLICATE_IOU, cut_at_gaps
 from reobj.types import (
@@ -81,15 +85,13 @@ def associate_component(
     priors: quadrics.Priors,
     moving: Collection[str] = (),
     looked: IntArray | None = None,
-    options: AssociationOptions | None = None,
-    reach: Reach = ignore,
 ) -> ComponentObjects:
     """Associate the detections of a component with 3D objects.
 
     Args:
         rows: all detections by frame; tracklet 0: untracked. moving: names of classes that move.
         looked: frames that the detector was run on, the only ones in which a detection can be
-            missed; None: all. options: None: the defaults. reach: reports the progress.
+            missed; None: all.
     """
     names = np.array([*class_names, ""])
     processed = poses.frame[poses.known]
@@ -101,12 +103,12 @@ def associate_component(
     tracked = table[table.tracklet_id > 0]
     label = np.full(len(rows), -1)
     iou = np.full(len(rows), np.nan)
-    unknown = quadrics.Ellipsoids(*(np.full(s, np.nan) for s in ((1, 3), (1, 3), (1, 3, 3))))
+    unknown = quadrics.Ellipsoids.unknown(1)
     if not len(tracked):
         return ComponentObjects(label, iou, [], None, unknown)
     frames, informative = informative_frames(tracked, poses, processed)
     fragment = cut_at_gaps(tracked, looked)
-    # fragments that show nothing new need no hypotheses: those before them have them
+    # Skip fragments without new viewpoints: earlier fragments already produced these hypotheses
     chosen = np.isin(tracked.frame, frames) & np.isin(fragment, fragment[informative])
     tracked = tracked[chosen]
     fragment = np.unique(fragment[chosen], return_inverse=True)[1]
@@ -116,41 +118,31 @@ def associate_component(
     classes = class_shares(tracked, fragment, count).argmax(1)
     fits = fit(views, classes.tolist(), Scene(trusts_classes=True))
     floor = find_floor(poses, fits)
-    reach("first fit", 1.0)
     categories = Categories(priors, names, fits.scale)
-    usual_size = categories.usual_size(classes)
-    on_floor = categories.on_floor(classes)
     in_chosen = np.isin(table.frame, frames)
     hypotheses = Shapes.concatenate([
-        propose(fits, views, classes, usual_size, floor, on_floor),
+        propose(fits, views, classes, categories, floor),
         _propose_from_untracked(table[in_chosen], observing, categories, fits.up, floor),
     ])  # fmt: skip
     detections = _posed_detections(table[in_chosen], poses, frames)
     scene = Scene(floor, None, None if poses.metric else fits.scale, trusts_classes=True)
     fit_shapes = _cached_fit(detections, categories, scene, fit)
-    associator = Associator(detections, fit_shapes, categories.size_log_odds, options, reach)
+    associator = Associator(detections, fit_shapes, categories.size_log_odds)
     found = associator.run(hypotheses, floor is not None)
     if len(frames) < len(processed):
         detections = _posed_detections(table, poses, processed)
         start = np.full(len(table), -1)
         start[in_chosen] = found.label
-        associator = Associator(detections, fit_shapes, categories.size_log_odds, options, reach)
+        associator = Associator(detections, fit_shapes, categories.size_log_odds)
         found = associator.assign(found.shapes, start)
-        reach("assign", 0.5)
     label[used] = found.label
     iou[used] = _iou_with_projections(detections, found)
     see_through = see_through_ratio(
         found.shapes.ellipsoids, found.evidence.expected, poses, processed
     )
-    reach("assign", 1.0)
-    none = Shapes(unknown, np.array([""]), np.array([-1]))
-    return ComponentObjects(
-        label,
-        iou,
-        confidence.of_objects(found, detections, see_through),
-        floor,
-        Shapes.concatenate([found.shapes, none]).ellipsoids,
-    )
+    certainty = objects_confidence(found, detections, see_through)
+    ellipsoids = quadrics.Ellipsoids.concatenate([found.shapes.ellipsoids, unknown])
+    return ComponentObjects(label, iou, certainty, floor, ellipsoids)
 
 
 def _moves(rows: Tracks, names: npt.NDArray[np.str_], moving: Collection[str]) -> BoolArray:
@@ -183,24 +175,16 @@ def find_floor(poses: Poses, fits: quadrics.ObjectFits) -> quadrics.Floor | None
 
 
 def _propose_from_untracked(
-    table: Tracks,
-    poses: Poses,
-    categories: Categories,
-    up: Array,
-    floor: quadrics.Floor | None,
+    table: Tracks, poses: Poses, categories: Categories, up: Array, floor: quadrics.Floor | None
 ) -> Shapes:
     """Propose shapes along the rays of good untracked detections: photos have many."""
-    measured = np.isin(table.frame, poses.frame[poses.measured])
-    table = table[measured & (table.tracklet_id == 0) & (table.score >= HYPOTHESIS_SCORE)]
+    good = (table.tracklet_id == 0) & (table.score >= HYPOTHESIS_SCORE)
+    table = table[good & np.isin(table.frame, poses.frame[poses.measured])]
     box = undistort_boxes(table.xyxy, poses.camera)
+    has_area = box_area(box) > 0
     row, _ = place_of(poses, table.frame)
-    cams = poses.camera.K @ poses.cam_from_world[row]
-    group = np.flatnonzero(box_area(box) > 0)
-    classes = table.class_id
-    usual_size = categories.usual_size(classes)
-    on_floor = categories.on_floor(classes)
-    best = (box[group], cams[group], group)
-    return propose_along_rays(*best, classes, usual_size, up, floor, on_floor)
+    cams = poses.camera.K @ poses.cam_from_world[row[has_area]]
+    return propose_along_rays(box[has_area], cams, table.class_id[has_area], categories, up, floor)
 
 
 def _posed_detections(table: Tracks, poses: Poses, frames: IntArray) -> PosedDetections:
@@ -315,3 +299,144 @@ def _cached_fit(
         return Shapes.concatenate([NO_SHAPES, *(cache[key] for key in keys)])
 
     return fit_shapes
+
+
+# ---- Hypotheses ----
+
+# Depths that are tried, over the depth at which a box shows an object of the usual size of its
+# class: smaller if a part is occluded (a step of a fifth is less than a chair's depth at 3 m)
+DEPTHS = np.geomspace(0.4, 1.6, 8)
+# Weight of the area of a box at the image border, to choose the best view: it may be truncated, but
+# a much larger one still shows the object better (with 1 the shapes of 25 of 38 refitted recordings
+# change, their scores within the noise)
+BORDER_WEIGHT = 0.3
+# Heights of floor-standing objects, over the usual height (without: .7 more false chairs a run of
+# the kitchen, benchmarks/RESULTS.md)
+STANDING_HEIGHTS = (0.3, 1.8)
+
+
+def propose(
+    fits: quadrics.ObjectFits,
+    views: Views,
+    classes: IntArray,
+    categories: Categories,
+    floor: quadrics.Floor | None,
+) -> Shapes:
+    """Propose shapes for groups of boxes: the fits, and several along rays of each group.
+
+    Args:
+        fits, views: of G groups. classes: (G,). floor: None if unknown.
+    """
+    good = np.isfinite(fits.ellipsoids.center_in_world[:, 0])
+    fitted = Shapes(fits.ellipsoids[good], fits.support[good], classes[good])
+    group, view = _best_views(views)
+    box = views.boxes[view, group]
+    cams = views.img_from_world[view]
+    rays = propose_along_rays(box, cams, classes[group], categories, fits.up, floor)
+    return Shapes.concatenate([fitted, rays])
+
+
+def propose_along_rays(
+    box: Array,
+    img_from_world: Array,
+    classes: IntArray,
+    categories: Categories,
+    up: Array,
+    floor: quadrics.Floor | None,
+) -> Shapes:
+    """Propose shapes at several depths along the rays of g boxes.
+
+    Args:
+        box: (g, 4) xyxy in undistorted pixels. img_from_world: (g, 3, 4) of its frame.
+        classes: (g,). floor: None if unknown.
+        up: (3,) unit; all 0: unknown, and nothing is proposed.
+    """
+    sets = [NO_SHAPES]
+    usual_size = categories.usual_size(classes)
+    stands = categories.on_floor(classes) & (floor is not None)
+    for standing in (True, False):
+        pick = np.flatnonzero((stands == standing) & bool(up.any()))
+        if len(pick):
+            boxes = (box[pick], img_from_world[pick], usual_size[pick])
+            ellipsoids, source = _along_rays(*boxes, up, floor if standing else None)
+            sets.append(Shapes(ellipsoids, np.full(len(source), "cylinder"), classes[pick[source]]))
+    return Shapes.concatenate(sets)
+
+
+def _best_views(views: Views) -> tuple[IntArray, IntArray]:
+    """Choose the largest box of each third of the views of each group.
+
+    (Three, as a tracklet may have slipped from one object to another.)
+
+    Returns:
+        groups (P,) and views (P,).
+    """
+    box = views.boxes
+    far_border = np.array(views.image_size) - 2  # px: a box this near to the border is truncated
+    whole = (box[..., :2] > 2).all(-1) & (box[..., 2:] < far_border).all(-1)
+    area = (box[..., 2:] - box[..., :2]).prod(-1) * np.where(whole, 1.0, BORDER_WEIGHT)  # (V, G)
+    seen = np.isfinite(area)
+    third = (3 * (seen.cumsum(0) - 1)) // seen.sum(0).clip(1)
+    best = [np.where(seen & (third == k), area, -1.0) for k in range(3)]
+    view = np.stack([a.argmax(0) for a in best])  # (3, G)
+    known = np.stack([a.max(0) > 0 for a in best])
+    index, group = np.nonzero(known)
+    return group, view[index, group]
+
+
+def _along_rays(
+    box: Array, img: Array, usual_size: Array, up: Array, floor: quadrics.Floor | None
+) -> tuple[quadrics.Ellipsoids, IntArray]:
+    """Place upright shapes along the rays of boxes (g, 4), in images (g, 3, 4).
+
+    One kind fills the box. The other has the usual width and extends from the top of the box down
+    to the floor, or over the usual height, as the lower part of the object may be occluded.
+
+    Returns:
+        ellipsoids; the box of each.
+    """
+    inverse = np.linalg.inv(img[:, :, :3])
+    centre = -np.einsum("gij,gj->gi", inverse, img[:, :, 3])
+    middle = (box[:, :2] + box[:, 2:]) / 2
+    focal = np.sqrt(np.abs(np.linalg.det(img[:, :, :3])))  # px, of a camera in units of the world
+    extent = (box[:, 2:] - box[:, :2]) / focal[:, None]  # (g, 2) at depth 1
+    usual = np.column_stack([np.sqrt(usual_size[:, 0] * usual_size[:, 1]), usual_size[:, 2]])
+    depth = (usual / extent).min(1)[:, None] * DEPTHS  # (g, D)
+    size = extent[:, None] * depth[..., None]  # (g, D, 2) that fills the box
+    center_depth = depth + size[..., 0] / 2
+    ray = np.einsum("gij,gj->gi", inverse, np.column_stack([middle, np.ones(len(box))]))
+    top = np.einsum("gij,gj->gi", inverse, np.column_stack([middle[:, 0], box[:, 1], focal**0]))
+    point = centre[:, None] + ray[:, None] * center_depth[..., None]  # (g, D, 3)
+    top_height = (centre[:, None] + top[:, None] * center_depth[..., None]) @ up  # (g, D)
+    narrow = np.broadcast_to(usual[:, None, 0], depth.shape)
+    if floor is None:
+        whole = np.broadcast_to(usual[:, None, 1], depth.shape)
+        kinds = [(size[..., 0], size[..., 1], point), (narrow, whole, None)]
+        good = [np.ones(depth.shape, bool), size[..., 1] < whole]
+    else:
+        # height of the point above the floor n x = d
+        lift = (point @ floor.normal - floor.offset) / (floor.normal @ up)
+        whole = top_height - (point @ up - lift)
+        low, high = (factor * usual[:, None, 1] for factor in STANDING_HEIGHTS)
+        stands = (whole > low) & (whole < high)
+        kinds = [(size[..., 0], whole, None), (narrow, whole, None)]
+        good = [stands, stands]
+    axes = _upright_axes(up)
+    shapes = []
+    source = []
+    for (width, height, center), keep in zip(kinds, good, strict=True):
+        if center is None:  # from the top downwards
+            center = point + ((top_height - height / 2) - point @ up)[..., None] * up
+        half = np.stack([width, width, height], -1)[keep] / 2
+        shapes.append((center[keep], half))
+        source.append(np.nonzero(keep)[0])
+    centers, halves = (np.concatenate(column) for column in zip(*shapes, strict=True))
+    ellipsoids = quadrics.Ellipsoids(centers, halves, np.tile(axes, (len(centers), 1, 1)))
+    return ellipsoids, np.concatenate(source)
+
+
+def _upright_axes(up: Array) -> Array:
+    """Return a rotation (3, 3) whose third column is up."""
+    first = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    first /= np.linalg.norm(first)
+    return np.column_stack([first, np.cross(up, first), up])

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -17,16 +17,20 @@ import numpy as np
 
 import quadrics
 from reobj.cameras import Poses, place_of
-from reobj.objects import confidence
-from reobj.objects.categories import name_of, on_floor
 from reobj.objects.component import associate_component, find_floor
-from reobj.objects.config import ObjectsConfig, make_fit
-from reobj.objects.description import describe_objects, describe_world
-from reobj.objects.frames import informative_frames, only_frames
-from reobj.objects.given_boxes import with_given_boxes
-from reobj.objects.observations import MIN_SCORE, Fit, Scene, gather_views, points_on
-from reobj.objects.occlusion import occluded_edges
-from reobj.objects.phases import PhasesOfFit, Reach, ignore
+from reobj.objects.config import ObjectsConfig, make_fit, with_given_boxes
+from reobj.objects.description import describe_objects, describe_world, identities_confidence
+from reobj.objects.likelihood import name_of, on_floor
+from reobj.objects.observations import (
+    MIN_SCORE,
+    Fit,
+    Scene,
+    gather_views,
+    informative_frames,
+    occluded_edges,
+    only_frames,
+    points_on,
+)
 from reobj.results.edits import Edits, apply_edits
 from reobj.results.links import ComponentShapes, Links, tracked_key
 from reobj.results.result import Object, Result
@@ -47,12 +51,7 @@ from reobj.types import (
 )
 
 
-def link_and_fit(
-    result: Result,
-    config: ObjectsConfig,
-    phases: PhasesOfFit | None = None,
-    last: Links | None = None,
-) -> Result:
+def link_and_fit(result: Result, config: ObjectsConfig, last: Links | None = None) -> Result:
     """Decide which detections belong to one object, and fit a shape to each object.
 
     An object lies in one component: an identity ends at a break of the trajectory. Only identities
@@ -61,7 +60,6 @@ def link_and_fit(
     longer find their objects are skipped with a warning.
 
     Args:
-        phases: shows the progress.
         last: links of the last result of the folder. Its identities are used again if its tracks,
             its cameras and the options of linking are the same, and keep their numbers else.
     Returns:
@@ -74,10 +72,7 @@ def link_and_fit(
     poses = result.poses
     components = _split_trajectory(poses, config, result.class_names)
 
-    def reach(component: _Component) -> Reach:
-        return ignore if phases is None else phases.of(component.number)
-
-    links = _link(result, config, reach, last)
+    links = _link(result, config, last)
     linked = links if _same(links, config, OPTIONS_OF_SHAPES) else _without_shapes(links)
     edited = _Edited(linked, result.class_names, [], None)
     if result.edits is not None:
@@ -104,7 +99,6 @@ def link_and_fit(
             edited.class_names,
             priors,
             config,
-            reach(component),
             result.video.fps,
         )
         objects += described
@@ -171,12 +165,7 @@ def _same(links: Links, config: ObjectsConfig, names: Sequence[str]) -> bool:
     return all(links.options.get(name) == options[name] for name in names)
 
 
-def _link(
-    result: Result,
-    config: ObjectsConfig,
-    reach: Callable[[_Component], Reach],
-    last: Links | None,
-) -> Links:
+def _link(result: Result, config: ObjectsConfig, last: Links | None) -> Links:
     """Return the identities of all components: those of the last result, or linked again.
 
     Without a change of the options of linking, detections are linked as in the last run: known
@@ -195,7 +184,7 @@ def _link(
     else:
         priors = linking.size_priors()
         links = _joined(
-            _link_component(component, *table, result, priors, linking, reach(component))
+            _link_component(component, *table, result, priors, linking)
             for component, table in zip(components, _split_table(result), strict=True)
         )
         links = links if last is None else links.keep_numbers_of(last)
@@ -250,20 +239,18 @@ def _link_component(
     result: Result,
     priors: quadrics.Priors,
     config: ObjectsConfig,
-    reach: Reach,
 ) -> Links:
     """Link the tracks of a component; identities are numbered from 1.
 
     Args:
         table: detections of the component. source: (N,) their rows in the result's tracks, or -1.
-        reach: reports the progress.
     """
     _, poses, fit = component
     objects = None
     if config.link and fit and poses is not None and poses.known.sum() >= config.min_views:
         moving = config.moving_classes
         objects = associate_component(
-            table, result.class_names, poses, fit, priors, moving, result.looked, reach=reach
+            table, result.class_names, poses, fit, priors, moving, result.looked
         )
     label = np.full(len(table), -1) if objects is None else objects.label
     keep = (source >= 0) | (label >= 0)
@@ -281,12 +268,11 @@ def _link_component(
         )  # fmt: skip
     else:
         tracks = tracks.with_identities(tracks.track_id)
-    reach("link", 1.0)
     certainty: dict[int, float] = {}
     label_of: dict[int, int] = {}
     if objects is not None and poses is not None:
         posed = np.isin(tracks.frame, poses.frame[poses.known])
-        certainty = confidence.of_identities(tracks, label, posed, objects.confidence)
+        certainty = identities_confidence(tracks, label, posed, objects.confidence)
         shown = label >= 0
         label_of = dict(zip(tracks.track_id[shown].tolist(), label[shown].tolist(), strict=True))
     shapes = None if objects is None else ComponentShapes(objects.floor, objects.ellipsoids)
@@ -488,14 +474,13 @@ def _fit_component(
     class_names: Sequence[str],
     priors: quadrics.Priors,
     config: ObjectsConfig,
-    reach: Reach,
     fps: float,
 ) -> tuple[list[Object], quadrics.ObjectFits | None]:
     """Fit and describe the objects of a component.
 
     Args:
-        rows: of its objects in the linked tracks. boxes_3d: of the detections. reach: reports the
-            progress. fps: frame rate of the source, Hz.
+        rows: of its objects in the linked tracks. boxes_3d: of the detections.
+        fps: frame rate of the source, Hz.
     """
     number, poses, fit = component
     tracks = linked.tracks[rows]
@@ -524,7 +509,6 @@ def _fit_component(
             occluded=occluded_edges(views, ellipsoids, standing, floor is not None),
             points=points_on(views, poses, ellipsoids),
         )
-        reach("occlusion", 1.0)
         # repeated views are more numerous than those of other sides: the fit takes new ones only
         new = np.zeros(views.boxes.shape[:2], bool)
         rows = np.flatnonzero(usable)[informative]
@@ -532,11 +516,10 @@ def _fit_component(
         views = dataclasses.replace(views, boxes=np.where(new[..., None], views.boxes, np.nan))
         fits = fit(views, categories, Scene(floor, None if floor is None else floor.normal))
         fits = with_given_boxes(fits, boxes_3d, tracks, group)
-    reach("fit", 1.0)
     described = describe_objects(
-        tracks, class_names, fits, views, config, linked.confidence, number, view_count, fps
-    )
-    reach("describe", 1.0)
+        tracks, class_names, fits, views, config.min_views, config.moving_classes,
+        linked.confidence, number, view_count, fps,
+    )  # fmt: skip
     if fits is not None and views is not None and poses is not None:
         inlier = np.zeros((int(poses.known.sum()), fits.inlier.shape[1]), bool)
         inlier[np.isin(poses.frame[poses.known], views.frame)] = fits.inlier
@@ -574,21 +557,18 @@ def join_fits(
     inlier = np.zeros((int(poses.known.sum()), len(order)), bool)
     for k, fit in made:
         inlier[np.ix_(poses.part[poses.known] == k, component_of_object == k)] = fit.inlier
-    columns: dict[str, Any] = {"inlier": inlier}
-    ellipsoids = [fit.ellipsoids for _, fit in made]
-    names = [f.name for f in dataclasses.fields(quadrics.Ellipsoids)]
-    arrays = (np.concatenate([getattr(e, name) for e in ellipsoids])[order] for name in names)
-    columns["ellipsoids"] = quadrics.Ellipsoids(*arrays)
     reasons = [reason for _, fit in made for reason in fit.reason]
-    columns["reason"] = [reasons[i] for i in order]
-    of_the_world = ("scale", "up", "up_source")  # the other columns are per object
-    for name in {f.name for f in dataclasses.fields(quadrics.ObjectFits)} - {*columns}:
-        values = [getattr(fit, name) for _, fit in made]
-        columns[name] = values[0] if name in of_the_world else np.concatenate(values)[order]
-    if fits[0] is None:  # the scale of the largest component is unknown
-        none = quadrics.Scale(1.0, np.inf, "none")
-        columns |= {"scale": none, "up": np.zeros(3), "up_source": "none"}
-    return quadrics.ObjectFits(**columns)
+    per_object = ("size", "cov", "support", "rms_px", "status", "parallax_deg", "prior_share")
+    columns: dict[str, Any] = {
+        name: np.concatenate([getattr(fit, name) for _, fit in made])[order] for name in per_object
+    }
+    return dataclasses.replace(
+        quadrics.ObjectFits.unfitted(inlier.shape, "") if fits[0] is None else fits[0],
+        ellipsoids=quadrics.Ellipsoids.concatenate([fit.ellipsoids for _, fit in made])[order],
+        inlier=inlier,
+        reason=[reasons[i] for i in order],
+        **columns,
+    )
 
 
 # ---- Interpolation -----------------------------------------------------------------------------

@@ -1,14 +1,16 @@
-"""Log odds that detections show objects: the terms of the association's objective.
+"""Log odds that detections show objects, and of sizes: the terms of the association's objective.
 
 For a detection and an object these are the log odds that the detector saw this object, against a
 detection of anything else: from the box and the object's projection, the score and the class. A box
-inside the projection may show a half-occluded object; a box that extends beyond it may not.
+inside the projection may show a half-occluded object; a box that extends beyond it may not. For an
+object they are those of its size by the prior of its category.
 
 Axes: V frames with a pose, O objects, N detections, M pairs of an object and a detection.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,10 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 import quadrics
-from reobj.objects.phases import Reach, ignore
 from reobj.types import Array, BoolArray, IntArray, box_area
 
-# Chosen on hololens_kitchen and redkitchen unless a source is given (benchmarks/RESULTS.md).
+# Measured on hololens_kitchen and redkitchen unless a source is given (benchmarks/RESULTS.md).
 EDGE_SIGMA = 0.08  # of an edge of a box, over the size of the box
 # Fraction of edges that are occluded (measured on hololens_kitchen's chairs: .29 of the upper ones,
 # .53 of the lower), and of edges that are outliers (as in quadrics.py)
@@ -92,20 +93,14 @@ class Shapes:
     @staticmethod
     def concatenate(sets: list[Shapes]) -> Shapes:
         """Concatenate sets of shapes."""
-        names = ("center_in_world", "half_axes", "world_from_obj")
-        arrays = [np.concatenate([getattr(s.ellipsoids, name) for s in sets]) for name in names]
         return Shapes(
-            quadrics.Ellipsoids(*arrays),
+            quadrics.Ellipsoids.concatenate([s.ellipsoids for s in sets]),
             np.concatenate([s.support for s in sets]),
             np.concatenate([s.class_id for s in sets]),
         )
 
 
-NO_SHAPES = Shapes(
-    quadrics.Ellipsoids(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3, 3))),
-    np.empty(0, str),
-    np.empty(0, np.int64),
-)
+NO_SHAPES = Shapes(quadrics.Ellipsoids.unknown(0), np.empty(0, str), np.empty(0, np.int64))
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,51 +120,20 @@ class Evidence:
     expected: BoolArray
 
 
-def gather_evidence(
-    shapes: Shapes,
-    detections: PosedDetections,
-    min_log_odds: float,
-    at_once: int = 500,
-    reach: Reach = ignore,
-) -> Evidence:
+def gather_evidence(shapes: Shapes, detections: PosedDetections, min_log_odds: float) -> Evidence:
     """Compare the projections of objects with the detections of all frames.
 
     Args:
         min_log_odds: pairs of a lower `assignment` are dropped.
-        at_once: objects that are projected together, to bound the memory.
-        reach: reports the progress of the hypotheses.
     """
     votes = np.bincount(detections.class_id.clip(0), detections.score) + 0.5
-    frequency: Array = np.asarray(votes, np.float64)
-    frequency /= frequency.sum()
-    starts = range(0, max(len(shapes), 1), at_once)
-    batches = list[Evidence]()
-    for done, k in enumerate(starts):
-        batches.append(_gather(shapes[k : k + at_once], detections, frequency, min_log_odds))
-        reach("hypotheses", (done + 0.8) / len(starts))  # the selection follows
-    return Evidence(
-        np.concatenate([batch.obj + k for k, batch in zip(starts, batches, strict=True)]),
-        np.concatenate([batch.row for batch in batches]),
-        np.concatenate([batch.existence for batch in batches]),
-        np.concatenate([batch.assignment for batch in batches]),
-        np.concatenate([batch.expected for batch in batches], 1),
-    )
-
-
-def _gather(
-    shapes: Shapes, detections: PosedDetections, frequency: Array, min_log_odds: float
-) -> Evidence:
-    """Gather the evidence of some objects.
-
-    Args:
-        frequency: of the classes in all detections.
-    """
+    frequency = votes / votes.sum()  # of the classes in all detections
     size = detections.image_size
     score_log_odds = logit(detections.score)
     starts = detections.start_of_view
     expected = np.zeros((len(detections.img_from_world), len(shapes)), bool)
-    found: list[tuple[IntArray, IntArray, Array, Array]] = []
-    chunk = 64  # frames whose pairs are compared together, to bound the memory
+    found = [(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0), np.empty(0))]
+    chunk = 1 + 30_000 // (1 + len(shapes))  # frames that are compared together, bounds the memory
     for first in range(0, len(expected), chunk):
         cams = detections.img_from_world[first : first + chunk]
         whole = quadrics.solid_boxes(shapes.ellipsoids, list(shapes.support), cams)  # (v, O, 4)
@@ -184,12 +148,10 @@ def _gather(
             pairs.append((shown[i], starts[first + v] + j))
         obj, row = (np.concatenate(column) for column in zip(*pairs, strict=True))
         box = _box_log_odds(clipped[detections.view[row] - first, obj], detections.box[row], size)
-        obj_class = shapes.class_id[obj]
         row_class = detections.class_id[row]
-        class_log_odds = np.log(
-            CLASS_KEPT * (obj_class == row_class) / frequency[row_class.clip(0)] + 1 - CLASS_KEPT
-        )
-        rest = score_log_odds[row] + class_log_odds
+        same_class = shapes.class_id[obj] == row_class
+        rest = score_log_odds[row]
+        rest += np.log(CLASS_KEPT * same_class / frequency[row_class.clip(0)] + 1 - CLASS_KEPT)
         rest += _depth_log_odds(
             *_depth_span(shapes.ellipsoids[obj], detections.img_from_world[detections.view[row]]),
             detections.depths[row],
@@ -239,7 +201,7 @@ def logit(score: Array) -> Array:
 def _overlapping(a: Array, b: Array) -> BoolArray:
     """Mark pairs (A, B) of boxes whose overlap is more than a quarter of the smaller one.
 
-    (The least overlap saves the time of comparing the others; chosen.)
+    (The least overlap saves the time of comparing the others.)
     """
     (ax, ay, ax2, ay2), (bx, by, bx2, by2) = a.T[..., None], b.T  # (A, 1), (B,) each
     width = np.minimum(ax2, bx2) - np.maximum(ax, bx)  # (A, B)
@@ -266,3 +228,66 @@ def _box_log_odds(projected: Array, box: Array, image_size: tuple[int, int]) -> 
     clutter /= np.float32(CLUTTER_LOG_SIZES**2)
     edges = density[0, 0] * density[0, 1] * density[1, 0] * density[1, 1]
     return np.asarray(np.log(edges / clutter), np.float64)
+
+
+# ---- Sizes ----
+
+SIZE_SIGMAS = 6.0  # limit on the deviation of a size: a class may be wrong (3 and 12 are alike)
+
+
+def name_of(class_names: Sequence[str], class_id: int) -> str:
+    """Return the name of a class, "object" if it has none."""
+    return class_names[class_id] if 0 <= class_id < len(class_names) else "object"
+
+
+def on_floor(priors: quadrics.Priors, names: list[str]) -> BoolArray:
+    """Mark the categories (G,) that stand on the floor."""
+    return np.asarray(_with_unknown(priors.on_floor, False)[priors.index(names)], bool)
+
+
+@dataclass(frozen=True, slots=True)
+class Categories:
+    """Size priors of the classes of a detector, in units of the world.
+
+    Attributes:
+        names: of the classes, and "" at the end. scale: metres per unit.
+    """
+
+    priors: quadrics.Priors
+    names: npt.NDArray[np.str_]
+    scale: quadrics.Scale
+
+    def rows(self, classes: IntArray) -> IntArray:
+        """Return the rows (G,) of classes in the priors, -1 unknown."""
+        return self.priors.index(self._names_of(classes))
+
+    def usual_size(self, classes: IntArray) -> Array:
+        """Return width, depth and height (G, 3)."""
+        unknown = np.log(quadrics.UNKNOWN_SIZE.mean_m)
+        log_size = _with_unknown(self.priors.log_mean, unknown)[self.rows(classes)]
+        return np.asarray(np.exp(log_size) / self.scale.value)
+
+    def on_floor(self, classes: IntArray) -> BoolArray:
+        """Mark the classes (G,) that stand on the floor."""
+        return on_floor(self.priors, self._names_of(classes))
+
+    def size_log_odds(self, shapes: Shapes) -> Array:
+        """Return the log odds (O,) of the sizes, 0 at the usual size, rotated by 90 deg or not."""
+        rows = self.rows(shapes.class_id)
+        no_scale = quadrics.UNKNOWN_SCALE_LOG
+        sigma = no_scale if self.scale.source == "none" else self.scale.rel_sigma
+        unknown = no_scale**2 * np.eye(3)
+        cov = _with_unknown(self.priors.log_cov, unknown)[rows] + sigma**2
+        size = np.log(2 * shapes.ellipsoids.half_axes)
+        off = size[:, [[0, 1, 2], [1, 0, 2]]] - np.log(self.usual_size(shapes.class_id))[:, None]
+        square = np.einsum("ski,sij,skj->sk", off, np.linalg.inv(cov), off).min(1)  # (O,)
+        return np.asarray(-0.5 * np.nan_to_num(square, nan=np.inf).clip(max=SIZE_SIGMAS**2))
+
+    def _names_of(self, classes: IntArray) -> list[str]:
+        names: list[str] = self.names[classes.clip(-1, len(self.names) - 1)].tolist()
+        return names
+
+
+def _with_unknown(column: npt.NDArray[Any], unknown: Any) -> npt.NDArray[Any]:
+    """Append the row of categories without priors (index -1) to a column of the priors."""
+    return np.concatenate([column, np.broadcast_to(unknown, (1, *column.shape[1:]))])

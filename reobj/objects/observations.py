@@ -1,11 +1,13 @@
 """Input of the fit: boxes of groups of tracks in frames with a pose, and sparse points on them.
 
 The caller decides which rows form a group: tracklet fragments before the association, identities
-after it.
+after it. Of a long video the frames with new evidence are used (`informative_frames`). Edges of
+boxes at which an occluder hides the object are one-sided (`occluded_edges`).
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -14,7 +16,7 @@ import numpy as np
 from scipy import sparse
 
 import quadrics
-from reobj.cameras import Poses, place_of, undistort_boxes
+from reobj.cameras import Poses, invert_rigid, place_of, undistort_boxes, viewing_rays
 from reobj.types import Array, BoolArray, IntArray, Tracks, rows_by
 from reobj.visible_points import VisiblePoints, points_in_boxes
 
@@ -89,7 +91,7 @@ def gather_views(
 # Least fraction of the views that observe a point in which it is inside the box: boxes are cut off
 # where the object is occluded (.95 is alike: benchmarks/LOG.md)
 INSIDE_FRACTION = 0.8
-MIN_POINTS = 5  # per object (chosen: fewer may all belong to another object)
+MIN_POINTS = 5  # per object: fewer may all belong to another object
 
 
 def points_on(
@@ -153,3 +155,250 @@ def _points_inside_most_boxes(views: Views, poses: Poses) -> tuple[IntArray, Int
 def _count_pairs(pairs: IntArray, shape: tuple[int, int]) -> sparse.csr_array:
     """Count pairs (2, K) of rows and columns."""
     return sparse.csr_array((np.ones(len(pairs[0]), np.int64), tuple(pairs)), shape)
+
+
+# ---- Frames of a long video ----
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameOptions:
+    """How many frames of a video are informative.
+
+    Attributes:
+        all_of: videos of at most this number of frames are used whole; of longer ones at least it.
+        same_direction_deg: viewing rays of an object within this angle see it from one side.
+        identity_frames: least number of chosen frames of each identity of the tracker, so that an
+            object that is seen briefly has enough views.
+        longest_step: frames from one chosen frame to the next: where nothing is detected, missing
+            detections are evidence too.
+    """
+
+    all_of: int = 600
+    same_direction_deg: float = 1.0
+    identity_frames: int = 10
+    longest_step: int = 30
+
+
+def informative_frames(
+    tracks: Tracks, poses: Poses, frames: IntArray, options: FrameOptions | None = None
+) -> tuple[IntArray, BoolArray]:
+    """Choose frames with new viewing directions and new identities, in the order of time.
+
+    Detections of nearly equal views repeat their errors: an object is detected, missed or occluded
+    in the same way. Objects of a long video are therefore associated on frames that differ in their
+    view of the objects; the detections of the other frames are assigned to the objects found.
+
+    A frame is chosen if at least half of the identities detected in it were not seen from their
+    direction in any frame chosen before, or if one of them has too few chosen frames. If these are
+    few, further frames are chosen at even steps.
+
+    Args:
+        tracks: N rows with identities of the tracker, by frame. poses: of one component.
+        frames: (F,) numbers to choose from, ascending, with a pose and a detector output.
+    Returns:
+        (K,) the chosen numbers, ascending; (N,) rows in them that show an identity from a new
+        direction, or one that has too few chosen frames. If all frames are chosen, these are all
+        rows of the frames.
+    """
+    options = options or FrameOptions()
+    in_frames = np.flatnonzero(np.isin(tracks.frame, frames))
+    informative = np.zeros(len(tracks), bool)
+    if len(frames) <= options.all_of:
+        informative[in_frames] = True
+        return frames, informative
+    tracks = tracks[in_frames]
+    row, _ = place_of(poses, tracks.frame)
+    img_from_world = (poses.camera.K @ poses.cam_from_world)[row]
+    ray = viewing_rays(undistort_boxes(tracks.xyxy, poses.camera), img_from_world)
+    identity = np.unique(tracks.track_id, return_inverse=True)[1]
+    start = np.searchsorted(tracks.frame, frames)
+    end = np.searchsorted(tracks.frame, frames, side="right")
+    same = np.cos(np.radians(options.same_direction_deg))
+    seen = np.full((int(identity.max(initial=-1)) + 1, 16, 3), np.nan)  # chosen rays of identities
+    count = np.zeros(len(seen), np.int64)
+    chosen = np.zeros(len(frames), bool)
+    last = -options.longest_step
+    for k in range(len(frames)):
+        rows = slice(start[k], end[k])
+        ids = identity[rows]
+        new = ~(np.einsum("nkj,nj->nk", seen[ids], ray[rows]) > same).any(1)
+        few = count[ids] < options.identity_frames
+        if 2 * new.sum() <= len(ids) and not few.any() and k - last < options.longest_step:
+            continue
+        chosen[k] = True
+        last = k
+        if count[ids].max(initial=0) == seen.shape[1]:
+            seen = np.concatenate([seen, np.full_like(seen, np.nan)], 1)
+        seen[ids, count[ids]] = ray[rows]
+        count[ids] += 1
+        informative[in_frames[rows]] = new | few
+    others = np.flatnonzero(~chosen)
+    missing = max(options.all_of - int(chosen.sum()), 0)
+    chosen[others[np.linspace(0, len(others) - 1, missing).round().astype(np.int64)]] = True
+    return frames[chosen], informative
+
+
+def only_frames(poses: Poses, frames: IntArray) -> Poses:
+    """Remove the poses of all other frames."""
+    other = ~np.isin(poses.frame, frames)[:, None, None]
+    return dataclasses.replace(poses, cam_from_world=np.where(other, np.nan, poses.cam_from_world))
+
+
+# ---- Occlusion ----
+
+# Offsets from the edge, over the size of the box: outside, where an occluder must be, and inside,
+# where none may be: the outline of the occluder is not known better
+BESIDE_EDGE = (0.1, -0.2)
+# Fraction of its height that a box may end above the lower edge of its object and still show all of
+# it (on hololens_kitchen .05 to .2 are alike)
+ABOVE_FLOOR = 0.1
+
+
+def occluded_edges(
+    views: Views, ellipsoids: quadrics.Ellipsoids, standing: BoolArray, floor_known: bool = True
+) -> BoolArray:
+    """Mark box edges where the object is occluded rather than ends.
+
+    Args:
+        ellipsoids: of the G groups of the views, NaN where unknown: they occlude nothing.
+        standing: (G,) of a category that stands on the floor. floor_known: where it is.
+    Returns:
+        (V, G, 4) left, upper, right and lower edge.
+    """
+    projected = quadrics.solid_boxes(ellipsoids, "box", views.img_from_world)
+    above = edges_above_floor(views.boxes, quadrics.clip_boxes(projected, views.image_size))
+    above &= (standing & floor_known)[:, None]
+    return _occluded_by_nearer(views, ellipsoids, standing) | above
+
+
+def edges_above_floor(boxes: Array, projected: Array) -> BoolArray:
+    """Mark the unreliable edges of boxes (..., 4) that end above the floor.
+
+    The lower part of a floor-standing object is occluded then. It may be the wider one: of a chair
+    at a table only the back is visible.
+
+    Args:
+        projected: (..., 4) boxes of the projected objects, which extend down to the floor.
+    Returns:
+        (..., 4) left, upper, right and lower edge.
+    """
+    height = projected[..., 3] - projected[..., 1]
+    above = boxes[..., 3] < projected[..., 3] - ABOVE_FLOOR * height
+    return np.asarray(above[..., None] & np.array([True, False, True, True]), bool)
+
+
+def _occluded_by_nearer(
+    views: Views, ellipsoids: quadrics.Ellipsoids, standing: BoolArray
+) -> BoolArray:
+    """Mark box edges (V, G, 4) with a nearer object just outside and none just inside.
+
+    A nearer object is there if it covers half of the points beside the edge or more. One that is
+    behind the object at the points inside supports it, and hides nothing, unless the object stands
+    on the floor.
+    """
+    occluded = np.zeros(views.boxes.shape, bool)
+    known = np.isfinite(ellipsoids.half_axes.sum(1) + ellipsoids.center_in_world.sum(1))
+    seen = np.isfinite(views.boxes.sum(2)) & known  # (V, G)
+    column = np.cumsum(known) - 1  # (G,) number among the S known shapes
+    shapes = ellipsoids[known]
+    outline = quadrics.solid_boxes(shapes, "box", views.img_from_world)  # (V, S, 4)
+    for v in np.flatnonzero(seen.any(1)):
+        camera = views.img_from_world[v]  # (D,)
+        groups = np.flatnonzero(seen[v])
+        points = _beside_edges(views.boxes[v, groups])  # (2, D, 4, P, 2)
+        aside = (outline[v, :, :2] > points.max((0, 1, 2, 3))).any(1)
+        aside |= (outline[v, :, 2:] < points.min((0, 1, 2, 3))).any(1)
+        candidates = np.flatnonzero(~aside)  # (N,) shapes that some of the rays may hit
+        depth = shapes.center_in_world @ camera[2, :3] + camera[2, 3]  # (S,)
+        entry = entry_depths(points.reshape(-1, 2), camera, shapes[candidates])
+        entry = entry.reshape(*points.shape[:4], -1)  # (2, D, 4, P, N)
+        itself = candidates == column[groups, None]  # (D, N)
+        entry = np.where(itself[:, None, None], np.inf, entry)
+        outside, inside = entry < depth[column[groups], None, None, None]  # (D, 4, P, N)
+        supports = np.isfinite(entry[1]) & ~inside & ~standing[groups, None, None, None]
+        outside &= ~supports
+        covered = [hit.any(3).mean(2) >= 0.5 for hit in (outside, inside)]  # (D, 4)
+        occluded[v, groups] = covered[0] & ~covered[1]
+    return occluded
+
+
+def _beside_edges(box: Array) -> Array:
+    """Return points (2, D, 4, P, 2) along the edges of boxes (D, 4), for each `BESIDE_EDGE`."""
+    low = box[:, None, :2]  # (D, 1, 2)
+    high = box[:, None, 2:]
+    point = (np.arange(8) + 0.5) / 8  # (P,) of the length of an edge; more take more time
+    along = low + (high - low) * point[:, None]  # (D, P, 2)
+    found = []
+    for beyond in BESIDE_EDGE:
+        off = beyond * (high - low)
+        first, last = (np.broadcast_to(edge, along.shape) for edge in (low - off, high + off))
+        sides = [(first, along), (along, first), (last, along), (along, last)]
+        found.append(np.stack([np.stack([x[..., 0], y[..., 1]], -1) for x, y in sides], 1))
+    return np.stack(found)
+
+
+def entry_depths(points: Array, camera: Array, boxes: quadrics.Ellipsoids) -> Array:
+    """Return the depths (K, S) where rays of image points (K, 2) enter boxes; inf: no hit."""
+    inverse = np.linalg.inv(camera[:, :3])
+    ray = np.column_stack([points, np.ones(len(points))]) @ inverse.T  # (K, 3), of depth 1
+    start = -inverse @ camera[:, 3] - boxes.center_in_world  # (S, 3)
+    start = np.einsum("sij,si->sj", boxes.world_from_obj, start)
+    ray = np.einsum("sij,ki->ksj", boxes.world_from_obj, ray)  # (K, S, 3)
+    faces = np.stack([-boxes.half_axes - start, boxes.half_axes - start]).transpose(0, 2, 1)
+    ray = np.ascontiguousarray(ray.transpose(2, 0, 1))  # (3, K, S): short axes first are fast
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = faces[:, :, None] / ray  # (2, 3, K, S)
+    enter = ends.min(0).max(0)  # (K, S)
+    leave = ends.max(0).min(0)
+    return np.where((enter < leave) & (leave > 0), np.maximum(enter, 0), np.inf)
+
+
+# Largest distance of a ray from the centre, over the half axes (larger: more points, but also rays
+# beside an object that fills its ellipsoid poorly)
+MIDDLE = 0.6
+# Least distance behind the object, over that from the camera (smaller: errors of depth count)
+BEHIND = 0.05
+# Ratio of points behind to points on an object that exists (measured: chairs, tables 1.8)
+HOLES = 2.0
+PRIOR_POINTS = 10.0  # added to both counts: few points are no evidence (5 and 10 are alike)
+
+
+def see_through_ratio(
+    ellipsoids: quadrics.Ellipsoids,
+    expected: BoolArray,
+    poses: Poses,
+    frame: IntArray,
+    most_points: int = 500,
+) -> Array:
+    """Measure how many sparse points are seen behind objects, compared with on or before them.
+
+    Args:
+        ellipsoids: O. expected: (V, O) frames in which the objects should be visible.
+        poses: with points and their visibility. frame: (V,) numbers.
+        most_points: of a frame that are tested; more take more time.
+    Returns:
+        (O,) log ratio of points behind to the others on rays through the middle, at least 0.
+    """
+    visible = VisiblePoints(poses)
+    row, _ = place_of(poses, frame)
+    camera = invert_rigid(poses.cam_from_world[row])[:, :, 3]  # (V, 3)
+    behind, others = np.zeros((2, expected.shape[1]))
+    for v in np.flatnonzero(expected.any(1)):
+        points = visible.observed(row[v])
+        if not len(points):
+            continue
+        objects = np.flatnonzero(expected[v])
+        ray = poses.points[points[:: len(points) // most_points + 1]] - camera[v]  # (N, 3)
+        scaled = ellipsoids.world_from_obj[objects] / ellipsoids.half_axes[objects][:, None]
+        start = np.einsum("si,sij->sj", camera[v] - ellipsoids.center_in_world[objects], scaled)
+        along = np.einsum("ni,sij->nsj", ray, scaled)  # in units of the half axes: unit spheres
+        a = (along**2).sum(2)  # (N, S)
+        b = (along * start).sum(2)
+        square = (start**2).sum(1)
+        root = np.sqrt((b**2 - a * (square - 1)).clip(0))
+        leave = (root - b) / a  # the point is at 1
+        middle = (square - b**2 / a < MIDDLE**2) & (leave > 0)
+        passes = leave < 1 - BEHIND
+        behind[objects] += (middle & passes).sum(0)
+        others[objects] += (middle & ~passes).sum(0)
+    return np.log((behind + PRIOR_POINTS) / (HOLES * others + PRIOR_POINTS)).clip(0)

@@ -3,7 +3,7 @@
 Cells are separated by commas, semicolons, tabs or spaces; a comma that is no separator may be the
 decimal point. A row of Boxer's CSV, which WildDet3D writes too, is a box in the world of the
 supplied cameras, seen in the frame of its time stamp. Its projection is a detection like any other;
-the boxes themselves are measurements of the objects' shapes (`objects.given_boxes`).
+the boxes themselves are measurements of the objects' shapes (`objects.config`).
 
 Ref: github.com/facebookresearch/boxer, utils/file_io.py (`ObbCsvWriter2`): z up, full extents,
 quaternions w first.

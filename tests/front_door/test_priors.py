@@ -43,9 +43,9 @@ def overlap(fits: q.ObjectFits, truth: q.Ellipsoids) -> float:
     return float(syn.box_overlap(fits.ellipsoids, truth).mean())
 
 
-@pytest.mark.parametrize("scale", [0.4, 0.63, 1.0, 1.6, 2.5])
+@pytest.mark.parametrize("scale", [0.4, 1.0, 2.5])
 @pytest.mark.parametrize("on_side", [False, True])
-@pytest.mark.parametrize("category", ["chair", "couch", "book"])
+@pytest.mark.parametrize("category", ["chair", "book"])
 def test_a_wrong_size_does_not_override_the_boxes(
     category: str, on_side: bool, scale: float
 ) -> None:
