@@ -9,12 +9,11 @@ COLMAP).
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import dataclasses
 import functools
 import signal
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,39 +26,17 @@ from reobj.files import atomic, load_npz, save_npz
 from reobj.types import Array, BoolArray, IntArray, ReobjError, as_numbers, counted
 
 
-@contextlib.contextmanager
-def _signals_kept() -> Iterator[None]:
-    """Restore the process's signal handlers after a package that is loaded here installed its own.
-
-    By the C library, because Python sets handlers in the main thread only. The stored struct
-    sigaction (152 bytes on Linux) is not interpreted.
-    """
-    if sys.platform == "win32":
-        yield
-        return
-    libc = ctypes.CDLL(None)
-    before = {}
-    for name in ("SIGTERM", "SIGSEGV", "SIGABRT", "SIGBUS", "SIGFPE", "SIGILL"):  # glog's
-        before[int(signal.Signals[name])] = ctypes.create_string_buffer(1024)
-    for number, action in before.items():
-        libc.sigaction(number, None, action)
-    try:
-        yield
-    finally:
-        for number, action in before.items():
-            libc.sigaction(number, action, None)
-
-
 def import_pycolmap() -> Any:
-    """Import pycolmap on demand, without its log on stderr and its signal handlers.
+    """Import pycolmap on demand, without its log on stderr and its handler of SIGTERM.
 
-    The handlers would print a C++ trace when a process is ended (SIGTERM), also in forked ones.
+    The handler would print a C++ trace when a process is ended.
     """
     if "pycolmap" not in sys.modules:
-        with _signals_kept():
-            import pycolmap
+        import pycolmap
 
         pycolmap.logging.minloglevel = 3
+        with contextlib.suppress(ValueError):  # handlers are set in the main thread only
+            signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
     import pycolmap  # waits for another thread that imports it
 
     return pycolmap
@@ -125,10 +102,8 @@ class Camera:
         if self.model == "PINHOLE":
             pixels[front] = ahead[:, :2] / ahead[:, 2:] @ self.K[:2, :2].T + self.K[:2, 2]
         elif len(front):
-            radius = np.hypot(*ahead[:, :2].T) / (1 + 1e-9)  # rounding at the fold
-            inside = radius <= self.fold_radius * ahead[:, 2]
             found = np.asarray(self.to_pycolmap().img_from_cam(ahead), np.float64)
-            pixels[front] = np.where(inside[:, None], found, np.nan)
+            pixels[front] = np.where(self._within_fold(ahead)[:, None], found, np.nan)
         return pixels.reshape(*np.shape(in_cam)[:-1], 2)
 
     def distort(self, xy: Array) -> Array:
@@ -157,27 +132,26 @@ class Camera:
             ideal[rows[inverted]] = ray[:, :2] / ray[:, 2:] @ self.K[:2, :2].T + self.K[:2, 2]
         return ideal.reshape(np.shape(xy))
 
+    def _within_fold(self, in_cam: Array) -> BoolArray:
+        """Test whether points (..., 3) in front of the camera lie within `fold_radius`."""
+        radius = np.hypot(in_cam[..., 0], in_cam[..., 1]) / (1 + 1e-9)  # rounding at the fold
+        return np.asarray(radius <= self.fold_radius * in_cam[..., 2], bool)
+
     def clip_segments(self, ends: Array) -> Array:
-        """Clip segments (n, 2, 3) in front of the camera to `fold_radius`; NaN: all is beyond."""
-        radius = self.fold_radius
-        if not np.isfinite(radius):
-            return ends
-        start = ends[:, 0]
-        way = ends[:, 1] - start
-        cone = np.array([1, 1, -(radius**2)])  # |xy|^2 - r^2 z^2 = 0 on the cone of rays
-        a = way**2 @ cone  # at start + t way: a t^2 + 2 b t + c
-        b = start * way @ cone
-        c = start**2 @ cone
-        q = -b - np.copysign(np.sqrt((b**2 - a * c).clip(0)), b)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            t = np.stack([0 * a, q / a, c / q, 0 * a + 1], 1)  # (n, 4)
-        t = np.sort(np.nan_to_num(t).clip(0, 1), 1)
-        middle = start[:, None] + ((t[:, :-1] + t[:, 1:]) / 2)[..., None] * way[:, None]
-        inside = (middle**2 @ cone <= 0) & (t[:, :-1] < t[:, 1:])  # (n, 3): neighbours if several
-        first = np.where(inside, t[:, :-1], np.inf).min(1)
-        last = np.where(inside, t[:, 1:], -np.inf).max(1)
-        kept = np.where(inside.any(1), [first, last], np.nan).T  # (n, 2)
-        return np.asarray(start[:, None] + kept[..., None] * way[:, None])
+        """Clip segments (n, 2, 3) in front of the camera to `fold_radius`; NaN: all is beyond.
+
+        To 1/512 of their length. The rays within the fold are a convex cone, so that one part of a
+        segment is left, and all of it if both ends are within.
+        """
+        cut = np.flatnonzero(~self._within_fold(ends).all(1))
+        share = np.linspace(0, 1, 513)[:, None]
+        line = ends[cut, :1] + share * (ends[cut, 1:] - ends[cut, :1])  # (c, 513, 3)
+        shown = self._within_fold(line)
+        kept = np.stack([shown.argmax(1), 512 - shown[:, ::-1].argmax(1)], 1)  # (c, 2)
+        clipped = ends.copy()
+        clipped[cut] = np.take_along_axis(line, kept[..., None], 1)
+        clipped[cut[~shown.any(1)]] = np.nan
+        return clipped
 
     def to_pycolmap(self) -> Any:
         """Convert to a `pycolmap.Camera` with id 1.
@@ -261,8 +235,7 @@ def checked_pose(
     if points is not None and (np.shape(points)[1:] != (3,) or not np.isfinite(points).all()):
         raise ReobjError(f"points of shape {np.shape(points)}, expected (N, 3), finite, in world")
     if not isinstance(part, int | np.integer) or not 0 <= part <= 1000:  # an hour's walk has a few
-        raise ReobjError(f"part {part!r}, expected the number of a component of the trajectory, "
-                         "from 0")  # fmt: skip
+        raise ReobjError(f"part {part!r}, expected the number of a component, from 0")
     if cam_from_world is None:
         return None
     pose = as_numbers(cam_from_world, "cam_from_world").astype(np.float64)
@@ -270,18 +243,13 @@ def checked_pose(
         raise ReobjError(f"cam_from_world of shape {pose.shape}, expected (3, 4): [R | t]")
     if np.isnan(pose).any():
         return None
-    offset = pose[:, 3]
-    rotation = pose[:, :3]
-    tolerance = 1e-3  # of R R' from the identity; float32 poses of devices are at 1e-6
-    if (np.abs(offset) > WORLD_MAX).any() or (np.abs(rotation) > 1 + tolerance).any():
-        raise ReobjError(f"cam_from_world {pose.tolist()}: values too large for a pose; expected "
-                         "[R | t]")  # fmt: skip
-    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    rotation = pose[:, :3].clip(-2, 2)  # the squares of 1e300 are too large
     determinant = np.linalg.det(rotation)
-    if error > tolerance or determinant < 0:
-        raise ReobjError("cam_from_world: the 3x3 block is not a rotation (orthogonality error "
-                         f"{error:.2g}, determinant {determinant:.2g}); expected [R | t], x right, "
-                         "y down, z forward")  # fmt: skip
+    is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=1e-3)
+    if not is_rotation or determinant < 0 or (np.abs(pose[:, 3]) > WORLD_MAX).any():
+        raise ReobjError("cam_from_world: its 3x3 block is not a rotation (determinant "
+                         f"{determinant:.2g}), or it is more than {WORLD_MAX:g} units away; "
+                         "expected [R | t], x right, y down, z forward")  # fmt: skip
     if not isinstance(camera, Camera):
         raise ReobjError("cam_from_world without a camera: give camera=rt.Camera(...) as well")
     if not usable(camera):
@@ -421,40 +389,25 @@ def without_copies(poses: Poses, copies: Mapping[int, int]) -> Poses:
     )
 
 
+_ARRAYS = ("frame", "time_s", "cam_from_world", "status", "points", "colors", "visibility", "part")
+_FACTS = ("source", "metric", "messages", "reading", "scale", "map_id")
+
+
 def save_poses(path: Path, poses: Poses, **more: Any) -> None:
     """Write poses as npz, atomically; `more` goes into its metadata."""
-    facts = more | {
-        "camera": dataclasses.asdict(poses.camera),
-        "source": poses.source,
-        "metric": poses.metric,
-        "up": None if poses.up_in_world is None else poses.up_in_world.tolist(),
-        "messages": poses.messages,
-        "reading": poses.reading,
-        "scale": poses.scale,
-        "map_id": poses.map_id,
-    }
-    names = (
-        "frame", "time_s", "cam_from_world", "status", "points", "colors", "visibility", "part"
-    )  # fmt: skip
-    save_npz(path, {name: getattr(poses, name) for name in names}, **facts)
+    facts = {name: getattr(poses, name) for name in _FACTS}
+    up = None if poses.up_in_world is None else poses.up_in_world.tolist()
+    arrays = {name: getattr(poses, name) for name in _ARRAYS}
+    save_npz(path, arrays, camera=dataclasses.asdict(poses.camera), up=up, **facts, **more)
 
 
 def load_poses(path: Path) -> Poses:
     """Read a file of `save_poses`."""
     arrays, facts = load_npz(path, sealed=True)
+    lists = {k: tuple(v) if isinstance(v, list) else v for k, v in facts.items() if k in _FACTS}
     camera = Camera(**facts["camera"] | {"params": tuple(facts["camera"]["params"])})
     up = None if facts["up"] is None else np.array(facts["up"])
-    return Poses(
-        camera=camera,
-        source=facts["source"],
-        metric=facts["metric"],
-        up_in_world=up,
-        messages=tuple(facts["messages"]),
-        reading=facts.get("reading", ""),
-        scale=None if facts.get("scale") is None else tuple(facts["scale"]),
-        map_id=facts.get("map_id", ""),
-        **arrays,
-    )
+    return Poses(camera, up_in_world=up, **lists, **arrays)
 
 
 def invert_rigid(b_from_a: Array) -> Array:
@@ -512,13 +465,10 @@ def distort_boxes(xyxy: Array, camera: Camera) -> Array:
     bounds = np.full_like(boxes, np.nan)
     rows = np.flatnonzero(np.isfinite(boxes).all(1))
     for count in (5, 33):  # points along a side: more where the fold cuts the box
-        cut = np.zeros(len(rows), bool)
-        for block in np.array_split(np.arange(len(rows)), len(rows) // 1024 + 1):  # memory
-            grid = _distorted_grid(boxes[rows[block]], camera, count)
-            cut[block] = np.isnan(grid).any((1, 2))
-            bounds[rows[block], :2] = np.nan_to_num(grid, nan=np.inf).min(1)
-            bounds[rows[block], 2:] = np.nan_to_num(grid, nan=-np.inf).max(1)
-        rows = rows[cut]
+        grid = _distorted_grid(boxes[rows], camera, count)
+        bounds[rows, :2] = np.nan_to_num(grid, nan=np.inf).min(1)
+        bounds[rows, 2:] = np.nan_to_num(grid, nan=-np.inf).max(1)
+        rows = rows[np.isnan(grid).any((1, 2))]
     bounds[~(bounds[:, :2] < bounds[:, 2:]).all(1)] = np.nan
     return bounds.reshape(xyxy.shape)
 
