@@ -9,6 +9,7 @@ from simulated import SIZE, chair_solids, walk
 
 import quadrics
 import reobj_track as rt
+from reobj.cameras import VisiblePoints
 from reobj.tracking.ellipsoid_map import (
     EllipsoidMap,
     depth_intervals,
@@ -20,7 +21,6 @@ from reobj.tracking.ellipsoid_map import (
     usual_size,
 )
 from reobj.types import box_iou, xyxy_from_cxcywh
-from reobj.visible_points import VisiblePoints
 
 
 def unit(rng: np.random.Generator, n: int, dim: int = 64) -> np.ndarray:

@@ -9,13 +9,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import quadrics
-from reobj.cameras import Poses, invert_rigid, undistort_boxes
+from reobj.cameras import Poses, VisiblePoints, invert_rigid, undistort_boxes
 from reobj.maps.compare import Visibility
 from reobj.maps.fusion import ObjectState
 from reobj.objects.occlusion import entry_depths
 from reobj.results.result import Object
 from reobj.types import Array, BoolArray, IntArray, Tracks
-from reobj.visible_points import VisiblePoints
 
 # IoU of a detection with a projection: that a view of a place without the object has one above it
 # by accident has these probabilities. (On 18 recordings with the shapes of their objects shifted by

@@ -14,9 +14,8 @@ import numpy as np
 from scipy import sparse
 
 import quadrics
-from reobj.cameras import Poses, place_of, undistort_boxes
+from reobj.cameras import Poses, VisiblePoints, place_of, points_in_boxes, undistort_boxes
 from reobj.types import Array, BoolArray, IntArray, Tracks, rows_by
-from reobj.visible_points import VisiblePoints, points_in_boxes
 
 # Boxes below this score, and interpolated boxes, do not enter the last fit (of the weakest boxes 1
 # in 25 is real)

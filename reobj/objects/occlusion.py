@@ -12,10 +12,9 @@ from __future__ import annotations
 import numpy as np
 
 import quadrics
-from reobj.cameras import Poses, invert_rigid, place_of
+from reobj.cameras import Poses, VisiblePoints, invert_rigid, place_of
 from reobj.objects.observations import Views
 from reobj.types import Array, BoolArray, IntArray
-from reobj.visible_points import VisiblePoints
 
 # Offsets from the edge, over the size of the box: outside, where an occluder must be, and inside,
 # where none may be (chosen: the outline of the occluder is not known better)

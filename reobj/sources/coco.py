@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from reobj.files import load_json, shortened
-from reobj.frame_lookup import frames_by_name
+from reobj.formats import frames_by_name
 from reobj.sources.image_frames import frames_of_names, frames_of_numbers, original_name
 from reobj.sources.masks import NO_RUNS, Counts, coco_runs, polygon_runs
 from reobj.sources.recorded import CORNERS, SIZES, RecordedDetections, Source

@@ -1,6 +1,6 @@
 """Map names and numbers in files of detections to the frames of a video: one rule for all formats.
 
-Names are matched to those of the source's images (`frame_lookup`). If none matches, the number in a
+Names are matched to those of the source's images (`formats.frames_by_name`). If none matches, the number in a
 name is that of an image, or of a frame. A number 0, or one that only counting from 1 places in the
 video, decides where frames begin; else the convention of the format; else it is an error.
 """
@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from reobj.files import shortened
-from reobj.frame_lookup import frames_by_name
+from reobj.formats import frames_by_name
 from reobj.sources.recorded import Source
 from reobj.types import IntArray, ReobjError
 

@@ -17,14 +17,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from reobj.cameras import Camera, Poses, invert_rigid
+from reobj.cameras import Camera, Poses, VisiblePoints, invert_rigid
 from reobj.files import load_json
 from reobj.poses.intrinsics import camera_of_keys
 from reobj.poses.supplied.frame_assignment import rows_by_time
 from reobj.poses.supplied.pose_formats import scannet_camera
 from reobj.sources.image_files import read_image
 from reobj.types import Array, BoolArray, Floats, IntArray, ReobjError, log
-from reobj.visible_points import VisiblePoints
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from reobj.cameras import invert_rigid
-from reobj.frame_lookup import frames_by_name
+from reobj.formats import frames_by_name
 from reobj.poses.supplied.pose_formats import PoseFile
 from reobj.sources.image_files import TimeUnit, is_date
 from reobj.types import Array, BoolArray, IntArray, ReobjError, nearest_of

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from reobj.frame_lookup import frames_by_name
+from reobj.formats import frames_by_name
 from reobj.poses.estimate import PosesConfig
 from reobj.poses.intrinsics import stated_camera
 from reobj.poses.supplied.frame_assignment import (
