@@ -141,8 +141,7 @@ from reobj.poses.stage import (
     supplied_poses,
     write_supplied_model,
 )
-from reobj.poses.supplied.imageless import open_video
-from reobj.poses.supplied.readers import read_poses
+from reobj.poses.supplied.readers import open_video, read_poses
 from reobj.results.changes import Change, Changes, read_changes
 from reobj.results.checkpoint import Checkpoint
 from reobj.results.edits import kept_edits, read_edits

@@ -601,6 +601,12 @@ def read_sparse_model(folder: Path) -> SparseModel:
     model = import_pycolmap().Reconstruction(str(folder))
     images = [model.image(i) for i in sorted(model.reg_image_ids())]
     points = sorted(model.points3D.items())
+    for point_id, point in points:
+        if not (np.abs(point.xyz) < WORLD_MAX).all():  # also NaN
+            raise ReobjError(
+                f"{folder}: point {point_id} is not finite, or more than {WORLD_MAX:g} units away "
+                "from the origin; remove it"
+            )
     row = {point_id: r for r, (point_id, _) in enumerate(points)}
     seen = [
         (r, row[p.point3D_id], *p.xy)

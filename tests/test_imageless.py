@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 import quadrics
 import reobj_track as rt
 from reobj.cameras import invert_rigid, write_colmap
-from reobj.poses.supplied.imageless import open_video
+from reobj.poses.supplied.readers import open_video
 
 SHARED = Path(os.environ.get("REOBJ_SHARED", Path(rt.__file__).resolve().parent.parent / "shared"))
 SIZE, FRAMES = (320, 240), 24

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 import reobj_track as rt
 from reobj.cameras import import_pycolmap, invert_rigid, write_colmap, write_tum
-from reobj.poses.supplied import colmap_model
+from reobj.poses.supplied import pose_formats as colmap_model
 
 CAMERA = f"{FOCAL},{FOCAL},320,240"
 K = [[FOCAL, 0, 320], [0, FOCAL, 240], [0, 0, 1]]
