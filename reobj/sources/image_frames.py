@@ -1,8 +1,8 @@
 """Map names and numbers in files of detections to the frames of a video: one rule for all formats.
 
 Names are matched to those of the source's images (`frames_by_name`). If none matches, the number in
-a name is that of an image, or of a frame. A number 0, or one that only counting from 1 places in the
-video, decides where frames begin; else the convention of the format; else it is an error.
+a name is that of an image, or of a frame. A number 0, or one that only counting from 1 places in
+the video, decides where frames begin; else the convention of the format; else it is an error.
 """
 
 from __future__ import annotations
