@@ -19,7 +19,14 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from reobj.cameras import CV_FROM_GL, WORLD_MAX, Camera, invert_rigid, read_sparse_model
+from reobj.cameras import (
+    CV_FROM_GL,
+    WORLD_MAX,
+    Camera,
+    import_pycolmap,
+    invert_rigid,
+    read_sparse_model,
+)
 from reobj.files import MEMORY_MAX, check_unpacked, load_json, read_lines
 from reobj.poses.intrinsics import (
     brown_camera,
@@ -581,6 +588,12 @@ def _read_text_model(folder: Path) -> PoseFile:
     cameras = {words[0]: colmap_camera(words[1:]) for words in camera_rows}
     images, where = _image_rows(folder / "images.txt")
     numbers = np.array([words[1:8] for words in images], np.float64)
+    length = np.linalg.norm(numbers[:, :4], axis=1)
+    fault = "the quaternion is not of length 1"
+    raise_where(~(np.abs(length - 1) <= POSE_TOLERANCE), where, fault)  # also NaN
+    turn_of = import_pycolmap().Rotation3d  # with its rounding
+    turns = [turn_of(xyzw).matrix() for xyzw in numbers[:, [1, 2, 3, 0]]]
+    cam_from_world = np.concatenate([turns, numbers[:, 4:, None]], 2)
     row_of = {words[0]: row for row, words in enumerate(images)}
     path = folder / "points3D.txt"
     rows, _ = _lines_of(path) if path.is_file() else ([], [])
@@ -590,12 +603,12 @@ def _read_text_model(folder: Path) -> PoseFile:
     raise_where(far, [f"{path}: point {words[0]}" for words in rows], FAR_POINT)
     seen = [(row_of[i], p) for p, words in enumerate(rows) for i in words[8::2] if i in row_of]
     return PoseFile(
-        from_quaternions(numbers, [4, 5, 6, 1, 2, 3, 0], where),
+        checked_rigid(homogeneous(cam_from_world), where),
         tuple(cameras[words[8]] for words in images),
         tuple(words[9].strip() for words in images),
         points=points,
         colors=np.array([words[4:7] for words in rows], np.uint8).reshape(-1, 3),
-        visibility=np.array(seen, np.int64).reshape(-1, 2),
+        visibility=np.array(sorted(seen), np.int64).reshape(-1, 2),
     )
 
 
