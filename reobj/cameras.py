@@ -596,17 +596,21 @@ class SparseModel:
     obs_xy: Array
 
 
+def checked_points(xyz: Sequence[Any], ids: Sequence[Any], where: Path) -> Array:
+    """Return points (N, 3) of a model; refuse one that is not finite, or far away, by its id."""
+    points = np.array(xyz, np.float64).reshape(-1, 3)
+    far = ~(np.abs(points) < WORLD_MAX).all(1)  # also NaN
+    if far.any():
+        raise ReobjError(f"{where}: point {ids[int(far.argmax())]} is not finite, or more than "
+                         f"{WORLD_MAX:g} units away from the origin; remove it")  # fmt: skip
+    return points
+
+
 def read_sparse_model(folder: Path) -> SparseModel:
     """Read a COLMAP model, binary or text, with pycolmap."""
     model = import_pycolmap().Reconstruction(str(folder))
     images = [model.image(i) for i in sorted(model.reg_image_ids())]
     points = sorted(model.points3D.items())
-    for point_id, point in points:
-        if not (np.abs(point.xyz) < WORLD_MAX).all():  # also NaN
-            raise ReobjError(
-                f"{folder}: point {point_id} is not finite, or more than {WORLD_MAX:g} units away "
-                "from the origin; remove it"
-            )
     row = {point_id: r for r, (point_id, _) in enumerate(points)}
     seen = [
         (r, row[p.point3D_id], *p.xy)
@@ -623,7 +627,7 @@ def read_sparse_model(folder: Path) -> SparseModel:
         names=tuple(image.name for image in images),
         cameras=[cameras[image.camera_id] for image in images],
         cam_from_world=np.array(poses).reshape(-1, 3, 4),
-        points=np.array([point.xyz for _, point in points]).reshape(-1, 3),
+        points=checked_points([point.xyz for _, point in points], list(row), folder),
         colors=np.array([point.color for _, point in points], np.uint8).reshape(-1, 3),
         track_length=np.array([point.track.length() for _, point in points], np.int64),
         obs_image=table[:, 0].astype(np.int64),

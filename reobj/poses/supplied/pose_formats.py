@@ -23,6 +23,7 @@ from reobj.cameras import (
     CV_FROM_GL,
     WORLD_MAX,
     Camera,
+    checked_points,
     import_pycolmap,
     invert_rigid,
     read_sparse_model,
@@ -519,7 +520,6 @@ def read_splatting(path: Path, size: tuple[int, int]) -> PoseFile:
 
 # ---- COLMAP models -------------------------------------------------------------------------------
 
-FAR_POINT = f"is not finite, or more than {WORLD_MAX:g} units away from the origin; remove it"
 UPRIGHT = "upright.txt"  # file in our models: their cameras are those of upright photos
 
 
@@ -598,15 +598,12 @@ def _read_text_model(folder: Path) -> PoseFile:
     path = folder / "points3D.txt"
     rows, _ = _lines_of(path) if path.is_file() else ([], [])
     rows.sort(key=lambda words: int(words[0]))
-    points = np.array([words[1:4] for words in rows], np.float64).reshape(-1, 3)
-    far = ~(np.abs(points) < WORLD_MAX).all(1)  # also NaN
-    raise_where(far, [f"{path}: point {words[0]}" for words in rows], FAR_POINT)
     seen = [(row_of[i], p) for p, words in enumerate(rows) for i in words[8::2] if i in row_of]
     return PoseFile(
         checked_rigid(homogeneous(cam_from_world), where),
         tuple(cameras[words[8]] for words in images),
         tuple(words[9].strip() for words in images),
-        points=points,
+        points=checked_points([w[1:4] for w in rows], [w[0] for w in rows], path),
         colors=np.array([words[4:7] for words in rows], np.uint8).reshape(-1, 3),
         visibility=np.array(sorted(seen), np.int64).reshape(-1, 2),
     )
