@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import reobj_track as rt
-from reobj.appearance.sampling import (
+from reobj.appearance.embedding import (
     inside_object,
     occupancy_map,
     pool_cells,
