@@ -404,10 +404,11 @@ def save_poses(path: Path, poses: Poses, **more: Any) -> None:
 def load_poses(path: Path) -> Poses:
     """Read a file of `save_poses`."""
     arrays, facts = load_npz(path, sealed=True)
-    lists = {k: tuple(v) if isinstance(v, list) else v for k, v in facts.items() if k in _FACTS}
+    given: dict[str, Any] = {k: facts[k] for k in _FACTS if k in facts}
+    given |= {k: tuple(v) for k, v in given.items() if isinstance(v, list)}
     camera = Camera(**facts["camera"] | {"params": tuple(facts["camera"]["params"])})
     up = None if facts["up"] is None else np.array(facts["up"])
-    return Poses(camera, up_in_world=up, **lists, **arrays)
+    return Poses(camera, up_in_world=up, **given, **arrays)
 
 
 def invert_rigid(b_from_a: Array) -> Array:

@@ -128,8 +128,8 @@ def test_a_convention_is_named_by_images_alone(
     ]
     facts = {"fl_x": 290, "cx": 160, "cy": 120, "w": 320, "h": 240, "frames": frames}
     (tmp_path / "transforms.json").write_text(json.dumps(facts))
-    words = ["poses", str(source), "-o", str(tmp_path / "out"), "--poses",
-             str(tmp_path / "transforms.json")]  # fmt: skip
+    words = ["poses", str(source), "-o", str(tmp_path / "out"), "--set", "poses.size_px=160",
+             "--poses", str(tmp_path / "transforms.json")]  # fmt: skip
     assert rt.main(words) == (2 if named else 0)
     error = capsys.readouterr().err
     assert named in error
@@ -157,7 +157,7 @@ def test_rows_in_the_order_of_the_names_as_text_are_named(tmp_path: Path, capsys
     path = tmp_path / "traj.txt"
     np.savetxt(path, world_from_cam()[order].reshape(-1, 16))
     words = ["poses", str(source), "-o", str(tmp_path / "out"), "--poses", str(path),
-             "--camera", LINE]  # fmt: skip
+             "--camera", LINE, "--set", "poses.size_px=160"]  # fmt: skip
     assert rt.main(words) == 2
     assert "--set poses.frames_by=text" in capsys.readouterr().err
     poses = rt.read_poses(path, rt.Video(source), camera=LINE, frames_by="text")
@@ -243,19 +243,19 @@ def test_photos_of_several_orientations_and_mirrored_ones(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("orientation", [3, 6])
-@pytest.mark.parametrize("given", ["out", "copy"])
-def test_our_own_output_is_read_back(tmp_path: Path, orientation: int, given: str) -> None:
+def test_our_own_output_is_read_back(tmp_path: Path, orientation: int) -> None:
     """Photos turned by EXIF: our model has upright cameras, which are not turned again."""
     source, path = turned_photos(tmp_path, [orientation] * FRAMES)
     size = (240, 320) if orientation > 4 else (320, 240)
     line = f"1 PINHOLE {size[0]} {size[1]} 290 290 {size[0] / 2} {size[1] / 2}"
     (path / "cameras.txt").write_text(f"{line}\n")
     words = ["poses", str(source), "-o", str(tmp_path / "out"), "--poses", str(path)]
-    assert rt.main(words) == 0
+    assert rt.main([*words, "--set", "poses.size_px=160"]) == 0
     shutil.copytree(tmp_path / "out" / "sparse", tmp_path / "copy")
-    poses = rt.read_poses(tmp_path / given, rt.Video(source))
-    assert_right(poses, ALL)
-    assert poses.camera == CAMERA and not poses.metric
+    for given in ("out", "copy"):
+        poses = rt.read_poses(tmp_path / given, rt.Video(source))
+        assert_right(poses, ALL)
+        assert poses.camera == CAMERA and not poses.metric
 
 
 # ---- Other tools ---------------------------------------------------------------------------------

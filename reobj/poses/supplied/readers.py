@@ -369,12 +369,17 @@ def _is_colmap(probe: Probe) -> bool:
     )
 
 
-def _has(probe: Probe, name: str, *keys: str) -> bool:
-    """Test for a folder with a file, or a JSON file whose (first) object has these keys."""
-    if probe.is_dir or not isinstance(probe.json, dict | list):
-        return name in probe.names
-    first = next(iter(probe.json.values() if isinstance(probe.json, dict) else probe.json), None)
-    return any(isinstance(one, dict) and {*keys} <= one.keys() for one in (probe.json, first))
+def _has(name: str, *keys: str) -> Callable[[Probe], bool]:
+    """Make a test for a folder with a file, or a JSON file whose (first) object has these keys."""
+
+    def test(probe: Probe) -> bool:
+        data = probe.json if not probe.is_dir else None
+        if not isinstance(data, dict | list):
+            return name in probe.names
+        first = next(iter(data.values() if isinstance(data, dict) else data), None)
+        return any(isinstance(one, dict) and {*keys} <= one.keys() for one in (data, first))
+
+    return test
 
 
 ReadPoses = Callable[[Path, tuple[int, int]], PoseFile]
@@ -396,13 +401,13 @@ POSES: Registry[ReadPoses] = Registry("poses", "--pose-format", [
     Format("matrices", "KITTI (12), Replica, NICE-SLAM (16): rows of matrices, row-major",
            lambda p: len(_head(p)[1]) in (12, 16), formats.read_matrices, ORDER, UNSTATED, GIVE),
     Format("transforms", "nerfstudio, instant-ngp, NeRF synthetic: `transforms.json`, OpenGL axes; "
-           "`applied_transform` is undone", lambda p: _has(p, "transforms.json", "frames"),
+           "`applied_transform` is undone", _has("transforms.json", "frames"),
            formats.read_transforms, NAME, UNKNOWN, "`applied_scale`"),
     Format("scannet", "ScanNet: folder `pose/N.txt`, z up; 7-Scenes: `*.pose.txt`",
            lambda p: p.is_dir and bool(formats.scannet_files(p.path)), formats.read_scannet, NAME,
            METRES, "7-Scenes: no intrinsics"),
     Format("scannetpp", "ScanNet++ (iPhone): `pose_intrinsic_imu.json`, `aligned_pose` (z up) or "
-           "`pose`", lambda p: _has(p, "pose_intrinsic_imu.json", "intrinsic"),
+           "`pose`", _has("pose_intrinsic_imu.json", "intrinsic"),
            formats.read_scannetpp, NAME, METRES, "IMU"),
     Format("arkitscenes", "ARKitScenes: `.traj`, axis-angle of cam_from_world; `.pincam` beside it",
            lambda p: any(name.endswith(".traj") for name in (*p.names, p.path.name)),
@@ -411,7 +416,7 @@ POSES: Registry[ReadPoses] = Registry("poses", "--pose-format", [
            "axes, y up", lambda p: p.is_dir and bool(formats.arkit_files(p.path)),
            formats.read_arkit, NAME, METRES),
     Format("record3d", "Record3D: `metadata`, its folder, or `.r3d`; OpenGL axes, y up",
-           lambda p: p.suffix == ".r3d" or _has(p, "metadata", "poses", "K"),
+           lambda p: p.suffix == ".r3d" or _has("metadata", "poses", "K")(p),
            formats.read_record3d, ORDER, METRES),
     Format("stray", "Stray Scanner: `odometry.csv` with `camera_matrix.csv`, y up; its `rgb.mp4`",
            lambda p: "odometry.csv" in {*p.names, p.path.name}, formats.read_stray, "number",
@@ -420,9 +425,9 @@ POSES: Registry[ReadPoses] = Registry("poses", "--pose-format", [
            lambda p: p.suffix == ".npy" or "poses_bounds.npy" in p.names, formats.read_llff,
            "order of the names as text: 1, 10, 2", UNKNOWN, "depth bounds"),
     Format("splatting", "3D Gaussian splatting: `cameras.json`",
-           lambda p: _has(p, "cameras.json", "img_name", "position"), formats.read_splatting, NAME,
+           _has("cameras.json", "img_name", "position"), formats.read_splatting, NAME,
            UNKNOWN),
-    *(Format("", title, lambda p, name=name, keys=keys: _has(p, name, *keys), None,
+    *(Format("", title, _has(name, *keys), None,
              advice=f"write a COLMAP model with {tool}") for title, name, keys, tool in (
         ("OpenSfM's reconstruction.json", "reconstruction.json", ["shots"],
          "`opensfm export_colmap`"),
