@@ -66,6 +66,7 @@ from reobj.appearance.embedding import (
     EmbedConfig,
     Embedder,
     LazyEmbeddings,
+    SamplingLayout,
     as_embeddings,
     fused_rows,
 )
@@ -75,7 +76,6 @@ from reobj.appearance.reid import (
     match_probability,
     part_cosines,
 )  # fmt: skip
-from reobj.appearance.sampling import SamplingLayout
 from reobj.cameras import Camera, Poses, checked_pose, viewing_rays, without_copies
 from reobj.commands import (
     SafeFormatter,
@@ -133,8 +133,7 @@ from reobj.poses.stage import (
     supplied_poses,
     write_supplied_model,
 )
-from reobj.poses.supplied.imageless import open_video
-from reobj.poses.supplied.readers import read_poses
+from reobj.poses.supplied.readers import open_video, read_poses
 from reobj.results.changes import Change, Changes, read_changes
 from reobj.results.edits import kept_edits, read_edits
 from reobj.results.entries import OutputFile
@@ -173,7 +172,6 @@ from reobj.sources.video import InputConfig, Video, in_batches
 from reobj.sources.weights import list_models, model_path
 from reobj.state import restore_state, state_arrays
 from reobj.tracking.assignment import Pairs, ambiguous_pairs, assign, touching
-from reobj.tracking.box_noise import STD_POSITION, STD_START, STD_VELOCITY
 from reobj.tracking.camera_motion import CameraMotion
 from reobj.tracking.ellipsoid_map import (
     EXPECTED_IN_VIEW,
@@ -183,6 +181,7 @@ from reobj.tracking.ellipsoid_map import (
     iou_within_uncertainty,
     rows_of,
 )  # fmt: skip
+from reobj.tracking.interpolation import STD_POSITION, STD_START, STD_VELOCITY
 from reobj.types import (
     COCO_NAMES,
     NOTE,
@@ -322,7 +321,7 @@ class Config:
 # ---- Kalman filter -----------------------------------------------------------------------------
 
 # Noise is relative to the box, as in DeepSORT: its mean side for x and y, its own side for w and h
-# (a measurement has `STD_POSITION` of `reobj.tracking.box_noise` at score .8).
+# (a measurement has `STD_POSITION` of `reobj.tracking.interpolation` at score .8).
 SCORE_NOISE = 0.25  # it grows with (1 - score) to this power (StrongSORT: 1)
 
 

@@ -53,14 +53,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import quadrics
 import reobj_track as rt
-from reobj.cameras import place_of, undistort_boxes
+from reobj.cameras import place_of, points_in_boxes, undistort_boxes
 from reobj.objects.fit import link_and_fit
 from reobj.options import read_config
 from reobj.results.entries import OutputFile
 from reobj.results.result import Object, Result
 from reobj.results.workspace import Workspace
 from reobj.types import Array, BoolArray, Embeddings, IntArray, ReobjError, Tracks
-from reobj.visible_points import points_in_boxes
 
 INNER = 0.6  # share of a box's width and height
 MIN_POINTS, MAX_BOXES = 5, 40

@@ -50,7 +50,7 @@ sys.path[:0] = [str(Path(__file__).resolve().parent), str(Path(__file__).resolve
 import render_room as rr  # noqa: E402
 
 import reobj_track as rt  # noqa: E402
-from reobj.appearance.sampling import PartSamples, occupancy_map, sample_parts  # noqa: E402
+from reobj.appearance.embedding import PartSamples, occupancy_map, sample_parts  # noqa: E402
 from reobj.sources.recorded import RecordedDetections, read_npz  # noqa: E402
 from reobj.types import Array, Image, IntArray, box_iou  # noqa: E402
 
@@ -692,7 +692,7 @@ def principal(weight: Any, rows: Any) -> None:
 
 def pooled(flat: Any, samples: Sequence[PartSamples], cells_a_map: int) -> list[Any]:
     """Pool cells (N, cells, C + 2) of all foregrounds and backgrounds, as
-    `reobj.appearance.sampling.pool_cells` does; flat: all maps' cells, one map after the other.
+    `reobj.appearance.embedding.pool_cells` does; flat: all maps' cells, one map after the other.
     """
     index = np.concatenate([s.index + i * cells_a_map for i, s in enumerate(samples)])
     weight = np.concatenate([s.weight for s in samples]).astype(np.float32)  # (cells, S)

@@ -3,18 +3,17 @@
 Conventions: `cam_from_world` maps world points into the camera (x right, y down, z forward, as in
 OpenCV and COLMAP); pixels are COLMAP's: the centre of the first pixel is (0.5, 0.5).
 `reobj.poses` estimates and reads poses; this module holds their types and writers (npz, TUM,
-COLMAP).
+COLMAP), and the index of the sparse points that a frame sees.
 """
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import dataclasses
 import functools
 import signal
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,39 +26,17 @@ from reobj.files import atomic, load_npz, save_npz
 from reobj.types import Array, BoolArray, IntArray, ReobjError, as_numbers, counted
 
 
-@contextlib.contextmanager
-def _signals_kept() -> Iterator[None]:
-    """Restore the process's signal handlers after a package that is loaded here installed its own.
-
-    By the C library, because Python sets handlers in the main thread only. The stored struct
-    sigaction (152 bytes on Linux) is not interpreted.
-    """
-    if sys.platform == "win32":
-        yield
-        return
-    libc = ctypes.CDLL(None)
-    before = {}
-    for name in ("SIGTERM", "SIGSEGV", "SIGABRT", "SIGBUS", "SIGFPE", "SIGILL"):  # glog's
-        before[int(signal.Signals[name])] = ctypes.create_string_buffer(1024)
-    for number, action in before.items():
-        libc.sigaction(number, None, action)
-    try:
-        yield
-    finally:
-        for number, action in before.items():
-            libc.sigaction(number, action, None)
-
-
 def import_pycolmap() -> Any:
-    """Import pycolmap on demand, without its log on stderr and its signal handlers.
+    """Import pycolmap on demand, without its log on stderr and its handler of SIGTERM.
 
-    The handlers would print a C++ trace when a process is ended (SIGTERM), also in forked ones.
+    The handler would print a C++ trace when a process is ended.
     """
     if "pycolmap" not in sys.modules:
-        with _signals_kept():
-            import pycolmap
+        import pycolmap
 
         pycolmap.logging.minloglevel = 3
+        with contextlib.suppress(ValueError):  # handlers are set in the main thread only
+            signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
     import pycolmap  # waits for another thread that imports it
 
     return pycolmap
@@ -125,10 +102,8 @@ class Camera:
         if self.model == "PINHOLE":
             pixels[front] = ahead[:, :2] / ahead[:, 2:] @ self.K[:2, :2].T + self.K[:2, 2]
         elif len(front):
-            radius = np.hypot(*ahead[:, :2].T) / (1 + 1e-9)  # rounding at the fold
-            inside = radius <= self.fold_radius * ahead[:, 2]
             found = np.asarray(self.to_pycolmap().img_from_cam(ahead), np.float64)
-            pixels[front] = np.where(inside[:, None], found, np.nan)
+            pixels[front] = np.where(self._within_fold(ahead)[:, None], found, np.nan)
         return pixels.reshape(*np.shape(in_cam)[:-1], 2)
 
     def distort(self, xy: Array) -> Array:
@@ -157,27 +132,26 @@ class Camera:
             ideal[rows[inverted]] = ray[:, :2] / ray[:, 2:] @ self.K[:2, :2].T + self.K[:2, 2]
         return ideal.reshape(np.shape(xy))
 
+    def _within_fold(self, in_cam: Array) -> BoolArray:
+        """Test whether points (..., 3) in front of the camera lie within `fold_radius`."""
+        radius = np.hypot(in_cam[..., 0], in_cam[..., 1]) / (1 + 1e-9)  # rounding at the fold
+        return np.asarray(radius <= self.fold_radius * in_cam[..., 2], bool)
+
     def clip_segments(self, ends: Array) -> Array:
-        """Clip segments (n, 2, 3) in front of the camera to `fold_radius`; NaN: all is beyond."""
-        radius = self.fold_radius
-        if not np.isfinite(radius):
-            return ends
-        start = ends[:, 0]
-        way = ends[:, 1] - start
-        cone = np.array([1, 1, -(radius**2)])  # |xy|^2 - r^2 z^2 = 0 on the cone of rays
-        a = way**2 @ cone  # at start + t way: a t^2 + 2 b t + c
-        b = start * way @ cone
-        c = start**2 @ cone
-        q = -b - np.copysign(np.sqrt((b**2 - a * c).clip(0)), b)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            t = np.stack([0 * a, q / a, c / q, 0 * a + 1], 1)  # (n, 4)
-        t = np.sort(np.nan_to_num(t).clip(0, 1), 1)
-        middle = start[:, None] + ((t[:, :-1] + t[:, 1:]) / 2)[..., None] * way[:, None]
-        inside = (middle**2 @ cone <= 0) & (t[:, :-1] < t[:, 1:])  # (n, 3): neighbours if several
-        first = np.where(inside, t[:, :-1], np.inf).min(1)
-        last = np.where(inside, t[:, 1:], -np.inf).max(1)
-        kept = np.where(inside.any(1), [first, last], np.nan).T  # (n, 2)
-        return np.asarray(start[:, None] + kept[..., None] * way[:, None])
+        """Clip segments (n, 2, 3) in front of the camera to `fold_radius`; NaN: all is beyond.
+
+        To 1/512 of their length. The rays within the fold are a convex cone, so that one part of a
+        segment is left, and all of it if both ends are within.
+        """
+        cut = np.flatnonzero(~self._within_fold(ends).all(1))
+        share = np.linspace(0, 1, 513)[:, None]
+        line = ends[cut, :1] + share * (ends[cut, 1:] - ends[cut, :1])  # (c, 513, 3)
+        shown = self._within_fold(line)
+        kept = np.stack([shown.argmax(1), 512 - shown[:, ::-1].argmax(1)], 1)  # (c, 2)
+        clipped = ends.copy()
+        clipped[cut] = np.take_along_axis(line, kept[..., None], 1)
+        clipped[cut[~shown.any(1)]] = np.nan
+        return clipped
 
     def to_pycolmap(self) -> Any:
         """Convert to a `pycolmap.Camera` with id 1.
@@ -261,8 +235,7 @@ def checked_pose(
     if points is not None and (np.shape(points)[1:] != (3,) or not np.isfinite(points).all()):
         raise ReobjError(f"points of shape {np.shape(points)}, expected (N, 3), finite, in world")
     if not isinstance(part, int | np.integer) or not 0 <= part <= 1000:  # an hour's walk has a few
-        raise ReobjError(f"part {part!r}, expected the number of a component of the trajectory, "
-                         "from 0")  # fmt: skip
+        raise ReobjError(f"part {part!r}, expected the number of a component, from 0")
     if cam_from_world is None:
         return None
     pose = as_numbers(cam_from_world, "cam_from_world").astype(np.float64)
@@ -270,18 +243,13 @@ def checked_pose(
         raise ReobjError(f"cam_from_world of shape {pose.shape}, expected (3, 4): [R | t]")
     if np.isnan(pose).any():
         return None
-    offset = pose[:, 3]
-    rotation = pose[:, :3]
-    tolerance = 1e-3  # of R R' from the identity; float32 poses of devices are at 1e-6
-    if (np.abs(offset) > WORLD_MAX).any() or (np.abs(rotation) > 1 + tolerance).any():
-        raise ReobjError(f"cam_from_world {pose.tolist()}: values too large for a pose; expected "
-                         "[R | t]")  # fmt: skip
-    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    rotation = pose[:, :3].clip(-2, 2)  # the squares of 1e300 are too large
     determinant = np.linalg.det(rotation)
-    if error > tolerance or determinant < 0:
-        raise ReobjError("cam_from_world: the 3x3 block is not a rotation (orthogonality error "
-                         f"{error:.2g}, determinant {determinant:.2g}); expected [R | t], x right, "
-                         "y down, z forward")  # fmt: skip
+    is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=1e-3)
+    if not is_rotation or determinant < 0 or (np.abs(pose[:, 3]) > WORLD_MAX).any():
+        raise ReobjError("cam_from_world: its 3x3 block is not a rotation (determinant "
+                         f"{determinant:.2g}), or it is more than {WORLD_MAX:g} units away; "
+                         "expected [R | t], x right, y down, z forward")  # fmt: skip
     if not isinstance(camera, Camera):
         raise ReobjError("cam_from_world without a camera: give camera=rt.Camera(...) as well")
     if not usable(camera):
@@ -421,40 +389,26 @@ def without_copies(poses: Poses, copies: Mapping[int, int]) -> Poses:
     )
 
 
+_ARRAYS = ("frame", "time_s", "cam_from_world", "status", "points", "colors", "visibility", "part")
+_FACTS = ("source", "metric", "messages", "reading", "scale", "map_id")
+
+
 def save_poses(path: Path, poses: Poses, **more: Any) -> None:
     """Write poses as npz, atomically; `more` goes into its metadata."""
-    facts = more | {
-        "camera": dataclasses.asdict(poses.camera),
-        "source": poses.source,
-        "metric": poses.metric,
-        "up": None if poses.up_in_world is None else poses.up_in_world.tolist(),
-        "messages": poses.messages,
-        "reading": poses.reading,
-        "scale": poses.scale,
-        "map_id": poses.map_id,
-    }
-    names = (
-        "frame", "time_s", "cam_from_world", "status", "points", "colors", "visibility", "part"
-    )  # fmt: skip
-    save_npz(path, {name: getattr(poses, name) for name in names}, **facts)
+    facts = {name: getattr(poses, name) for name in _FACTS}
+    up = None if poses.up_in_world is None else poses.up_in_world.tolist()
+    arrays = {name: getattr(poses, name) for name in _ARRAYS}
+    save_npz(path, arrays, camera=dataclasses.asdict(poses.camera), up=up, **facts, **more)
 
 
 def load_poses(path: Path) -> Poses:
     """Read a file of `save_poses`."""
     arrays, facts = load_npz(path, sealed=True)
+    given: dict[str, Any] = {k: facts[k] for k in _FACTS if k in facts}
+    given |= {k: tuple(v) for k, v in given.items() if isinstance(v, list)}
     camera = Camera(**facts["camera"] | {"params": tuple(facts["camera"]["params"])})
     up = None if facts["up"] is None else np.array(facts["up"])
-    return Poses(
-        camera=camera,
-        source=facts["source"],
-        metric=facts["metric"],
-        up_in_world=up,
-        messages=tuple(facts["messages"]),
-        reading=facts.get("reading", ""),
-        scale=None if facts.get("scale") is None else tuple(facts["scale"]),
-        map_id=facts.get("map_id", ""),
-        **arrays,
-    )
+    return Poses(camera, up_in_world=up, **given, **arrays)
 
 
 def invert_rigid(b_from_a: Array) -> Array:
@@ -512,13 +466,10 @@ def distort_boxes(xyxy: Array, camera: Camera) -> Array:
     bounds = np.full_like(boxes, np.nan)
     rows = np.flatnonzero(np.isfinite(boxes).all(1))
     for count in (5, 33):  # points along a side: more where the fold cuts the box
-        cut = np.zeros(len(rows), bool)
-        for block in np.array_split(np.arange(len(rows)), len(rows) // 1024 + 1):  # memory
-            grid = _distorted_grid(boxes[rows[block]], camera, count)
-            cut[block] = np.isnan(grid).any((1, 2))
-            bounds[rows[block], :2] = np.nan_to_num(grid, nan=np.inf).min(1)
-            bounds[rows[block], 2:] = np.nan_to_num(grid, nan=-np.inf).max(1)
-        rows = rows[cut]
+        grid = _distorted_grid(boxes[rows], camera, count)
+        bounds[rows, :2] = np.nan_to_num(grid, nan=np.inf).min(1)
+        bounds[rows, 2:] = np.nan_to_num(grid, nan=-np.inf).max(1)
+        rows = rows[np.isnan(grid).any((1, 2))]
     bounds[~(bounds[:, :2] < bounds[:, 2:]).all(1)] = np.nan
     return bounds.reshape(xyxy.shape)
 
@@ -646,6 +597,16 @@ class SparseModel:
     obs_xy: Array
 
 
+def checked_points(xyz: Sequence[Any], ids: Sequence[Any], where: Path) -> Array:
+    """Return points (N, 3) of a model; refuse one that is not finite, or far away, by its id."""
+    points = np.array(xyz, np.float64).reshape(-1, 3)
+    far = ~(np.abs(points) < WORLD_MAX).all(1)  # also NaN
+    if far.any():
+        raise ReobjError(f"{where}: point {ids[int(far.argmax())]} is not finite, or more than "
+                         f"{WORLD_MAX:g} units away from the origin; remove it")  # fmt: skip
+    return points
+
+
 def read_sparse_model(folder: Path) -> SparseModel:
     """Read a COLMAP model, binary or text, with pycolmap."""
     model = import_pycolmap().Reconstruction(str(folder))
@@ -667,10 +628,95 @@ def read_sparse_model(folder: Path) -> SparseModel:
         names=tuple(image.name for image in images),
         cameras=[cameras[image.camera_id] for image in images],
         cam_from_world=np.array(poses).reshape(-1, 3, 4),
-        points=np.array([point.xyz for _, point in points]).reshape(-1, 3),
+        points=checked_points([point.xyz for _, point in points], list(row), folder),
         colors=np.array([point.color for _, point in points], np.uint8).reshape(-1, 3),
         track_length=np.array([point.track.length() for _, point in points], np.int64),
         obs_image=table[:, 0].astype(np.int64),
         obs_point=table[:, 1].astype(np.int64),
         obs_xy=table[:, 2:],
     )
+
+
+# ---- Sparse points that a frame sees -----------------------------------------------------------
+
+
+class VisiblePoints:
+    """Index of the sparse points that each frame sees.
+
+    A frame without observations of its own (between two keyframes, or without a depth map) is
+    assumed to see what the nearest observing frames before and after it, of its component of the
+    trajectory, observed. Occlusion is not tested: such a point may lie behind a nearer object.
+    """
+
+    def __init__(self, poses: Poses) -> None:
+        self.poses = poses
+        observer, self._point = np.unique(poses.visibility, axis=0).T  # (M,) rows each
+        self._start = np.searchsorted(observer, np.arange(len(poses.frame) + 1))
+        self._observers = np.flatnonzero(np.diff(self._start))  # frames with observations
+        self._img_from_world = poses.camera.K @ poses.cam_from_world  # (F, 3, 4)
+
+    def observed(self, row: int) -> IntArray:
+        """Return the points that the frame in this row of the poses observed itself."""
+        return np.asarray(self._point[self._start[row] : self._start[row + 1]], np.int64)
+
+    def nearby(self, row: int) -> IntArray:
+        """Return the points that a frame observed, else those of its neighbours, ascending.
+
+        Neighbours' points may project outside the image of this frame (see `in_frame`).
+        """
+        if len(observed := self.observed(row)):
+            return observed
+        same_component = self.poses.part[self._observers] == self.poses.part[row]
+        observers = self._observers[same_component]
+        after = np.searchsorted(observers, row)
+        sets = [self.observed(other) for other in observers[max(after - 1, 0) : after + 1]]
+        return np.unique(np.concatenate([np.empty(0, np.int64), *sets]))
+
+    def in_frame(self, row: int) -> IntArray:
+        """Return the rows of the points in the image of a frame, ascending; none without a pose."""
+        if not self.poses.known[row]:
+            return np.empty(0, np.int64)
+        points = self.nearby(row)
+        if len(self.observed(row)):
+            return points
+        size = (self.poses.camera.width, self.poses.camera.height)
+        image = np.array([[0.0, 0.0, *size]])
+        _, inside, _ = points_in_boxes(self.poses.points[points], self._img_from_world[row], image)
+        return points[inside]
+
+    def in_boxes(self, row: int, xyxy: Array) -> tuple[IntArray, IntArray, Array]:
+        """Find the points that a frame sees inside boxes.
+
+        Args:
+            row: of the frame in the poses. xyxy: (D, 4) boxes in native pixels.
+        Returns:
+            one entry for each of K pairs of a box and a point in it, by box: rows of the boxes
+            (K,) and of the points (K,), depth (K,) of the point in the frame's camera.
+        """
+        points = self.in_frame(row)
+        boxes = undistort_boxes(xyxy, self.poses.camera)
+        box, inside, depth = points_in_boxes(
+            self.poses.points[points], self._img_from_world[row], boxes
+        )
+        return box, points[inside], depth
+
+
+def points_in_boxes(
+    points: Array, img_from_world: Array, xyxy: Array
+) -> tuple[IntArray, IntArray, Array]:
+    """Find the points in front of a camera that project into boxes.
+
+    Args:
+        points: (N, 3) in world. img_from_world: (3, 4) K @ cam_from_world of a pinhole camera.
+        xyxy: (D, 4) undistorted boxes in its pixels; NaN: none.
+    Returns:
+        one entry for each of K pairs of a box and a point in it, by box: rows of the boxes (K,)
+        and of the points (K,), depth (K,) of the point along the optical axis, in world units.
+    """
+    projected = points @ img_from_world[:, :3].T + img_from_world[:, 3]  # (N, 3)
+    depth = projected[:, 2]
+    xy = projected[:, :2] / np.where(depth > 0, depth, np.nan)[:, None]  # (N, 2)
+    boxes = xyxy[:, None]  # (D, 1, 4)
+    inside = ((xy >= boxes[..., :2]) & (xy <= boxes[..., 2:])).all(2)  # (D, N)
+    box, point = np.nonzero(inside)
+    return box, point, depth[point]

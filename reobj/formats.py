@@ -1,4 +1,6 @@
-"""Registries of file formats: one entry a format, recognised by structure alone or named by a flag.
+"""Registries of file formats, and the frames that the names of images in files belong to.
+
+An entry is a format, recognised by structure alone or named by a flag.
 
 There is one registry each for detections, poses, cameras and ground truth. Nothing is scored or
 guessed: a file that fits no entry, or several, is refused with their names and the flag.
@@ -9,13 +11,16 @@ from __future__ import annotations
 import functools
 import xml.etree.ElementTree as ElementTree
 import zipfile
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Generic, TypeVar
 
+import numpy as np
+
 from reobj.files import did_you_mean, load_json, shortened
-from reobj.types import ReobjError
+from reobj.types import IntArray, ReobjError
 
 R = TypeVar("R", bound=Callable[..., Any])
 AUTO = "auto"
@@ -186,3 +191,55 @@ class Registry(Generic[R]):
             for entry in sorted(self.formats, key=lambda entry: entry.read is None)
         ]  # fmt: skip
         return "\n".join(f"| {' | '.join(row)} |" for row in rows) + "\n"
+
+
+# ---- Names of images -----------------------------------------------------------------------------
+
+
+def _components(name: str | Path, suffix: bool) -> tuple[str, ...]:
+    """Split a path, also of Windows, into its components; the last one with or without suffix."""
+    path = PurePosixPath(str(name).replace("\\", "/"))
+    components = tuple(part for part in path.parts if part not in (".", "/"))
+    return components if suffix else (*components[:-1], path.stem)
+
+
+def frames_by_name(
+    given: Sequence[str], images: Sequence[str | Path], where: str = "names"
+) -> tuple[IntArray, str]:
+    """Match names of images to the images of a source.
+
+    The file names are compared first. Where a file name is not unique, on either side, folders are
+    added from the right until it is. Suffixes are ignored if no name matches with its suffix.
+
+    Args:
+        given: (N,) distinct names, with or without folders. images: (F,) paths of all images of
+            the source, in the order of its frames. where: source of the names, for the error.
+    Returns:
+        frame (N,) of each name, -1: no image has that name; and the rule that matched, "" if none.
+    Raises:
+        ReobjError: with any number of folders a name matches several images, or an image several
+            names.
+    """
+    for suffix in (True, False):
+        given_paths = [_components(name, suffix) for name in given]
+        image_paths = [_components(image, suffix) for image in images]
+        clash: list[tuple[str, ...]] = []
+        for depth in range(1, max(map(len, given_paths + image_paths), default=0) + 1):
+            of_given = Counter(path[-depth:] for path in given_paths)
+            of_images = Counter(path[-depth:] for path in image_paths)
+            matched = [key for key in of_given if key in of_images]
+            if not matched:
+                break  # longer keys match no better
+            clash = [key for key in matched if of_given[key] > 1 or of_images[key] > 1]
+            if not clash:
+                frame_of = {path[-depth:]: frame for frame, path in enumerate(image_paths)}
+                rule = "file names" if depth == 1 else f"file names with {depth - 1} folders"
+                rule += "" if suffix else ", without suffixes"
+                frames = [frame_of.get(path[-depth:], -1) for path in given_paths]
+                return np.array(frames, np.int64), rule
+        if clash:
+            raise ReobjError(
+                f"{where}: {'/'.join(clash[0])} is the name of several images in different "
+                "folders; rename the images, or give the images of one folder only"
+            )
+    return np.full(len(given), -1, np.int64), ""

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Iterator
-
 import cv2
 import numpy as np
 import pytest
 
-from reobj.tracking import camera_motion
 from reobj.tracking.camera_motion import CameraMotion
-from reobj.types import Frame
 
 
 def textured(rng: np.random.Generator, size_hw: tuple[int, int] = (480, 640)) -> np.ndarray:
@@ -44,44 +39,6 @@ def test_a_known_motion_is_recovered(size_hw: tuple[int, int], truth: np.ndarray
     corners = np.array([(x, y, 1.0) for x in (50, 250) for y in (50, 170)])
     np.testing.assert_allclose(corners @ new_from_old[:2].T, corners @ truth.T, atol=0.7)
     np.testing.assert_array_equal(motion.parallax(corners[:, :2]), np.zeros((4, 2)))  # not deep
-
-
-def one_by_one(batches: Iterator[list[Frame]], sizes: list[int]) -> Iterator[Frame]:
-    for batch in batches:
-        sizes.append(len(batch))
-        yield from batch
-
-
-@pytest.mark.parametrize("batch", [1, 4])
-@pytest.mark.parametrize(("foreign", "computed_here"), [(9, 0), (3, 4)])
-def test_estimating_ahead_changes_nothing(
-    monkeypatch: pytest.MonkeyPatch, foreign: int, computed_here: int, batch: int
-) -> None:
-    """The motion is computed ahead of its request, and again after an unexpected image."""
-    rng, here = np.random.default_rng(2), []
-    wide = textured(rng, (240, 500))
-    frames = [Frame(i, i / 30, wide[:, 9 * i : 9 * i + 320].copy()) for i in range(6)]
-
-    def estimated(*args: object, step: Callable[..., object] = camera_motion._step) -> object:
-        here.append(threading.current_thread() is threading.main_thread())
-        return step(*args)
-
-    plain, ahead = CameraMotion(), CameraMotion()
-    for i, frame in enumerate(frames):
-        if i == foreign:
-            plain(wide[:, 400:])
-        plain(frame.image)
-    monkeypatch.setattr(camera_motion, "_step", estimated)
-    batches = list[int]()
-    for i, frame in enumerate(one_by_one(ahead.ahead(frames, batch), batches)):
-        if i == foreign:
-            ahead(wide[:, 400:])
-        motion = ahead(frame.image)
-    assert batches == {1: [1] * 6, 4: [4, 2]}[batch]
-    assert sum(here) == computed_here and len(here) == len(frames) + computed_here
-    np.testing.assert_array_equal(ahead.corners, plain.corners)
-    np.testing.assert_array_equal(ahead.residual_flow, plain.residual_flow)
-    np.testing.assert_allclose(motion[:2, 2], [-9, 0], atol=0.3)
 
 
 def test_a_wide_step_needs_no_majority_of_corners() -> None:
@@ -125,19 +82,6 @@ def test_parallax_of_a_scene_with_depth(shifts: tuple[int, ...], expected: int) 
     assert motion.parallax(np.empty((0, 2))).shape == (0, 2)
 
 
-def test_parallax_uses_the_latest_step_only() -> None:
-    image = textured(np.random.default_rng(6))
-    motion = CameraMotion()
-    motion(image)
-    bands = zip(np.split(image, 4), (4, 22, 10, 16), strict=True)
-    deep = np.concatenate([np.roll(band, shift, 1) for band, shift in bands])
-    motion(deep)
-    at = np.array([[320.0, 440.0]])
-    assert np.abs(motion.parallax(at)).max() > 1
-    motion(deep)
-    np.testing.assert_array_equal(motion.parallax(at), [[0, 0]])
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_too_few_inliers_give_no_motion(seed: int) -> None:
     """Two unrelated images have corners, but fewer than 8 inliers by chance."""
@@ -152,18 +96,6 @@ def test_frames_without_texture_and_of_another_size() -> None:
     blank = np.full((100, 100, 3), 128, np.uint8)
     for image in (blank, blank, textured(rng, (100, 100)), textured(rng, (120, 100)), blank):
         np.testing.assert_array_equal(motion(image), np.eye(3))
-
-
-def test_corners_are_of_the_latest_image() -> None:
-    """The texture of the left half disappears, that of the right half appears."""
-    image, motion = textured(np.random.default_rng(2)), CameraMotion()
-    for side in (slice(0, 320), slice(320, 640)):
-        half = np.full_like(image, 128)
-        half[:, side] = image[:, side]
-        motion(half)
-        assert motion.corners is not None
-        x = 2 * motion.corners[:, 0, 0]  # followed in an image of half the size
-        assert len(x) > 20 and x.min() > side.start - 10 and x.max() < side.stop + 10
 
 
 def test_the_state_is_complete_in_arrays() -> None:

@@ -7,13 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from test_embedding import (
-    BACKBONE_FILES,
     IMAGENET_MEAN,
-    IMAGENET_STD,
     boxes,
     mean_backbone,
     save_onnx,
-    scene_with_identical_objects,
     sum_head,
 )
 
@@ -65,24 +62,6 @@ def test_the_configured_embedder_is_built(net: str, tmp_path: Path) -> None:
     assert with_head is not None and with_head.trained
 
 
-def test_crops_use_the_backbone_with_a_bundled_block(monkeypatch) -> None:
-    if not BACKBONE_FILES.is_dir():
-        pytest.skip("no frozen backbones here")
-    monkeypatch.setenv("REOBJ_MODELS", str(BACKBONE_FILES))
-    crops = make_embedder("crops", threads=1, offline=True)
-    assert isinstance(crops, rt.CropEmbedder) and crops.model == "crops:mobilenetv2_feat"
-    image, found = scene_with_identical_objects()
-    assert crops(image, found).foreground.shape == (2, 192)
-    plain = make_embedder("crops", "none", threads=1)
-    assert plain is not None and plain(image, found).foreground.shape == (2, 320 * 49)
-
-
-def test_offline_and_unknown_models_are_refused(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setenv("REOBJ_MODELS", str(tmp_path))
-    with pytest.raises(rt.ReobjError, match="no such file"):
-        make_embedder("crops:nothing.onnx")
-
-
 # ---- Crops ----
 
 
@@ -132,31 +111,6 @@ def test_crops_beyond_the_frame_are_black_there(net: str) -> None:
     assert not corner[:, 113:].any() and (corner[:80, :80] == 200).all()
 
 
-def test_maps_are_of_rgb_normalised_as_imagenet(net: str) -> None:
-    """Red crops: high in the first channel. The map at stride 32 is 7 x 7."""
-    maps = rt.CropEmbedder(net, threads=1).maps(np.full((2, 224, 224, 3), (10, 20, 250), np.uint8))
-    assert maps.shape == (2, 4, 7, 7)
-    expected = (np.array([250, 20, 10]) - IMAGENET_MEAN) / IMAGENET_STD
-    np.testing.assert_allclose(maps[:, :3].mean((2, 3)), np.tile(expected, (2, 1)), rtol=1e-4)
-
-
-def test_the_map_at_stride_32_is_taken(tmp_path: Path) -> None:
-    """Of a network that also gives one at stride 16."""
-    weights = {"a": np.ones((2, 3, 16, 16)) / 256, "b": np.ones((3, 2, 2, 2))}
-    nodes = [
-        ("Conv", ["image", "a"], ["fine"], {"strides": [16, 16]}),
-        ("Conv", ["fine", "b"], ["deep"], {"strides": [2, 2]}),
-    ]
-    ends = (
-        [("image", ["n", 3, "h", "v"])],
-        [("fine", ["n", 2, "a", "b"]), ("deep", ["n", 3, "c", "d"])],
-    )
-    path = str(save_onnx(tmp_path / "two.onnx", nodes, ends, weights))
-    crops = rt.CropEmbedder(path, threads=1)
-    assert crops.maps(np.zeros((1, 224, 224, 3), np.uint8)).shape == (1, 3, 7, 7)
-    assert rt.Embedder(path, threads=1).backbone(np.zeros((64, 64, 3), np.uint8)).shape == (4, 4, 2)
-
-
 def test_embeddings_of_both_crops_separate_or_joined(net: str, tmp_path: Path) -> None:
     """Foreground red, background green; the ConvBlock gets the foreground's channels first."""
     image, found = red_on_green()
@@ -188,14 +142,6 @@ def test_a_conv_block_defines_the_layout_and_must_match(net: str, tmp_path: Path
     row = str(sum_head(tmp_path / "rows.onnx"))
     with pytest.raises(rt.ReobjError, match="ConvBlock trained with this backbone"):
         rt.CropEmbedder(net, row, threads=1)(image, found)
-
-
-def test_only_requested_rows_are_embedded(net: str) -> None:
-    image, found = scene_with_identical_objects()
-    crops = rt.CropEmbedder(net, layout=rt.SamplingLayout(crop_px=64), threads=1)
-    whole, part = crops(image, found), crops(image, found, np.array([1]))
-    np.testing.assert_allclose(whole.foreground[1:], part.foreground, atol=1e-6)
-    assert len(crops(image, found, np.zeros(0, np.int64)).foreground) == 0
 
 
 # ---- The bundled weights on crops ----
@@ -230,12 +176,3 @@ def test_trained_crops_mask_confident_other_objects(score: float, hides: bool) -
     np.testing.assert_allclose(alone.foreground, beside.foreground, atol=1e-5)
     same = np.allclose(alone.background, beside.background, atol=1e-5)
     assert same is not hides
-
-
-def test_bundled_weights_get_black_pixels_for_masked_parts() -> None:
-    image, found = red_on_green()
-    crops = rt.CropEmbedder("reobj", layout=rt.SamplingLayout(crop_px=64), threads=1)
-    pixels, own = crops.cut(image, found, np.arange(1))
-    fore, back = crops.masked(pixels, own)
-    np.testing.assert_array_equal(fore, pixels[0] * own[0][..., None])
-    np.testing.assert_array_equal(back, pixels[0] * ~own[0][..., None])

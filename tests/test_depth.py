@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,7 +11,7 @@ import pytest
 from pose_worlds import FakeVideo, motion, supplied
 
 import reobj_track as rt
-from reobj.cameras import invert_rigid, read_sparse_model, write_colmap
+from reobj.cameras import invert_rigid
 from reobj.poses import stage
 from reobj.poses.supplied.depth import add_depth, depth_scale, find_depth_maps, smooth_pixels
 from reobj.results.workspace import Workspace
@@ -54,18 +53,6 @@ def write_maps(folder, cams, names, units=1000.0, camera=CAMERA, depth_from_colo
     return folder
 
 
-def test_pixels_at_edges_of_depth_are_not_used():
-    """A sensor mixes both depths there; a slope of 4 % a pixel is a surface, a hole none."""
-    depth = np.full((9, 30), 2, np.float32)
-    depth[:, 10] = 2.5
-    depth[:, 11:20] = 3
-    depth[:, 20:] = 3 * 1.04 ** np.arange(10)
-    depth[4, 15] = 0
-    ok = smooth_pixels(depth)
-    assert not ok[:, 9:12].any() and not ok[3:6, 14:17].any()
-    assert ok[:, :9].all() and ok[:, 18:].all() and ok[:3, 12:].all()
-
-
 @pytest.fixture
 def walk():
     cams = motion("walk", FRAMES)
@@ -74,11 +61,6 @@ def walk():
 
 def metric(poses):
     return dataclasses.replace(poses, metric=True)
-
-
-def video_of(names):
-    images = [np.full((*SIZE[::-1], 3), 20 * i, np.uint8) for i in range(FRAMES)]
-    return FakeVideo(images, names)
 
 
 class NamedVideo(FakeVideo):
@@ -138,18 +120,6 @@ def test_occluded_points_are_not_observed(tmp_path, walk):
     assert not far[other].any()  # others see through it: it was dropped, or seen by 4 and 5
 
 
-def test_existing_points_keep_their_rows(tmp_path, walk):
-    own = np.array([[9.0, 9, 9], [8, 8, 8]])
-    given = dataclasses.replace(
-        metric(walk), points=own, colors=np.array([[1, 2, 3]] * 2, np.uint8),
-        visibility=np.array([[0, 1], [1, 0]]),
-    )  # fmt: skip
-    poses = add(given, write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS))
-    np.testing.assert_array_equal(poses.points[:2], own)
-    np.testing.assert_array_equal(poses.visibility[:2], [[0, 1], [1, 0]])
-    assert poses.visibility[2:, 1].min() == 2 and len(poses.colors) == len(poses.points)
-
-
 def test_maps_of_another_camera_use_its_file(tmp_path, walk):
     """Intrinsics, size and pose differ from the colour camera's."""
     camera = rt.Camera("PINHOLE", 200, 160, (190.0, 180.0, 104.0, 77.0))
@@ -176,7 +146,7 @@ def test_scannets_intrinsics_have_another_pixel_centre(tmp_path, walk):
     folder = write_maps(tmp_path / "depth", walk.cam_from_world[:1], ["0.png"])
     (tmp_path / "intrinsic").mkdir()
     np.savetxt(tmp_path / "intrinsic" / "intrinsic_depth.txt", K)
-    maps = find_depth_maps(str(folder), walk, video_of(()))
+    maps = find_depth_maps(str(folder), walk, NamedVideo([]))
     assert maps.camera.params == (240, 240, 100, 80)
 
 
@@ -194,7 +164,7 @@ def test_subsampled_maps_have_no_pixel_offset(tmp_path, walk):
     """Every 3rd pixel of 960: half a pixel off would show."""
     camera = CAMERA.resized((960, 720))
     folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS, camera=camera)
-    maps = find_depth_maps(str(folder), walk, video_of(()))
+    maps = find_depth_maps(str(folder), walk, NamedVideo([]))
     depth, K = maps.read(5)
     assert depth.shape == (240, 320)
     y, x = np.mgrid[30:200:10, 40:300:10].reshape(2, -1)
@@ -242,7 +212,7 @@ def test_a_reconstruction_becomes_metric(tmp_path, walk, unit_m, noise):
 
 def test_the_sigma_of_the_scale_is_calibrated(tmp_path, walk):
     folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS)
-    maps = find_depth_maps(str(folder), walk, video_of(()))
+    maps = find_depth_maps(str(folder), walk, NamedVideo([]))
     errors = []
     for seed in range(10):
         scale, sigma, used = depth_scale(with_points(walk, 0.5, 0.1, seed), maps)
@@ -291,14 +261,6 @@ def test_maps_that_contradict_metric_poses_give_no_points(tmp_path, walk, mistak
     assert len(poses.points) == 0 and "no points from depth" in poses.messages[0]
 
 
-def test_maps_without_depth_are_reported(tmp_path, walk):
-    folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS)
-    for path in folder.glob("*.png"):
-        cv2.imwrite(str(path), np.zeros((24, 32), np.uint16))
-    poses = add(metric(walk), folder)
-    assert len(poses.points) == 0 and "show no surface" in poses.messages[0]
-
-
 # ---- Assignment of maps to frames ----------------------------------------------------------------
 
 
@@ -321,153 +283,73 @@ def test_maps_are_assigned_to_frames(tmp_path, maps, names, expected):
     assert sorted(found.files) == expected
 
 
-def empty(folder):
-    folder.mkdir()
+def image(shape, kind=np.uint16):
+    return cv2.imencode(".png", np.ones(shape, kind))[1].tobytes()
 
 
-def strange(folder):
-    folder.mkdir()
-    (folder / "x.png").write_bytes(b"no image")
-
-
-def color_image(folder):
-    folder.mkdir()
-    cv2.imwrite(str(folder / "0001.png"), np.zeros((240, 320, 3), np.uint8))
-
-
-def other_names(folder):
-    write_maps(folder, motion("walk", 1), ["99.png"])
-
-
-def other_sizes(folder):
-    write_maps(folder, motion("walk", 2), NUMBERS[:2])
-    cv2.imwrite(str(folder / NUMBERS[1]), np.ones((24, 32), np.uint16))
-
-
-def other_json(folder):
-    write_maps(folder, motion("walk", 1), NUMBERS[:1])
-    (folder / "intrinsics.json").write_text('{"fx": 3}')
-
-
-def lacking_json(folder):
-    write_maps(folder, motion("walk", 1), NUMBERS[:1])
-    (folder / "intrinsics.json").write_text('{"fx": 50}')
-
-
-def other_matrix(folder):
-    write_maps(folder, motion("walk", 1), NUMBERS[:1])
-    (folder / "intrinsic_depth.txt").write_text("1 2 3")
+MAP = {"0000.png": image(SIZE[::-1])}
 
 
 @pytest.mark.parametrize(
-    ("make", "text", "expected"),
+    ("files", "text", "expected"),
     [
-        (None, "d", "no such folder"), (empty, "d:much", "no such folder"),
-        (empty, "d:0", "no such folder"), (empty, "d", "no .png in it"),
-        (strange, "d", "not a depth map"), (color_image, "d", "not a depth map"),
-        (other_names, "d", "none of its 1 depth maps"), (other_sizes, "d", "32x24 pixels"),
-        (other_json, "d", "expected fx, fy"), (lacking_json, "d", "intrinsics.json: expected fx"),
-        (other_matrix, "d", "intrinsic_depth.txt: 3 numbers"),
+        (None, "d", "no such folder"), ({}, "d:much", "no such folder"),
+        ({}, "d:0", "no such folder"), ({}, "d", "no .png in it"),
+        ({"0001.png": b"no image"}, "d", "not a depth map"),
+        ({"0001.png": image((240, 320, 3), np.uint8)}, "d", "not a depth map"),
+        ({"99.png": image((24, 32))}, "d", "none of its 1 depth maps"),
+        (MAP | {"0001.png": image((24, 32))}, "d", "32x24 pixels"),
+        (MAP | {"intrinsics.json": b'{"f": {}}'}, "d", "intrinsics.json: expected fx"),
+        (MAP | {"intrinsic_depth.txt": b"1 2 3"}, "d", "intrinsic_depth.txt: 3 numbers"),
     ],
 )  # fmt: skip
-def test_bad_input_gives_one_line(tmp_path, walk, make, text, expected):
-    if make is not None:
-        make(tmp_path / "d")
-    if make is strange:
-        (tmp_path / "d" / "x.png").rename(tmp_path / "d" / "0001.png")
-    with pytest.raises(rt.ReobjError, match=expected):
+def test_bad_input_gives_one_line(tmp_path, walk, files, text, expected):
+    for name, content in (files or {}).items():
+        (tmp_path / "d").mkdir(exist_ok=True)
+        (tmp_path / "d" / name).write_bytes(content)
+    if files == {}:
+        (tmp_path / "d").mkdir()
+    with pytest.raises(rt.ReobjError, match=expected) as refused:
         add(metric(walk), f"{tmp_path}/{text}")
+    assert "\n" not in str(refused.value)
 
 
-def test_units_are_given_after_the_colon(tmp_path, walk):
-    folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS, units=5000)
-    assert on_walls(add(metric(walk), f"{folder}:5000").points).max() < 0.01
-
-
-# ---- In a run ------------------------------------------------------------------------------------
-
-
-def image_folder(folder):
-    folder.mkdir()
-    for i in range(FRAMES):
-        cv2.imwrite(str(folder / f"{i:04d}.png"), np.full((*SIZE[::-1], 3), 20 * i, np.uint8))
-    return rt.Video(folder)
-
-
-def test_a_reconstruction_and_its_model_become_metric_once(tmp_path, walk, monkeypatch):
-    """The second run uses the cache; the model without depth maps is unchanged."""
-    pycolmap = pytest.importorskip("pycolmap")
-    video, workspace = image_folder(tmp_path / "images"), Workspace(tmp_path / "out")
-    folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS)
-    found, asked = with_points(walk, 0.5), []
-
-    def estimate(video, config, work, **_):
-        asked.append(config)
-        write_colmap(work / "text", found, NUMBERS)
-        (work / "sparse").mkdir()
-        pycolmap.Reconstruction(str(work / "text")).write(str(work / "sparse"))
-        return found
-
-    monkeypatch.setattr(stage, "estimate_poses", estimate)
-    config = rt.PosesConfig(depth=str(folder))
-    for _ in range(2):
-        poses, model = stage.reconstruct_cached(video, config, workspace)
-        assert poses.metric and len(poses.points) > 3000 and len(asked) == 1
-        cams = read_sparse_model(model[0]).cam_from_world
-        np.testing.assert_allclose(cams, poses.cam_from_world, atol=1e-6)
-        assert len(read_sparse_model(model[0]).points) == len(found.points)
-        monkeypatch.setattr(stage, "add_depth", None)
-    plain, model = stage.reconstruct_cached(video, rt.PosesConfig(), workspace)
-    assert not plain.metric and len(asked) == 1
-    cams = read_sparse_model(model[0]).cam_from_world
-    np.testing.assert_allclose(cams, found.cam_from_world, atol=1e-6)
-
-
-def test_supplied_poses_without_points_are_triangulated_once(tmp_path, walk, monkeypatch):
-    video, workspace = image_folder(tmp_path / "images"), Workspace(tmp_path / "out")
-    folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS)
-    asked = []
-
-    def triangulate(poses, video, *, size_px, seed, **_):
-        asked.append((size_px, seed))
-        return with_points(poses, 1.0)
-
-    monkeypatch.setattr(stage, "triangulate", triangulate)
-    options = {"size_px": 300, "seed": 7}
-    for _ in range(2):
-        poses = stage.with_points(walk, video, rt.PosesConfig(**options), workspace)
-        assert len(poses.points) == 360 and asked == [(300, 7)]
-    assert stage.with_points(poses, video, rt.PosesConfig(), workspace) is poses
-    with_depth = rt.PosesConfig(depth=str(folder), **options)
-    found = stage.with_points(metric(walk), video, with_depth, workspace)  # maps alone
-    assert len(found.points) > 3000 and len(asked) == 1
-    found = stage.with_points(walk, video, with_depth, workspace)  # the scale needs points
-    assert found.metric and len(asked) == 2
-    contradicted = rt.PosesConfig(depth=f"{folder}:300", **options)
-    found = stage.with_points(metric(walk), video, contradicted, workspace)
-    assert len(found.points) == 360 and len(asked) == 3 and "no points from" in found.messages[0]
-    unknown = dataclasses.replace(walk, cam_from_world=np.full_like(walk.cam_from_world, np.nan))
-    assert stage.with_points(unknown, video, rt.PosesConfig(), workspace) is unknown
-
-
-# ---- A recording ---------------------------------------------------------------------------------
-
-REDKITCHEN = Path(__file__).resolve().parents[2] / "shared" / "data" / "redkitchen_7scenes"
-
-
-@pytest.mark.skipif(not REDKITCHEN.exists(), reason="needs ../shared/data")
-def test_redkitchens_maps_agree_with_its_poses():
-    """Their floor lies where it was measured in the fused cloud: up.X = -1.525 (+- 3 cm)."""
-    video = rt.Video(REDKITCHEN / "images", rt.InputConfig(every=10))
-    world_from_cam = np.loadtxt(REDKITCHEN / "poses_c2w.txt").reshape(-1, 4, 4)[::10, :3]
-    camera = rt.Camera("PINHOLE", 640, 480, (530.0, 530.0, 322.0, 238.0))
+def test_edges_of_depth_are_not_used_and_own_points_keep_their_rows(tmp_path, walk):
+    """A sensor mixes both depths at an edge; in units of .2 mm, with points of the user."""
+    depth = np.full((9, 30), 2, np.float32)
+    depth[:, 10:20] = 3
+    depth[:, 20:] = 3 * 1.04 ** np.arange(10)  # a slope of 4 % a pixel is a surface
+    depth[4, 15] = 0  # a hole is none
+    ok = smooth_pixels(depth)
+    assert not ok[:, 9:11].any() and not ok[3:6, 14:17].any()
+    assert ok[:, :9].all() and ok[:, 18:].all() and ok[:3, 12:].all()
+    own = np.array([[9.0, 9, 9], [8, 8, 8]])
     given = dataclasses.replace(
-        metric(supplied(invert_rigid(world_from_cam), camera)),
-        frame=np.array([frame.index for frame in video]),
-    )
-    poses = add_depth(given, str(REDKITCHEN / "depth"), video)
-    assert 10000 < len(poses.points) <= 20000 and poses.messages == ()
-    assert len(poses.visibility) > 5 * len(poses.points)
-    height = poses.points @ [0.0070, -0.8930, -0.4500]
-    on_floor = np.abs(height + 1.525) < 0.05
-    assert on_floor.sum() > 300 and (height < -1.7).mean() < 0.02
+        metric(walk), points=own, colors=np.array([[1, 2, 3]] * 2, np.uint8),
+        visibility=np.array([[0, 1], [1, 0]]),
+    )  # fmt: skip
+    folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS, units=5000)
+    poses = add(given, f"{folder}:5000")
+    np.testing.assert_array_equal(poses.points[:2], own)
+    np.testing.assert_array_equal(poses.visibility[:2], [[0, 1], [1, 0]])
+    assert poses.visibility[2:, 1].min() == 2 and len(poses.colors) == len(poses.points)
+    assert on_walls(poses.points[2:]).max() < 0.01
+
+
+@pytest.mark.parametrize("supplied_poses", [True, False])
+def test_depth_in_a_run_and_its_cache(tmp_path, walk, supplied_poses):
+    """Poses in metres get points; a second call takes them from the cache."""
+    (tmp_path / "images").mkdir()
+    for i in range(FRAMES):
+        picture = np.full((*SIZE[::-1], 3), 20 * i, np.uint8)
+        cv2.imwrite(str(tmp_path / "images" / NUMBERS[i]), picture)
+    video, workspace = rt.Video(tmp_path / "images"), Workspace(tmp_path / "out")
+    folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS)
+    config = rt.PosesConfig(depth=str(folder))
+    given = metric(walk) if supplied_poses else with_points(walk, 0.5)
+    found = [stage.with_points(given, video, config, workspace) for _ in range(2)]
+    assert found[0].metric and len(found[0].points) > 3000
+    np.testing.assert_array_equal(found[0].points, found[1].points)
+    np.testing.assert_allclose(found[0].cam_from_world, walk.cam_from_world, rtol=0.02, atol=1e-9)
+    if not supplied_poses:
+        assert stage.with_points(given, video, rt.PosesConfig(), workspace) is given

@@ -12,13 +12,11 @@ import pytest
 
 import reobj_track as rt
 from reobj.appearance.embedding import (
-    Backbone,
     LazyEmbeddings,
     as_embeddings,
     neighbour_embedding,
     trained_head,
 )
-from reobj.sources.weights import onnx_metadata, onnx_session, own_models
 
 # of ImageNet's pixels, RGB (torchvision's documentation)
 IMAGENET_MEAN = 255 * np.array([0.485, 0.456, 0.406])
@@ -122,22 +120,6 @@ def test_a_network_of_our_own_gets_bgr_bytes() -> None:
     assert np.abs(blue - red).max() > 0.1
 
 
-@pytest.mark.parametrize(
-    ("size_hw", "size_px", "expected"),
-    [
-        ((480, 640), 320, (8, 10)),  # 240 x 320: 7.5 -> 8 squares of 32
-        ((480, 640), 960, (15, 20)),  # never enlarged
-        ((20, 400), 160, (1, 5)),  # at least one square
-    ],
-)
-def test_size_of_the_map(net: str, size_hw, size_px, expected) -> None:
-    layout = rt.SamplingLayout(size_px=size_px)
-    features = rt.Embedder(net, layout=layout, threads=1).backbone(
-        np.zeros((*size_hw, 3), np.uint8)
-    )
-    assert features.shape == (*expected, 4)
-
-
 def test_a_model_without_a_map_is_refused(tmp_path: Path) -> None:
     nodes = [("GlobalAveragePool", ["image"], ["p"], {}), ("Flatten", ["p"], ["row"], {})]
     ends = ([("image", ["n", 3, "h", "v"])], [("row", ["n", 3])])
@@ -162,15 +144,6 @@ def test_real_backbones_are_found_by_their_file_names(monkeypatch: pytest.Monkey
 
 
 # ---- Heads ----
-
-
-@pytest.mark.parametrize("name", ["mobilenetv2_feat", "crops:mobilenetv2_feat"])
-def test_heads_of_mobilenetv2_are_bundled(name: str) -> None:
-    path = trained_head(name)
-    assert path is not None and path.parent == own_models()
-    facts = onnx_metadata(onnx_session(path, 1))
-    assert facts["trained"]["rooms"] > 10 and {"layout", "trained"} <= set(facts)
-    assert trained_head(name, "none") is None and trained_head("squeezenet1.1") is None
 
 
 def test_a_head_is_found_beside_its_backbone_or_given(net: str, tmp_path: Path) -> None:
@@ -226,26 +199,6 @@ def test_foreground_shows_the_object_and_background_the_rest(net: str) -> None:
     assert look.background.shape == (1, 64)
 
 
-def test_without_a_head_cells_with_few_samples_weigh_less(net: str) -> None:
-    """By the square root of the fraction of the cell in the ellipse, small at box corners."""
-    image = np.full((512, 512, 3), 250, np.uint8)
-    layout = rt.SamplingLayout(size_px=512, foreground_cells=4)
-    embedder, found = rt.Embedder(net, layout=layout, threads=1), boxes((128, 128, 384, 384))
-    fore, _ = embedder.cells(image, found, np.arange(1))
-    weight = fore[0, :, 4]
-    assert weight.max() == 1 and weight[0] < 0.5
-    look = embedder(image, found).foreground.reshape(16, 4)
-    np.testing.assert_allclose(look[:, 0] / look[5, 0], np.sqrt(weight), atol=1e-5)
-
-
-def test_without_a_head_each_box_of_the_background_counts_the_same(net: str) -> None:
-    layout = rt.SamplingLayout(surround_scale=1.5, surround_cells=5)
-    image, found = scene_with_identical_objects()
-    background = rt.Embedder(net, layout=layout, threads=1)(image, found).background
-    assert background.shape == (2, (16 + 25) * 4)
-    np.testing.assert_allclose(np.linalg.norm(background[:, :64], axis=1), 0.5**0.5, rtol=1e-5)
-
-
 def test_a_mask_decides_what_is_foreground(net: str) -> None:
     """With a mask of the left half, changing the right half of the box has no effect."""
     image, plain = scene_with_identical_objects()
@@ -273,47 +226,19 @@ def test_boxes_at_and_over_the_border(box: tuple[float, ...], net: str) -> None:
 
 
 @pytest.mark.parametrize("trained", [True, False])
-def test_some_rows_are_embedded_as_all_rows(trained: bool, net: str, monkeypatch) -> None:
-    """In any order of requests; the map is computed once per frame."""
-    model, computed, plain = "reobj" if trained else net, [], Backbone.__call__
-    monkeypatch.setattr(
-        Backbone, "__call__", lambda self, frame: (computed.append(1), plain(self, frame))[1]
-    )
+def test_some_rows_are_embedded_as_all_rows(trained: bool, net: str) -> None:
+    """In any order of requests."""
+    model = "reobj" if trained else net
     image, detections = scene_with_identical_objects()
-    embedder = rt.Embedder(model, threads=1)
-    whole, part = embedder(image, detections), embedder(image, detections, np.array([1]))
-    np.testing.assert_allclose(whole.foreground[1:], part.foreground, atol=1e-5)
-    np.testing.assert_allclose(whole.background[1:], part.background, atol=1e-5)
+    whole = rt.Embedder(model, threads=1)(image, detections)
     later = rt.Embedder(model, threads=1)
-    for _ in range(2):
-        later(image, detections, np.array([1]))
-    turned = later(image, detections, np.array([1, 0]))
-    assert len(computed) == 2  # one of each embedder
-    np.testing.assert_allclose(whole.foreground[::-1], turned.foreground, atol=1e-5)
-    np.testing.assert_allclose(whole.background[::-1], turned.background, atol=1e-5)
-    later(image, detections[:])
-    assert len(computed) == 3  # other detections
-    later(image, detections)
-    later(image.copy(), detections)
-    assert len(computed) == 5  # another frame
-    assert len(embedder(image, detections, np.zeros(0, np.int64)).background) == 0
-
-
-def test_no_foreground_is_computed_twice(monkeypatch) -> None:
-    """The first request also computes the neighbours' foreground."""
-    computed, plain = [], rt.Embedder.cells
-
-    def counted(self, frame, detections, fore_rows, back_rows):
-        computed.append((fore_rows.tolist(), back_rows.tolist()))
-        return plain(self, frame, detections, fore_rows, back_rows)
-
-    monkeypatch.setattr(rt.Embedder, "cells", counted)
-    image, two = scene_with_identical_objects()
-    three = rt.Detections(two.xyxy[[0, 1, 1]], np.array([0.9, 0.9, 0.2]), np.zeros(3, np.int64))
-    embedder = rt.Embedder("reobj", threads=1)
-    for row in (1, 0, 2):
-        embedder(image, three, np.array([row]))
-    assert computed == [([0, 1], [1]), ([], [0]), ([2], [2])]
+    for rows in (np.array([1]), np.array([1, 0])):
+        part = later(image, detections, rows)
+        np.testing.assert_allclose(whole.foreground[rows], part.foreground, atol=1e-5)
+        np.testing.assert_allclose(whole.background[rows], part.background, atol=1e-5)
+    other = later(255 - image, detections, np.array([1]))  # another frame
+    assert np.abs(other.foreground - whole.foreground[1:]).max() > 1e-3
+    assert len(later(image, detections, np.zeros(0, np.int64)).background) == 0
 
 
 def test_weak_detections_mask_no_background_and_are_no_neighbours() -> None:
@@ -355,38 +280,7 @@ def test_neighbour_embedding_averages_near_confident_objects() -> None:
     np.testing.assert_allclose(around[2:], some)
 
 
-def test_neighbours_separate_identical_objects() -> None:
-    """Identical objects on a plain wall; a red and a green object are nearby."""
-    image, grey = np.full((480, 640, 3), 160, np.uint8), (40, 40, 40)
-    colours = {20: grey, 440: grey, 200: (0, 0, 220), 620: (0, 220, 0)}
-    for x, colour in colours.items():
-        image[220:260, x - 20 : x + 20] = colour
-    found = boxes(*[(x - 20, 220, x + 20, 260) for x in colours])
-    plain, extended = (
-        rt.Embedder("reobj", layout=rt.SamplingLayout(neighbours=weight), threads=1)(image, found)
-        for weight in (0.0, 0.2)
-    )
-    assert (plain.background.shape[1], extended.background.shape[1]) == (128, 256)
-    np.testing.assert_allclose(np.linalg.norm(extended.background, axis=1), 1, atol=1e-5)
-    np.testing.assert_allclose(extended.background[:, :128], 0.8**0.5 * plain.background, atol=1e-5)
-    around = neighbour_embedding(found.xyxy, plain.foreground, np.ones(4, bool), np.arange(4))
-    np.testing.assert_allclose(extended.background[:, 128:], 0.2**0.5 * around, atol=1e-5)
-    cosine = [(b[0] @ b[1]).item() for b in (extended.background, plain.background)]
-    assert cosine[0] < cosine[1] - 0.02
-    alone = rt.Embedder("reobj", threads=1)(image, found[:1]).background
-    assert not alone[:, 128:].any() and np.linalg.norm(alone) == pytest.approx(1, abs=1e-5)
-
-
 # ---- The bundled weights ----
-
-
-def test_bundled_weights_need_no_download(tmp_path, monkeypatch) -> None:
-    monkeypatch.setenv("REOBJ_MODELS", str(tmp_path))
-    path = rt.model_path("reobj", offline=True)
-    assert path.parent == own_models()
-    assert sum(f.stat().st_size for f in path.parent.iterdir()) < 5e6
-    state = {row.weights.name: row.state for row in rt.list_models()}
-    assert state["reobj"] == "verified"
 
 
 def test_bundled_weights_reidentify_identical_objects() -> None:
@@ -420,14 +314,6 @@ def test_bundled_foreground_ignores_the_context() -> None:
     assert (one.background * two.background).sum() < 0.95
 
 
-def test_bundled_weights_document_their_training() -> None:
-    facts = onnx_metadata(onnx_session(rt.model_path("reobj"), 1))
-    assert {"layout", "multiple", "head", "trained"} <= set(facts)
-    assert {"steps", "seed", "minutes", "rooms"} <= set(facts["trained"])
-    layout = rt.Embedder("reobj", threads=1).layout
-    assert (layout.size_px, layout.surround_scale, layout.foreground_channels) == (320, 1.5, 41)
-
-
 # ---- Embeddings on request ----
 
 
@@ -449,13 +335,6 @@ def test_cosines_of_fused_rows_are_weighted_means() -> None:
     assert rows.dtype == np.float32
 
 
-@pytest.mark.parametrize("weight", [0.5, 0.0])
-def test_fused_rows_without_a_background_are_the_foreground(weight: float) -> None:
-    given = as_embeddings([[3.0, 4.0]], 1)
-    lazy = LazyEmbeddings(given, None, None, boxes((0, 0, 9, 9)), weight)
-    np.testing.assert_allclose(lazy.get(np.arange(1)), [[0.6, 0.8]], atol=1e-6)
-
-
 def test_only_requested_rows_are_computed() -> None:
     asked = []
 
@@ -474,27 +353,12 @@ def test_only_requested_rows_are_computed() -> None:
     assert not LazyEmbeddings(None, None, np.zeros((9, 9, 3), np.uint8), found, 0.5).available
 
 
-def test_accepted_embeddings() -> None:
-    assert as_embeddings(None, 3) is None
-    both = rt.Embeddings(np.ones((2, 4)), np.ones((2, 1)))
-    assert as_embeddings(both, 2) is both
-    plain = as_embeddings(np.ones((2, 4)), 2)
-    assert plain is not None
-    assert plain.foreground.shape == (2, 4) and plain.background.shape == (2, 0)
-    assert as_embeddings(both, 2, width=5) is both
-    assert as_embeddings([], 0, width=5) is not None
-
-
 @pytest.mark.parametrize(
     ("given", "width", "message"),
     [
         (rt.Embeddings(np.ones((3, 4)), np.ones((3, 1))), 0, r"\(3, 4\), expected \(2, E\)"),
-        (np.ones((4, 2)), 0, r"\(4, 2\), expected \(2, E\): one row per detection"),
         (np.ones(8), 0, r"\(8,\), expected \(2, E\)"),  # not two rows of four
-        (np.ones((2, 2, 2)), 0, r"\(2, 2, 2\), expected"),
-        (rt.Embeddings(np.ones((2, 4)), np.ones((1, 4))), 0, r"\(1, 4\), expected"),
         (np.ones((2, 4)), 5, "width 4, expected 5, as in earlier frames"),
-        (np.ones((2, 0)), 0, "width 0, expected at least 1"),
         (np.array([[1, np.nan], [0, 1]]), 0, "not finite"),
         (np.array([[1, 1e39], [0, 1]]), 0, "not finite as float32"),
         ([["a"], ["b"]], 0, "no array of numbers"),

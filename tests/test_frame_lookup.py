@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from reobj.frame_lookup import frames_by_name
+from reobj.formats import frames_by_name
 from reobj.types import ReobjError
 
 IMAGES = ["/data/walk/left/0001.jpg", "/data/walk/left/0002.jpg", "/data/walk/left/0003.jpg"]

@@ -136,12 +136,6 @@ def test_boxes_stay_in_the_image() -> None:
     np.testing.assert_allclose(new, [[590, 0, 640, 75]] * 2, atol=1e-6)
 
 
-def test_nothing_to_fill() -> None:
-    assert len(fill_gaps(rt.Tracks.empty(), SIZE, 5)) == 0
-    one = table(ALL[:1], BOXES[:1])
-    assert len(fill_gaps(one, SIZE, 5)) == 1
-
-
 def test_filled_rows_affect_no_ellipsoid_and_no_position() -> None:
     """Their score is 0: fitting and linking exclude them for any min_score above."""
     seen = np.delete(ALL, [17, 18, 19])

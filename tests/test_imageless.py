@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +14,7 @@ from scipy.spatial.transform import Rotation
 import quadrics
 import reobj_track as rt
 from reobj.cameras import invert_rigid, write_colmap
-from reobj.poses.supplied.imageless import open_video
 
-SHARED = Path(os.environ.get("REOBJ_SHARED", Path(rt.__file__).resolve().parent.parent / "shared"))
 SIZE, FRAMES = (320, 240), 24
 CAMERA = rt.Camera("PINHOLE", *SIZE, (300.0, 300.0, 160.0, 120.0))
 LINE = "PINHOLE 320 240 300 300 160 120"
@@ -49,23 +46,6 @@ def as_npz(folder: Path) -> Path:
     ]
     rt.write_detections_npz(folder / "det.npz", frames, rt.COCO_NAMES, SIZE)
     return folder / "det.npz"
-
-
-def as_coco(folder: Path, names: list[str]) -> Path:
-    """COCO results with the dataset beside them, whose images come in another order."""
-    order = np.random.default_rng(0).permutation(FRAMES).tolist()
-    images = [
-        {"id": 100 + f, "file_name": f"images/{names[f]}", "width": 320, "height": 240}
-        for f in order
-    ]
-    data = {"images": images, "categories": [{"id": 1, "name": "chair"}]}
-    (folder / "dataset.json").write_text(json.dumps(data))
-    rows = [
-        {"image_id": 100 + f, "category_id": 1, "score": 0.9,
-         "bbox": [x, y, x2 - x, y2 - y]} for f, _, (x, y, x2, y2) in boxes()
-    ]  # fmt: skip
-    (folder / "det.json").write_text(json.dumps(rows))
-    return folder / "det.json"
 
 
 def as_tum(folder: Path, times: object = None) -> Path:
@@ -156,12 +136,6 @@ def test_names_of_the_poses_number_the_frames_as_their_folder_would(
     np.testing.assert_allclose(stamps, start + np.arange(FRAMES) / 30, atol=1e-5)
 
 
-def test_names_of_a_coco_dataset_number_the_frames(tmp_path: Path) -> None:
-    names = [f"frame_{7 * i:04d}.jpg" for i in range(FRAMES)]
-    path = as_coco(tmp_path, names)
-    assert_both_chairs(run(tmp_path, path, as_colmap(tmp_path, names)))
-
-
 def test_poses_of_some_images_keep_the_numbers_in_their_names(tmp_path: Path) -> None:
     model = as_colmap(tmp_path, [f"{i:04d}.jpg" for i in range(FRAMES)])
     images = (model / "images.txt").read_text().splitlines()
@@ -186,15 +160,6 @@ def test_a_column_of_times_meets_poses_of_a_higher_rate(tmp_path: Path) -> None:
     result = run(tmp_path, path, mocap, LINE)
     assert_both_chairs(result)
     np.testing.assert_allclose(result.poses.time_s, np.array(times, float), atol=1e-6)
-
-
-@pytest.mark.parametrize("every", [1, 3])
-def test_frames_are_chosen_as_of_a_video(tmp_path: Path, every: int) -> None:
-    config = rt.InputConfig(start=2, stop=20, every=every)
-    section = rt.PosesConfig(mode=str(as_tum(tmp_path)), camera=LINE)
-    video = open_video(None, config, section, as_csv(tmp_path))
-    assert [frame.index for frame in video] == list(range(2, 20, every))
-    assert all(frame.image is None for frame in video) and video.expected == 18 // every
 
 
 def test_our_own_poses_with_a_gap_keep_their_frames(tmp_path: Path) -> None:
@@ -276,6 +241,3 @@ def test_tracks_need_no_images_either(tmp_path: Path) -> None:
     path.write_text("frame,id,x1,y1,x2,y2,class\n" + "\n".join(rows) + "\n")
     config = rt.Config(poses=rt.PosesConfig(mode=str(as_tum(tmp_path)), camera=LINE))
     assert_both_chairs(rt.run(None, tmp_path / "out", config, tracks=path))
-
-
-# ---- Real recordings -----------------------------------------------------------------------------

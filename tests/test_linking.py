@@ -127,30 +127,6 @@ def test_a_wrong_return_is_split_by_its_position() -> None:
     assert [(e.kind, e.tracklets) for e in events] == [("split", (3,))]
 
 
-def test_a_right_return_is_not_split() -> None:
-    """The same chair from two sides: the joint shape explains both visits."""
-    poses = walk()
-    table = table_of(poses)
-    table = table[(table.detection_index == 0) & ((table.frame < 50) | (table.frame > 70))]
-    found, events = linked(table, poses)
-    assert objects_of(found, table.detection_index) == [[0]] and events == []
-
-
-def test_boxes_that_fit_no_shape_are_not_split_off() -> None:
-    """The return has random boxes: a separate shape would fit no better than the joint one."""
-    poses = walk()
-    table = table_of(poses)
-    late = table.frame >= 100
-    table = table[(table.detection_index == 0) & ((table.frame < 50) | late & (table.frame < 112))]
-    late, xyxy = table.frame >= 100, table.xyxy.copy()
-    shift = np.random.default_rng(0).uniform(-1.5, 1.5, 12) * (xyxy[late, 2] - xyxy[late, 0])
-    xyxy[late] += shift[:, None] * [1, 0, 1, 0]
-    one = np.ones(len(table), np.int64)
-    table = dataclasses.replace(table, xyxy=xyxy, track_id=one, tracklet_id=1 + late)
-    found, events = linked(table, poses)
-    assert np.unique(found.track_id).tolist() == [1] and events == []
-
-
 def test_a_poor_fit_alone_splits_nothing() -> None:
     """An object on a chair has the chair's identity: two shapes would fit better, but their
     positions coincide.
@@ -384,36 +360,6 @@ def test_the_most_similar_are_joined_first_against_their_rivals(
     assert names == group
 
 
-def test_appearance_weighs_less_across_viewpoints() -> None:
-    """The first and the last views of the chairs, on an arc of 120 degrees around them: with
-    poses the evidence of every join by appearance is weaker.
-    """
-    poses = walk()
-    table = table_of(poses)
-    table = table[(table.frame < 15) | (table.frame >= 105)]
-    ids = table.tracklet_id + 3 * (table.frame > 60)
-    table = dataclasses.replace(table, track_id=ids, tracklet_id=ids)
-    views = views_of(table, table.detection_index, 0.3)
-    odds = []
-    for known in (None, poses):
-        _, events = linked(table, known, views)
-        odds.append([e.appearance_log_odds for e in events])
-        assert len(odds[-1]) == 3
-    assert (np.array(odds[1]) < 0.7 * np.array(odds[0])).all()
-
-
-def test_a_misclassified_fragment_does_not_prevent_a_join() -> None:
-    """A gap within the second tracklet of a chair, before which the detected class is cup."""
-    table = table_of(walk())
-    table = table[(table.detection_index == 0) & ((table.frame < 40) | (table.frame >= 80))]
-    late = (table.frame >= 80).astype(np.int64)
-    class_id = np.where((late == 1) & (table.frame < 84), CUP, CHAIR)
-    table = dataclasses.replace(table, track_id=1 + late, tracklet_id=1 + late, class_id=class_id)
-    table = table[(table.frame < 84) | (table.frame > 93)]
-    found, _ = linked(table, None, views_of(table, table.detection_index, 0.5))
-    assert np.unique(found.track_id).tolist() == [1]
-
-
 @pytest.mark.parametrize(
     ("common", "kinds", "objects"),
     [(0.0, [CHAIR] * 3, 3), (0.9, [CHAIR] * 3, 6), (0.0, [CHAIR, CUP, PERSON], 6)],
@@ -436,23 +382,6 @@ def test_similarity_is_calibrated_on_the_video(
     views += np.random.default_rng(2).normal(0, 0.03, views.shape)
     found, _ = linked(table, None, views / np.linalg.norm(views, axis=1, keepdims=True))
     assert len(np.unique(found.track_id)) == objects
-
-
-def test_tracklets_calibrate_the_variation_of_one_object() -> None:
-    """Appearance turns by .9 degrees a frame: within a tracklet as much as until the return.
-
-    (Views of the same moment would be uninformative: they are nearly identical.)
-    """
-    table = table_of(walk())
-    table = table[(table.frame < 40) | (table.frame >= 80)]
-    chair = table.detection_index
-    ids = 1 + chair + 3 * (table.frame >= 80)
-    table = dataclasses.replace(table, track_id=ids, tracklet_id=ids)
-    angle, views = np.radians(0.9) * table.frame, np.zeros((len(table), 6))
-    views[np.arange(len(table)), 2 * chair] = np.cos(angle)
-    views[np.arange(len(table)), 2 * chair + 1] = np.sin(angle)
-    found, _ = linked(table, None, views)
-    assert objects_of(found, chair) == [[0], [1], [2]]
 
 
 def test_identities_are_numbered_by_first_appearance() -> None:

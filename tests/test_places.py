@@ -8,6 +8,7 @@ from simulated import SIZE, walk
 
 import quadrics
 import reobj_track as rt
+from reobj.cameras import VisiblePoints
 from reobj.tracking.ellipsoid_map import (
     EllipsoidMap,
     depth_intervals,
@@ -16,7 +17,6 @@ from reobj.tracking.ellipsoid_map import (
     project_half_intervals,
 )
 from reobj.types import box_iou, xyxy_from_cxcywh
-from reobj.visible_points import VisiblePoints
 
 
 def unit(rng: np.random.Generator, n: int, dim: int = 64) -> np.ndarray:

@@ -79,14 +79,6 @@ def test_a_gallery_is_bounded_and_per_identity() -> None:
     assert gallery.rows.nbytes == sizes
 
 
-def test_memory_grows_with_the_identities() -> None:
-    gallery = Gallery(views=2)
-    for identity in range(100):
-        gallery.add(one(identity), at_degrees(identity), UNKNOWN)
-    assert gallery.count[:100].tolist() == [1] * 100 and len(gallery.count) < 256
-    np.testing.assert_allclose(gallery.rows[:100, 0], at_degrees(*range(100)), atol=1e-6)
-
-
 def test_gallery_parts_come_from_the_most_similar_view() -> None:
     gallery = Gallery()
     gallery.foreground_width = 2
@@ -102,24 +94,6 @@ def test_gallery_parts_come_from_the_most_similar_view() -> None:
     mixed = np.array([[0.6, 0.8, 0, 1.0]], np.float32) / np.sqrt(2)  # nearer to the second
     fore, back, _ = gallery.parts(mixed, one(), ahead)
     assert (fore, back) == (pytest.approx(0.8), pytest.approx(1))
-
-
-def test_unused_slots_are_not_compared() -> None:
-    """Also if all used views have a negative cosine."""
-    fore, _, _ = filled((0, 30)).parts(at_degrees(150), one(), UNKNOWN)
-    np.testing.assert_allclose(fore, [[-0.5]], atol=1e-6)
-
-
-def test_gallery_parts_of_unknown_identities() -> None:
-    gallery = filled((0, 90))
-    gallery.add(one(2), at_degrees(45), UNKNOWN)
-    row = at_degrees(45)
-    fore, back, _ = gallery.parts(row, np.array([2, 1, 0]), UNKNOWN)
-    np.testing.assert_allclose(fore, [[1, np.nan, 0.5**0.5]], rtol=1e-6)
-    assert np.isnan(back).all()  # no background part
-    for rows, identity in ((np.zeros((1, 0)), one()), (np.ones((1, 3)), one()), (row, one()[:0])):
-        for part in gallery.parts(rows.astype(np.float32), identity, UNKNOWN):
-            assert part.shape == (1, len(identity)) and np.isnan(part).all()
 
 
 def test_identities_after_the_last_with_a_view_are_unknown() -> None:
@@ -201,26 +175,6 @@ def test_log_odds_follow_the_documented_formula(
     assert calibration.logit(foreground, background) == pytest.approx(unknown, abs=1e-9)
 
 
-def test_the_prior_counts_as_ten_pairs() -> None:
-    ten = SimilarityCalibration(10)
-    assert SimilarityCalibration().logit(0.7, 0.4) == ten.logit(0.7, 0.4)
-
-
-def test_probability_is_monotone_in_its_evidence() -> None:
-    """In both cosines; a background from another viewpoint weighs less; bounded."""
-    same = SimilarityCalibration()
-    high, low = same.logit(0.9, 0.9), same.logit(0.9, 0.2)
-    assert high > low and same.logit(0.95, 0.9) > high
-    near = same.logit(0.9, [0.2, 0.9], 0.0)
-    side = same.logit(0.9, [0.2, 0.9], 80.0)
-    assert np.ptp(near) > 3 * np.ptp(side)
-    assert np.ptp(same.logit(0.9, [0.2, 0.9], 90.0)) == pytest.approx(0)
-    assert np.isfinite(same.logit(0.9, np.nan))
-    assert np.abs(same.logit([1.0, -1.0], [1.0, -1.0])).max() < 7
-    assert same.logit(np.full((2, 3), 0.5), 0.4).shape == (2, 3)
-    assert same.logit(np.nan, 0.5) == -np.inf and same.probability(np.nan) == 0
-
-
 def test_probability_has_a_prior() -> None:
     same = SimilarityCalibration()
     odds = np.exp(same.logit(0.9, 0.9))
@@ -251,17 +205,3 @@ def test_match_probability_equals_brute_force() -> None:
             expected[i, j] = odds[i, j] / (odds[i, j] + 1 + others.max())
         np.testing.assert_allclose(match_probability(logit, prior), expected)
     np.testing.assert_array_equal(match_probability(logit), match_probability(logit, 1.8))
-
-
-@pytest.mark.parametrize(
-    ("logit", "expected"),
-    [
-        ([[0.0]], [[0.5]]),  # alone: as probable as no match
-        ([[0.0, 0.0]], [[1 / 3, 1 / 3]]),  # two equally good ones: ambiguous
-        ([[5.0], [5.0]], [[0.4983, 0.4983]]),
-        ([[-np.inf]], [[0.0]]),
-    ],
-)
-def test_match_probability_of_single_pairs(logit, expected) -> None:
-    found = match_probability(np.array(logit), 1.0)
-    np.testing.assert_allclose(found, np.reshape(expected, found.shape), atol=1e-4)

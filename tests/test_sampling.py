@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 import reobj_track as rt
-from reobj.appearance.sampling import (
-    inside_object,
+from reobj.appearance.embedding import (
     occupancy_map,
     pool_cells,
     sample_parts,
@@ -88,42 +87,12 @@ def test_only_confident_objects_mask_the_background_of_others(score: float, hide
     assert strict.weight[0][strict.index[0] % 100 >= 50].all()
 
 
-def test_an_empty_mask_is_no_mask() -> None:
-    masks = np.zeros((2, 200, 400), bool)
-    masks[1, :40, :40] = True
-    xyxy = ((100, 50, 200, 150), (0, 0, 50, 50))
-    with_mask, without = samples(boxes(*xyxy, masks=masks))[0], samples(boxes(xyxy[0]))[0]
-    np.testing.assert_array_equal(with_mask.weight[0], without.weight[0])
-    occupied = occupancy_map(boxes(*xyxy, masks=masks), (200, 400), (200, 400))
-    assert occupied[:, 60:].mean() == pytest.approx(np.pi / 4 * 100**2 / (200 * 340), rel=0.05)
-
-
 def test_occupancy_is_drawn_at_the_scale_of_the_map() -> None:
     occupied = occupancy_map(boxes((100, 50, 200, 150)), (200, 400), (50, 100))
     y, x = np.mgrid[:50, :100] + 0.5
     inside = ((x * 4 - 150) / 50) ** 2 + ((y * 4 - 100) / 50) ** 2
     assert occupied[inside < 0.7].all() and not occupied[inside > 1.4].any()
     assert not occupancy_map(rt.Detections.empty(), (200, 400), (50, 100)).any()
-
-
-def test_points_inside_an_object() -> None:
-    """Centre, corner of the box (not of the ellipse), and the same by a mask of the corner."""
-    at = np.array([[50.0, 11.0], [40.0, 21.0]])  # x, y of two points
-    centre, half = np.array([[50.0], [40.0]]), np.array([[40.0], [20.0]])
-    rows, found = np.zeros(2, np.int64), boxes((10, 20, 90, 60))
-    assert inside_object(found, rows, at, centre, half).tolist() == [True, False]
-    mask = np.zeros((1, 200, 400), bool)
-    mask[0, 21, 11] = True
-    masked = boxes((10, 20, 90, 60), masks=mask)
-    assert inside_object(masked, rows, at, centre, half).tolist() == [False, True]
-
-
-def test_the_margin_has_a_minimum_size() -> None:
-    """A tenth of the longer side of the image, 40 px on every side of a box of 10."""
-    layout = rt.SamplingLayout(context=0.5, min_margin=0.1, samples=4)
-    _, near = samples(boxes((100, 100, 110, 110)))
-    _, far = samples(boxes((100, 100, 110, 110)), layout)
-    assert np.ptp(near.index % 100) * 4 <= 20 and 76 <= np.ptp(far.index % 100) * 4 <= 92
 
 
 def test_the_wider_box_contains_other_objects_but_not_its_own() -> None:
@@ -158,14 +127,6 @@ def test_cells_are_means_of_the_valid_samples() -> None:
     np.testing.assert_allclose(back[0, 0, 1::-1], np.nanmean(first, 1), rtol=1e-5)
     assert fore[0, 0, 1] == both.weight[0].mean()
     assert back[1, 20, 2] == both.weight[4 + 41 + 20].mean()
-
-
-def test_cells_without_valid_samples_are_zero() -> None:
-    found = boxes((900, 900, 950, 950))
-    rows = [np.array([0])] * 2
-    both = sample_parts(found, rows, (200, 400), np.zeros((50, 100), bool), LAYOUT)
-    fore, back = pool_cells(np.ones((50, 100, 3), np.float32), both, LAYOUT)
-    assert not fore.any() and not back.any()
 
 
 @pytest.mark.parametrize("box", [(-50, -50, 20, 20), (395, 190, 600, 400), (900, 900, 950, 950)])

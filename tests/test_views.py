@@ -12,8 +12,8 @@ from simulated import CAMERA, SIZE, chair_solids, tracks_of, walk, with_columns
 
 import quadrics
 import reobj_track as rt
+from reobj.cameras import VisiblePoints, points_in_boxes
 from reobj.objects.observations import gather_views, points_on
-from reobj.visible_points import VisiblePoints, points_in_boxes
 
 
 def one_box_each(frames: list[int], box: tuple[float, ...] = (10, 20, 60, 90)) -> rt.Tracks:

@@ -9,13 +9,14 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from reobj.appearance.embedding import Embedder, trained_head
-from reobj.appearance.sampling import (
+from reobj.appearance.embedding import (
+    Embedder,
     SamplingLayout,
     inside_object,
     occupancy_map,
     pool_cells,
     sample_parts,
+    trained_head,
 )
 from reobj.sources.weights import IMAGENET_MEAN, onnx_metadata, onnx_session
 from reobj.types import (

@@ -7,13 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 
 import quadrics
-from reobj.cameras import invert_rigid, undistort_boxes
+from reobj.cameras import VisiblePoints, invert_rigid, undistort_boxes
 from reobj.maps.compare import Visibility
 from reobj.maps.fusion import ObjectState, alignment_jacobian, shapes_of
 from reobj.objects.observations import entry_depths
 from reobj.results.result import Object, Result
 from reobj.types import Array, BoolArray, IntArray, Tracks
-from reobj.visible_points import VisiblePoints
 
 # IoU of a detection with a projection: that a view of a place without the object has one above it
 # by accident has these probabilities. (On 18 recordings with the shapes of their objects shifted by

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 import quadrics
-from reobj.cameras import Poses, place_of, undistort_boxes
+from reobj.cameras import Poses, VisiblePoints, place_of, points_in_boxes, undistort_boxes
 from reobj.objects.association import Association, Associator, FitShapes
 from reobj.objects.description import objects_confidence
 from reobj.objects.likelihood import (
@@ -53,7 +53,6 @@ from reobj.types import (
     class_shares,
     rows_by,
 )
-from reobj.visible_points import VisiblePoints, points_in_boxes
 
 # Least score of untracked detections that give hypotheses (.3 finds 73.5 objects instead of 72, in
 # 1.2 times the time: benchmarks/LOG.md)

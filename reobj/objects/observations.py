@@ -16,9 +16,16 @@ import numpy as np
 from scipy import sparse
 
 import quadrics
-from reobj.cameras import Poses, invert_rigid, place_of, undistort_boxes, viewing_rays
+from reobj.cameras import (
+    Poses,
+    VisiblePoints,
+    invert_rigid,
+    place_of,
+    points_in_boxes,
+    undistort_boxes,
+    viewing_rays,
+)
 from reobj.types import Array, BoolArray, IntArray, Tracks, rows_by
-from reobj.visible_points import VisiblePoints, points_in_boxes
 
 # Boxes below this score, and interpolated boxes, do not enter the last fit (of the weakest boxes 1
 # in 25 is real)

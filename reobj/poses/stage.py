@@ -18,8 +18,8 @@ from reobj.poses.estimate import PosesConfig, estimate_poses
 from reobj.poses.intrinsics import camera_line, parse_camera
 from reobj.poses.sfm import CheckMatches, triangulate
 from reobj.poses.supplied.check import Supplied, check_boxes, check_matches, without_frozen
-from reobj.poses.supplied.colmap_model import UPRIGHT
 from reobj.poses.supplied.depth import add_depth
+from reobj.poses.supplied.pose_formats import UPRIGHT
 from reobj.poses.supplied.readers import read_supplied
 from reobj.sources.video import Video, source_fingerprint
 from reobj.types import ReobjError, Tracks

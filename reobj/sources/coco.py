@@ -20,7 +20,7 @@ import msgspec
 import numpy as np
 
 from reobj.files import load_json, shortened
-from reobj.frame_lookup import frames_by_name
+from reobj.formats import frames_by_name
 from reobj.sources.recorded import (
     CORNERS,
     NO_RUNS,

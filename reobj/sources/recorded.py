@@ -27,7 +27,7 @@ import numpy.typing as npt
 
 from reobj.cameras import Poses
 from reobj.files import LINES_MAX, MEMORY_MAX, load_npz, save_npz, shortened
-from reobj.frame_lookup import frames_by_name
+from reobj.formats import frames_by_name
 from reobj.types import (
     CLASS_MAX,
     COORDINATE_MAX,

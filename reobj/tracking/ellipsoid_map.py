@@ -17,9 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 import quadrics
-from reobj.cameras import Poses, scaled_camera, viewing_rays
+from reobj.cameras import Poses, VisiblePoints, scaled_camera, viewing_rays
 from reobj.types import Array, BoolArray, IntArray, cxcywh_from_xyxy
-from reobj.visible_points import VisiblePoints
 
 # ---- Ellipsoids of identities ------------------------------------------------------------------
 

@@ -152,7 +152,6 @@ KEPT = {
     "first missing": ALL[1:],
     "last missing": ALL[:-1],
     "both missing": ALL[1:-1],
-    "one in the middle missing": [i for i in ALL if i != 11],
 }
 
 
@@ -172,6 +171,8 @@ def test_numbers_of_a_video_that_count_from_0_and_from_1_are_asked(
     if frames[0] + first > 0 and frames[-1] + first < FRAMES:
         with pytest.raises(rt.ReobjError, match=r"2 ways: number0.*number1.*poses.frames_by="):
             rt.read_poses(path, video)
+        with pytest.raises(rt.ReobjError, match="can be read by number0, number1"):
+            rt.read_poses(path, video, frames_by="time")
         chosen = f"number{first}"
     poses = rt.read_poses(path, video, frames_by=chosen)
     assert_right(poses, frames)
@@ -179,7 +180,7 @@ def test_numbers_of_a_video_that_count_from_0_and_from_1_are_asked(
 
 
 @pytest.mark.parametrize("first", [0, 1])
-@pytest.mark.parametrize("every", [2, 3, 4])
+@pytest.mark.parametrize("every", [2, 4])
 def test_every_kth_frame_renumbered(tmp_path: Path, every: int, first: int) -> None:
     frames = ALL[::every]
     names = [f"frame_{i + first:05d}.png" for i in range(len(frames))]
@@ -205,23 +206,6 @@ def test_photos_from_0_beside_names_from_1(tmp_path: Path) -> None:
     assert_right(rt.read_poses(path, source, frames_by="number1"), ALL[:-1])
 
 
-def test_both_numberings_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    source = write_clip(tmp_path, blank=True)
-    path = model(tmp_path / "m", ALL[1:-1], [f"{i:05d}.jpg" for i in ALL[1:-1]])
-    words = ["poses", str(source), "-o", str(tmp_path / "out"), "--poses", str(path),
-             "--set", "poses.size_px=160"]  # fmt: skip
-    assert rt.main(words) == 2
-    error = capsys.readouterr().err
-    assert "counted from 0" in error and "counted from 1" in error
-    assert "--set poses.frames_by=number0" in error
-    assert not (tmp_path / "out" / "poses.txt").exists()
-    for first in (0, 1):
-        poses = rt.read_poses(path, rt.Video(source), frames_by=f"number{first}")
-        assert poses.frame[poses.known][0] == 1 - first
-    assert rt.main([*words, "--set", "poses.frames_by=time"]) == 2
-    assert "can be read by number0, number1" in capsys.readouterr().err
-
-
 def test_equal_file_names_in_two_folders_of_a_model(tmp_path: Path) -> None:
     source = folder_of(tmp_path).rename(tmp_path / "left")
     frames = [*ALL[::-1], *ALL]
@@ -238,24 +222,21 @@ def test_equal_file_names_in_two_folders_of_a_model(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("stamps", "said"),
-    [
-        ([str(5 + i) for i in ALL], "order"),  # whole seconds, as many as images
-        ([str(i) for i in ALL], "whole numbers"),
-        ([str(1700000000 + i) for i in ALL], "order"),
-        ([f"{i / 10:.4f}" for i in ALL], "order"),
-    ],
+    ("first", "step", "said"),
+    [(5, 1, "order"), (0, 1, "whole numbers"), (1700000000, 1, "order"), (0, 0.1, "order")],
 )
-def test_as_many_rows_as_images_without_times(tmp_path: Path, stamps: list[str], said: str) -> None:
+def test_as_many_rows_as_images_without_times(
+    tmp_path: Path, first: int, step: float, said: str
+) -> None:
     """Images without time stamps have no times: none is assumed."""
-    path = tum(tmp_path / "t.txt", stamps, ALL)
+    path = tum(tmp_path / "t.txt", [str(first + step * i) for i in ALL], ALL)
     poses = rt.read_poses(path, rt.Video(folder_of(tmp_path)), camera=LINE)
     assert_right(poses, ALL)
     assert said in poses.reading
 
 
 @pytest.mark.parametrize("first", [0, 1])
-@pytest.mark.parametrize("kept", ["all", "last missing", "one in the middle missing"])
+@pytest.mark.parametrize("kept", ["all", "last missing"])
 def test_frame_numbers_in_the_column_of_times(tmp_path: Path, first: int, kept: str) -> None:
     frames = KEPT[kept]
     path = tum(tmp_path / "t.txt", [f"{i + first}.0" for i in frames], frames)
@@ -337,10 +318,8 @@ def test_of_several_models_one_has_to_be_named(tmp_path: Path) -> None:
     with pytest.raises(rt.ReobjError, match=r"sparse/0 and .*sparse/1; name one"):
         rt.read_poses(tmp_path / "w", source)
     assert_right(rt.read_poses(small, source), ALL[:6])
-    below = large / "sparse" / "0"
-    below.mkdir(parents=True)
-    import_pycolmap().Reconstruction(str(small)).write_binary(str(below))
-    assert_right(rt.read_poses(large, source), ALL[4:])  # named, though a binary one is below it
+    small.rename(large / "0")
+    assert_right(rt.read_poses(large, source), ALL[4:])  # named, though another one is below it
 
 
 @pytest.mark.parametrize("name", ["cameras", "images"])
@@ -399,7 +378,7 @@ def test_only_cameras_of_images_that_are_frames_count(tmp_path: Path) -> None:
     assert rt.read_poses(path, source, camera=LINE).camera == CAMERA
 
 
-@pytest.mark.parametrize("number", ["nan", "inf", "1e300"])
+@pytest.mark.parametrize("number", ["nan", "1e300"])
 @pytest.mark.parametrize("binary", [True, False])
 def test_points_that_are_not_finite_are_refused(
     tmp_path: Path, number: str, binary: bool, capsys: pytest.CaptureFixture[str]
@@ -408,74 +387,24 @@ def test_points_that_are_not_finite_are_refused(
     x = "5" if binary else number
     (path / "points3D.txt").write_text(f"3 0 0 1 9 9 9 0\n7 {x} 0 1 9 9 9 0\n")
     if binary:
-        pycolmap = import_pycolmap()
-        whole = pycolmap.Reconstruction(str(path))
+        whole = import_pycolmap().Reconstruction(str(path))
         whole.points3D[7].xyz = [float(number), 0, 1]
-        path = tmp_path / "binary"
-        path.mkdir()
         whole.write_binary(str(path))
     assert run(tmp_path, None, path) == 2
-    error = capsys.readouterr().err  # pycolmap refuses nan in text without the number
-    assert ("point 7 is" if binary or number == "1e300" else "not a COLMAP model") in error
+    assert "point 7 is not finite, or more than" in capsys.readouterr().err
     assert not (tmp_path / "out" / "objects.json").exists()
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize(
-    "camera",
-    [
-        "OPENCV 320 240 290 290 160 120 0 0 2 0",
-        "OPENCV 320 240 290 290 160 120 1e20 0 0 0",
-        "OPENCV 320 240 290 290 160 120 0 0 0 1e5",
-        "SIMPLE_RADIAL 320 240 290 160 120 -10",
-        "SIMPLE_RADIAL 320 240 290 160 120 -1000",
-        "SIMPLE_RADIAL 320 240 290 160 120 1e5",
-    ],
-)
-@pytest.mark.parametrize("in_model", [True, False])
-def test_a_lens_that_leaves_no_pixel_is_refused(
-    tmp_path: Path, camera: str, in_model: bool, capsys: pytest.CaptureFixture[str]
-) -> None:
-    names = [f"{i:04d}.jpg" for i in ALL]
-    path = model(tmp_path / "m", ALL, names, f"1 {camera}\n" if in_model else "")
-    assert run(tmp_path, None, path, *([] if in_model else ["--camera", camera])) == 2
-    error = capsys.readouterr().err
-    assert "its distortion is invertible for only" in error and error.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    ("text", "camera"),
-    [
-        ("image_width: 320\nimage_height: 240\ncamera_matrix:\n  rows: 3\n  cols: 3\n"
-         "  data: [290, 0, 160,\n    0, 290, 120, 0, 0, 1]\ndistortion_model: plumb_bob\n"
-         "distortion_coefficients:\n  rows: 1\n  cols: 5\n  data: [0.1, 0.02, 0.001, 0.002, 0]\n",
-         rt.Camera("OPENCV", *SIZE, (290, 290, 160, 120, 0.1, 0.02, 0.001, 0.002))),
-        ("%YAML:1.0\n---\nimage_width: 320\nimage_height: 240\n"
-         "Camera_Matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
-         "   data: [ 2.9e+02, 0., 160., 0., 290., 120., 0., 0., 1. ]\n", CAMERA),
-        ("cam0:\n  camera_model: pinhole\n  distortion_coeffs: [0.1, 0.02, 0.003, 0.004]\n"
-         "  distortion_model: equidistant\n  intrinsics: [290, 290, 160, 120]\n"
-         "  resolution: [320, 240]\n  rostopic: /cam0/image_raw\n",
-         rt.Camera("OPENCV_FISHEYE", *SIZE, (290, 290, 160, 120, 0.1, 0.02, 0.003, 0.004))),
-        ("%YAML:1.0\nCamera.type: \"PinHole\"\nCamera.fx: 290.0\nCamera.fy: 290.0\n"
-         "Camera.cx: 160.0\nCamera.cy: 120.0\nCamera.k1: 0.1\nCamera.width: 320\n"
-         "Camera.height: 240\n",
-         rt.Camera("OPENCV", *SIZE, (290, 290, 160, 120, 0.1, 0, 0, 0))),
-    ],
+    "lens",
+    ["OPENCV 320 240 290 290 160 120 0 0 2 0", "OPENCV 320 240 290 290 160 120 1e20 0 0 0",
+     "SIMPLE_RADIAL 320 240 290 160 120 -1000"],
 )  # fmt: skip
-def test_yaml_of_cameras(tmp_path: Path, text: str, camera: rt.Camera) -> None:
-    path = tmp_path / "camera.yaml"
-    path.write_text(text)
-    rows = tum(tmp_path / "t.txt", [str(i) for i in ALL], ALL)
-    found = rt.read_poses(rows, rt.Video(folder_of(tmp_path)), camera=str(path))
-    assert found.camera == camera
-
-
-@pytest.mark.parametrize("numbers", [12, 16])
-def test_rows_of_matrices_are_poses(tmp_path: Path, numbers: int) -> None:
-    """KITTI's, and Replica's and our poses_c2w.txt."""
-    rows = np.tile(np.eye(4), (FRAMES, 1, 1))
-    rows[:, :3] = invert_rigid(path_of())
-    path = tmp_path / "poses_c2w.txt"
-    np.savetxt(path, rows.reshape(FRAMES, 16)[:, :numbers])
-    assert_right(rt.read_poses(path, rt.Video(folder_of(tmp_path)), camera=LINE), ALL)
+@pytest.mark.parametrize("in_model", [True, False])
+def test_a_lens_that_leaves_no_pixel_is_refused(tmp_path: Path, lens: str, in_model: bool) -> None:
+    source = rt.Video(folder_of(tmp_path))
+    names = [f"{i:04d}.jpg" for i in ALL]
+    path = model(tmp_path / "m", ALL, names, f"1 {lens}\n" if in_model else "")
+    with pytest.raises(rt.ReobjError, match="its distortion is invertible for only"):
+        rt.read_poses(path, source, camera="" if in_model else lens)

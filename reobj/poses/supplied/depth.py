@@ -6,6 +6,7 @@ points with their visibility. Frames without a map are unchanged.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import re
 from collections.abc import Sequence
@@ -17,14 +18,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from reobj.cameras import Camera, Poses, invert_rigid
+from reobj.cameras import Camera, Poses, VisiblePoints, invert_rigid
 from reobj.files import load_json
 from reobj.poses.intrinsics import camera_of_keys
 from reobj.poses.supplied.frame_assignment import rows_by_time
 from reobj.poses.supplied.pose_formats import scannet_camera
 from reobj.sources.image_files import read_image
 from reobj.types import Array, BoolArray, Floats, IntArray, ReobjError, log
-from reobj.visible_points import VisiblePoints
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,32 +145,30 @@ def _depth_camera(folder: Path, size: tuple[int, int], color: Camera) -> tuple[C
     Returns:
         camera, and color_from_depth (3, 4).
     """
-    same = np.eye(3, 4)
     for path in (folder, folder.parent, folder.parent / "intrinsic"):
         if (file := path / "intrinsic_depth.txt").exists():
-            return scannet_camera(file, size), same
+            return scannet_camera(file, size), np.eye(3, 4)
     for path in (folder / "intrinsics.json", folder.parent / "intrinsics.json"):
         content = load_json(path) if path.exists() else {}
-        try:
-            depth = content.get("depth", content if path.parent == folder else {})
-            transform = np.array(content.get("T_color_from_depth", [0, 0, 0]), np.float64)
-            if transform.shape == (3,):
-                transform = np.column_stack([np.eye(3), transform])
-            if {"fx", "fy", "cx", "cy"} <= depth.keys():
-                camera = camera_of_keys({k: v for k, v in depth.items() if k != "depth"}, size)
-                return camera.resized(size), transform.reshape(-1, 4)[:3]  # type: ignore[union-attr]
-        except (AttributeError, TypeError, ValueError):
-            depth = {"": 0}
-        if depth:
+        if not (depth := content.get("depth", content if path.parent == folder else None)):
+            continue
+        camera = None
+        color_from_depth = np.eye(3, 4)
+        with contextlib.suppress(AttributeError, TypeError, ValueError):
+            given = np.array(content.get("T_color_from_depth", [0, 0, 0]), np.float64)
+            color_from_depth[:, 3 if given.ndim == 1 else slice(4)] = given[:3]
+            camera = camera_of_keys(depth, size)
+        if camera is None:
             expected = "fx, fy, cx, cy of the depth maps, T_color_from_depth: 3 or 3x4 numbers in m"
             raise ReobjError(f"{path}: expected {expected}")
+        return camera.resized(size), color_from_depth
     if abs(color.width * size[1] - color.height * size[0]) > max(color.width, color.height, *size):
         raise ReobjError(
             f"{folder}: depth maps of {size[0]}x{size[1]}, frames of {color.width}x{color.height}: "
             "another aspect ratio; add the depth camera's intrinsics there: intrinsics.json with "
             "fx, fy, cx, cy"
         )
-    return color.resized(size), same
+    return color.resized(size), np.eye(3, 4)
 
 
 # ---- Scale and points ----------------------------------------------------------------------------
@@ -261,11 +259,9 @@ def _log_ratio(poses: Poses, maps: DepthMaps, visible: VisiblePoints, row: int) 
     in_depth = in_color @ maps.depth_from_color[:, :3].T  # without the shift, which needs the scale
     measured = look_up_depth(depth, K, in_depth)
     good = (measured > 0) & (in_depth[:, 2] > 0)
-    return (
-        float(np.median(np.log(measured[good] / in_depth[good, 2])))
-        if good.sum() >= least
-        else None
-    )
+    if good.sum() < least:
+        return None
+    return float(np.median(np.log(measured[good] / in_depth[good, 2])))
 
 
 def moved(points: Array, b_from_a: Array) -> Array:

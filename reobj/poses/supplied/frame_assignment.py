@@ -6,6 +6,7 @@ Where a file allows several assignments, an error names them; the user declares 
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -15,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from reobj.cameras import invert_rigid
-from reobj.frame_lookup import frames_by_name
+from reobj.formats import frames_by_name
 from reobj.poses.supplied.pose_formats import PoseFile
 from reobj.sources.image_files import TimeUnit, is_date
 from reobj.types import Array, BoolArray, IntArray, ReobjError, nearest_of
@@ -114,11 +115,11 @@ def _compared(names: Sequence[str], stamps_s: Array | None, source: SourceFrames
         return f"images {names[0]!r} ..., frames {first!r} ..."
     if stamps_s is None:
         return "in order"
-    start, end = source.time_s[[0, -1]]
-    frames = f"frames {start:.3f}-{end:.3f} s" if source.timed else "the images have no times"
+    times = "{:.3f}-{:.3f} s".format
+    frames = f"frames {times(*source.time_s[[0, -1]])}" if source.timed else "images without times"
     return (
-        f"{stamps_s[0]:.3f}-{stamps_s[-1]:.3f} s, {frames}; expected seconds of the same clock, "
-        "frame numbers, or one row for each frame"
+        f"{times(*stamps_s[[0, -1]])}, {frames}; expected seconds of the same clock, frame "
+        "numbers, or one row for each frame"
     )
 
 
@@ -190,15 +191,13 @@ def numbers_of_names(names: Sequence[str], where: str) -> IntArray:
         ReobjError: no number differs between all names.
     """
     digits = [re.findall(r"\d+", PurePosixPath(name.replace("\\", "/")).stem) for name in names]
-    numbered = [found for found in digits if found]
-    counts = {len(found) for found in numbered}
+    counts = {len(found) for found in digits if found}
     for group in range(1, max(counts, default=1) + 1 if len(counts) < 2 else 2):
         number = [int(found[-group][-18:]) if found else -1 for found in digits]  # int64 holds 18
-        if len({*number} - {-1}) == len(numbered):
+        repeated = [n for n, count in Counter(number).items() if n >= 0 and count > 1]
+        if not repeated:
             return np.array(number, np.int64)
-    keys = [found[-1].lstrip("0") if found else "-" for found in digits]
-    twice = next(key for key in keys if key != "-" and keys.count(key) > 1)
-    same = [name for name, key in zip(names, keys, strict=True) if key == twice]
+    same = [name for name, n in zip(names, number, strict=True) if n == repeated[0]]
     raise ReobjError(
         f"{where}: {same[0]!r} and {same[1]!r} have the same number, and neither is the name of a "
         "frame; give the poses of one camera, or a folder of images with these names"

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+import struct
 import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -18,11 +19,20 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from reobj.cameras import CV_FROM_GL, WORLD_MAX, Camera, invert_rigid, read_sparse_model
+from reobj.cameras import (
+    CV_FROM_GL,
+    WORLD_MAX,
+    Camera,
+    checked_points,
+    import_pycolmap,
+    invert_rigid,
+    read_sparse_model,
+)
 from reobj.files import MEMORY_MAX, check_unpacked, load_json, read_lines
 from reobj.poses.intrinsics import (
     brown_camera,
     camera_of_keys,
+    colmap_camera,
     image_side,
     read_camera,
     read_yaml,
@@ -44,11 +54,10 @@ class PoseFile:
         is_ours: this tool wrote the stamps, for the same video.
         visibility: (M, 2) row of the pose that observed a point, and row of the point.
         axes: (3, 3) OpenCV's camera axes from those of the file, as it was read.
-        identity: (3, 4) the identity in the file, as it was read; None: that in these axes.
         by_text: without names, poses are in the order of the images' names as text: 1, 10, 2.
         stored_pixels: cameras are those of images as they are stored, without their EXIF turn.
         metric: whether the file states metres (True) or an unknown scale; None: it says nothing.
-        kind: name of the format. lost: number of poses that are missing.
+        kind: name of the format.
         messages: what was assumed or left out.
     """
 
@@ -64,21 +73,17 @@ class PoseFile:
     colors: npt.NDArray[np.uint8] = field(default_factory=lambda: np.empty((0, 3), np.uint8))
     visibility: IntArray = field(default_factory=lambda: np.empty((0, 2), np.int64))
     axes: Array = field(default_factory=lambda: np.eye(3))
-    identity: Array | None = None
     by_text: bool = False
     stored_pixels: bool = False
-    lost: int = 0
     kind: str = ""
     messages: tuple[str, ...] = ()
 
 
-def read_table(
-    path: Path, columns: Sequence[int], finite: bool = True
-) -> tuple[Array, list[str], str]:
+def read_table(path: Path, columns: Sequence[int]) -> tuple[Array, list[str], str]:
     """Read a table of numbers with spaces or commas, after a header.
 
     Args:
-        columns: numbers of columns that are allowed. finite: refuse inf and nan.
+        columns: numbers of columns that are allowed.
     Returns:
         rows (N, C), C in `columns`; file and line of each; the header: comments, column names.
     """
@@ -93,14 +98,12 @@ def read_table(
             continue
         where.append(f"{path}, line {number}")
         is_row = all(map(is_number, words)) and len(words) in columns
+        is_row &= not rows or len(words) == len(rows[0])
         raise_where([not is_row], where[-1:], f"{len(words)} words {text.strip()[:60]!r}; expected "
                     f"{expected} numbers")  # fmt: skip
         rows.append([float(word) for word in words])
-        raise_where([len(rows[-1]) != len(rows[0])], where[-1:], "another row length")
     raise_where([not rows], [str(path)], f"no poses in it; expected rows of {expected} numbers")
-    table = np.array(rows)  # (N, C)
-    raise_where(finite & ~np.isfinite(table).all(1), where, "a number is not finite")
-    return table, where, header
+    return np.array(rows), where, header
 
 
 def is_number(word: str) -> bool:
@@ -126,21 +129,16 @@ def checked_rigid(matrix: Array, where: Sequence[str]) -> Array:
     """
     lost = ~np.isfinite(matrix).all((1, 2)) | (matrix[:, :3, :3] == 0).all((1, 2))
     matrix = np.where(lost[:, None, None], np.eye(4), matrix)
-    last_row = np.abs(matrix[:, 3] - [0, 0, 0, 1])  # (N, 4)
-    raise_where(
-        last_row.max(1) > POSE_TOLERANCE,
-        where,
-        "the last row is not 0 0 0 1; expected row-major 4x4 (transpose column-major ones)",
-    )
     far = (np.abs(matrix[:, :3, 3]) >= WORLD_MAX).any(1)
     raise_where(far, where, f"more than {WORLD_MAX:g} units away from the origin")
     rotation = matrix[:, :3, :3].clip(-2, 2)  # the squares of 1e300 are too large
-    error = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3))  # (N, 3, 3)
+    error = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)).max((1, 2))  # (N,)
+    error = np.maximum(error, np.abs(matrix[:, 3] - [0, 0, 0, 1]).max(1))
     raise_where(
-        error.max((1, 2)) > POSE_TOLERANCE,
+        error > POSE_TOLERANCE,
         where,
-        "the 3x3 block is not a rotation (rows not of length 1 and perpendicular); expected a "
-        "row-major rigid pose without scale",
+        "the 3x3 block is not a rotation, or the last row not 0 0 0 1; expected a row-major rigid "
+        "pose without scale (transpose column-major ones)",
     )
     raise_where(
         np.linalg.det(rotation) < 0,
@@ -233,7 +231,7 @@ def stated_metric(header: str) -> bool | None:
 def read_tum(path: Path, size: tuple[int, int]) -> PoseFile:
     """Read TUM rows: time, world_from_cam, w last. Column names in the header override this."""
     path = table_file(path)
-    rows, where, header = read_table(path, (8,), finite=False)
+    rows, where, header = read_table(path, (8,))
     columns = named_columns(header, 8)
     is_open = columns is None and "," in read_lines(path)[-1]  # TUM has spaces
     text = f"{path}: no header names its columns: read as TUM's, quaternion w last"
@@ -257,24 +255,23 @@ def read_euroc(path: Path, size: tuple[int, int]) -> PoseFile:
     without one the body is taken for the camera, with a message.
     """
     path = _file(path, "data.csv")
-    rows, where, header = read_table(path, (8, 17), finite=False)
+    rows, where, header = read_table(path, (8, 17))
     columns = named_columns(header, rows.shape[1]) or [1, 2, 3, 5, 6, 7, 4]
     body_from_world = invert_rigid(from_quaternions(rows, columns, where))
     near = (path.parent, path.parent.parent / "cam0", path.parent / "cam0")
-    sensors = {s: read_yaml(s) for s in (f / "sensor.yaml" for f in near) if s.is_file()}
-    is_camera = (s for s in sensors if sensors[s].get("sensor_type", "camera") == "camera")
-    if (sensor := next(is_camera, None)) is None:
+    sensors = [read_yaml(s) for s in (f / "sensor.yaml" for f in near) if s.is_file()]
+    sensors = [sensor for sensor in sensors if sensor.get("sensor_type", "camera") == "camera"]
+    if not sensors:
         text = (
             f"{path}: poses of the body, and no sensor.yaml with the camera's T_BS beside it: body "
             "taken for camera"
         )
         return PoseFile(body_from_world, stamps=rows[:, 0], unit="ns", messages=(text,))
-    matrix = np.array(sensors[sensor]["T_BS"]["data"], np.float64).reshape(1, 4, 4)
-    cam_from_body = invert_rigid(checked_rigid(matrix, [f"{sensor}, T_BS"]))
+    matrix = np.array(sensors[0]["T_BS"]["data"], np.float64).reshape(1, 4, 4)
+    cam_from_body = invert_rigid(checked_rigid(matrix, ["T_BS of sensor.yaml"]))
     return PoseFile(
-        cam_from_body @ homogeneous(body_from_world), (camera_of_keys(sensors[sensor], size),),
-        stamps=rows[:, 0], unit="ns", identity=cam_from_body[0],
-        messages=(f"{path}: T_BS and intrinsics of {sensor}",),
+        cam_from_body @ homogeneous(body_from_world), (camera_of_keys(sensors[0], size),),
+        stamps=rows[:, 0], unit="ns",
     )  # fmt: skip
 
 
@@ -286,7 +283,7 @@ def read_matrices(path: Path, size: tuple[int, int]) -> PoseFile:
 
 def matrix_rows(path: Path) -> tuple[Array, list[str], str]:
     """Read rows of 12 or 16 numbers: matrices (N, 4, 4), locations, header; not finite: lost."""
-    rows, where, header = read_table(path, (12, 16), finite=False)
+    rows, where, header = read_table(path, (12, 16))
     whole = np.tile(np.eye(4), (len(rows), 1, 1))
     whole.reshape(-1, 16)[:, : rows.shape[1]] = rows
     return whole, where, header
@@ -314,7 +311,7 @@ def read_stray(path: Path, size: tuple[int, int]) -> PoseFile:
     """
     path = _file(path, "odometry.csv")
     names = [word.strip().lower() for word in read_lines(path)[0].split(",")]
-    rows, where, header = read_table(path, (len(names),), finite=False)
+    rows, where, header = read_table(path, (len(names),))
     columns = named_columns(header, len(names))
     if columns is None or "frame" not in names:
         raise ReobjError(f"{path}: expected columns frame, x, y, z, qx, qy, qz, qw")
@@ -331,11 +328,9 @@ def _phone_camera(K: Array, size: tuple[int, int]) -> Camera:
 
     The principal point is near the middle of the right one.
     """
-    native = (1920, 1440)  # in landscape
-    offset = [np.abs(2 * K[:2, 2] / some - 1).max() for some in (size, native)]
-    return brown_camera(
-        size if offset[0] <= offset[1] else native, *K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
-    )
+    sizes = (size, (1920, 1440))  # in landscape
+    right = min(sizes, key=lambda one: np.abs(2 * K[:2, 2] / one - 1).max())
+    return brown_camera(right, *K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist())
 
 
 def read_record3d(path: Path, size: tuple[int, int]) -> PoseFile:
@@ -373,7 +368,7 @@ def read_scannet(path: Path, size: tuple[int, int]) -> PoseFile:
     path = path.parent if path.name == "pose" else path
     files = scannet_files(path)
     where = [str(file) for file in files]
-    tables = [read_table(file, (4,), finite=False)[0] for file in files]
+    tables = [read_table(file, (4,))[0] for file in files]
     raise_where([len(table) != 4 for table in tables], where, "expected 4 rows of 4 numbers")
     matrix = path / "intrinsic" / "intrinsic_color.txt"
     return PoseFile(
@@ -456,9 +451,9 @@ def read_transforms(path: Path, size: tuple[int, int]) -> PoseFile:
 
     named = {f"{path}, frames[{i}]": frame for i, frame in enumerate(frames)}
     found = _listed(named, read, CV_FROM_GL)
-    where = [f"{path}, applied_transform"]
     applied = np.eye(4)
     applied[:3] = np.array(data.get("applied_transform", applied), np.float64)[:3]
+    where = [f"{path}, applied_transform"]
     raise_where([not np.isfinite(applied).all()], where, "expected 3x4 or 4x4 finite numbers")
     turn = homogeneous(checked_rigid(applied[None], where))
     return dataclasses.replace(found, cam_from_world=found.cam_from_world @ turn)
@@ -521,3 +516,154 @@ def read_splatting(path: Path, size: tuple[int, int]) -> PoseFile:
     path = _file(path, "cameras.json")
     named = {f"{path}, entry {i}": entry for i, entry in enumerate(load_json(path))}
     return _listed(named, read, np.eye(3))
+
+
+# ---- COLMAP models -------------------------------------------------------------------------------
+
+UPRIGHT = "upright.txt"  # file in our models: their cameras are those of upright photos
+
+
+def find_models(path: Path) -> list[Path]:
+    """List the image files of the COLMAP models at a path or below it.
+
+    Below a folder without a model: `sparse/N` and `sparse`, else `N`, else `colmap/sparse/N`.
+    """
+    if path.is_file():
+        return [path] if path.stem == "images" else _model_in(path.parent)
+    models = _model_in(path)
+    levels = (("sparse", "sparse/*"), ("*",), ("colmap/sparse", "colmap/sparse/*"))
+    for patterns in levels if not models else ():
+        folders = [folder for pattern in patterns for folder in sorted(path.glob(pattern))]
+        folders = [f for f in folders if f.name.isdecimal() or f.name == "sparse"]
+        models = models or [model for folder in folders for model in _model_in(folder)]
+    return models
+
+
+def _model_in(folder: Path) -> list[Path]:
+    return [p for p in (folder / "images.bin", folder / "images.txt") if p.is_file()][:1]
+
+
+def read_colmap(path: Path, size: tuple[int, int]) -> PoseFile:
+    """Read a COLMAP model, binary (preferred) or text, with or without rigs; scale unknown.
+
+    Raises:
+        ReobjError: none, several, or one of which a file is missing.
+    """
+    models = find_models(path)
+    if len(models) > 1:
+        names = " and ".join(str(model.parent) for model in models)
+        raise ReobjError(f"{path}: several COLMAP models: {names}; name one of them with --poses")
+    lacking = models[0].with_stem("cameras").name if models else "images.bin"
+    if not models or not models[0].with_name(lacking).is_file():
+        raise ReobjError(f"{path}: no {lacking} beside it; a COLMAP model is a folder with "
+                         "cameras, images and points3D: give that folder")  # fmt: skip
+    folder = models[0].parent
+    is_binary = models[0].suffix == ".bin"
+    found = _read_binary_model(folder) if is_binary else _read_text_model(folder)
+    kind = "(binary)" if is_binary else "(text)"
+    kind += f" in {folder}" if folder not in (path, path.parent) else ""
+    return dataclasses.replace(found, kind=kind, stored_pixels=not (folder / UPRIGHT).exists())
+
+
+def _read_binary_model(folder: Path) -> PoseFile:
+    """Read a binary COLMAP model."""
+    _check_counts(folder)
+    model = read_sparse_model(folder)
+    raise_where([not model.names], [f"{folder / 'images.bin'}"], "no registered image")
+    where = [f"{folder / 'images.bin'}, {name}" for name in model.names]
+    return PoseFile(
+        checked_rigid(homogeneous(model.cam_from_world), where), tuple(model.cameras), model.names,
+        points=model.points, colors=model.colors,
+        visibility=np.column_stack([model.obs_image, model.obs_point]),
+    )  # fmt: skip
+
+
+def _read_text_model(folder: Path) -> PoseFile:
+    """Read a COLMAP model of text: pycolmap refuses or misreads what other tools leave out.
+
+    These are points3D.txt, and the line of observations after each image. Names may have spaces.
+    Observations are those of the points.
+    """
+    camera_rows, _ = _lines_of(folder / "cameras.txt")
+    cameras = {words[0]: colmap_camera(words[1:]) for words in camera_rows}
+    images, where = _image_rows(folder / "images.txt")
+    numbers = np.array([words[1:8] for words in images], np.float64)
+    length = np.linalg.norm(numbers[:, :4], axis=1)
+    fault = "the quaternion is not of length 1"
+    raise_where(~(np.abs(length - 1) <= POSE_TOLERANCE), where, fault)  # also NaN
+    turn_of = import_pycolmap().Rotation3d  # with its rounding
+    turns = [turn_of(xyzw).matrix() for xyzw in numbers[:, [1, 2, 3, 0]]]
+    cam_from_world = np.concatenate([turns, numbers[:, 4:, None]], 2)
+    row_of = {words[0]: row for row, words in enumerate(images)}
+    path = folder / "points3D.txt"
+    rows, _ = _lines_of(path) if path.is_file() else ([], [])
+    rows.sort(key=lambda words: int(words[0]))
+    seen = [(row_of[i], p) for p, words in enumerate(rows) for i in words[8::2] if i in row_of]
+    return PoseFile(
+        checked_rigid(homogeneous(cam_from_world), where),
+        tuple(cameras[words[8]] for words in images),
+        tuple(words[9].strip() for words in images),
+        points=checked_points([w[1:4] for w in rows], [w[0] for w in rows], path),
+        colors=np.array([words[4:7] for words in rows], np.uint8).reshape(-1, 3),
+        visibility=np.array(sorted(seen), np.int64).reshape(-1, 2),
+    )
+
+
+def _lines_of(path: Path) -> tuple[list[list[str]], list[str]]:
+    """Return the words of the lines of a text file that are no comments, and their locations."""
+    lines = [(line.split(), f"{path}, line {n}") for n, line in enumerate(read_lines(path), 1)]
+    kept = [(words, where) for words, where in lines if words and not words[0].startswith("#")]
+    return [words for words, _ in kept], [where for _, where in kept]
+
+
+def _image_rows(path: Path) -> tuple[list[list[str]], list[str]]:
+    """Return ID, QW QX QY QZ, TX TY TZ, CAMERA_ID, NAME of images by ascending id; locations."""
+    rows: list[tuple[list[str], str]] = []
+    observations_next = False
+    for number, line in enumerate(read_lines(path), 1):
+        words = line.split()
+        if line.startswith("#"):
+            continue
+        triples = len(words) % 3 == 0 and all(w.lstrip("-").isdigit() for w in words[2::3])
+        if (observations_next and triples) or not words:
+            observations_next = False
+            continue
+        observations_next = True
+        where = f"{path}, line {number}"
+        is_row = len(words) >= 10 and all(map(is_number, words[:8]))
+        raise_where([not is_row], [where], "expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME")
+        rows.append((line.split(maxsplit=9), where))
+    raise_where([not rows], [str(path)], "no registered image")
+    rows.sort(key=lambda row: int(row[0][0]))
+    return [words for words, _ in rows], [where for _, where in rows]
+
+
+# Records of COLMAP's binary files: bytes before a name, or before the number of entries; the format
+# of that number; bytes of an entry
+RECORDS = {
+    "cameras.bin": (24, "", 0),
+    "images.bin": (64, "<Q", 24),  # with a name
+    "points3D.bin": (43, "<Q", 8),
+    "frames.bin": (64, "<I", 16),
+    "rigs.bin": (8, "", 0),
+}
+
+
+def _check_counts(folder: Path) -> None:
+    """Refuse a binary model that claims more than it contains: pycolmap reads without end."""
+    for name, (head, number, size) in RECORDS.items():
+        if not (folder / name).exists():
+            continue
+        data = (folder / name).read_bytes()
+        (count,) = struct.unpack_from("<Q", data)
+        offset = 8
+        if offset + count * head > len(data):
+            raise ValueError(f"{name} claims {count} records in {len(data)} bytes")
+        for _ in range(count if number else 0):
+            offset += head
+            if name == "images.bin":
+                offset = data.index(b"\0", offset) + 1
+            (n,) = struct.unpack_from(number, data, offset)
+            offset += struct.calcsize(number) + n * size
+            if offset > len(data):
+                raise ValueError(f"{name} claims {n} entries in {len(data)} bytes")

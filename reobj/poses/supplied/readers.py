@@ -1,8 +1,9 @@
 """Read the poses of a video's frames from files of other tools: the registry POSES.
 
 The reader of each format converts its conventions to cam_from_world, OpenCV axes, COLMAP pixels
-(`pose_formats`, `colmap_model`); poses are then assigned to frames (`frame_assignment`). Whether
-the file follows its conventions is checked later, against images or tracks (`check`).
+(`pose_formats`); poses are then assigned to frames (`frame_assignment`). Whether the file follows
+its conventions is checked later, against images or tracks (`check`). `open_video` opens a video, or
+without one the frames of the files of poses and detections.
 """
 
 from __future__ import annotations
@@ -15,33 +16,36 @@ from typing import Any
 
 import numpy as np
 
-from reobj.cameras import WORLD_MAX, Camera, Poses, invert_rigid
+from reobj.cameras import WORLD_MAX, Camera, Poses, camera_parameters, invert_rigid
 from reobj.files import spans
-from reobj.formats import AUTO, Format, Probe, Registry
+from reobj.formats import AUTO, Format, Probe, Registry, frames_by_name
 from reobj.poses.estimate import PosesConfig
 from reobj.poses.intrinsics import (
     CAMERA_FORMS,
     fitted_camera,
-    is_dso_camera,
-    is_kitti_calibration,
     parse_camera,
     refuse_unusable,
+    stated_camera,
 )
 from reobj.poses.supplied import pose_formats as formats
 from reobj.poses.supplied.check import Supplied
-from reobj.poses.supplied.colmap_model import find_models, read_colmap
 from reobj.poses.supplied.frame_assignment import (
     FrameAssignment,
     SourceFrames,
     assign,
+    by_numbers,
     by_order,
     interpolated,
+    numbers_of_names,
+    numbers_of_times,
     seconds_of,
     source_of,
 )
-from reobj.poses.supplied.orientation import turned, turns_of
 from reobj.poses.supplied.pose_formats import PoseFile
-from reobj.types import Array, BoolArray, IntArray, ReobjError
+from reobj.sources.detection_files import DetectConfig, described_images, read_detections
+from reobj.sources.image_files import exif_orientation, sorted_names
+from reobj.sources.video import ImagelessVideo, InputConfig, Video
+from reobj.types import NOTE_START, Array, BoolArray, IntArray, ReobjError
 
 
 def read_poses(
@@ -88,7 +92,11 @@ def read_supplied(video: Any, config: PosesConfig) -> Supplied:
     assignment = assign(pose_file, stamps_s, source, str(path), config.frames_by)
     row = assignment.row
     turns = turns_of(source, size, pose_file.cameras, row) if pose_file.stored_pixels else {}
-    camera = stated or one_camera(_cameras_of(pose_file, row, turns), path, size)
+    cameras = pose_file.cameras
+    if len(cameras) == len(pose_file.cam_from_world) > 1:  # those of the frames
+        used = [(f, r) for f, r in enumerate(row.tolist()) if r >= 0]
+        cameras = tuple(turned(cameras[r], turns.get(f)) for f, r in used)
+    camera = stated or one_camera(cameras, path, size)
     cam_from_world = _of_frames(pose_file.cam_from_world, assignment, source, stamps_s)
     if (np.abs(cam_from_world) >= WORLD_MAX).any():
         raise ReobjError(f"{path}: a camera is more than {WORLD_MAX:g} units away from the origin")
@@ -99,32 +107,31 @@ def read_supplied(video: Any, config: PosesConfig) -> Supplied:
     is_assumed = pose_file.metric is None and not config.metric
     if metric:
         _check_units(cam_from_world, path)
+    frame_of = np.full(len(pose_file.cam_from_world), -1)
+    frame_of[row[row >= 0]] = np.flatnonzero(row >= 0)
+    seen = np.column_stack([frame_of[pose_file.visibility[:, 0]], pose_file.visibility[:, 1]])
     poses = Poses(
         camera, source.frame, source.time_s, cam_from_world,
         np.where(known, "supplied", "none"), "user", metric=metric,
         up_in_world=pose_file.up_in_world, points=pose_file.points, colors=pose_file.colors,
-        visibility=_in_frames(pose_file.visibility, row),
+        visibility=seen[seen[:, 0] >= 0],
         messages=tuple(_messages(pose_file, path, source, known, len(turns))),
         reading=f"{pose_file.kind}{METRES_ASSUMED * is_assumed}, frames by {assignment.rule}",
     )  # fmt: skip
+    by_text = assignment.key == "order"
+    others = (
+        by_order(len(pose_file.cam_from_world), source, by_text)
+        if by_text or assignment.key == "text"
+        else []
+    )
     orders = {
         f"the {one.rule} (--set poses.frames_by={one.key})": _of_frames(
             pose_file.cam_from_world, one, source
         )
-        for one in by_order(len(pose_file.cam_from_world), source, assignment.key == "order")
-        if assignment.key in ("order", "text") and one.key != assignment.key
+        for one in others
+        if one.key != assignment.key
     }
     return Supplied(poses, pose_file.axes, orders)
-
-
-def _cameras_of(
-    pose_file: PoseFile, row: IntArray, turns: dict[int, Array]
-) -> Sequence[Camera | None]:
-    """Return the cameras of the frames with a pose, turned with their photos, or that of all."""
-    cameras = pose_file.cameras
-    if not len(cameras) == len(pose_file.cam_from_world) > 1:
-        return cameras
-    return [turned(cameras[r], turns.get(f)) for f, r in enumerate(row.tolist()) if r >= 0]
 
 
 def _messages(
@@ -140,8 +147,8 @@ def _messages(
         step = int(np.median(np.diff(source.frame))) if len(known) > 1 else 1
         without = spans(source.frame[~known].tolist(), step)
         facts.append(f"poses for {known.sum()} of {len(known)} frames, none for {without}")
-    if pose_file.lost:
-        facts.append(f"{pose_file.lost} poses of lost frames (the identity, zeros, not finite)")
+    if lost := int((~np.isfinite(pose_file.cam_from_world).all((1, 2))).sum()):
+        facts.append(f"{lost} poses of lost frames (the identity, zeros, not finite)")
     return messages + [f"{path}: {'; '.join(facts)}"] * bool(facts)
 
 
@@ -206,12 +213,62 @@ def _of_frames(
     return poses
 
 
-def _in_frames(visibility: IntArray, row: IntArray) -> IntArray:
-    """Replace rows of poses (M, 2) by those of their frames; poses without a frame are dropped."""
-    frame_of = np.full(int(max(row.max(initial=-1), visibility[:, 0].max(initial=-1))) + 1, -1)
-    frame_of[row[row >= 0]] = np.flatnonzero(row >= 0)
-    frame = frame_of[visibility[:, 0]]
-    return np.column_stack([frame, visibility[:, 1]])[frame >= 0]
+# ---- EXIF orientations: COLMAP's cameras are those of the stored pixels --------------------------
+
+# upright_from_stored (2, 2): of offsets from the middle of the image
+TURNS = {3: -np.eye(2), 6: np.array([[0.0, -1], [1, 0]]), 8: np.array([[0.0, 1], [-1, 0]])}
+
+
+def turns_of(
+    source: SourceFrames, size: tuple[int, int], cameras: Sequence[Camera | None], row: IntArray
+) -> dict[int, Array]:
+    """Return the turns (2, 2) of the photos with an EXIF orientation, by frame row.
+
+    A camera of the shape of the upright photos, where a turn by 90 deg changes it, is not turned.
+
+    Args:
+        size: (w, h) of the upright photos.
+        cameras: of the stored pixels, of each pose. row: (F,) pose of each frame, -1: none.
+    """
+    turns: dict[int, Array] = {}
+    for f in np.flatnonzero(row >= 0).tolist() if source.images else ():
+        path = Path(source.images[int(source.frame[f])])
+        orientation = exif_orientation(path)
+        camera = cameras[row[f]]
+        if orientation == 1 or camera is None:
+            continue
+        if orientation not in TURNS:
+            raise ReobjError(
+                f"{path}: a mirrored EXIF orientation ({orientation}), which COLMAP ignores; store "
+                "the photos upright, without EXIF orientation, and reconstruct them again"
+            )
+        is_upright = size[0] != size[1] and (camera.width > camera.height) == (size[0] > size[1])
+        if orientation == 3 or not is_upright:
+            turns[f] = TURNS[orientation]
+    return turns
+
+
+def turned(camera: Camera | None, turn: Array | None) -> Camera | None:
+    """Return the camera of the turned images; turn: (2, 2) of TURNS, or None."""
+    if camera is None or turn is None:
+        return camera
+    names = camera_parameters(camera.model)
+    if unknown := [n for n in names if not re.fullmatch(r"[fc][xy]?|k\d?|p[12]|omega", n)]:
+        raise ReobjError(
+            f"a {camera.model} camera is not turned with the EXIF orientation of its photos "
+            f"({', '.join(unknown)}); store them upright and reconstruct them again"
+        )
+    values = dict(zip(names, camera.params, strict=True))
+    stored = np.array([camera.width, camera.height])
+    size = np.abs(turn @ stored).astype(int)
+    if "p2" in values:  # (p2, p1) r^2 + 2 ((p2, p1) x) x: a vector of the image
+        values["p2"], values["p1"] = turn @ [values["p2"], values["p1"]]
+    if "fx" in values:
+        values["fx"], values["fy"] = np.abs(turn @ [values["fx"], values["fy"]])
+    centre = turn @ (np.array([values["cx"], values["cy"]]) - stored / 2) + size / 2
+    values["cx"], values["cy"] = centre
+    width, height = size.tolist()
+    return Camera(camera.model, width, height, tuple(float(values[name]) for name in names))
 
 
 # ---- Formats -------------------------------------------------------------------------------------
@@ -224,7 +281,7 @@ def read_pose_file(path: Path, fmt: str, size: tuple[int, int]) -> PoseFile:
         size: (w, h) of the images, for formats that do not state it.
     """
     read = POSES.reader(path, fmt)
-    entry = POSES.find(path, fmt)
+    entry = next(one for one in POSES.formats if one.read is read)
     try:
         found = read(path, size)
     except ReobjError as error:
@@ -253,18 +310,16 @@ def _settled(found: PoseFile, entry: Format[ReadPoses], path: Path) -> PoseFile:
             messages += (f"{path}: {repeated} rows repeat a time stamp and are left out",)
         poses = poses[kept]
     identity = np.column_stack([found.axes, np.zeros(3)])
-    identity = identity if found.identity is None else found.identity
     same: BoolArray = np.all(np.abs(poses - identity) < 1e-9, axis=(1, 2))  # (N,)
     begins = same[:1].any() and not same[1:2].any()
     if begins or (found.names and same.sum() == 1):
         same[same.argmax()] = False
     same &= not same.all()
     poses = np.where(same[:, None, None], np.nan, poses)
-    lost = int((~np.isfinite(poses).all((1, 2))).sum())
-    if lost == len(poses):
+    if not np.isfinite(poses).all((1, 2)).any():
         raise ReobjError(f"{path}: no poses in it, or only those of lost frames")
     return dataclasses.replace(
-        found, cam_from_world=poses, stamps=stamps, messages=messages, lost=lost,
+        found, cam_from_world=poses, stamps=stamps, messages=messages,
         metric={METRES: True, UNKNOWN: False}.get(entry.units, found.metric),
         kind=f"{entry.name} {found.kind}".strip(),
     )  # fmt: skip
@@ -275,8 +330,6 @@ def _head(probe: Probe) -> tuple[str, list[str], str]:
     probe = Probe(formats.table_file(probe.path)) if probe.is_dir else probe
     for k, line in enumerate(probe.lines):
         words = line.replace(",", " ").split()
-        if re.fullmatch(r"(\S*\d,\d\S*\s+){6,}\S+", line) and "." not in line:
-            raise ReobjError(f"{probe.path}: decimal commas ({line:.30} ...); expected points")
         if words and all(map(formats.is_number, words)):
             return "\n".join(probe.lines[:k]), words, line
     return "", [], ""
@@ -309,23 +362,23 @@ def _is_colmap(probe: Probe) -> bool:
     """Test for a model; not that from which nerfstudio's transforms.json beside it was made."""
     if probe.is_dir:
         has_copy = {"transforms.json", "colmap"} <= probe.names or _is_ours(probe)
-        return not has_copy and bool(find_models(probe.path))
+        return not has_copy and bool(formats.find_models(probe.path))
     return probe.path.stem in ("cameras", "images", "points3D", "frames", "rigs") and (
         probe.suffix in (".bin", ".txt")
     )
 
 
-def _is_reality_capture(probe: Probe) -> bool:
-    first = "".join(probe.lines[:1]).lower().replace(" ", "")
-    return probe.suffix == ".xmp" or first.startswith(("#name,x,y,", "#cameras"))
+def _has(name: str, *keys: str) -> Callable[[Probe], bool]:
+    """Make a test for a folder with a file, or a JSON file whose (first) object has these keys."""
 
+    def test(probe: Probe) -> bool:
+        data = probe.json if not probe.is_dir else None
+        if not isinstance(data, dict | list):
+            return name in probe.names
+        first = next(iter(data.values() if isinstance(data, dict) else data), None)
+        return any(isinstance(one, dict) and {*keys} <= one.keys() for one in (data, first))
 
-def _has(probe: Probe, name: str, *keys: str) -> bool:
-    """Test for a folder with a file, or a JSON file whose (first) object has these keys."""
-    if probe.is_dir or not isinstance(probe.json, dict | list):
-        return name in probe.names
-    first = next(iter(probe.json.values() if isinstance(probe.json, dict) else probe.json), None)
-    return any(isinstance(one, dict) and {*keys} <= one.keys() for one in (probe.json, first))
+    return test
 
 
 ReadPoses = Callable[[Path, tuple[int, int]], PoseFile]
@@ -336,7 +389,7 @@ METRES_ASSUMED = ", metres assumed (no `# units:` in the file)"
 GIVE = "no intrinsics (`--camera`)"
 POSES: Registry[ReadPoses] = Registry("poses", "--pose-format", [
     Format("colmap", "COLMAP: model, binary (preferred) or text, with its points", _is_colmap,
-           read_colmap, NAME, UNKNOWN, "cameras of images that are no frames"),
+           formats.read_colmap, NAME, UNKNOWN, "cameras of images that are no frames"),
     Format("tum", "TUM, ORB-SLAM3: rows `t tx ty tz qx qy qz qw`, or as a header names them",
            _is_tum, formats.read_tum, TIME, UNSTATED, GIVE),
     Format("reobj", "this tool: output folder, `poses.txt` with the camera of `sparse/`", _is_ours,
@@ -347,13 +400,13 @@ POSES: Registry[ReadPoses] = Registry("poses", "--pose-format", [
     Format("matrices", "KITTI (12), Replica, NICE-SLAM (16): rows of matrices, row-major",
            lambda p: len(_head(p)[1]) in (12, 16), formats.read_matrices, ORDER, UNSTATED, GIVE),
     Format("transforms", "nerfstudio, instant-ngp, NeRF synthetic: `transforms.json`, OpenGL axes; "
-           "`applied_transform` is undone", lambda p: _has(p, "transforms.json", "frames"),
+           "`applied_transform` is undone", _has("transforms.json", "frames"),
            formats.read_transforms, NAME, UNKNOWN, "`applied_scale`"),
     Format("scannet", "ScanNet: folder `pose/N.txt`, z up; 7-Scenes: `*.pose.txt`",
            lambda p: p.is_dir and bool(formats.scannet_files(p.path)), formats.read_scannet, NAME,
            METRES, "7-Scenes: no intrinsics"),
     Format("scannetpp", "ScanNet++ (iPhone): `pose_intrinsic_imu.json`, `aligned_pose` (z up) or "
-           "`pose`", lambda p: _has(p, "pose_intrinsic_imu.json", "intrinsic"),
+           "`pose`", _has("pose_intrinsic_imu.json", "intrinsic"),
            formats.read_scannetpp, NAME, METRES, "IMU"),
     Format("arkitscenes", "ARKitScenes: `.traj`, axis-angle of cam_from_world; `.pincam` beside it",
            lambda p: any(name.endswith(".traj") for name in (*p.names, p.path.name)),
@@ -362,7 +415,7 @@ POSES: Registry[ReadPoses] = Registry("poses", "--pose-format", [
            "axes, y up", lambda p: p.is_dir and bool(formats.arkit_files(p.path)),
            formats.read_arkit, NAME, METRES),
     Format("record3d", "Record3D: `metadata`, its folder, or `.r3d`; OpenGL axes, y up",
-           lambda p: p.suffix == ".r3d" or _has(p, "metadata", "poses", "K"),
+           lambda p: p.suffix == ".r3d" or _has("metadata", "poses", "K")(p),
            formats.read_record3d, ORDER, METRES),
     Format("stray", "Stray Scanner: `odometry.csv` with `camera_matrix.csv`, y up; its `rgb.mp4`",
            lambda p: "odometry.csv" in {*p.names, p.path.name}, formats.read_stray, "number",
@@ -371,29 +424,126 @@ POSES: Registry[ReadPoses] = Registry("poses", "--pose-format", [
            lambda p: p.suffix == ".npy" or "poses_bounds.npy" in p.names, formats.read_llff,
            "order of the names as text: 1, 10, 2", UNKNOWN, "depth bounds"),
     Format("splatting", "3D Gaussian splatting: `cameras.json`",
-           lambda p: _has(p, "cameras.json", "img_name", "position"), formats.read_splatting, NAME,
+           _has("cameras.json", "img_name", "position"), formats.read_splatting, NAME,
            UNKNOWN),
-    Format("", "OpenSfM's reconstruction.json", lambda p: _has(p, "reconstruction.json", "shots"),
-           None, advice="write a COLMAP model with `opensfm export_colmap`"),
+    *(Format("", title, _has(name, *keys), None,
+             advice=f"write a COLMAP model with {tool}") for title, name, keys, tool in (
+        ("OpenSfM's reconstruction.json", "reconstruction.json", ["shots"],
+         "`opensfm export_colmap`"),
+        ("Meshroom's cameras.sfm", "cameras.sfm", ["views", "version"], "the node ExportColmap"),
+        ("openMVG's sfm_data.json", "sfm_data.json", ["sfm_data_version"],
+         "openMVG_main_openMVG2Colmap"),
+    )),
     Format("", "Metashape's cameras.xml", lambda p: p.root is not None and p.root.tag == "document",
            None, advice="export the cameras as COLMAP: File, Export, Export Cameras"),
-    Format("", "Meshroom's cameras.sfm", lambda p: _has(p, "cameras.sfm", "views", "version"), None,
-           advice="write a COLMAP model with the node ExportColmap"),
-    Format("", "openMVG's sfm_data.json", lambda p: "sfm_data_version" in p.keys(), None,
-           advice="write a COLMAP model with openMVG_main_openMVG2Colmap"),
-    Format("", "Bundler's bundle.out, VisualSFM's .nvm", lambda p: "".join(p.lines[:1]).startswith(
-           ("# Bundle file", "NVM_V3")), None,
-           advice="reconstruct the images with COLMAP"),
-    Format("", "RealityCapture's CSV or XMP", _is_reality_capture, None,
-           advice="export the registration as COLMAP"),
-    Format("", "KITTI's calib.txt", is_kitti_calibration, None,
-           advice="it holds cameras: give it as --camera, and the rows of poses/NN.txt as --poses"),
-    Format("", "DSO's camera.txt", is_dso_camera, None, advice="give its result.txt as --poses"),
-    Format("", "a folder of NeRF splits", lambda p: "transforms_train.json" in p.names
-           and "transforms.json" not in p.names, None,
-           advice="give the file transforms_....json of the images"),
-    Format("", "cameras of `ns-export cameras` of nerfstudio",
-           lambda p: not p.is_dir and {"file_path", "transform"} <= p.keys(), None,
-           advice="their world is scaled, and they have no intrinsics: give the transforms.json of "
-           "the data"),
 ])  # fmt: skip
+
+
+# ---- Without a video -----------------------------------------------------------------------------
+
+
+def open_video(
+    source: Video | str | Path | int | None,
+    config: InputConfig,
+    poses: PosesConfig,
+    boxes: Any = None,
+    detect: DetectConfig | None = None,
+) -> Video:
+    """Open a video, or without one the frames of the files of detections and poses.
+
+    Args:
+        source: a `Video`, or its source; None: there is none.
+        poses, boxes: file of poses, and of detections or identities; used without a video.
+        detect: how the detections are read.
+    Raises:
+        ReobjError: no video, and no file of detections, poses or size of the images either;
+            options that need a video or camera poses.
+    """
+    if poses.mode == "none" and (poses.depth or poses.metric):
+        raise ReobjError("--depth and --metric need camera poses, but --poses is none")
+    if isinstance(source, Video):
+        return source
+    if source is not None:
+        return Video(source, config)
+    if poses.depth:
+        raise ReobjError(f"--depth {poses.depth}: depth maps are matched to images; name the video")
+    if not isinstance(boxes, str | Path) or not boxes or poses.mode in ("auto", "none"):
+        raise ReobjError(
+            "no video: name one, or use `run` without images: --detections FILE (or --tracks "
+            "FILE), --poses FILE and --camera MODEL WIDTH HEIGHT PARAMS, or a file"
+        )
+    path = Path(boxes)
+    unknown = (1, 1)
+    if not path.exists():
+        raise ReobjError(f"{path} does not exist")
+    detect = detect or DetectConfig()
+    size = described_images(path, detect)[0]
+    stated = stated_camera(poses.camera, size, poses.camera_format)
+    size = size or (unknown if stated is None else (stated.width, stated.height))
+    pose_file = read_pose_file(Path(poses.mode), poses.fmt, size)
+    if size == unknown and (camera := next(filter(None, pose_file.cameras), None)) is not None:
+        size = (camera.width, camera.height)
+    if size == unknown:
+        raise ReobjError(
+            f"{poses.mode}: no image size in it; give --camera MODEL WIDTH HEIGHT PARAMS"
+        )
+    video = _frames_of(pose_file, path, size, poses.mode, config, detect)
+    video.messages.append(
+        f"{NOTE_START}no images: {video.frame_count} frames of {size[0]}x{size[1]} from "
+        f"{poses.mode} and {path}; tracked by motion and cameras alone, without appearance and "
+        "overlay video"
+    )
+    return video
+
+
+def _frames_of(
+    pose_file: PoseFile,
+    boxes: Path,
+    size: tuple[int, int],
+    source: str,
+    config: InputConfig,
+    detect: DetectConfig,
+) -> ImagelessVideo:
+    """Number the frames of poses and detections as a folder of their images would be.
+
+    Times in a CSV of detections are those of the frames. Else images of a COCO dataset or of the
+    poses are numbered in the order of the numbers in their names; if the detections have more
+    frames, by these numbers. Poses without names: evenly spaced times from 0 on are numbers;
+    otherwise each row is one frame.
+    """
+    _, given, times_s = described_images(boxes, detect)
+    if times_s is not None:
+        return ImagelessVideo(source, size, config, times_s=times_s)
+    named = {Path(name.replace("\\", "/")).name for name in given}
+    posed = {Path(name).name for name in pose_file.names}
+    if named and posed and (frames_by_name(sorted(named), sorted(posed))[0] >= 0).all():
+        named = posed  # all of the detections' images and more, with suffixes
+    names = sorted_names(named or posed)
+    first = ImagelessVideo(source, size, config, names=names if named else ())
+    unfiltered = dataclasses.replace(detect, min_score=0.0, classes="", max_detections=0)
+    count = int(read_detections(boxes, first, unfiltered).frame.max(initial=-1)) + 1
+    if names and count > len(names):
+        number = numbers_of_names(names, source)
+        frames = SourceFrames(np.arange(count), np.arange(count) / 1.0, count)
+        inside = [a for a in by_numbers(number, frames, "numbers") if not a.outside]
+        if len(inside) != 1:
+            last = int(number.max()) + 1
+            return ImagelessVideo(source, size, config, count=count if inside else max(count, last))
+        names = [names[row] if row >= 0 else "" for row in inside[0].row]
+    if names:
+        return ImagelessVideo(source, size, config, names=names)
+    rows = len(pose_file.cam_from_world)
+    stamps = pose_file.stamps
+    if stamps is not None:
+        stamps_s = seconds_of(stamps, pose_file.unit)
+        number = numbers_of_times(stamps_s)
+        times_s = np.interp(np.arange(number[-1] + 1), number, stamps_s)
+        rows = len(times_s)
+        if count <= rows:
+            return ImagelessVideo(source, size, config, times_s=times_s)
+    if count > rows:
+        raise ReobjError(
+            f"{boxes}: frame {count - 1}, but {source} has {rows} poses without names; expected a "
+            "pose for each frame, or a CSV with a `timestamp`"
+        )
+    return ImagelessVideo(source, size, config, count=rows)
