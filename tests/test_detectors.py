@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import reobj_track as rt
-from reobj.options import read_config
+from reobj.config import read_config
 from reobj.results.stages import keep_detections
 from reobj.results.workspace import Workspace
 from reobj.sources import detectors, weights

@@ -20,7 +20,7 @@ from reobj.objects.config import make_fit
 from reobj.objects.description import describe_objects, describe_world
 from reobj.objects.given_boxes import mean_box
 from reobj.objects.observations import Scene, Views, gather_views
-from reobj.options import parse_known_size, parse_up
+from reobj.words import parse_known_size, parse_up
 
 
 def options(**changes: object) -> rt.ObjectsConfig:

@@ -21,8 +21,8 @@ from simulated import chair_solids, fitted, tracks_of, walk
 import quadrics
 import reobj_track as rt
 from reobj.cameras import load_poses, save_poses
+from reobj.config import read_config, with_option
 from reobj.files import load_cached
-from reobj.options import parse_known_size, parse_up, read_config, with_option
 from reobj.poses.intrinsics import parse_camera
 from reobj.results.edits import apply_edits, read_edits
 from reobj.results.evaluation_3d import read_true_objects
@@ -30,6 +30,7 @@ from reobj.results.truth import read_truth
 from reobj.results.workspace import Workspace
 from reobj.sources.imageless import ImagelessVideo
 from reobj.sources.recorded import read_npz
+from reobj.words import parse_known_size, parse_up
 
 hypothesis = pytest.importorskip("hypothesis", reason="pip install hypothesis (dev extra)")
 from hypothesis import example, given  # noqa: E402

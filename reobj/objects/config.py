@@ -11,8 +11,8 @@ import quadrics
 from reobj.cameras import Poses
 from reobj.objects.frames import FrameOptions
 from reobj.objects.observations import Fit, Scene, Views
-from reobj.options import load_size_priors, parse_known_size, parse_up
 from reobj.types import ReobjError, option
+from reobj.words import load_size_priors, parse_known_size, parse_up
 
 
 class Solver(enum.StrEnum):

@@ -156,7 +156,6 @@ def collect_tracks(
     collected = TrackedFrames() if checkpoint is None else checkpoint.collected
     try:
         with progress("track", video.expected) as line:
-            line.resume(len(collected.frames))
             for frame, _ in steps:
                 collected.add(frame.index, tracker)
                 if checkpoint is not None:

@@ -19,7 +19,7 @@ import numpy as np
 from PIL import Image as PillowImage
 from PIL import ImageSequence
 
-from reobj.runtime import quiet_opencv
+from reobj.files import quiet_opencv
 from reobj.types import Array, Image, ReobjError
 
 

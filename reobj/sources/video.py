@@ -31,8 +31,7 @@ from typing import Any, TypeVar
 import cv2
 import numpy as np
 
-from reobj.files import shortened
-from reobj.runtime import check_versions, guard_forks, quiet_opencv
+from reobj.files import quiet_opencv, shortened
 from reobj.sources.decoding import (
     Decoded,
     Opened,
@@ -144,8 +143,6 @@ class Video:
         config: InputConfig | None = None,
         live: LiveTimes | None = None,
     ) -> None:
-        check_versions()
-        guard_forks()
         self._address = str(source)
         self.config = config or InputConfig()
         self._live = live or LiveTimes()
