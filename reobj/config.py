@@ -190,7 +190,7 @@ def _converted(value: Any, kind: type) -> Any:
         value = {"1": True, "true": True, "yes": True, "on": True, "0": False, "false": False,
                  "no": False, "off": False}.get(value.lower())  # fmt: skip
     if kind is bool or isinstance(value, bool):
-        if not isinstance(value, kind):
+        if type(value) is not kind:
             raise TypeError
         return value
     if kind is int and isinstance(value, float):
@@ -238,7 +238,7 @@ def _with_table(config: C, table: Mapping[str, Any], where: str) -> C:
     for key, value in table.items():
         inner = value if isinstance(value, Mapping) else {"": value}
         for name, item in inner.items():
-            config = with_option(config, f"{key}.{name}" if name else key, item, where)
+            config = with_option(config, f"{key}.{name}" if name else str(key), item, where)
     return config
 
 
