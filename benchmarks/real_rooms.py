@@ -66,6 +66,7 @@ from synthetic_quadrics import table, write_table
 
 import quadrics
 import reobj_track as rt
+from reobj import pipeline
 from reobj.objects.confidence import LOW_CONFIDENCE
 from reobj.objects.fit import link_and_fit
 from reobj.objects.observations import Views
@@ -316,7 +317,7 @@ def shake(seed: int) -> None:
             result = dataclasses.replace(result, **{name: dataclasses.replace(rows, xyxy=xyxy)})
         return link_and_fit(result, config, phases, last)
 
-    rt.link_and_fit = shaken  # type: ignore[attr-defined]
+    pipeline.link_and_fit = shaken
 
 
 def mean_of(runs: Sequence[Figures]) -> Figures:

@@ -100,12 +100,12 @@ def locked(path: Path, wait_s: float = 0.0, named: Path | None = None) -> Iterat
         LockedError: another process, or this one, still holds it.
     """
     lock = filelock.FileLock(path, timeout=wait_s)
-    try:
-        with writing(path, named):
-            path.parent.mkdir(parents=True, exist_ok=True)
+    with writing(path, named):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
             lock.acquire()
-    except filelock.Timeout:
-        raise LockedError(f"{path}: locked by another process") from None
+        except filelock.Timeout:
+            raise LockedError(f"{path}: locked by another process") from None
     try:
         yield
     finally:
@@ -378,12 +378,16 @@ class Progress:
 
     def _show(self) -> None:
         self._shown = time.monotonic()
-        parts = "{desc}: {percentage:3.0f}% [{elapsed}<{remaining}]"
-        layout = None if self.counted or not self.total else parts
-        name = f"{self.stage:<9}"
-        elapsed_s = self._shown - self._started
+        parts = ["{desc} {percentage:3.0f} %"] if self.total else ["{desc}"]
+        parts += ["{n_fmt}/{total_fmt}" if self.total else "{n_fmt}"] * self.counted
+        parts += ["[{elapsed}" + "<{remaining}" * bool(self.total) + ", {rate_fmt}" * self.counted]
         text = tqdm.format_meter(
-            self.done, self.total or None, elapsed_s, ncols=0, prefix=name, bar_format=layout
+            self.done,
+            self.total or None,
+            self._shown - self._started,
+            prefix=f"{self.stage:<9}",
+            unit="",
+            bar_format=" ".join(parts) + "]",
         )
         if self._is_terminal:
             sys.stderr.write(f"\r{text}\x1b[K")  # erases the rest of a longer line

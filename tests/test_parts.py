@@ -37,6 +37,7 @@ from reobj.cameras import invert_rigid, read_sparse_model, write_colmap
 from reobj.files import part_path
 from reobj.objects.description import components_message
 from reobj.poses.floor import Floor
+from reobj.results.evaluation import score_report
 from reobj.results.evaluation_3d import score_objects
 from reobj.results.overlay import Overlay
 from reobj.results.saving import validate_objects
@@ -505,7 +506,7 @@ def test_poses_command_writes_a_file_for_each_component(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     given = (two_parts(), None)
-    monkeypatch.setattr(rt, "reconstruct_cached", lambda *a, **k: given)
+    monkeypatch.setattr("reobj.pipeline.reconstruct_cached", lambda *a, **k: given)
     frames = str(parted_folder.parent / "frames")
     assert rt.main(["poses", frames, "-o", str(tmp_path)]) == 0
     lengths = [len(np.loadtxt(tmp_path / name)) for name in ("poses.txt", "poses_part1.txt")]
@@ -686,7 +687,7 @@ def test_eval_reports_both_components(parted_folder: Path, tmp_path: Path) -> No
     np.savetxt(tmp_path / "gt.txt", rows, delimiter=",")
     scores = rt.evaluate(parted_folder, tmp_path / "gt.txt", *truth(tmp_path))
     assert scores["objects"]["found"] == 3 and scores["objects"]["o3d_all"] > 0.9
-    assert "scale_error" in rt.score_report(scores)
+    assert "scale_error" in score_report(scores)
     assert scores["tracks"]["all"]["ids_per_object"] == 2
 
 

@@ -26,6 +26,7 @@ import pytest
 import reobj_track as rt
 from reobj.sources import weights
 from reobj.sources.onnx_layouts import LAYOUTS
+from reobj.types import NOTE
 
 SHARED = Path(os.environ.get("REOBJ_SHARED", Path(__file__).resolve().parents[2] / "shared"))
 needs_shared = pytest.mark.skipif(
@@ -103,7 +104,7 @@ def here(server: Any) -> list[Path]:
 def test_a_download_is_announced_verified_and_done_once(
     server: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
-    caplog.set_level(rt.NOTE, "reobj_track")
+    caplog.set_level(NOTE, "reobj_track")
     assert rt.model_path("toy") == server.target and server.target.read_bytes() == BLOB
     for shown in ("0.3 MB", "licence MIT", "http://127.0.0.1", "sha256 " + SHA256):
         assert shown in caplog.text

@@ -32,7 +32,6 @@ from PIL import Image
 from simulated import tracks_of, unlinked, walk
 
 import reobj_track as rt
-from reobj import runtime
 from reobj.cameras import Camera
 from reobj.maps.stage import session_key
 from reobj.poses.keyframes import ResizedVideo
@@ -1297,37 +1296,6 @@ def test_ctrl_c_leaves_complete_files(stream: tuple[Stream, str], tmp_path: Path
 # ---- Processes and packages ----------------------------------------------------------------------
 
 
-FORKED = """
-import multiprocessing, sys
-import cv2, numpy as np
-import reobj_track
-from reobj.poses.keyframes import follow_points
-from reobj.runtime import guard_forks
-guard_forks()  # as `Video` does
-def use(threads):
-    image = np.random.default_rng(0).integers(0, 255, (480, 640), np.uint8)
-    for n in threads:
-        cv2.setNumThreads(n)
-        for _ in range(3):
-            follow_points(image, image, np.random.default_rng(1).uniform(50, 400, (500, 2)))
-            cv2.GaussianBlur(image, (0, 0), 5)
-    return cv2.getNumThreads()
-use([4])
-context = multiprocessing.get_context("fork")
-with context.Pool(2) as pool:
-    print(pool.map_async(use, [[1, 3], [0], [2, 1]]).get(60), cv2.getNumThreads())
-    use([4])
-    print(pool.map_async(use, [[2]]).get(60), cv2.getNumThreads())
-"""
-
-
-def test_threads_of_opencv_in_a_forked_process() -> None:
-    """OpenCV would wait forever for the threads of the parent process."""
-    done = subprocess.run([sys.executable, "-c", FORKED], cwd=ROOT, timeout=100, text=True,
-                          capture_output=True, check=True)  # fmt: skip
-    assert done.stdout.splitlines() == ["[3, 1, 1] 4", "[2] 4"]
-
-
 TERMINATED = """
 import faulthandler, multiprocessing, signal, sys, threading, time
 faulthandler.enable()
@@ -1351,36 +1319,3 @@ def test_a_terminated_process_prints_no_traceback() -> None:
     done = subprocess.run([sys.executable, "-c", TERMINATED], cwd=ROOT, timeout=100, text=True,
                           capture_output=True, check=False)  # fmt: skip
     assert (done.returncode, done.stderr) == (-15, "")
-
-
-@pytest.mark.parametrize("file", ["pyproject.toml", "requirements.txt", ".ci/lowest.txt"])
-def test_lower_bounds_are_the_same_everywhere(file: str) -> None:
-    text = (ROOT / file).read_text()
-    for package, least in runtime.LEAST_VERSIONS.items():
-        assert re.search(rf'^ *"?{package}[=>]={re.escape(least)}', text, re.MULTILINE), package
-
-
-@pytest.mark.parametrize(
-    ("package", "version", "said"),
-    [
-        ("cv2", "4.9.0", "OpenCV 4.9.0 is installed, 4.10 or later is needed: pip install"),
-        ("cv2", "3.4.18-dev", "OpenCV 3.4.18-dev is installed"),
-        ("numpy", "1.24.4", "numpy 1.24.4 is installed, 1.26.4 or later is needed"),
-        ("cv2", "4.10.0", ""),
-        ("cv2", "6.0.0-pre", ""),
-    ],
-)
-def test_a_package_that_is_too_old_is_one_line(
-    package: str, version: str, said: str, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
-    installed = runtime.importlib.metadata.version
-    if package == "cv2":
-        monkeypatch.setattr(cv2, "__version__", version)
-    monkeypatch.setattr(runtime.importlib.metadata, "version",
-                        lambda name: version if name == package else installed(name))  # fmt: skip
-    runtime.check_versions.cache_clear()
-    code = rt.main(["track", str(tmp_path / "none.mp4"), "-o", str(tmp_path / "out")])
-    runtime.check_versions.cache_clear()
-    text = capsys.readouterr().err
-    assert code == 2 and text.count("\n") == 1 and (said or "no such file") in text
