@@ -102,6 +102,7 @@ def locked(path: Path, wait_s: float = 0.0, named: Path | None = None) -> Iterat
     lock = filelock.FileLock(path, timeout=wait_s)
     with writing(path, named):
         path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()  # where that is impossible, filelock would wait
         try:
             lock.acquire()
         except filelock.Timeout:

@@ -176,6 +176,7 @@ def need(page: str) -> None:
         pytest.importorskip("onnx")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES)
 def test_tutorial(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As a reader does: in a checkout, one block after the other; `run` with less input."""
@@ -239,6 +240,7 @@ def test_the_tables_of_formats_are_those_of_the_registries() -> None:
     assert all(table in text for table in make_formats.TABLES.values())
 
 
+@pytest.mark.slow
 def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     """Links and anchors lead somewhere, every name of the reference is found.
 
