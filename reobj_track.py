@@ -1175,7 +1175,7 @@ def run(
     config: Config | Mapping[str, Any] | None = None,
     *,
     detector: Any = None,
-    detections: pipeline.Detections = None,
+    detections: pipeline.DetectionInput = None,
     tracks: str | Path | None = None,
     map: str | Path | None = None,
     map_frozen: bool = False,

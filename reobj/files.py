@@ -147,16 +147,18 @@ def check_places(folder: Path, names: Iterable[str | Path]) -> None:
     """Refuse files (paths within a folder) that cannot be written or replaced.
 
     Raises:
-        ReobjError: the path of a file is a folder, or that of a folder is a file.
+        ReobjError: the path of a file is a folder, that of a folder is a file, or a folder is not
+            writable.
     """
     for name in map(Path, names):
         above = [folder / parent for parent in name.parents]
         blocked = [path for path in above if os.path.lexists(path) and not path.is_dir()]
+        blocked += [path for path in above if path.is_dir() and not os.access(path, os.W_OK)]
         if (path := folder / name).is_dir() and not path.is_symlink():
             blocked.append(path)
         if blocked:
-            what = "a file is in the place of a folder, or the reverse"
-            raise ReobjError(f"{blocked[0]}: results are written here, but {what}; move it away")
+            what = "it is not writable, or a file in the place of a folder, or the reverse"
+            raise ReobjError(f"{blocked[0]}: results go here, but {what}; move it away")
 
 
 def _sync(path: Path) -> None:
@@ -212,11 +214,15 @@ def read_lines(path: Path) -> list[str]:
 
 def load_json(path: Path) -> Any:
     """Read a JSON file; an error names the line."""
+    text = read_text(path)
+    if digits := re.search(r"\d{309}", text):  # no float
+        line = text.count("\n", 0, digits.start()) + 1
+        raise ReobjError(f"{path}, line {line}: a number of more than 308 digits")
     try:
-        return json.loads(read_text(path))
+        return json.loads(text)
     except json.JSONDecodeError as error:
         raise ReobjError(f"{path}, line {error.lineno}: not valid JSON ({error.msg})") from error
-    except (RecursionError, ValueError) as error:  # nested too deep, too many digits
+    except (RecursionError, ValueError) as error:  # nested too deep
         raise ReobjError(f"{path}: invalid JSON ({error})") from error
 
 

@@ -73,7 +73,7 @@ from reobj.words import (
     unused_sizes,
 )
 
-Detections = str | Path | Callable[[Image], Any] | None  # of `run`
+DetectionInput = str | Path | Callable[[Image], Any] | None  # of `run`
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,7 +224,7 @@ def last_config(out: str | Path) -> Config:
 
 
 def detect(
-    job: Job, detections: Detections, in_3d: bool, poses: Poses | None
+    job: Job, detections: DetectionInput, in_3d: bool, poses: Poses | None
 ) -> tuple[DetectionSource, Tracks]:
     """Open the detections; if cameras are estimated, detect in all frames of a recorded video.
 

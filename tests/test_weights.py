@@ -225,7 +225,7 @@ def test_a_full_disk(server: Any, monkeypatch: pytest.MonkeyPatch) -> None:
         return opened(Path("/dev/full") if mode == "wb" else path, mode, **options)
 
     monkeypatch.setattr(Path, "open", on_a_full_disk)
-    why = r"toy.*\.onnx: cannot be written \(No space left on device\); make room on this disk"
+    why = r"toy.*\.onnx: cannot be written \(No space left on device\); make room"
     with pytest.raises(rt.ReobjError, match=why):
         rt.model_path("toy")
     assert here(server) == []
