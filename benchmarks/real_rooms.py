@@ -317,7 +317,7 @@ def shake(seed: int) -> None:
             result = dataclasses.replace(result, **{name: dataclasses.replace(rows, xyxy=xyxy)})
         return link_and_fit(result, config, phases, last)
 
-    pipeline.link_and_fit = shaken
+    pipeline.link_and_fit = shaken  # type: ignore[attr-defined]
 
 
 def mean_of(runs: Sequence[Figures]) -> Figures:
