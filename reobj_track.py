@@ -22,10 +22,10 @@ How it works (start reading at `run()`, then `track()`, then `Tracker.update()`)
   7. link      associate detections with 3D objects; tracklets are joined or split
   8. fit       one shape and its ellipsoid per object, from its boxes and a size prior (quadrics.py)
 
-This file holds the Kalman filter, association, re-identification, the pipeline and the command
-line. The package `reobj` holds the rest: sources/ (video, detections, weights), appearance/
-(embeddings, gallery), tracking/ (assignment, linking), poses/ (cameras), objects/ (association and
-fit), results/ (files, pages), maps/ (maps of a room).
+This file holds the Kalman filter, association, re-identification and the order of the stages. The
+package `reobj` holds the rest: config, cli, pipeline (the stages), sources/ (video, detections,
+weights), appearance/ (embeddings, gallery), tracking/ (assignment, linking), poses/ (cameras),
+objects/ (association and fit), results/ (files, pages), maps/ (maps of a room).
 
 Conventions: frames 0-based (1-based in MOT files); boxes `xyxy` in pixels, the top-left pixel spans
 [0, 1] and has its centre at (0.5, 0.5) as in COLMAP; `b_from_a` maps coordinates in a to b;
@@ -39,28 +39,18 @@ al., ECCV 2022), BoT-SORT (Aharon et al., 2022), COLMAP (Schoenberger and Frahm,
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import json
-import logging
 import math
-import re
 import sys
-import time
-import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
-import quadrics
-from reobj import __version__
+from reobj import __version__, cli, pipeline
 from reobj.appearance.crops import CropEmbedder, make_embedder
 from reobj.appearance.embedding import (
     EmbedConfig,
@@ -76,92 +66,22 @@ from reobj.appearance.reid import (
     match_probability,
     part_cosines,
 )  # fmt: skip
-from reobj.cameras import Camera, Poses, checked_pose, viewing_rays, without_copies
-from reobj.commands import (
-    SafeFormatter,
-    apply_command,
-    make_parser,
-    say,
-    short_help,
-    with_streams,
-)
-from reobj.files import (
-    Progress,
-    atomic,
-    load_cached,
-    load_npz,
-    part_path,
-    save_npz,
-    shortened,
-    wrapped,
-)
-from reobj.maps.corrections import FolderMap, corrected
+from reobj.cameras import Camera, Poses, checked_pose, viewing_rays
+from reobj.config import Config, OutputConfig, TrackerConfig, as_config
+from reobj.files import load_cached, load_npz, restore_state, save_npz, state_arrays
 from reobj.maps.fusion import class_ids, ellipsoid_map_of, embeddings_of, object_state
-from reobj.maps.listing import MAP_EXPORTS, export_map, listing
-from reobj.maps.room_map import RoomMap, map_lock
-from reobj.maps.stage import (
-    MapConfig,
-    OpenMap,
-    Placed,
-    finish_map,
-    move_models,
-    opened_map,
-    place_recording,
-    session_key,
-)
-from reobj.objects.config import ObjectsConfig, solve_again
-from reobj.objects.description import components_message, scores_far_off
-from reobj.objects.fit import fill, link_and_fit
-from reobj.options import (
-    as_config,
-    changed_options,
-    check_known_size,
-    check_shape,
-    config_from_args,
-    parse_known_size,
-    parse_up,
-    priors_used,
-    read_config,
-    unused_sizes,
-    write_config,
-)
+from reobj.maps.room_map import RoomMap
+from reobj.maps.stage import MapConfig, opened_map
+from reobj.objects.config import ObjectsConfig
 from reobj.poses.estimate import PosesConfig, estimate_poses
-from reobj.poses.stage import (
-    checked_poses,
-    poses_key,
-    reconstruct_cached,
-    supplied_poses,
-    write_supplied_model,
-)
-from reobj.poses.supplied.readers import open_video, read_poses
-from reobj.results.changes import Change, Changes, read_changes
-from reobj.results.edits import kept_edits, read_edits
-from reobj.results.entries import OutputFile
-from reobj.results.evaluation import evaluate, score_report
-from reobj.results.export import EXPORTS, Viewer, export
-from reobj.results.links import Links
-from reobj.results.live import LivePage, open_viewer
-from reobj.results.overlay import film_layers
-from reobj.results.plausibility import implausible
-from reobj.results.result import (
-    Object,
-    Part,
-    Result,
-    VideoInfo,
-    World,
-    load_tracked,
-    save_tracked,
-    write_objects,
-)
-from reobj.results.saving import (
-    copy_models,
-    replaced,
-    validate_objects,
-    write_trajectories,
-)
-from reobj.results.scene import write_pictures
-from reobj.results.serve import Server
-from reobj.results.stages import collect_tracks, detect_all, detections_key, keep_detections
+from reobj.poses.stage import poses_key, supplied_poses
+from reobj.poses.supplied.readers import read_poses
+from reobj.results.changes import Change, Changes
+from reobj.results.edits import read_edits
+from reobj.results.evaluation import evaluate
+from reobj.results.export import export
+from reobj.results.result import Object, Part, Result, World, load_tracked, save_tracked
+from reobj.results.stages import collect_tracks, detections_key
 from reobj.results.workspace import Workspace
 from reobj.sources.detection_files import DetectConfig, read_detections, read_tracks
 from reobj.sources.detectors import DetectionSource, open_detections, with_detector
@@ -170,7 +90,6 @@ from reobj.sources.recorded import Intervals, write_detections_npz
 from reobj.sources.tables import boxes_3d_of
 from reobj.sources.video import InputConfig, Video, in_batches
 from reobj.sources.weights import list_models, model_path
-from reobj.state import restore_state, state_arrays
 from reobj.tracking.assignment import Pairs, ambiguous_pairs, assign, touching
 from reobj.tracking.camera_motion import CameraMotion
 from reobj.tracking.ellipsoid_map import (
@@ -181,10 +100,9 @@ from reobj.tracking.ellipsoid_map import (
     iou_within_uncertainty,
     rows_of,
 )  # fmt: skip
-from reobj.tracking.interpolation import STD_POSITION, STD_START, STD_VELOCITY
+from reobj.tracking.interpolation import STD_POSITION, STD_START
 from reobj.types import (
     COCO_NAMES,
-    NOTE,
     Array,
     BoolArray,
     Detections,
@@ -200,16 +118,11 @@ from reobj.types import (
     as_frame,
     cxcywh_from_xyxy,
     log,
-    log_message,
-    one_line,
-    option,
     rows_by,
     unit_rows,
     widen,
-    without_secrets,
     xyxy_from_cxcywh,
 )
-from reobj.words import among
 
 __all__ = [
     "COCO_NAMES", "Camera", "Change", "Changes", "Config", "CropEmbedder", "DetectConfig",
@@ -226,96 +139,6 @@ __all__ = [
 def __dir__() -> list[str]:
     """List the public names, for completion."""
     return list(__all__)
-
-
-# ---- Configuration -----------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class TrackerConfig:
-    """Tracking and re-identification."""
-
-    high_score: float = option(
-        0.4, "detections of at least this score are matched first", "--high-score"
-    )
-    low_score: float = option(
-        0.1, "second association round: minimum detection score (ByteTrack); raise it for noisy "
-        "detectors"
-    )  # fmt: skip
-    new_score: float = option(0.5, "minimum score of the detection that starts a new track")
-    n_init: int = option(
-        3, "confirm a track once its scores sum to n_init x 0.5; re-identified tracks need 0.5 "
-        "less; raise it for fewer false objects"
-    )  # fmt: skip
-    coast_frames: int = option(
-        30, "frames with detector output that a track survives without a detection", "--coast"
-    )
-    remember: bool = option(True, "re-identify objects that return, after any time")
-    std_position: float = option(
-        STD_POSITION, "process noise of the position, over the box size; raise it for jerky cameras"
-    )
-    std_velocity: float = option(
-        STD_VELOCITY, "process noise of the velocity, over the box size; raise it for jerky cameras"
-    )
-    appearance_weight: float = option(0.7, "weight of appearance in the cost of ambiguous matches")
-    foreground_weight: float = option(
-        0.5, "weight of the foreground in the appearance; the rest is that of the surroundings"
-    )
-    embed_every: int = option(10, "frames with detector output between two embeddings of a track")
-    return_probability: float = option(
-        0.5, "minimum probability of a re-identification; raise it for fewer wrong identities"
-    )
-    camera_motion: bool = option(True, "compensate the camera's motion (sparse optical flow)")
-
-
-@dataclass(frozen=True, slots=True)
-class OutputConfig:
-    """Files written."""
-
-    overlay: str = option(
-        "solids",
-        "layers of the overlay video besides boxes: solids, ellipses, trails; none: no video",
-    )
-    scene: bool = option(True, "write the viewer, scene.html")
-    cloud: bool = option(
-        False,
-        "dense coloured points in the viewer: from the maps of --depth, else from optical flow, "
-        "about a minute longer",
-    )
-    doubtful: bool = option(
-        False, "include low-confidence objects in tracks.txt, overlay video and viewer"
-    )
-    fill_gaps: int = option(
-        5,
-        "interpolate track gaps of up to N frames (0: off); interpolated boxes have score 0. 3D "
-        "objects are also projected into frames from nearby viewpoints",
-    )
-
-    def __post_init__(self) -> None:
-        film_layers(self.overlay)  # an invalid value is an error before the run starts
-
-
-@dataclass(frozen=True, slots=True)
-class Config:
-    """All options; sections are set by `--set section.field=value` on the command line."""
-
-    input: InputConfig = field(default_factory=InputConfig)
-    detect: DetectConfig = field(default_factory=DetectConfig)
-    embed: EmbedConfig = field(default_factory=EmbedConfig)
-    tracker: TrackerConfig = field(default_factory=TrackerConfig)
-    poses: PosesConfig = field(default_factory=PosesConfig)
-    objects: ObjectsConfig = field(default_factory=ObjectsConfig)
-    output: OutputConfig = field(default_factory=OutputConfig)
-    map: MapConfig = field(default_factory=MapConfig)
-    threads: int = option(0, "threads of onnxruntime and OpenCV (0: all cores)", "--threads")
-    device: str = option(
-        "cpu", "device of the networks: cpu, cuda, coreml, ... (onnxruntime)", "--device"
-    )
-    offline: bool = option(False, "never download weights", "--offline")
-
-    def __repr__(self) -> str:
-        """List the options that differ from the defaults, in one line."""
-        return f"Config({', '.join(f'{k}={v!r}' for k, v in changed_options(self).items())})"
 
 
 # ---- Kalman filter -----------------------------------------------------------------------------
@@ -1346,7 +1169,7 @@ def run(
     config: Config | Mapping[str, Any] | None = None,
     *,
     detector: Any = None,
-    detections: str | Path | Callable[[Image], Any] | None = None,
+    detections: pipeline.DetectionInput = None,
     tracks: str | Path | None = None,
     map: str | Path | None = None,
     map_frozen: bool = False,
@@ -1377,65 +1200,35 @@ def run(
     Raises:
         ReobjError: invalid input; the message says what to do.
     """
-    config = _with_map(as_config(Config(), config), map, map_frozen)
-    config, detections = _with_detector(config, detector, detections)
-    if config.threads:
-        cv2.setNumThreads(config.threads)
-    _check_objects(config.objects)
-    video = open_video(source, config.input, config.poses, tracks or detections, config.detect)
-    config = _with_input(config, video.config)
-    out = _default_out(source) if out is None else out
-    with (
-        Workspace(out, overwrite) as workspace,
-        opened_map(config.map) as room,
-        ExitStack() as opened,
-    ):
-        workspace.bind(video, overwrite)
-        poses_config = config.poses.absolute()
-        config = dataclasses.replace(config, map=config.map.absolute(), poses=poses_config)
-        job = _Job(video, workspace, config)
-        log.info("input: %r", video)
-        log.debug("options that differ from the defaults: %s", changed_options(config))
-        viewer = open_viewer(VideoInfo.of(video), opened) if show else None
-        in_3d = in_3d and config.poses.mode != "none"
-        supplied = supplied_poses(video, config.poses) if in_3d else None
+    if detector is not None and detections is not None:
+        raise ReobjError("detector and detections are the same argument: give one of them")
+    config = pipeline.run_config(config, map, map_frozen)
+    detect, detections = with_detector(config.detect, detections if detector is None else detector)
+    config = dataclasses.replace(config, detect=detect)
+    with pipeline.open_job(source, out, config, tracks or detections, overwrite, show) as job:
+        in_3d = in_3d and job.config.poses.mode != "none"
+        supplied = supplied_poses(job.video, job.config.poses) if in_3d else None
+        detected = None
         if tracks:
-            result = _given_tracks(tracks, video, config.detect, workspace.last_tracks)
+            result = pipeline.given_tracks(job, tracks, job.workspace.last_tracks)
             boxes = result.tracks
             class_names = result.class_names
         else:
             cameras = supplied.poses if supplied else None
-            detected, boxes = _detect(job, detections, in_3d, cameras)
+            detected, boxes = pipeline.detect(job, detections, in_3d, cameras)
             class_names = tuple(detected.class_names)
-            log.info("detections: %d, of %d classes", len(boxes), len(np.unique(boxes.class_id)))
-        sizes = config.objects
-        check_known_size(sizes.known_size, sizes.size_priors(), class_names)
         poses: Poses | None = None
         models: list[Path] = []
         if supplied:
-            with job.timed("poses"):
-                seen = boxes if tracks else _tracklets(boxes)
-                poses = checked_poses(supplied, seen, video, config.poses, workspace, job.progress)
-        elif in_3d and not video.is_live:
-            poses, models = _reconstructed_cameras(job, boxes, class_names)
-        if poses is not None:
-            log.info("%s", poses.cameras_text)
-        placed = None
-        if room is not None and poses is not None and poses.known.any():
-            placed, models = _place(job, room, poses, models)
-            poses = placed.poses
-        if not tracks:
-            result = _track_video(job, detected, poses, viewer)
+            poses = pipeline.check_cameras(job, supplied, boxes if tracks else _tracklets(boxes))
+        elif in_3d and not job.video.is_live:
+            poses, models = pipeline.reconstruct(job, boxes, class_names)
+        poses, models, placed = pipeline.place(job, poses, models)
+        if detected is not None:
+            result = _track_video(job, detected, poses)
         log.info("identities: %d", len(np.unique(result.tracks.track_id)))
-        result = dataclasses.replace(result, poses=poses)
-        if placed is not None:
-            result = _without_moved_boxes(result, placed)
-        warnings = workspace.save_last(result, result.poses, models)
-        result = dataclasses.replace(result, warnings=[*result.warnings, *warnings])
-        result = _finish(job, result, room, placed)
-        if viewer is not None:
-            viewer.show(result.without_doubtful(), Path("rerun"), images=not viewer.followed)
-        return result
+        result = pipeline.save_last(job, result, poses, models, placed)
+        return pipeline.finish(job, result, placed)
 
 
 def refit(
@@ -1460,191 +1253,31 @@ def refit(
         last = workspace.load_last()
         video, warnings = (workspace.video(), []) if tracks else workspace.video_or_frames(last)
         corrections = read_edits(edits) if edits else None
-        last_config = _last_config(out)
-        config = as_config(last_config, config)
-        poses_config = config.poses.absolute()
-        config = dataclasses.replace(config, input=video.config, poses=poses_config)
-        _check_objects(config.objects)
-        sizes = config.objects
-        check_known_size(sizes.known_size, sizes.size_priors(), last.class_names)
-        result = last
-        links = workspace.last_links()
+        before = pipeline.last_config(out)
+        config = as_config(before, config)
+        config = dataclasses.replace(config, input=video.config, poses=config.poses.absolute())
+        pipeline.check_objects(config.objects)
+        job = pipeline.Job(video, workspace, config)
+        job.check_known_size(last.class_names)
+        result = dataclasses.replace(last, warnings=[*last.warnings, *warnings])
+        links = None
         if tracks:
-            links = None
-            result = _given_tracks(tracks, video, config.detect, last)
-            warnings = workspace.save_last(result, last.poses, workspace.last_models())
-        result = dataclasses.replace(
-            result, poses=last.poses, edits=corrections, warnings=[*result.warnings, *warnings]
-        )
+            result = pipeline.given_tracks(job, tracks, last)
+            result = pipeline.save_last(job, result, last.poses, workspace.last_models())
+        else:
+            links = workspace.last_links()
+        result = dataclasses.replace(result, edits=corrections)
         with opened_map(config.map, must_exist=True) as room:
-            return _finish(_Job(video, workspace, config), result, room, links=links)
+            return pipeline.finish(dataclasses.replace(job, room=room), result, links=links)
 
 
-def _with_detector(config: Config, detector: Any, detections: Any) -> tuple[Config, Any]:
-    """Return the options with the detector that the arguments of `run` name, and the detections."""
-    if detector is not None and detections is not None:
-        raise ReobjError("detector and detections are the same argument: give one of them")
-    given = detections if detector is None else detector
-    detect, given = with_detector(config.detect, given)
-    return dataclasses.replace(config, detect=detect), given
-
-
-def _with_input(config: Config, of_video: InputConfig) -> Config:
-    """Return the options with those that the video was opened with."""
-    if config.input not in (InputConfig(), of_video):
-        raise ReobjError(f"config.input is {config.input}, but the Video was opened with {of_video}"
-                         ": give these options to the Video only")  # fmt: skip
-    return dataclasses.replace(config, input=of_video)
-
-
-def _default_out(source: Video | str | Path | int | None) -> Path:
-    """Name the output folder of a source, in the working folder.
-
-    >>> _default_out("recordings/room.mp4").name
-    'room_out'
-    """
-    if source is None:
-        return Path("out")
-    text = str(source.source if isinstance(source, Video) else source)
-    name = re.sub(r"[^\w.-]+", "_", Path(without_secrets(text)).stem).strip("_.")
-    return Path(f"{name}_out" if name else "out")
-
-
-def _with_map(config: Config, path: str | Path | None, frozen: bool) -> Config:
-    """Return the options with the map that the arguments of `run` give, if they give one."""
-    if path is None and not frozen:
-        return config
-    where = config.map.path if path is None else str(path)
-    return dataclasses.replace(
-        config, map=dataclasses.replace(config.map, path=where, frozen=frozen)
-    )
-
-
-def _last_config(out: str | Path) -> Config:
-    """Read the options of the last run in an output folder; the defaults if it has none."""
-    path = Path(out) / OutputFile.CONFIG
-    return read_config(Config(), path) if path.is_file() else Config()
-
-
-# What an interrupted stage leaves for the next run, besides the results of the stages before it
-KEPT = {
-    "detect": "the frames detected so far",
-    "poses": "the features and matches so far",
-    "track": "nothing",
-    "map": "nothing",
-    "objects": "nothing",
-    "write": "the files that are complete",
-}
-
-
-@dataclass(frozen=True, slots=True)
-class _Job:
-    """Inputs of every stage of `run`.
-
-    Attributes:
-        seconds: wall time of each stage, added by the stage. step_seconds: of its steps; {} if its
-            result was taken from the cache.
-        lines: progress lines of the current stage.
-    """
-
-    video: Video
-    workspace: Workspace
-    config: Config
-    seconds: dict[str, float] = field(default_factory=dict)
-    step_seconds: dict[str, dict[str, float]] = field(default_factory=dict)
-    lines: list[Progress] = field(default_factory=list)
-
-    @property
-    def runtime(self) -> tuple[int, bool, str]:
-        """Return the options of networks: threads, offline, device."""
-        return self.config.threads, self.config.offline, self.config.device
-
-    def progress(self, step: str, total: int = 0, counted: bool = True) -> Progress:
-        """Begin the progress line of a step of the current stage."""
-        self.lines.append(Progress(step, total, counted))
-        return self.lines[-1]
-
-    @contextmanager
-    def timed(self, stage: str, may_be_cached: bool = False) -> Iterator[None]:
-        """Measure the wall time of a stage and of its steps; nothing is stored after an exception.
-
-        Args:
-            may_be_cached: without any step, the result was taken from the cache.
-        """
-        started = time.monotonic()
-        self.lines.clear()
-        try:
-            yield
-        except KeyboardInterrupt as interruption:
-            interruption.add_note(f"in the stage {stage}, which keeps {KEPT[stage]}")
-            raise
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.monotonic() - started
-        steps = self.step_seconds.get(stage, {})
-        for line in self.lines:
-            steps[line.stage] = steps.get(line.stage, 0.0) + line.seconds
-        if steps or may_be_cached:
-            self.step_seconds[stage] = steps
-        details = ", ".join(f"{step} {seconds:.1f} s" for step, seconds in steps.items())
-        if may_be_cached and not steps:
-            details = "from the cache"
-        log.info("%s: %.1f s%s", stage, self.seconds[stage], f" ({details})" * bool(details))
-
-
-def _check_objects(config: ObjectsConfig) -> None:
-    """Validate the options of the fit before the earlier stages take minutes."""
-    config.size_priors()
-    if config.up:
-        parse_up(config.up)
-    check_shape(config.support)
-    parse_known_size(config.known_size)
-
-
-def _detect(
-    job: _Job,
-    detections: str | Path | Callable[[Image], Any] | None,
-    in_3d: bool,
-    poses: Poses | None,
-) -> tuple[DetectionSource, Tracks]:
-    """Open the detections; if cameras are estimated, detect in all frames of a recorded video.
-
-    Args:
-        poses: supplied cameras.
-    Returns:
-        the source, and the boxes of all frames (empty if they are detected frame by frame): the
-        reconstruction leaves out moving objects, and supplied poses are checked with boxes.
-    """
-    opened = open_detections(job.video, job.config.detect, detections, *job.runtime, poses)
-    source = keep_detections(opened, job.video, job.workspace)
-    if not in_3d or job.video.is_live:
-        return source, Tracks.empty()
-    with job.timed("detect", may_be_cached=source.recorded is None):
-        return detect_all(source, job.video, job.workspace, job.progress)
-
-
-def _reconstructed_cameras(
-    job: _Job, boxes: Tracks, class_names: Sequence[str]
-) -> tuple[Poses, list[Path]]:
-    """Reconstruct the cameras from the images without features on moving objects.
-
-    Returns:
-        poses, and the folders of the COLMAP models.
-    """
-    with job.timed("poses", may_be_cached=True):
-        moving = among([*class_names, ""], job.config.objects.moving_classes)[boxes.class_id]
-        rows = boxes[moving & (boxes.score >= job.config.tracker.high_score)]
-        return reconstruct_cached(job.video, job.config.poses, job.workspace, rows, job.progress)
-
-
-def _track_video(
-    job: _Job, source: DetectionSource, poses: Poses | None, viewer: Viewer | LivePage | None = None
-) -> Result:
+def _track_video(job: pipeline.Job, source: DetectionSource, poses: Poses | None) -> Result:
     """Track all frames, or load the tracks from the cache; live sources are not cached."""
     video = job.video
     config = job.config
     poses = poses if poses is not None and poses.known.any() else None
     setup = (config.embed, config.tracker, config.device, poses_key(poses))
-    key = (*detections_key(source, video), *setup)
-    path = job.workspace.path("tracks", *key)
+    path = job.workspace.path("tracks", *detections_key(source, video), *setup)
     keep = bool(source.key) and not video.is_live
     with job.timed("track", may_be_cached=keep):
         if keep and (known := load_cached(path, load_tracked)):
@@ -1652,8 +1285,8 @@ def _track_video(
         embedder = make_embedder(config.embed.model, config.embed.head, *job.runtime)
         tracker = Tracker(config.tracker, embedder)
         steps = track(video, source, tracker, poses=poses)
-        if viewer is not None:
-            steps = viewer.follow(steps, source.class_names, video, poses)
+        if job.viewer is not None:
+            steps = job.viewer.follow(steps, source.class_names, video, poses)
         result = collect_tracks(steps, tracker, video, source, job.progress)
         result = dataclasses.replace(result, boxes_3d=boxes_3d_of(source.recorded))
         save_tracked(result, path)
@@ -1672,334 +1305,12 @@ def _tracklets(boxes: Tracks) -> Tracks:
     return Tracks.concatenate(frames, tracks_of_frames)
 
 
-def _given_tracks(
-    path: str | Path, video: Video, config: DetectConfig, before: Result | None
-) -> Result:
-    """Build a result from identities in a file; they are never joined, split or renumbered."""
-    known = (None, ()) if before is None else (before.tracks, before.class_names)
-    tracks, class_names, messages = read_tracks(path, video, config, *known)
-    return Result(
-        tracks, class_names, VideoInfo.of(video), identities_given=True, warnings=messages
-    )
-
-
-def _place(job: _Job, room: OpenMap, poses: Poses, models: list[Path]) -> tuple[Placed, list[Path]]:
-    """Place the cameras, and their COLMAP models, in the world of the map."""
-    with job.timed("map"):
-        size_px = job.config.poses.size_px
-        placed = place_recording(room, poses, job.video, size_px, job.progress)
-        folder = job.workspace.path("placed", job.video.fingerprint).with_suffix(".sparse")
-        return placed, move_models(models, poses, placed, lambda k: part_path(folder, k))
-
-
-def _without_moved_boxes(result: Result, placed: Placed) -> Result:
-    """Leave out the boxes in 3D if the cameras were moved into the world of a map."""
-    placement = placed.placement
-    if result.boxes_3d is None or placement is None or placement.refused:
-        return result
-    text = "the 3D boxes are used as 2D boxes only: the map has another world"
-    return dataclasses.replace(result, boxes_3d=None, warnings=[*result.warnings, text])
-
-
-def _embedder_key(job: _Job) -> str:
-    """Name the model of the embeddings, for the map."""
-    return f"{job.config.embed.model} {job.config.embed.head}"
-
-
-def _finish(
-    job: _Job,
-    result: Result,
-    room: OpenMap | None = None,
-    placed: Placed | None = None,
-    links: Links | None = None,
-) -> Result:
-    """Link tracklets, fit one shape per object, and write the map and the output folder.
-
-    Args:
-        links: of the last result of the folder.
-    """
-    with job.timed("objects"):
-        result = _fit_objects(job, result, links)
-    if room is not None:
-        with job.timed("map"):
-            path = job.workspace.out / OutputFile.CHANGES
-            before = read_changes(path) if placed is None and path.is_file() else None
-            embedder = _embedder_key(job)
-            result = finish_map(room, result, job.video, embedder, placed, job.progress, before)
-    warnings = [*result.warnings, *_warnings(job.config, result)]
-    result = dataclasses.replace(result, warnings=warnings, out=job.workspace.out)
-    with job.timed("write"):
-        result = _write(job, result)
-    for warning in result.warnings:
-        log_message(warning)
-    return dataclasses.replace(result, seconds=job.seconds, step_seconds=job.step_seconds)
-
-
-def _fit_objects(job: _Job, result: Result, links: Links | None = None) -> Result:
-    """Link and fit; gaps of tracks are filled with the default solver's shapes."""
-    config = job.config
-    edits = result.edits or kept_edits(job.workspace.out)
-    with job.progress("objects"):
-        views, warnings = _views_once(result.poses, job.video)
-        result = dataclasses.replace(result, edits=edits, warnings=[*result.warnings, *warnings])
-        once = dataclasses.replace(result, poses=views)
-        fitted = link_and_fit(once, config.objects, links)
-        gap = 0 if result.identities_given else config.output.fill_gaps
-        tracks = fill(fitted, job.video.size, gap)
-        detected = np.flatnonzero(tracks.detection_index >= 0)  # rows that were not filled in
-        return dataclasses.replace(
-            solve_again(fitted, config.objects),
-            poses=result.poses,
-            tracks=tracks,
-            embedding_row=detected[fitted.embedding_row],
-        )
-
-
-def _views_once(poses: Poses | None, video: Video) -> tuple[Poses | None, list[str]]:
-    """Return the poses without those of copied images, and a warning about these."""
-    if poses is None:
-        return None, []
-    views = without_copies(poses, video.copies)
-    names = [video.name(frame) for frame in views.frame[poses.known & ~views.known].tolist()]
-    text = f"{len(names)} images are copies of others, of which each is one view: "
-    return views, [text + shortened(names)] if names else []
-
-
-def _warnings(config: Config, result: Result) -> list[str]:
-    """Collect warnings about cameras, objects and options."""
-    poses = result.poses
-    of_cameras = [] if poses is None else [*poses.messages, *components_message(poses)]
-    tracker = config.tracker
-    moving = config.objects.moving_classes
-    of_objects = implausible(result, tracker.high_score, moving, tracker.new_score)
-    located = [o.class_name for o in result.located]
-    fit = config.objects
-    of_sizes = unused_sizes(fit.known_size, fit.size_priors(), located)
-    of_objects += scores_far_off(result)
-    return [*of_cameras, *of_objects, *of_sizes, *priors_used(fit.priors, fit.prior, located)]
-
-
-def _write(job: _Job, result: Result) -> Result:
-    """Write all files; pictures last, so that a failure of theirs loses no results.
-
-    Returns:
-        the result, with a warning for each picture that could not be made.
-    """
-    workspace = job.workspace
-    output = job.config.output
-    models = workspace.last_models()
-
-    def write_more(folder: Path) -> None:
-        write_config(job.config, folder / OutputFile.CONFIG)
-        if models is not None:
-            copy_models(models, folder)
-            write_supplied_model(result.poses, job.video, folder)
-
-    stale = (OutputFile.MODEL,) if models is not None or result.poses is None else ()
-    result.save(workspace.out, output.doubtful, write_more, stale)
-    shown = (output.overlay, output.scene, output.doubtful)
-    line = job.progress("write", job.video.expected)
-    command = apply_command(workspace.out)
-    failures = write_pictures(
-        result,
-        workspace.out,
-        job.video,
-        *shown,
-        line,
-        command=command,
-        cloud=output.cloud,
-        depth=job.config.poses.depth,
-    )
-    if failures:
-        result = dataclasses.replace(result, warnings=[*result.warnings, *failures])
-        write_objects(result, workspace.out / OutputFile.OBJECTS)
-    return result
-
-
-# ---- Command line ------------------------------------------------------------------------------
-
-
-def _parser() -> argparse.ArgumentParser:
-    commands = {
-        "run": _cmd_run, "track": _cmd_run, "poses": _cmd_poses, "objects": _cmd_objects,
-        "serve": _cmd_serve, "eval": _cmd_eval, "export": _cmd_export, "map": _cmd_map,
-        "models": _cmd_models,
-    }  # fmt: skip
-    return make_parser(Config(), commands, tuple(EXPORTS), tuple(MAP_EXPORTS))
-
-
-def _cmd_run(args: argparse.Namespace) -> int:
-    given = {name: getattr(args, name) for name in ("detections", "tracks", "overwrite", "show")}
-    config = config_from_args(Config(), args)
-    print(run(args.video, args.out, config, in_3d=args.command == "run", **given).summary())
-    return 0
-
-
-def _cmd_poses(args: argparse.Namespace) -> int:
-    config = config_from_args(Config(), args)
-    video = Video(args.video, config.input)
-    with Workspace(args.out, args.overwrite) as workspace:
-        workspace.bind(video, args.overwrite)
-        model = None
-        if supplied := supplied_poses(video, config.poses):
-            poses = checked_poses(supplied, Tracks.empty(), video, config.poses, workspace)
-        else:
-            poses, model = reconstruct_cached(video, config.poses, workspace)
-        with replaced(workspace.out, (OutputFile.POSES, OutputFile.MODEL)) as new:
-            copy_models(model or (), new)
-            write_trajectories(new, poses)
-            write_supplied_model(poses, video, new)
-    where = f"{workspace.out / 'poses.txt'}, {workspace.out / 'sparse'}"
-    print(f"{poses.cameras_text}, {len(poses.points)} points; look at: {where}")
-    for message in (*video.messages, *poses.messages, *components_message(poses)):
-        log_message(message)
-    return 0
-
-
-def _cmd_objects(args: argparse.Namespace) -> int:
-    if args.validate:
-        faults = validate_objects(Path(args.out))
-        print("\n".join(faults) or "valid")
-        return 2 if faults else 0
-    config = config_from_args(_last_config(args.out), args)
-    print(refit(args.out, config, args.tracks, args.edits).summary())
-    return 0
-
-
-def _folder_map(out: Path) -> FolderMap | None:
-    """Return the map of an output folder; None: there is none."""
-    config = _last_config(out).map
-    if not config.path:
-        return None
-    workspace = Workspace.open(out)
-    video, _ = workspace.video_or_frames(workspace.load_last())
-    return FolderMap(Path(config.path), session_key(video), config.frozen)
-
-
-def _cmd_serve(args: argparse.Namespace) -> int:
-    command = [sys.executable, __file__]
-    with Server(args.out, args.port, command, partial(_folder_map, args.out)) as server:
-        print(f"viewer of {args.out}: {server.url}\nCtrl-C ends it", flush=True)
-        if args.open:
-            server.open_browser()
-        try:
-            server.serve_forever()
-        except KeyboardInterrupt:
-            server.corrections.stop()
-    return 0
-
-
-def _cmd_eval(args: argparse.Namespace) -> int:
-    poses: Path | None = args.gt_poses
-    if poses is None and args.gt_objects:
-        beside = [args.gt_objects.with_name(n) for n in ("poses_c2w.txt", "poses.txt")]
-        poses = next((p for p in beside if p.exists()), None)
-    classes = [c.strip() for c in args.classes.split(",") if c.strip()]
-    first = config_from_args(Config(), args).detect.first_frame
-    more = (args.min_visibility, args.gt_format, first)
-    scores = evaluate(args.out, args.gt, args.gt_objects, poses, classes, *more)
-    try:
-        if args.out.is_dir():
-            with atomic(args.out / "eval.json") as part:
-                part.write_text(json.dumps(scores, indent=1), encoding="utf-8")
-    finally:
-        print(score_report(scores))
-    return 0
-
-
-def _cmd_export(args: argparse.Namespace) -> int:
-    print(export(args.out, args.to, args.output))
-    return 0
-
-
-def _cmd_map(args: argparse.Namespace) -> int:
-    path: Path = args.map
-    output: Path | None = args.output
-    if output is not None and args.export is None:
-        raise ReobjError(f"-o {output}: give --export too, one of {', '.join(MAP_EXPORTS)}")
-    if args.export is not None:
-        output = output or path.with_suffix(f".{args.export}")
-        if output.resolve() == path.resolve():
-            raise ReobjError(f"{output}: is the map; give another file with -o")
-    corrections = [
-        args.forget, args.merge, [(_object_number(number), name) for number, name in args.rename],
-        args.delete, args.undelete,
-    ]  # fmt: skip
-    room = RoomMap.load(path)
-    if any(corrections):
-        with map_lock(path):
-            room, lines = corrected(RoomMap.load(path), *corrections)
-            room.save(path)
-        print("\n".join(lines))
-    if output is not None:
-        print(export_map(room, args.export, output))
-    elif not any(corrections):
-        print(listing(room, path))
-    return 0
-
-
-def _object_number(text: str) -> int:
-    """Read the number of an object."""
-    if not text.isdecimal():
-        raise ReobjError(f"--rename {text}: expected the number of an object")
-    return int(text)
-
-
-def _cmd_models(args: argparse.Namespace) -> int:
-    for name in args.names:
-        print(model_path(name, offline=bool(args.offline)))
-    if not args.names:
-        for row in list_models():
-            w = row.weights
-            size = f"{w.size / 1e6:.1f}" if w.size else "?"
-            facts = f"{w.name:<15} {w.role:<9} {size:>5} MB  {w.licence:<11}"
-            print("\n".join(wrapped(f"{facts} {row.state:<9} {w.note}")))
-    return 0
-
-
-LEVEL_NAMES = {
-    logging.DEBUG: "debug", logging.INFO: "info", NOTE: "note", logging.WARNING: "warning",
-}  # fmt: skip
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns 0, 2 for bad input, 130 after Ctrl-C, 1 for a fault of ours.
 
     Ctrl-C is the way to end a live source: its files are written, and 0 is returned.
     """
-    return with_streams(lambda: _main(list(sys.argv[1:] if argv is None else argv)))
-
-
-def _main(words: Sequence[str]) -> int:
-    """Parse the words and run the command; an exception becomes a message and an exit code."""
-    parser = _parser()
-    args = None
-    try:
-        if (text := short_help(parser, words)) is not None:
-            say(text)
-            return 2
-        args = parser.parse_args(words)
-        log.setLevel(logging.DEBUG if args.debug else logging.INFO if args.verbose else NOTE)
-        for level, name in LEVEL_NAMES.items():
-            logging.addLevelName(level, name)
-        handler = logging.StreamHandler(sys.stderr)
-        handler.setFormatter(SafeFormatter("%(levelname)s: %(message)s"))
-        logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
-        return int(args.func(args))
-    except KeyboardInterrupt as interruption:
-        where = "".join(f" {note}" for note in getattr(interruption, "__notes__", [])[-1:])
-        say(f"\ninterrupted{where}; what was computed before is kept: run the same command again "
-            "to go on")  # fmt: skip
-        return 130
-    except BrokenPipeError:  # `with_streams` handles it
-        raise
-    except Exception as error:
-        expected = isinstance(error, ReobjError | quadrics.QuadricsError | OSError)
-        text = f"error: {one_line(str(error))}"
-        if not expected or (args is not None and args.debug):
-            text = without_secrets(traceback.format_exc())
-        say(text)
-        return 2 if expected else 1
+    return cli.main(list(sys.argv[1:] if argv is None else argv), run, refit)
 
 
 if __name__ == "__main__":

@@ -54,8 +54,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import quadrics
 import reobj_track as rt
 from reobj.cameras import place_of, points_in_boxes, undistort_boxes
+from reobj.config import read_config
 from reobj.objects.fit import link_and_fit
-from reobj.options import read_config
 from reobj.results.entries import OutputFile
 from reobj.results.result import Object, Result
 from reobj.results.workspace import Workspace

@@ -1,4 +1,4 @@
-"""Atomic files, locks, text, JSON and npz; progress; text for messages."""
+"""Atomic files, locks, text, JSON, npz and saved states; progress; text for messages."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import base64
 import contextlib
 import dataclasses
 import difflib
-import errno
 import hashlib
 import json
 import math
@@ -21,8 +20,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+import cv2
+import filelock
 import numpy as np
 import numpy.typing as npt
+from tqdm import tqdm
 
 from reobj.types import Array, ReobjError, log
 
@@ -65,40 +67,26 @@ def _folder(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def writing(path: Path, named: Path | None = None) -> Iterator[None]:
-    """Convert disk errors of the block that writes `path` to errors that say what to do.
+    """Convert disk errors of the block that writes `path` to a ReobjError; others pass.
 
     Args:
-        named: in the errors, instead of `path`.
-    Raises:
-        ReobjError: for the errors listed here. Others, and those of files in other folders, pass.
+        named: in the error, instead of `path`.
     """
-    advice_of = {
-        errno.ENOSPC: "make room on this disk",
-        errno.EDQUOT: "make room: your quota is used up",
-        errno.EFBIG: "choose a folder on a file system that takes larger files",
-        errno.EROFS: "choose a folder on a disk that is not read-only",
-        errno.EACCES: "choose a folder that you may write into",
-        errno.EPERM: "choose a folder that you may write into",
-        errno.EEXIST: "a file stands where a folder should be: move it away",
-        errno.ENOTDIR: "a file stands where a folder should be: move it away",
-        errno.EISDIR: "a folder stands where a file should be: move it away",
-        errno.EIO: "disk I/O error: check the disk",
-        errno.ENOENT: "this folder takes no files (as /proc): choose another one",
-    }
     try:
         yield
     except OSError as error:
-        full = re.search(r"\d+ requested and \d+ written", str(error))  # numpy's, without an errno
-        number = errno.ENOSPC if full else error.errno
-        at = Path(os.fsdecode(error.filename or path.parent / "?"))
-        above = path.is_relative_to(at)
-        beside = at.is_relative_to(path.parent) and number != errno.ENOENT  # else an input
-        if number not in advice_of or not (above or beside):
-            raise
-        why = os.strerror(number)
-        advice = advice_of[number]
+        at = Path(os.fsdecode(error.filename or path))
+        if not (path.is_relative_to(at) or at.is_relative_to(path) or ".part-" in str(at)):
+            raise  # of an input
         shown = Path(*(name for name in (named or path).parts if name != PART_RESULTS))
-        raise ReobjError(f"{shown}: cannot be written ({why}); {advice}, then run again") from error
+        advice = "make room, or choose a folder that takes files"
+        raise ReobjError(
+            f"{shown}: cannot be written ({error.strerror or error}); {advice}"
+        ) from error
+
+
+class LockedError(ReobjError):
+    """A lock is held by another process."""
 
 
 @contextlib.contextmanager
@@ -106,46 +94,23 @@ def locked(path: Path, wait_s: float = 0.0, named: Path | None = None) -> Iterat
     """Hold the lock of a file; the system releases it when the process ends, even if killed.
 
     Args:
-        wait_s: longest time to wait for another process that holds it. named: by disk errors,
+        wait_s: longest time to wait for another process that holds it. named: in disk errors,
             instead of the lock: the file beside it that will be written.
     Raises:
         LockedError: another process, or this one, still holds it.
     """
+    lock = filelock.FileLock(path, timeout=wait_s)
     with writing(path, named):
         path.parent.mkdir(parents=True, exist_ok=True)
-        file = open(path, "ab")
-    with file:
-        until = time.monotonic() + wait_s
-        while not _lock(file.fileno()):
-            if time.monotonic() >= until:
-                raise LockedError(f"{path}: locked by another process")
-            time.sleep(0.05)  # a person does not notice the delay
-        yield
-
-
-class LockedError(ReobjError):
-    """A lock is held by another process."""
-
-
-def _lock(handle: int) -> bool:
-    """Take the lock of an open file; False if it is held; True where the system has no locks."""
+        path.touch()  # where that is impossible, filelock would wait
+        try:
+            lock.acquire()
+        except filelock.Timeout:
+            raise LockedError(f"{path}: locked by another process") from None
     try:
-        _take_lock(handle)
-    except OSError as error:
-        return error.errno not in (errno.EWOULDBLOCK, errno.EACCES, errno.EDEADLK)  # held
-    return True
-
-
-if sys.platform == "win32":
-    import msvcrt
-
-    def _take_lock(handle: int) -> None:
-        msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)  # the first byte, also of an empty file
-else:
-    import fcntl
-
-    def _take_lock(handle: int) -> None:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        lock.release()
 
 
 PART_RESULTS = ".part-results"  # folder of unfinished results, in the output folder
@@ -182,18 +147,18 @@ def check_places(folder: Path, names: Iterable[str | Path]) -> None:
     """Refuse files (paths within a folder) that cannot be written or replaced.
 
     Raises:
-        ReobjError: the path of a file is a folder, that of a folder is none, or a folder is not
+        ReobjError: the path of a file is a folder, that of a folder is a file, or a folder is not
             writable.
     """
     for name in map(Path, names):
-        for path in (folder / parent for parent in name.parents):
-            if os.path.lexists(path) and not path.is_dir():
-                raise ReobjError(f"{path}: is no folder, but one is written here; move it away")
-            if path.is_dir() and not os.access(path, os.W_OK | os.X_OK):
-                fault = "is not writable, but results are written here; allow it (chmod u+w)"
-                raise ReobjError(f"{path}: {fault}")
+        above = [folder / parent for parent in name.parents]
+        blocked = [path for path in above if os.path.lexists(path) and not path.is_dir()]
+        blocked += [path for path in above if path.is_dir() and not os.access(path, os.W_OK)]
         if (path := folder / name).is_dir() and not path.is_symlink():
-            raise ReobjError(f"{path}: is a folder, but a file is written here; move it away")
+            blocked.append(path)
+        if blocked:
+            what = "it is not writable, or a file in the place of a folder, or the reverse"
+            raise ReobjError(f"{blocked[0]}: results go here, but {what}; move it away")
 
 
 def _sync(path: Path) -> None:
@@ -220,9 +185,7 @@ def part_paths(path: Path) -> list[Path]:
     return sorted(path.parent.glob(f"{path.stem}_part[0-9]*{path.suffix}"))
 
 
-# Bytes of memory that one input file may take; chosen: two million detections with masks in JSON,
-# or those of more than an hour of video in npz
-MEMORY_MAX = 1 << 31
+MEMORY_MAX = 1 << 31  # bytes that one input file may take; detections of an hour of video in npz
 LINES_MAX = 2_000_000  # of a table; chosen: an hour at 30 Hz with 18 boxes a frame
 
 
@@ -245,33 +208,14 @@ def read_text(path: Path, most: int | None = None, errors: str = "strict") -> st
 
 
 def read_lines(path: Path) -> list[str]:
-    """Read a UTF-8 file of at most LINES_MAX lines, with their ends."""
-    text = read_text(path)
-    breaks = "\n\x0b\x0c\x1c\x1d\x1e\x85\u2028\u2029"  # as of str.splitlines
-    count = sum(map(text.count, breaks))
-    if count > LINES_MAX:
-        raise ReobjError(
-            f"{path}: {count} lines, at most {LINES_MAX} are allowed; cut it into pieces"
-        )
-    lines = text.splitlines(keepends=True)
-    most = 1 << 22  # characters of a line: the observations of 100,000 points in COLMAP's text
-    if lines and (longest := max(map(len, lines))) > most:
-        raise ReobjError(f"{path}: a line of {longest} characters, at most {most} are allowed")
-    return lines
-
-
-def json_memory(text: str) -> int:
-    """Estimate the bytes of memory that a JSON text takes once it is read (sys.getsizeof)."""
-    return 200 * text.count("{") + 64 * (text.count("[") + text.count(","))
+    """Read the lines of a UTF-8 file, with their ends."""
+    return read_text(path).splitlines(keepends=True)
 
 
 def load_json(path: Path) -> Any:
-    """Read a JSON file of at most MEMORY_MAX bytes in memory; an error names the line."""
+    """Read a JSON file; an error names the line."""
     text = read_text(path)
-    if (size := json_memory(text)) > MEMORY_MAX:
-        memory = f"would take {size >> 20} MB of memory, at most {MEMORY_MAX >> 20} MB are allowed"
-        raise ReobjError(f"{path}: {memory}; cut it into pieces")
-    if digits := re.search(r"\d{309}", text):
+    if digits := re.search(r"\d{309}", text):  # no float
         line = text.count("\n", 0, digits.start()) + 1
         raise ReobjError(f"{path}, line {line}: a number of more than 308 digits")
     try:
@@ -345,6 +289,45 @@ def load_npz(path: Path, sealed: bool = False) -> tuple[dict[str, Any], dict[str
     return arrays, metadata
 
 
+def saved_fields(owner: Any) -> Sequence[str]:
+    """Return the names of the attributes that are the state of a dataclass or of another class."""
+    if dataclasses.is_dataclass(owner):
+        return [one.name for one in dataclasses.fields(owner)]
+    return getattr(owner, "ARRAYS", ())
+
+
+def state_arrays(value: Any, name: str) -> dict[str, Any]:
+    """Flatten a state to arrays by dotted names; None is left out."""
+    if value is None:
+        return {}
+    if isinstance(value, list):
+        items = {f"{name}.{k}": item for k, item in enumerate(value)}
+    else:
+        items = {f"{name}.{key}": getattr(value, key) for key in saved_fields(value)}
+    if not items:
+        return {name: value}
+    return {key: x for path, item in items.items() for key, x in state_arrays(item, path).items()}
+
+
+def restore_state(value: Any, name: str, arrays: dict[str, Any]) -> Any:
+    """Fill a fresh state from `state_arrays`; returns it, or the array that takes its place.
+
+    Raises:
+        KeyError: an array is missing.
+    """
+    if isinstance(value, list):
+        prefix = re.compile(re.escape(name) + r"\.(\d+)\.")
+        count = len({found[1] for key in arrays if (found := prefix.match(key))})
+        return [restore_state(type(value[0])(), f"{name}.{k}", arrays) for k in range(count)]
+    if keys := saved_fields(value):
+        for key in keys:
+            setattr(value, key, restore_state(getattr(value, key), f"{name}.{key}", arrays))
+        return value
+    if value is None:
+        return arrays.get(name)
+    return int(arrays[name]) if isinstance(value, int) else arrays[name]
+
+
 def load_cached(path: Path, read: Callable[[Path], T]) -> T | None:
     """Read a file of the cache; None where it is missing or damaged (then it is removed)."""
     if not path.exists():
@@ -362,12 +345,11 @@ def load_cached(path: Path, read: Callable[[Path], T]) -> T | None:
 
 
 class Progress:
-    """Show the progress of a stage on stderr: how much is done, the time left, the rate.
+    """Show the progress of a stage on stderr in the form of tqdm: done, time left, rate.
 
     On a terminal it is one line that is drawn again. Elsewhere (a log file) a long stage leaves a
-    plain line every 10 s, and each stage of at least a second one at its end. Used in a `with`
-    block: the stage is complete if the block ends without an exception, whatever the expected total
-    was.
+    line every 10 s (environment variable REOBJ_PROGRESS_S), and one at its end. In a `with` block
+    the stage is complete if the block ends without an exception, whatever the expected total was.
 
     Args:
         counted: the steps have a meaning for the user, such as frames; False: they are fractions
@@ -384,117 +366,63 @@ class Progress:
         self.done = 0
         self.seconds = 0.0
         self.complete = True
-        self.started = self.shown = time.monotonic()
-        self._resumed = 0  # steps of an earlier run
-        self._measured = 0  # steps that are in the rate
-        self._recent_steps = 0.0  # weighted, as the next
-        self._recent_s = 0.0
+        self._started = self._shown = time.monotonic()
         self._is_terminal = sys.stderr is not None and sys.stderr.isatty()
-        log_every_s = float(os.environ.get("REOBJ_PROGRESS_S", LOG_EVERY_S))  # of `serve`
-        self._every_s = (
-            0.1 if self._is_terminal else math.inf if sys.stderr is None else log_every_s
-        )
+        every_s = float(os.environ.get("REOBJ_PROGRESS_S", "10"))
+        self._every_s = 0.1 if self._is_terminal else every_s
 
     def __enter__(self) -> Progress:
-        if self._is_terminal:
-            self._write("...")
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self.close(self.complete and kind is None)
 
-    def resume(self, done: int) -> None:
-        """Continue after `done` steps of an earlier run, which are not in the rate."""
-        self.done = self._resumed = self._measured = done
-        if self._is_terminal and done:
-            self._write(f"{self._count()}, continued")
-
     def step(self, n: int = 1) -> None:
         """Count n more steps; 0: none yet, the stage continues."""
         self.done += n
-        now = time.monotonic()
-        if now - self.shown > self._every_s:  # readable, and costs no time
-            self._show(now)
+        if time.monotonic() - self._shown > self._every_s:
+            self._show()
 
-    def _show(self, now: float) -> None:
-        """Show the steps, and the time left at the rate of the latest third of the stage.
-
-        Steps of uneven cost change the rate little, and a stage that becomes slower (its first
-        frames were in the cache) is noticed.
-        """
-        since = now - self.shown
-        self.shown = now
-        kept = math.exp(-since / max(10.0, (now - self.started) / 3))
-        self._recent_s = self._recent_s * kept + since
-        self._recent_steps = self._recent_steps * kept + self.done - self._measured
-        self._measured = self.done
-        rate = self._recent_steps / self._recent_s if self._recent_s > 0 else 0.0
-        texts = [self._count()] if self.done or self.total else []
-        if self.total > self.done and rate:
-            texts.append(f"{duration((self.total - self.done) / rate)} left")
-        elif not self.done or self.total:  # what is left is not known
-            texts.append(f"{duration(now - self.started)} so far")
-        if self.counted and rate:
-            texts.append(f"{rate:.1f}/s")
-        self._write(", ".join(texts))
-
-    def _count(self) -> str:
-        """Format the steps so far; 100 % is left to `close`."""
-        if not self.total:
-            return str(self.done)
-        percent = f"{min(100 * self.done / self.total, 99):3.0f} %"
-        return f"{self.done}/{self.total} {percent}" if self.counted else percent.strip()
-
-    def _write(self, text: str) -> None:
-        line = f"{self.stage:<9} {text}"
-        # erases the rest of a longer line
-        sys.stderr.write(f"\r{line}\x1b[K" if self._is_terminal else f"{line}\n")
-        sys.stderr.flush()
+    def _show(self) -> None:
+        self._shown = time.monotonic()
+        parts = ["{desc} {percentage:3.0f} %"] if self.total else ["{desc}"]
+        parts += ["{n_fmt}/{total_fmt}" if self.total else "{n_fmt}"] * self.counted
+        parts += ["[{elapsed}" + "<{remaining}" * bool(self.total) + ", {rate_fmt}" * self.counted]
+        text = tqdm.format_meter(
+            self.done,
+            self.total or None,
+            self._shown - self._started,
+            prefix=f"{self.stage:<9}",
+            unit="",
+            bar_format=" ".join(parts) + "]",
+        )
+        if self._is_terminal:
+            sys.stderr.write(f"\r{text}\x1b[K")  # erases the rest of a longer line
+            sys.stderr.flush()
+        elif sys.stderr is not None:
+            print(text, file=sys.stderr, flush=True)
 
     def close(self, complete: bool = True) -> float:
-        """Finish the line, at 100 % if the stage is complete, with the mean rate of the stage.
-
-        Returns:
-            seconds since the start.
-        """
-        self.seconds = time.monotonic() - self.started
-        texts = [f"{self.seconds:.1f} s"]
-        if self.done and not self.counted:
-            texts.insert(0, "100 %" if complete else self._count())
-        elif self.done:
-            total = f"/{self.done} 100 %" if complete else f"/{self.total}" * (self.total > 0)
-            texts.insert(0, f"{self.done}{total}")
-        if not complete:
-            texts.append("not finished")
-        now_done = self.done - self._resumed
-        if now_done and self.counted and self.seconds > 0.1:  # that of a cached stage: no meaning
-            texts.append(f"{now_done / self.seconds:.1f}/s")
-        if self._is_terminal or (sys.stderr is not None and self.seconds > LOG_LEAST_S):
-            self._write(", ".join(texts))
+        """Finish the line, at 100 % if the stage is complete; returns seconds since the start."""
+        self.seconds = time.monotonic() - self._started
+        if complete:
+            self.total = self.done
+        if self._is_terminal or self.seconds > 1:
+            self._show()
         if self._is_terminal:
             sys.stderr.write("\n")
         return self.seconds
 
 
-# Where stderr is no terminal: s between lines of a stage, and its least duration for a line at its
-# end
-LOG_EVERY_S = 10.0
-LOG_LEAST_S = 1.0
-
-
-def duration(seconds: float) -> str:
-    """Format a duration, above a minute to 10 s.
-
-    >>> duration(36.4), duration(131), duration(3900)
-    ('36 s', '2 min 10 s', '1 h 5 min')
-    """
-    if round(seconds) < 60:
-        return f"{seconds:.0f} s"
-    if seconds < 3595:
-        minutes, tens = divmod(round(seconds / 10), 6)
-        return f"{minutes} min {10 * tens} s" if tens else f"{minutes} min"
-    hours, minutes = divmod(round(seconds / 60), 60)
-    return f"{hours} h {minutes} min" if minutes else f"{hours} h"
+@contextlib.contextmanager
+def quiet_opencv() -> Iterator[None]:
+    """Silence OpenCV's log on stderr: unlike our errors it names no file."""
+    opencv: Any = getattr(cv2.utils, "logging", cv2)  # OpenCV 5, 4
+    before = opencv.setLogLevel(0)
+    try:
+        yield
+    finally:
+        opencv.setLogLevel(before)
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

@@ -215,7 +215,7 @@ class Detections:
         >>> Detections.from_array([[0, 0, 10, 20, 0.9, 56]]).class_id
         array([56])
         """
-        return _checked(*_columns_of_rows(rows))
+        return as_detections(rows)
 
     @staticmethod
     def from_supervision(detections: Any) -> Detections:
@@ -305,22 +305,27 @@ class Tracks:
         """
         if not steps:
             return Tracks.empty()
-        columns = [f.name for f in dataclasses.fields(Tracks)]
-        values = {n: np.concatenate([getattr(s, n) for s in steps]) for n in columns}
-        values["frame"] = np.repeat(np.asarray(frames, np.int64), [len(s) for s in steps])
-        tracklets, inverse = np.unique(values["tracklet_id"], return_inverse=True)
+        table = Tracks._stacked(steps)
+        tracklets, inverse = np.unique(table.tracklet_id, return_inverse=True)
         identity = np.zeros(len(tracklets), np.int64)
-        np.maximum.at(identity, inverse, values["track_id"])
-        values |= {"track_id": identity[inverse], "xyxy": values["xyxy"] / scale}
-        table = Tracks(**values)
+        np.maximum.at(identity, inverse, table.track_id)
+        frame = np.repeat(np.asarray(frames, np.int64), [len(step) for step in steps])
+        table = dataclasses.replace(
+            table, frame=frame, track_id=identity[inverse], xyxy=table.xyxy / scale
+        )
         return table[table.track_id > 0]
 
     @staticmethod
     def joined(tables: Sequence[Tracks]) -> Tracks:
         """Concatenate tables and sort their rows by frame."""
-        names = [f.name for f in dataclasses.fields(Tracks)]
-        rows = Tracks(*(np.concatenate([getattr(t, name) for t in tables]) for name in names))
+        rows = Tracks._stacked(tables)
         return rows[np.argsort(rows.frame, kind="stable")]
+
+    @staticmethod
+    def _stacked(tables: Sequence[Tracks]) -> Tracks:
+        """Concatenate the columns of at least one table."""
+        names = Tracks.__slots__
+        return Tracks(*(np.concatenate([getattr(t, name) for t in tables]) for name in names))
 
     def with_identities(self, track_id: IntArray) -> Tracks:
         """Return the rows with other identities, renumbered 1, 2, ... by first appearance."""
@@ -391,20 +396,15 @@ def as_detections(detections: Any, class_id: Any = None) -> Detections:
             or beyond 1e7, scores outside [0, 1], classes that are no index.
     """
     detections = _single(detections)
-    if class_id is not None:
-        return _with_classes(detections, class_id)
-    if isinstance(detections, Detections):
-        checked = _checked(detections.xyxy, detections.score, detections.class_id, detections.masks)
-        names = detections.__slots__
-        same = all(getattr(checked, name) is getattr(detections, name) for name in names)
-        return detections if same else checked
-    if isinstance(detections, Mapping):
-        return _checked(*_columns_of_mapping(detections))
-    if hasattr(detections, "orig_shape") and hasattr(detections, "boxes"):
-        return _checked(*_columns_of_ultralytics(detections))
-    if hasattr(detections, "xyxy"):
-        return _checked(*_columns_of_boxes(detections))
-    return _checked(*_columns_of_rows(detections))
+    if class_id is not None and isinstance(detections, Mapping):
+        detections = {**detections, "labels": class_id}
+    xyxy, score, own_class_id, masks = _columns(detections)
+    checked = _checked(xyxy, score, own_class_id if class_id is None else class_id, masks)
+    if not isinstance(detections, Detections):
+        return checked
+    names = detections.__slots__
+    same = all(getattr(checked, name) is getattr(detections, name) for name in names)
+    return detections if same else checked
 
 
 def _unusable(fault: str) -> ReobjError:
@@ -417,20 +417,24 @@ def _unusable(fault: str) -> ReobjError:
 
 def _single(detections: Any) -> Any:
     """Return the only element of a batch of one image; other types unchanged."""
-    if isinstance(detections, list | tuple) and len(detections) == 1 and _is_frame(detections[0]):
-        return detections[0]
+    if isinstance(detections, list | tuple) and len(detections) == 1:
+        (item,) = detections  # detections of a frame, or one row of them
+        if isinstance(item, Mapping) or hasattr(item, "xyxy") or hasattr(item, "boxes"):
+            return item
     return detections
 
 
-def _with_classes(detections: Any, class_id: Any) -> Detections:
-    """Convert detections of another library, their classes replaced by (D,) `class_id`."""
+def _columns(detections: Any) -> tuple[Any, ...]:
+    """Return boxes, scores, classes and masks of detections of any of the types."""
+    if isinstance(detections, Detections):
+        return detections.xyxy, detections.score, detections.class_id, detections.masks
     if isinstance(detections, Mapping):
-        return as_detections({**detections, "labels": class_id})
+        return _columns_of_mapping(detections)
     if hasattr(detections, "orig_shape") and hasattr(detections, "boxes"):
-        box, score, _, masks = _columns_of_ultralytics(detections)
-    else:
-        box, score, _, masks = _columns_of_boxes(detections)
-    return _checked(box, score, class_id, masks)
+        return _columns_of_ultralytics(detections)
+    if hasattr(detections, "xyxy"):
+        return _columns_of_boxes(detections)
+    return _columns_of_rows(detections)
 
 
 def text_labels(detections: Any) -> list[str] | None:
@@ -464,11 +468,6 @@ def _is_text(labels: Any) -> bool:
         labels = labels.tolist()
     usable = isinstance(labels, list | tuple) and len(labels) > 0
     return usable and all(isinstance(label, str) for label in labels)
-
-
-def _is_frame(item: Any) -> bool:
-    """Test whether an item holds the detections of a frame, not one row of them."""
-    return isinstance(item, Mapping) or any(hasattr(item, name) for name in ("xyxy", "boxes"))
 
 
 def _columns_of_rows(rows: Any) -> tuple[Any, ...]:

@@ -34,23 +34,6 @@ def test_public_names_are_few_sorted_and_documented() -> None:
         assert not name.startswith("_"), name
 
 
-def test_dir_lists_the_public_names() -> None:
-    assert dir(rt) == rt.__all__ and "run" in dir(rt)
-
-
-def test_every_public_method_has_a_docstring() -> None:
-    missing = [
-        f"{name}.{method}"
-        for name in rt.__all__
-        if inspect.isclass(getattr(rt, name))
-        for method, value in vars(getattr(rt, name)).items()
-        if not method.startswith("_")
-        and (inspect.isfunction(value) or isinstance(value, property | staticmethod | classmethod))
-        and not inspect.getdoc(value)
-    ]
-    assert missing == []
-
-
 # ---- Ways to call the tracker ----
 
 
@@ -114,23 +97,6 @@ def test_supervision_in_and_out(real: bool) -> None:
     assert len(empty) == 0 and len(empty.to_supervision(given[np.zeros(3, bool)]).xyxy) == 0
 
 
-def test_supervision_without_scores_classes_and_masks() -> None:
-    own = rt.Detections.from_supervision(Duck(np.array([[0, 0, 9, 9.0]])))
-    assert (own.score.tolist(), own.class_id.tolist(), own.masks) == ([1.0], [0], None)
-
-
-def test_arrays_in_and_out() -> None:
-    """Rows keep the index of their detection, also if earlier rows are not tracked."""
-    tracker = rt.Tracker(rt.TrackerConfig(n_init=1))
-    rows = np.array([[0, 0, 9, 9, 0.05, 1], [10, 10, 50, 90, 0.9, 2]])
-    out = tracker.update(rows).to_array()
-    assert out.shape == (1, 8) and out.dtype == np.float64
-    np.testing.assert_allclose(out, [[10, 10, 50, 90, 1, 0.9, 2, 1]])
-    assert tracker.update(np.empty((0, 6))).to_array().shape == (0, 8)
-    with pytest.raises(ValueError):
-        tracker.update(np.zeros((2, 5)))
-
-
 def test_track_is_lazy_and_numbers_frames_as_the_source() -> None:
     """Any function of an image serves as detector; `latest` has the tentative tracks too."""
     read: list[int] = []
@@ -158,30 +124,6 @@ def test_track_is_lazy_and_numbers_frames_as_the_source() -> None:
     assert seen == [(3, 1, 1), (5, 1, 2), (7, 1, 2), (9, 2, 2)]
     assert asked == [(480, 640, 3)] * 4
     assert read in ([3, 5, 7, 9], [3, 5, 7, 9, 11])  # a thread is one frame ahead
-
-
-def test_track_takes_paths_and_brings_an_embedder(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Recorded detections are looked up by the source's frame numbers."""
-    made = []
-
-    class Stub:
-        def __call__(self, frame: Any, detections: Any, rows: np.ndarray) -> rt.Embeddings:
-            return rt.Embeddings(np.eye(1, 8).repeat(len(rows), 0), np.empty((len(rows), 0)))
-
-    def tracker(config: Any = None, embedder: Any = None) -> rt.Tracker:
-        made.append(embedder)
-        return Tracker(config, embedder)
-
-    Tracker = rt.Tracker
-    monkeypatch.setattr(rt, "Embedder", Stub)
-    monkeypatch.setattr(rt, "Tracker", tracker)
-    first = next(rt.track(ROOM / "room.mp4", DETECTIONS))
-    assert first[0].index == 0 and len(first[1]) > 3
-    assert [type(embedder) for embedder in made] == [Stub]
-    video = rt.Video(ROOM / "room.mp4", rt.InputConfig(start=20, stop=21))
-    recorded = rt.read_detections(DETECTIONS, video)
-    (_, later), *rest = rt.track(video, DETECTIONS, Tracker())
-    assert rest == [] and len(later) == (recorded.at(20).score >= 0.5).sum()
 
 
 def test_track_hands_poses_to_the_tracker() -> None:

@@ -79,17 +79,6 @@ def test_bad_manifest(case: str, tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert not (tmp_path / "out").exists()
 
 
-def test_without_ray_the_message_names_the_package(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.setitem(sys.modules, "ray", None)
-    path = manifest(tmp_path, "--stop 3")
-    assert batch.main([str(path), "-o", str(tmp_path / "out")]) == 2
-    assert "pip install ray" in capsys.readouterr().err
-
-
 def test_finished_means_same_files_and_options(tmp_path: Path) -> None:
     """Run in this process, as a worker does; any change of input or options undoes it."""
     det = tmp_path / "det.npz"
@@ -117,27 +106,6 @@ def test_finished_means_same_files_and_options(tmp_path: Path) -> None:
     assert batch.finished(first) is None and not (tmp_path / "a" / batch.MARKER).exists()
 
 
-@pytest.mark.usefixtures("no_points")
-def test_the_summary_equals_the_results_of_the_run(tmp_path: Path) -> None:
-    """With true cameras of the clip, which are in metres, for 25 of its first 30 frames."""
-    lines = (ROOM / "poses.txt").read_text().splitlines(keepends=True)
-    (tmp_path / "poses.txt").write_text("".join([x for x in lines if x[0] != "#"][:25]))
-    row = {"path": str(ROOM / "room.mp4"), "detections": str(ROOM / "detections.npz"),
-           "poses": str(tmp_path / "poses.txt"),
-           "options": "--stop 30 --camera 492.757,492.757,320,240 --set output.overlay=false "
-           "--set output.scene=false"}  # fmt: skip
-    result = batch.run_item(batch.make_item(row, tmp_path, tmp_path), str(ROOT))
-    assert result["status"] == "done", result["error"]
-    data = json.loads((tmp_path / "room/objects.json").read_text())
-    status = [o["status"] for o in data["objects"]]
-    assert (result["frames"], result["frames_with_pose"]) == (30, 25)
-    assert result["metres_per_unit"] == 1.0 and result["warnings"] == len(data["warnings"])
-    kinds = ("ok", "prior_dominated", "implausible", "rejected", "doubtful", "tracked")
-    assert [result[kind] for kind in kinds] == [status.count(kind) for kind in kinds]
-    assert result["prior_dominated"] and result["doubtful"]
-    assert result["objects"] == len(status) - result["doubtful"] - result["implausible"]
-
-
 def wait_for(path: Path, process: subprocess.Popen[str]) -> str:
     while not path.exists() or not path.read_text():
         assert process.poll() is None, process.communicate()[1]
@@ -145,6 +113,7 @@ def wait_for(path: Path, process: subprocess.Popen[str]) -> str:
     return path.read_text()
 
 
+@pytest.mark.slow
 def test_a_killed_worker_loses_and_repeats_no_videos(tmp_path: Path) -> None:
     """Two workers, three videos; the worker of b is killed; then the batch is run again."""
     pytest.importorskip("ray")

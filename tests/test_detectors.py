@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import reobj_track as rt
-from reobj.options import read_config
+from reobj.config import read_config
 from reobj.sources.detectors import (
     DetectionCache,
     DetectionSource,

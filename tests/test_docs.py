@@ -8,7 +8,6 @@ import re
 import shlex
 import subprocess
 import sys
-import tomllib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -177,15 +176,7 @@ def need(page: str) -> None:
         pytest.importorskip("onnx")
 
 
-def test_every_tutorial_is_tested() -> None:
-    pages = {path.stem for path in TUTORIALS.glob("*.md")} - {"README"}
-    listed = re.findall(r"\]\((\w+)\.md\)", (TUTORIALS / "README.md").read_text())
-    assert set(listed) == pages
-    pages.remove("first_hour")  # front_door/test_documented.py
-    assert pages == set(PAGES)
-    assert all(blocks(TUTORIALS / f"{page}.md") for page in pages)
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES)
 def test_tutorial(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As a reader does: in a checkout, one block after the other; `run` with less input."""
@@ -218,37 +209,6 @@ def test_tutorial(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 # ---- Packaging: neither file is built by the tests ----
 
 
-def test_the_conda_recipe_has_version_and_dependencies_of_the_project() -> None:
-    yaml = pytest.importorskip("yaml", reason="pip install pyyaml (extra `dev`)")
-    recipe = yaml.safe_load((ROOT / "docs/packaging/recipe.yaml").read_text())
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    facts = project["project"]
-    pypi = "opencv-python-headless>=4.10.0.84"
-    conda = "py-opencv>=4.10.0"
-    wanted = ["python>=${{python_min}}", *facts["dependencies"]]
-    wanted = [line.replace(pypi, conda) for line in wanted]
-    assert [line.replace(" ", "") for line in recipe["requirements"]["run"]] == wanted
-    (backend,) = project["build-system"]["requires"]
-    assert recipe["requirements"]["host"][-1].replace(" ", "") == backend
-    assert recipe["context"] == {
-        "version": facts["version"],
-        "python_min": facts["requires-python"].removeprefix(">="),
-    }
-    assert recipe["about"]["summary"] == facts["description"]
-    assert recipe["about"]["license_file"] == facts["license-files"]
-    (program,) = (f"{name} = {where}" for name, where in facts["scripts"].items())
-    assert recipe["build"]["python"]["entry_points"] == [program]
-
-
-def test_the_dockerfile_copies_what_the_wheel_needs() -> None:
-    text = (ROOT / "docs/packaging/Dockerfile").read_text()
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    copied = {path for line in re.findall(r"^COPY (.*) \S+$", text, re.M) for path in line.split()}
-    wheel = project["tool"]["hatch"]["build"]["targets"]["wheel"]["only-include"]
-    assert copied == {*wheel, project["project"]["readme"], "LICENSE", "pyproject.toml"}
-    assert re.search(r"^FROM python:3\.1[123]-slim$", text, re.M)
-
-
 PAGES_OF_TEXT = [
     ROOT / "README.md",
     ROOT / "CONTRIBUTING.md",
@@ -262,26 +222,6 @@ def test_links_have_targets(page: Path) -> None:
     targets = re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text())
     local = [t for t in targets if "://" not in t]
     assert [t for t in local if not (page.parent / t).exists()] == []
-
-
-@pytest.mark.parametrize("page", PAGES_OF_TEXT, ids=lambda p: p.relative_to(ROOT).as_posix())
-def test_every_table_has_a_header_and_equal_rows(page: Path) -> None:
-    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.S)
-    for table in re.findall(r"(?:^\|.*\n)+", text, re.M):
-        lines = table.splitlines()
-        assert len(lines) > 2 and re.fullmatch(r"\|[-:| ]+\|", lines[1]), lines[0]
-        columns = {len(re.findall(r"(?<!\\)\|", line)) for line in lines}
-        assert len(columns) == 1, lines[0]
-
-
-def test_figures_of_readme_are_those_of_the_results() -> None:
-    """Every number in a table of README is in benchmarks/RESULTS.md too."""
-    results = (ROOT / "benchmarks/RESULTS.md").read_text()
-    rows = re.findall(r"^\|.*\|$", (ROOT / "README.md").read_text(), re.M)
-    figures = {c.strip(" *") for row in rows for c in row.strip("|").split("|")[1:]}
-    figures = {f for f in figures if re.fullmatch(r"[\d.]+( of \d+| %| \(\d+-\d+\))?", f)}
-    assert len(figures) > 20
-    assert {f for f in figures if f"| {f} " not in results} == set()
 
 
 def test_the_reference_has_all_public_names_and_is_up_to_date() -> None:
@@ -300,12 +240,7 @@ def test_the_tables_of_formats_are_those_of_the_registries() -> None:
     assert all(table in text for table in make_formats.TABLES.values())
 
 
-def test_every_page_is_in_the_navigation() -> None:
-    listed = re.findall(r"^ +- (?:\w+: )?(\S+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.M)
-    pages = [p.relative_to(ROOT / "docs").as_posix() for p in (ROOT / "docs").rglob("*.md")]
-    assert sorted(p for p in listed if not p.startswith("benchmarks/")) == sorted(pages)
-
-
+@pytest.mark.slow
 def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     """Links and anchors lead somewhere, every name of the reference is found.
 

@@ -17,8 +17,8 @@ import reobj_track as rt
 from reobj.objects.config import make_fit, mean_box
 from reobj.objects.description import describe_objects, describe_world, scores_far_off
 from reobj.objects.observations import Scene, Views, gather_views
-from reobj.options import parse_known_size, parse_up
 from reobj.types import Existence
+from reobj.words import parse_known_size, parse_up
 
 
 def options(**changes: object) -> rt.ObjectsConfig:

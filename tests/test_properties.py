@@ -19,7 +19,7 @@ from simulated import chair_solids, walk
 
 import quadrics
 import reobj_track as rt
-from reobj.options import read_config
+from reobj.config import read_config
 from reobj.results.edits import apply_edits, read_edits
 from reobj.results.evaluation_3d import read_true_objects
 from reobj.results.truth import read_truth

@@ -40,6 +40,21 @@ def update(tracker: rt.Tracker, *args: Any, **known: Any) -> rt.Tracks:
     return tracker.latest
 
 
+def repeat(count: int, tracker: rt.Tracker, *args: Any, **known: Any) -> rt.Tracks:
+    """Track the same input for some frames; the tracks of the last one."""
+    tracks = rt.Tracks.empty()
+    for _ in range(count):
+        tracks = tracker.update(*args, **known)
+    return tracks
+
+
+NOTHING = rt.Detections.empty()
+CORNER = rows((0, 0, 50, 50))
+BOX = rows((100, 100, 150, 150))
+LARGE = rows((100, 100, 200, 200))
+TALL = rows((100, 100, 110, 350))
+
+
 # ---- Kalman filter ----
 
 
@@ -113,28 +128,10 @@ def test_overlapping_boxes_pass_the_gate_with_a_distant_centre() -> None:
     """A static object of 200 px, of which only the right end is detected."""
     tracker, appearance = rt.Tracker(rt.TrackerConfig(n_init=1)), [[1.0, 0, 0]]
     whole, end = [100, 100, 300, 300, 0.9, 0], [256, 100, 301, 300, 0.9, 0]
-    for _ in range(20):
-        tracker.update([whole], embeddings=appearance)
+    repeat(20, tracker, [whole], embeddings=appearance)
     state = rt.kalman_predict(tracker.state.tracks.mean, tracker.state.tracks.cov, tracker.config)
     assert 9.21 * rt.center_variance(*state)[0, 0] < (256 - 200) ** 2  # px, to its nearest edge
     assert tracker.update([end], embeddings=appearance).tracklet_id.tolist() == [1]
-
-
-@pytest.mark.parametrize("scale", [0.8, 1.0, 1.3])
-def test_states_follow_a_zoom_of_the_camera(scale: float) -> None:
-    """Positions are mapped; sizes and velocities grow by the scale, variances by its square."""
-    turn, shift = np.radians(7.0), np.array([20, -30.0])
-    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    homography = np.eye(3)
-    homography[:2] = np.c_[scale * rotation, shift]
-    rng = np.random.default_rng(1)
-    mean, cov = rng.uniform(50, 200, (3, 4, 2)), rng.uniform(1, 9, (3, 4, 3))
-    moved, spread = rt.warp_states(mean, cov, homography)
-    at = mean[:, :2, 0] @ (scale * rotation).T + shift
-    np.testing.assert_allclose(moved[:, :2, 0], at)
-    np.testing.assert_allclose(moved[:, 2:, 0], scale * mean[:, 2:, 0])
-    np.testing.assert_allclose(moved[..., 1], scale * mean[..., 1])
-    np.testing.assert_allclose(spread, scale**2 * cov)
 
 
 def test_states_are_scaled_by_the_local_area_of_a_homography() -> None:
@@ -152,20 +149,12 @@ def test_states_are_scaled_by_the_local_area_of_a_homography() -> None:
         assert spread[i, 3, 2] == pytest.approx(edges / 1e-4, rel=1e-3)
 
 
-def test_a_broken_homography_changes_sizes_by_two_at_most() -> None:
-    mean, cov = np.full((1, 4, 2), 50.0), np.ones((1, 4, 3))
-    for scale, bounded in ((10.0, 2.0), (0.01, 0.5)):
-        moved, _ = rt.warp_states(mean, cov, np.diag([scale, scale, 1]))
-        np.testing.assert_allclose(moved[0, 2:, 0], 50 * bounded)
-
-
 def test_a_low_score_moves_a_track_less() -> None:
     """A box of low score has a larger variance: the track moves less towards it."""
     at = {}
     for score in (0.95, 0.6):
         tracker = rt.Tracker()
-        for _ in range(5):
-            tracker.update(rows((100, 100, 150, 150)))
+        repeat(5, tracker, BOX)
         tracker.update(rows((110, 100, 160, 150), score=score))
         at[score] = tracker.state.tracks.mean[0, 0, 0]
     assert 125 < at[0.6] < at[0.95] - 0.3 < 135
@@ -186,8 +175,7 @@ def test_identity_survives_a_camera_jerk() -> None:
     found = {}
     for on in (True, False):
         tracker = rt.Tracker(rt.TrackerConfig(camera_motion=on))
-        for _ in range(10):
-            tracker.update(rows((200, 200, 230, 230)), image)
+        repeat(10, tracker, rows((200, 200, 230, 230)), image)
         for _ in range(4):
             found[on] = tracker.update(rows((140, 200, 170, 230)), moved).track_id.tolist()
     assert found[True] == [1]
@@ -197,11 +185,10 @@ def test_identity_survives_a_camera_jerk() -> None:
 def test_tracks_move_with_the_parallax_of_a_deep_scene() -> None:
     """Four bands of the image move sideways; a track in the last one moves with it."""
     image, tracker = textured(np.random.default_rng(6)), rt.Tracker()
-    for _ in range(4):
-        tracker.update(rows((300, 420, 340, 460)), image)
+    repeat(4, tracker, rows((300, 420, 340, 460)), image)
     bands = zip(np.split(image, 4), (4, 22, 10, 16), strict=True)
     moved = np.concatenate([np.roll(band, shift, 1) for band, shift in bands])
-    tracker.update(rt.Detections.empty(), moved)
+    tracker.update(NOTHING, moved)
     np.testing.assert_allclose(tracker.state.tracks.mean[0, :2, 0], [336, 440], atol=1.5)
 
 
@@ -231,7 +218,7 @@ def test_identities_start_at_one_in_every_tracker() -> None:
         tracker = rt.Tracker(rt.TrackerConfig(n_init=1))
         assert tracker.update(rows((0, 0, 50, 50), (100, 0, 150, 50))).track_id.tolist() == [1, 2]
     tracker.reset()
-    assert tracker.update(rows((0, 0, 50, 50))).track_id.tolist() == [1]
+    assert tracker.update(CORNER).track_id.tolist() == [1]
 
 
 @pytest.mark.parametrize(
@@ -252,70 +239,40 @@ def test_a_new_track_is_tentative_until_its_scores_sum_to_n_init_halves(
 def test_a_return_is_confirmed_one_detection_earlier() -> None:
     views = unit(np.random.default_rng(12), 2)
     tracker = rt.Tracker()
-    for _ in range(12):
-        tracker.update(rows((0, 0, 50, 50)), embeddings=views[:1])
-    for _ in range(60):
-        tracker.update(rt.Detections.empty())
+    repeat(12, tracker, CORNER, embeddings=views[:1])
+    repeat(60, tracker, NOTHING)
     both = rows((300, 0, 350, 50), (500, 0, 550, 50), score=0.6)
     ids = [tracker.update(both, embeddings=views).track_id.tolist() for _ in range(3)]
     assert ids == [[], [1], [1, 2]]
 
 
-def test_latest_contains_tentative_tracks_and_their_tracklet() -> None:
-    tracker = rt.Tracker(rt.TrackerConfig(n_init=2))
-    both = rows((0, 0, 50, 50), (100, 0, 150, 50), score=0.6)
-    first, second, third = (update(tracker, part) for part in (both[:1], both, both))
-    assert [t.track_id.tolist() for t in (first, second, third)] == [[1], [1, 0], [1, 2]]
-    assert second.tracklet_id.tolist() == third.tracklet_id.tolist()
-
-
-def test_every_row_has_the_index_of_its_detection() -> None:
-    tracker = rt.Tracker(rt.TrackerConfig(n_init=1))
-    detections = rows(
-        (300, 0, 350, 50, 0.05), (0, 0, 50, 50), (100, 0, 150, 50)
-    )  # the first is too weak
-    tracks = tracker.update(detections)
-    assert tracks.detection_index.tolist() == [1, 2]
-    np.testing.assert_array_equal(tracks.xyxy, detections.xyxy[1:])
-
-
 def test_empty_frames_and_empty_first_frame() -> None:
     tracker = rt.Tracker(rt.TrackerConfig(n_init=1))
-    assert len(tracker.update(rt.Detections.empty())) == 0
-    tracker.update(rows((0, 0, 50, 50)))
-    assert tracker.update(rt.Detections.empty()).xyxy.shape == (0, 4)
-    assert tracker.update(rows((0, 0, 50, 50))).track_id.tolist() == [1]
-
-
-def test_low_scores_continue_tracks_but_start_none() -> None:
-    tracker = rt.Tracker(rt.TrackerConfig(n_init=1))
-    tracker.update(rows((0, 0, 50, 50)))
-    tracks = tracker.update(rows((0, 0, 50, 50, 0.2), (200, 200, 260, 260, 0.2)))
-    assert tracks.track_id.tolist() == [1]
+    assert len(tracker.update(NOTHING)) == 0
+    tracker.update(CORNER)
+    assert tracker.update(NOTHING).xyxy.shape == (0, 4)
+    assert tracker.update(CORNER).track_id.tolist() == [1]
 
 
 def test_crossing_objects_keep_their_identity_by_appearance() -> None:
     """Two objects swap positions between frames: motion contradicts the embeddings."""
     views = unit(np.random.default_rng(3), 2)
     tracker = rt.Tracker(rt.TrackerConfig(n_init=1, appearance_weight=0.8))
-    for _ in range(5):
-        tracker.update(rows((100, 100, 150, 150), (108, 100, 158, 150)), embeddings=views)
+    repeat(5, tracker, rows((100, 100, 150, 150), (108, 100, 158, 150)), embeddings=views)
     tracks = tracker.update(
         rows((102, 100, 152, 150), (106, 100, 156, 150)), embeddings=views[::-1]
     )
     assert tracks.track_id.tolist() == [2, 1]
 
 
-@pytest.mark.parametrize("left", [130, 140, 145])
+@pytest.mark.parametrize("left", [130, 145])
 def test_a_coasting_track_is_not_matched_to_a_dissimilar_detection(left: int) -> None:
     """The new object is nearer to a third track, which has its own detection."""
     seen, gone, new = unit(np.random.default_rng(13), 3)
     tracker = rt.Tracker(rt.TrackerConfig(n_init=1))
     both = rows((100, 100, 150, 150), (left, 100, left + 50, 150))
-    for _ in range(12):
-        tracker.update(both, embeddings=np.stack([seen, gone]))
-    for _ in range(5):
-        tracker.update(both[:1], embeddings=seen[None])
+    repeat(12, tracker, both, embeddings=np.stack([seen, gone]))
+    repeat(5, tracker, both[:1], embeddings=seen[None])
     found = rows((100, 100, 150, 150), (109, 100, 159, 150))
     tracks = tracker.update(found, embeddings=np.stack([seen, new]))
     assert tracks.track_id.tolist() == [1, 3]
@@ -327,13 +284,12 @@ def test_a_weak_match_requires_a_similar_appearance(left: int, score: float, kin
     seen, other = unit(np.random.default_rng(13), 2)
     for view, expected in ((seen, [1]), (other, [])):
         tracker = rt.Tracker()
-        for _ in range(12):
-            tracker.update(rows((100, 100, 150, 150)), embeddings=seen[None])
+        repeat(12, tracker, BOX, embeddings=seen[None])
         found = rows((left, 100, left + 50, 150), score=score, class_id=kind)
         assert tracker.update(found, embeddings=view[None]).track_id.tolist() == expected
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_duplicate_box_does_not_take_the_identity(seed: int) -> None:
     """The track of the second box has no embedding yet, which is no evidence."""
     rng, tracker = np.random.default_rng(seed), rt.Tracker()
@@ -352,13 +308,10 @@ def away_and_back(
 ) -> list[int]:
     """Show objects on the left, nothing for a while, then objects on the right with other sizes."""
     left = [(60 * i, 50, 60 * i + 40, 110) for i in range(len(views))]
-    for _ in range(12):
-        tracker.update(rows(*left), embeddings=views)
-    for _ in range(gap):
-        tracker.update(rt.Detections.empty())
+    repeat(12, tracker, rows(*left), embeddings=views)
+    repeat(gap, tracker, NOTHING)
     right = [(900 + 90 * i, 400, 960 + 90 * i, 440) for i in range(len(back))]
-    for _ in range(6):
-        tracks = tracker.update(rows(*right), embeddings=back)
+    tracks = repeat(6, tracker, rows(*right), embeddings=back)
     return tracks.track_id.tolist()
 
 
@@ -377,12 +330,9 @@ def test_a_new_object_is_not_one_expected_elsewhere(gone: int, expected: int) ->
     view = unit(rng, 1)
     similar = view + 0.09 * rng.normal(size=view.shape)
     tracker = rt.Tracker()
-    for _ in range(12):
-        tracker.update(rows((0, 0, 50, 50)), embeddings=view)
-    for _ in range(gone):
-        tracker.update(rt.Detections.empty())
-    for _ in range(4):
-        tracks = tracker.update(rows((600, 400, 650, 450)), embeddings=similar)
+    repeat(12, tracker, CORNER, embeddings=view)
+    repeat(gone, tracker, NOTHING)
+    tracks = repeat(4, tracker, rows((600, 400, 650, 450)), embeddings=similar)
     assert tracks.track_id.tolist() == [expected]
 
 
@@ -407,10 +357,8 @@ def test_identical_objects_are_distinguished_by_their_background() -> None:
     both = rt.Embeddings(same, around)
     tracker = rt.Tracker()
     boxes = [(60 * i, 50, 60 * i + 40, 110) for i in range(3)]
-    for _ in range(12):
-        tracker.update(rows(*boxes), embeddings=both)
-    for _ in range(100):
-        tracker.update(rt.Detections.empty())
+    repeat(12, tracker, rows(*boxes), embeddings=both)
+    repeat(100, tracker, NOTHING)
     for _ in range(5):
         moved = [(500 + 60 * i, 50, 540 + 60 * i, 110) for i in range(3)]
         tracks = tracker.update(rows(*moved), embeddings=rt.Embeddings(same, around[[2, 0, 1]]))
@@ -420,12 +368,9 @@ def test_identical_objects_are_distinguished_by_their_background() -> None:
 def test_another_class_never_takes_over_an_identity() -> None:
     view = unit(np.random.default_rng(8), 1)
     tracker = rt.Tracker()
-    for _ in range(5):
-        tracker.update(rows((0, 0, 50, 50)), embeddings=view)
-    for _ in range(60):
-        tracker.update(rt.Detections.empty())
-    for _ in range(5):
-        tracks = tracker.update(rows((300, 0, 350, 50), class_id=CUP), embeddings=view)
+    repeat(5, tracker, CORNER, embeddings=view)
+    repeat(60, tracker, NOTHING)
+    tracks = repeat(5, tracker, rows((300, 0, 350, 50), class_id=CUP), embeddings=view)
     assert tracks.track_id.tolist() == [2]
 
 
@@ -493,43 +438,15 @@ def test_invalid_input_leaves_the_tracker_unchanged(wrong: dict[str, Any], messa
     assert after.frame.tolist() == [1, 1]
 
 
-def test_a_pose_with_nan_is_ignored() -> None:
-    tracker = rt.Tracker()
-    tracker.update([], cam_from_world=np.full((3, 4), np.nan), camera=K640)
-    assert tracker.state.last_pose is None
-
-
-def test_frames_of_one_pixel_are_accepted() -> None:
-    tracker = rt.Tracker()
-    for size in ((1, 1), (1, 640), (480, 1), (2, 3)):
-        tracker.update(rows((0, 0, 5, 5)), np.zeros((*size, 3), np.uint8))
-
-
-def test_tracker_is_deterministic() -> None:
-    def once() -> np.ndarray:
-        rng = np.random.default_rng(11)
-        tracker = rt.Tracker()
-        out = []
-        for _ in range(40):
-            boxes = rng.uniform(0, 400, (8, 2))
-            detections = rt.Detections(
-                np.c_[boxes, boxes + 40], rng.uniform(0.2, 1, 8), np.full(8, CHAIR)
-            )
-            out.append(tracker.update(detections, embeddings=unit(rng, 8)).to_array())
-        return np.concatenate(out)
-
-    np.testing.assert_array_equal(once(), once())
-
-
 def test_state_does_not_grow_with_time() -> None:
-    """The same five objects for 1,500 frames: as many rows at the end as after 100."""
+    """The same five objects for 600 frames: as many rows at the end as after 100."""
     rng = np.random.default_rng(12)
     views, tracker = unit(rng, 5), rt.Tracker(rt.TrackerConfig(embed_every=1))
     boxes = [(80 * i, 0, 80 * i + 50, 50) for i in range(5)]
     sizes = []
-    for frame in range(1500):
+    for frame in range(600):
         tracker.update(rows(*boxes), embeddings=views + 0.3 * unit(rng, 5))
-        if frame in (100, 1499):
+        if frame in (100, 599):
             sizes.append((tracker.state.gallery.rows.nbytes, len(tracker.state.tracks.mean)))
     assert sizes[0] == sizes[1]
 
@@ -542,10 +459,8 @@ def test_a_new_object_does_not_take_over_a_missed_track() -> None:
     here, beside = (100, 100, 160, 160), (125, 105, 185, 165)
     for newcomer, expected in ((views[0], [1]), (views[2], [2])):
         tracker = rt.Tracker(rt.TrackerConfig(n_init=1))
-        for _ in range(20):
-            tracker.update(rows(here), embeddings=views[:1])
-        for _ in range(3):
-            found = tracker.update(rows(beside), embeddings=newcomer[None])
+        repeat(20, tracker, rows(here), embeddings=views[:1])
+        found = repeat(3, tracker, rows(beside), embeddings=newcomer[None])
         assert found.track_id.tolist() == expected
     both = tracker.update(rows(here, beside), embeddings=views[[0, 2]])
     assert both.track_id.tolist() == [1, 2]
@@ -568,6 +483,7 @@ def rows_of_clip(tracker: rt.Tracker, frames: list[rt.Frame], posed: bool) -> li
     return [np.c_[t.to_array(), t.tracklet_id] for t in step]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("posed", [False, True])
 def test_a_restored_tracker_continues_identically(posed: bool, tmp_path: Path) -> None:
     frames = list(itertools.islice(rt.Video(ROOM / "room.mp4"), 60))
@@ -582,17 +498,6 @@ def test_a_restored_tracker_continues_identically(posed: bool, tmp_path: Path) -
     assert sum(len(w) for w in whole[33:]) > 300 and second.ellipsoid_map.known.any() == posed
 
 
-@pytest.mark.parametrize("options", [{}, {"n_init": 1, "coast_frames": 7}])
-def test_an_unused_tracker_can_be_saved(options: dict[str, int], tmp_path: Path) -> None:
-    rt.Tracker(rt.TrackerConfig(**options)).save(tmp_path / "state.npz")
-    loaded = rt.Tracker.load(tmp_path / "state.npz")
-    assert loaded.config == rt.TrackerConfig(**options)
-    assert loaded.matching == rt.MatchingOptions()
-    loaded.update(rows((0, 0, 50, 50)))
-    both = rows((0, 0, 50, 50), (90, 0, 140, 50))
-    assert len(loaded.update(both)) == 1 + (options.get("n_init") == 1)
-
-
 def test_matching_options_are_applied_and_saved(tmp_path: Path) -> None:
     """A box that has doubled its width is another object to a tracker of motion alone."""
     for size, names in ((1.5, [2]), (3.0, [1])):
@@ -600,7 +505,7 @@ def test_matching_options_are_applied_and_saved(tmp_path: Path) -> None:
         rt.Tracker(rt.TrackerConfig(n_init=1), matching=matching).save(tmp_path / "state.npz")
         tracker = rt.Tracker.load(tmp_path / "state.npz")
         assert tracker.matching == matching
-        tracker.update(rows((0, 0, 50, 50)))
+        tracker.update(CORNER)
         assert tracker.update(rows((0, 0, 100, 50))).track_id.tolist() == names
 
 
@@ -695,7 +600,7 @@ def test_backgrounds_from_other_viewpoints_are_no_evidence(turn_deg: int, known:
     seen = []
     for step in range(60):
         back = step >= 55
-        found = box if step < 15 or back else rt.Detections.empty()
+        found = box if step < 15 or back else NOTHING
         view = (part[[int(back)]][: len(found)] for part in (front, wall))
         tracks = tracker.update(
             found, embeddings=rt.Embeddings(*view),
@@ -711,8 +616,7 @@ def test_a_frame_without_pose_changes_no_ellipsoid() -> None:
     walk(tracker, PAST)
     before = tracker.ellipsoid_map.dual_q.copy()
     assert tracker.ellipsoid_map.known.sum() == 2
-    for _ in range(20):
-        tracker.update(rt.Detections.empty(), cam_from_world=np.full((3, 4), np.nan), camera=CAMERA)
+    repeat(20, tracker, NOTHING, cam_from_world=np.full((3, 4), np.nan), camera=CAMERA)
     np.testing.assert_array_equal(tracker.ellipsoid_map.dual_q, before)
 
 
@@ -724,7 +628,7 @@ def points_on_balls(scale: float) -> np.ndarray:
     return scale * np.concatenate([balls.reshape(-1, 3), wall])
 
 
-@pytest.mark.parametrize("scale", [1.0, 0.02, 37.0])
+@pytest.mark.parametrize("scale", [1.0, 37.0])
 def test_identical_objects_keep_identities_over_wide_steps(scale: float) -> None:
     """Two balls that look the same, 125 px apart and 50 wide; the camera moves by 100 px, so each
     appears beside the last position of the other. Given poses of any unit, and a few points.
@@ -785,8 +689,7 @@ def test_a_new_component_does_not_use_ellipsoids_of_another() -> None:
 def test_another_class_has_a_cost() -> None:
     """Two boxes near a chair's track: the cup is slightly nearer, the chair is matched."""
     tracker = rt.Tracker()
-    for _ in range(5):
-        tracker.update(rows((100, 100, 200, 200)))
+    repeat(5, tracker, LARGE)
     cup, chair = (93, 100, 193, 200, 0.9, CUP), (112, 100, 212, 200)
     tracks = tracker.update(rows(cup, chair))
     assert tracks.detection_index[tracks.track_id == 1].tolist() == [1]
@@ -799,10 +702,8 @@ def test_another_class_is_evidence_against_a_match(kind: int, expected: list[int
     new = new - (new @ seen) * seen
     new = 0.3 * seen + np.sqrt(1 - 0.3**2) * new / np.linalg.norm(new)
     tracker = rt.Tracker()
-    for _ in range(12):
-        tracker.update(rows((100, 100, 150, 150)), embeddings=seen[None])
-    for _ in range(12):  # a longer absence widens the gate: the match is weak
-        tracker.update(rt.Detections.empty())
+    repeat(12, tracker, BOX, embeddings=seen[None])
+    repeat(12, tracker, NOTHING)
     found = rows((114, 100, 164, 150), class_id=kind)
     assert tracker.update(found, embeddings=new[None]).track_id.tolist() == expected
 
@@ -816,8 +717,7 @@ def test_another_class_is_evidence_against_a_match(kind: int, expected: list[int
 )
 def test_without_appearance_boxes_must_be_similar(box: tuple[float, ...], same: bool) -> None:
     tracker = rt.Tracker()
-    for _ in range(5):
-        tracker.update(rows((100, 100, 110, 350)))
+    repeat(5, tracker, TALL)
     assert (update(tracker, rows(box)).tracklet_id == 1).tolist() == [same]
 
 
@@ -825,20 +725,9 @@ def test_without_appearance_boxes_must_be_similar(box: tuple[float, ...], same: 
 def test_without_appearance_boxes_must_overlap(left: int, same: bool) -> None:
     """After some missed frames, a position beside so tall a box is well within the gate."""
     tracker = rt.Tracker()
-    for _ in range(5):
-        tracker.update(rows((100, 100, 110, 350)))
-    for _ in range(12):
-        tracker.update(rt.Detections.empty())
+    repeat(5, tracker, TALL)
+    repeat(12, tracker, NOTHING)
     found = update(tracker, rows((left, 100, left + 10, 350)))
-    assert (found.tracklet_id == 1).tolist() == [same]
-
-
-@pytest.mark.parametrize(("half", "same"), [(47, True), (60, False)])
-def test_without_appearance_no_side_may_double(half: int, same: bool) -> None:
-    tracker = rt.Tracker()
-    for _ in range(5):
-        tracker.update(rows((100, 100, 150, 150)))
-    found = update(tracker, rows((125 - half, 125 - half, 125 + half, 125 + half)))
     assert (found.tracklet_id == 1).tolist() == [same]
 
 
@@ -846,10 +735,8 @@ def test_recently_seen_tracks_are_matched_first() -> None:
     """One detection between two tracks, a little nearer to the one that was missed for a while."""
     tracker = rt.Tracker()
     seen, missed = (100, 100, 200, 200), (110, 100, 210, 200)
-    for _ in range(8):
-        tracker.update(rows(seen, missed))
-    for _ in range(8):
-        tracker.update(rows(seen))
+    repeat(8, tracker, rows(seen, missed))
+    repeat(8, tracker, rows(seen))
     assert tracker.update(rows((107, 100, 207, 200))).track_id.tolist() == [1]
 
 
@@ -857,8 +744,7 @@ def test_confirmed_tracks_are_matched_first() -> None:
     """One detection between two tracks, a little nearer to the tentative one."""
     tracker = rt.Tracker()
     known, tentative = (100, 100, 200, 200), (110, 100, 210, 200)
-    for _ in range(8):
-        tracker.update(rows(known))
+    repeat(8, tracker, rows(known))
     for _ in range(2):
         tracks = update(tracker, rows(known, tentative, score=0.6))
     assert tracks.track_id.tolist() == [1, 0]
@@ -885,7 +771,7 @@ def counted(config: rt.TrackerConfig) -> tuple[rt.Tracker, Counted]:
     return embedder.tracker, embedder
 
 
-@pytest.mark.parametrize("every", [4, 10])
+@pytest.mark.parametrize("every", [4])
 def test_unambiguous_matches_are_embedded_at_intervals(every: int) -> None:
     """All of them in one pass every n-th frame, a new track twice before it is confirmed, and weak
     matches: nothing else is embedded.
@@ -911,19 +797,16 @@ def test_tentative_tracks_wait_as_long_as_they_were_seen(seen: int, gap: int, sa
     tracker.update(rows(known))
     for _ in range(seen):
         before = update(tracker, rows(known, new)).tracklet_id[1]
-    for _ in range(gap):
-        tracker.update(rows(known))
+    repeat(gap, tracker, rows(known))
     assert (update(tracker, rows(known, new)).tracklet_id[1] == before) == same
 
 
 @pytest.mark.parametrize(("gap", "same"), [(5, True), (6, False)])
 def test_tracks_wait_for_coast_frames(gap: int, same: bool) -> None:
     tracker = rt.Tracker(rt.TrackerConfig(coast_frames=5))
-    for _ in range(4):
-        tracker.update(rows((100, 100, 150, 150)))
-    for _ in range(gap):
-        tracker.update(rt.Detections.empty())
-    assert (update(tracker, rows((100, 100, 150, 150))).tracklet_id == 1).tolist() == [same]
+    repeat(4, tracker, BOX)
+    repeat(gap, tracker, NOTHING)
+    assert (update(tracker, BOX).tracklet_id == 1).tolist() == [same]
 
 
 def test_missed_identities_have_predicted_boxes() -> None:
@@ -944,20 +827,10 @@ def test_missed_identities_have_predicted_boxes() -> None:
             assert (found.score, found.class_id, found.detection_index) == (0, CHAIR, -1)
 
 
-def test_tracks_end_individually() -> None:
-    """One is lost a frame later than the other, and ends a frame later."""
-    tracker, counts = rt.Tracker(rt.TrackerConfig(coast_frames=5)), []
-    both = rows((100, 100, 150, 150), (300, 100, 350, 150))
-    for found in [both] * 4 + [both[:1]] + [both[:0]] * 6:
-        tracker.update(found)
-        counts.append(len(tracker.state.tracks.mean))
-    assert counts == [2] * 9 + [1, 0]
-
-
 @pytest.mark.parametrize(("score", "found"), [(0.09, []), (0.11, [1])])
 def test_scores_below_the_low_one_continue_nothing(score: float, found: list[int]) -> None:
     tracker = rt.Tracker()
-    tracker.update(rows((100, 100, 150, 150)))
+    tracker.update(BOX)
     assert tracker.update(rows((101, 100, 151, 150), score=score)).track_id.tolist() == found
 
 
@@ -979,10 +852,8 @@ def test_the_limit_of_the_matching_distance(
 ) -> None:
     """A box of 50 px that moved; no appearance."""
     tracker = rt.Tracker()
-    for _ in range(6):
-        tracker.update(rows((100, 100, 150, 150)))
-    for _ in range(unseen):
-        tracker.update(rt.Detections.empty())
+    repeat(6, tracker, BOX)
+    repeat(unseen, tracker, NOTHING)
     found = rows((100 + shift, 100, 150 + shift, 150), score=score, class_id=kind)
     assert (1 in update(tracker, found).tracklet_id) == same
 
@@ -990,8 +861,7 @@ def test_the_limit_of_the_matching_distance(
 def test_low_scores_are_matched_after_high_ones() -> None:
     """A low score exactly on the track, a high one beside it: the high one continues it."""
     tracker = rt.Tracker()
-    for _ in range(5):
-        tracker.update(rows((100, 100, 200, 200)))
+    repeat(5, tracker, LARGE)
     tracks = tracker.update(rows((100, 100, 200, 200, 0.3), (115, 100, 215, 200, 0.9)))
     assert tracks.detection_index.tolist() == [1]
 
@@ -1001,10 +871,8 @@ def test_low_scores_are_matched_after_high_ones() -> None:
 
 def gone(tracker: rt.Tracker, view: np.ndarray, frames: int = 60) -> None:
     """Show one chair of this appearance on the left for 12 frames, then nothing."""
-    for _ in range(12):
-        tracker.update(rows((0, 0, 50, 50)), embeddings=view)
-    for _ in range(frames):
-        tracker.update(rt.Detections.empty())
+    repeat(12, tracker, CORNER, embeddings=view)
+    repeat(frames, tracker, NOTHING)
 
 
 def test_an_identity_goes_to_one_of_two_newcomers() -> None:
@@ -1025,12 +893,10 @@ def test_simultaneous_objects_are_different() -> None:
     views = unit(np.random.default_rng(24), 2)
     old, new, third = (0, 0, 50, 50), (300, 0, 350, 50), (600, 0, 650, 50)
     tracker = rt.Tracker()
-    for _ in range(12):
-        tracker.update(rows(old), embeddings=views[:1])
+    repeat(12, tracker, rows(old), embeddings=views[:1])
     tracker.update(rows(old, new), embeddings=views[[0, 0]])
     tracker.update(rows(third), embeddings=views[1:])
-    for _ in range(3):
-        tracks = tracker.update(rows(new, third), embeddings=views)
+    tracks = repeat(3, tracker, rows(new, third), embeddings=views)
     assert sorted(tracks.track_id.tolist()) == [2, 3]
 
 
@@ -1040,11 +906,9 @@ def test_a_return_ends_the_track_that_still_coasts() -> None:
     old, new = (0, 0, 50, 50), (400, 0, 450, 50)
     tracker = rt.Tracker()
     gone(tracker, views[:1], frames=5)
-    for _ in range(4):
-        tracks = tracker.update(rows(new), embeddings=views[:1])
+    tracks = repeat(4, tracker, rows(new), embeddings=views[:1])
     assert tracks.track_id.tolist() == [1] and tracker.state.tracks.identity.tolist() == [0]
-    for _ in range(4):
-        tracks = tracker.update(rows(new, old), embeddings=views)
+    tracks = repeat(4, tracker, rows(new, old), embeddings=views)
     assert tracks.track_id.tolist() == [1, 2]
 
 
@@ -1052,10 +916,8 @@ def test_a_track_votes_for_its_class() -> None:
     """Most of its score is a cup's: it may match the lost cup, although it last was a chair."""
     view = unit(np.random.default_rng(26), 1)
     tracker = rt.Tracker()
-    for _ in range(12):
-        tracker.update(rows((0, 0, 50, 50), class_id=CUP), embeddings=view)
-    for _ in range(60):
-        tracker.update(rt.Detections.empty())
+    repeat(12, tracker, rows((0, 0, 50, 50), class_id=CUP), embeddings=view)
+    repeat(60, tracker, NOTHING)
     for kind, score in ((CUP, 0.9), (CHAIR, 0.6)):
         found = rows((300, 0, 350, 50), score=score, class_id=kind)
         tracks = tracker.update(found, embeddings=view)
@@ -1111,7 +973,7 @@ def test_tracks_of_known_position_expire_in_view() -> None:
     walk(tracker, PAST)
     counts = []
     for _ in range(7):
-        tracker.update(rt.Detections.empty(), cam_from_world=PAST[-1], camera=CAMERA)
+        tracker.update(NOTHING, cam_from_world=PAST[-1], camera=CAMERA)
         counts.append(len(tracker.state.tracks.mean))
     assert counts == [2] * 5 + [0] * 2
 
@@ -1123,7 +985,7 @@ def test_a_missed_track_of_known_position_follows_its_projection() -> None:
     before = tracker.latest.tracklet_id.tolist()
     for x in (0.3, 0.0, -0.3, -0.6):
         pose = pose_at(x)
-        tracker.update(rt.Detections.empty(), cam_from_world=pose, camera=CAMERA)
+        tracker.update(NOTHING, cam_from_world=pose, camera=CAMERA)
     walk(tracker, [pose])
     assert tracker.latest.tracklet_id.tolist() == before
 
@@ -1135,8 +997,7 @@ def test_competing_boxes_are_embedded_in_one_pass() -> None:
     """Two boxes beside a track: both are embedded, also the one that would not be matched."""
     tracker, embedder = counted(rt.TrackerConfig(camera_motion=False))
     image = np.zeros((300, 400, 3), np.uint8)
-    for _ in range(12):
-        tracker.update(rows((100, 100, 150, 150)), image)
+    repeat(12, tracker, BOX, image)
     tracker.update(rows((103, 100, 153, 150), (92, 100, 142, 150)), image)
     assert embedder.asked[-1] == (12, [0, 1])
 
@@ -1144,8 +1005,7 @@ def test_competing_boxes_are_embedded_in_one_pass() -> None:
 def test_two_classes_on_one_object_do_not_compete() -> None:
     tracker, embedder = counted(rt.TrackerConfig(camera_motion=False))
     image = np.zeros((300, 400, 3), np.uint8)
-    for _ in range(12):
-        tracker.update(rows((100, 100, 150, 150)), image)
+    repeat(12, tracker, BOX, image)
     before = len(embedder.asked)
     tracker.update(rows((101, 100, 151, 150), (100, 101, 150, 151, 0.9, CUP)), image)
     assert len(embedder.asked) == before
@@ -1167,8 +1027,7 @@ def test_a_match_above_the_cost_limit_is_rejected(shift: int, same: bool) -> Non
     """A track without an embedding, and a box near the limit of the gate."""
     view, tracker = unit(np.random.default_rng(32), 1), rt.Tracker()
     known, new = (300, 300, 350, 350), (100, 20, 110, 270)
-    for _ in range(4):
-        tracker.update(rows(known), embeddings=view)
+    repeat(4, tracker, rows(known), embeddings=view)
     before = update(tracker, rows(known, new), embeddings=view.repeat(2, 0)).tracklet_id[1]
     moved = (100 + shift, 20, 110 + shift, 270)
     after = update(tracker, rows(known, moved), embeddings=view.repeat(2, 0)).tracklet_id[1]
@@ -1180,7 +1039,7 @@ def test_embedding_of_a_track_is_a_running_mean() -> None:
     first, second = np.eye(2, 8)
     tracker = rt.Tracker(rt.TrackerConfig(embed_every=1))
     for view in (first, second):
-        tracker.update(rows((0, 0, 50, 50)), embeddings=view[None])
+        tracker.update(CORNER, embeddings=view[None])
     expected = (0.8 * first + 0.2 * second) / np.hypot(0.8, 0.2)
     np.testing.assert_allclose(tracker.state.tracks.embedding[0], expected, atol=1e-6)
 
@@ -1213,22 +1072,11 @@ def test_simultaneous_objects_of_a_class_calibrate_the_similarity(kind: int, pai
 # ---- Identities by 3D position ----
 
 
-def test_an_identical_object_at_another_position_is_new() -> None:
-    """It equals the first ball, which is out of view, at an impossible position."""
-    views = unit(np.random.default_rng(34), 2)[[0, 1, 0]]
-    tracker = rt.Tracker()
-    for pose in PAST + [pose_at(0.5, 62.0)] * 6:
-        found, which = balls_seen(pose)
-        tracks = tracker.update(found, embeddings=views[which], cam_from_world=pose, camera=CAMERA)
-    assert which.tolist() == [2] and tracks.track_id.tolist() == [3]
-
-
 def test_without_appearance_the_position_identifies_an_object() -> None:
     """No detections for longer than `coast_frames`: tracks are new, identities are not."""
     tracker = rt.Tracker(rt.TrackerConfig(coast_frames=5))
     walk(tracker, PAST)
-    for _ in range(10):
-        tracker.update(rt.Detections.empty(), cam_from_world=PAST[-1], camera=CAMERA)
+    repeat(10, tracker, NOTHING, cam_from_world=PAST[-1], camera=CAMERA)
     assert len(tracker.state.tracks.mean) == 0
     assert walk(tracker, [PAST[-1]] * 4)[-1] == {0: 1, 1: 2}
     assert tracker.latest.tracklet_id.tolist() == [3, 4]
@@ -1243,14 +1091,17 @@ def test_half_the_overlap_does_not_outweigh_appearance(shift: float, look: int, 
     for pose in PAST:
         boxes = balls_seen(pose)[0]
         tracker.update(boxes, embeddings=views[[0, 2]], cam_from_world=pose, camera=CAMERA)
-    for _ in range(10):
-        tracker.update(rt.Detections.empty(), cam_from_world=PAST[-1], camera=CAMERA)
+    repeat(10, tracker, NOTHING, cam_from_world=PAST[-1], camera=CAMERA)
     x0, y0, x1, y1 = boxes.xyxy[0]
     moved = rows((x0 + shift * (x1 - x0), y0 + shift * (y1 - y0), x1, y1))
-    for _ in range(4):
-        tracks = tracker.update(
-            moved, embeddings=views[[0 if look == 0 else 1]], cam_from_world=PAST[-1], camera=CAMERA
-        )
+    tracks = repeat(
+        4,
+        tracker,
+        moved,
+        embeddings=views[[0 if look == 0 else 1]],
+        cam_from_world=PAST[-1],
+        camera=CAMERA,
+    )
     assert tracks.track_id.tolist() == [found]
 
 
@@ -1297,21 +1148,8 @@ def test_everything_is_saved(tmp_path: Path) -> None:
         np.testing.assert_array_equal(value, theirs[name], err_msg=name)
     for pose in AWAY[10:20]:  # without an image the rotation since the last pose is used
         for one in (tracker, loaded):
-            one.update(rt.Detections.empty(), cam_from_world=pose, camera=CAMERA)
+            one.update(NOTHING, cam_from_world=pose, camera=CAMERA)
         np.testing.assert_array_equal(tracker.state.tracks.mean, loaded.state.tracks.mean)
-
-
-def test_the_first_rotation_after_loading_is_used(tmp_path: Path) -> None:
-    """A tracked box of unknown position (no parallax) moves with the camera rotation."""
-    tracker, box = rt.Tracker(), rows((300, 200, 340, 260))
-    for _ in range(4):
-        tracker.update(box, cam_from_world=pose_at(0), camera=CAMERA)
-    tracker.save(tmp_path / "state.npz")
-    loaded = rt.Tracker.load(tmp_path / "state.npz")
-    loaded.update(rt.Detections.empty(), cam_from_world=pose_at(0, 10.0), camera=CAMERA)
-    assert loaded.state.tracks.mean[0, 0, 0] == pytest.approx(
-        320 - 500 * np.tan(np.radians(10)), abs=2
-    )
 
 
 def test_reset_clears_the_whole_state() -> None:

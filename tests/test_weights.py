@@ -20,6 +20,7 @@ import pytest
 import reobj_track as rt
 from reobj.sources import weights
 from reobj.sources.onnx_layouts import LAYOUTS
+from reobj.types import NOTE
 
 BLOB = np.random.default_rng(0).integers(0, 256, 300_000, dtype=np.uint8).tobytes()
 SHA256 = hashlib.sha256(BLOB).hexdigest()
@@ -76,7 +77,7 @@ def here(server: Any) -> list[Path]:
 def test_a_download_is_announced_verified_and_done_once(
     server: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
-    caplog.set_level(rt.NOTE, "reobj_track")
+    caplog.set_level(NOTE, "reobj_track")
     assert rt.model_path("toy") == server.target and server.target.read_bytes() == BLOB
     for shown in ("0.3 MB", "licence MIT", "http://127.0.0.1", "sha256 " + SHA256):
         assert shown in caplog.text

@@ -19,7 +19,6 @@ from reobj.cameras import Poses, import_pycolmap
 from reobj.objects.description import describe_objects
 from reobj.objects.likelihood import name_of
 from reobj.objects.observations import MIN_SCORE, Fit, FrameOptions, Scene, Views, gather_views
-from reobj.options import load_size_priors, parse_known_size, parse_up
 from reobj.results.result import Object, Result
 from reobj.sources.tables import Boxes3D
 from reobj.types import (
@@ -32,6 +31,7 @@ from reobj.types import (
     option,
     rows_by,
 )
+from reobj.words import load_size_priors, parse_known_size, parse_up
 
 
 class Solver(enum.StrEnum):

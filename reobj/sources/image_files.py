@@ -28,8 +28,7 @@ import numpy.typing as npt
 from PIL import Image as PillowImage
 from PIL import ImageSequence
 
-from reobj.files import shortened
-from reobj.runtime import quiet_opencv
+from reobj.files import quiet_opencv, shortened
 from reobj.types import Array, Image, ReobjError
 
 IMAGE_FPS = 30.0  # Hz, rate of images without times; chosen: most phones record at 30 Hz

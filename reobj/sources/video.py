@@ -33,8 +33,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from reobj.files import shortened
-from reobj.runtime import quiet_opencv
+from reobj.files import quiet_opencv, shortened
 from reobj.sources.image_files import (
     IMAGE_FPS,
     IMAGE_SUFFIXES,

@@ -31,20 +31,6 @@ def test_a_worse_figure_misses_its_floor(key: str) -> None:
     assert key in text or "exit code 1" in text
 
 
-def test_missing_figures_and_missing_floors_are_errors() -> None:
-    floors = recordings.floors_of(FIGURES)
-    without = {k: v for k, v in FIGURES.items() if k != "off"}
-    assert len(recordings.missed(without, floors)) == 1
-    assert len(recordings.missed(FIGURES, None)) == 1
-
-
-def test_command_names_are_unique() -> None:
-    names = [case.name for case in recordings.CASES + recordings.LONG]
-    assert len(set(names)) == len(names)
-    if recordings.FLOORS.exists():
-        assert set(json.loads(recordings.FLOORS.read_text())) == set(names)
-
-
 def output(rows: list[list[float]], names: dict[int, str]) -> scores.Output:
     objects = [{"id": i, "class": name} for i, name in names.items()]
     return scores.Output({}, np.array(rows, float).reshape(-1, 6), objects, {})

@@ -14,10 +14,9 @@ from simulated import tracks_of, unlinked, walk
 import quadrics as q
 from reobj.objects.config import ObjectsConfig
 from reobj.objects.fit import link_and_fit
-from reobj.options import check_known_size, load_size_priors, unused_sizes
 from reobj.results.edits import read_edits
 from reobj.sources.detection_files import class_filter
-from reobj.words import canonical
+from reobj.words import canonical, check_known_size, load_size_priors, unused_sizes
 
 UP = (0.0, 0.0, 1.0)
 PRIORS = q.load_priors()
