@@ -29,21 +29,15 @@ class Located:
     """Poses of all frames by one model.
 
     Attributes:
-        key_rows: (R,) row of each image of the model. keys: rows of all keyframes, ascending.
+        key_rows: (R,) row of each image of the model.
         cam_from_world: (F, 3, 4), NaN where PnP failed or the camera jumped. status: (F,) as in
             `Poses`.
     """
 
     model: SparseModel
     key_rows: IntArray
-    keys: IntArray
     cam_from_world: Array
     status: npt.NDArray[np.str_]
-
-    def is_of(self, model: SparseModel, key_rows: IntArray) -> bool:
-        """True if a model has the same points, and these keyframes among others."""
-        has_images = np.isin(self.key_rows, key_rows).all()
-        return bool(has_images) and np.array_equal(model.points, self.model.points)
 
 
 def locate_between(
@@ -53,7 +47,6 @@ def locate_between(
     video: ResizedVideo,
     seed: int,
     line: Progress,
-    before: Located | None = None,
 ) -> Located:
     """Locate every frame by PnP on points tracked from the keyframes before and after it.
 
@@ -63,8 +56,6 @@ def locate_between(
     Args:
         model: of the keyframes, native pixels. key_rows: (R,) row of each of its images in the
             video, ascending. unmapped: (L,) rows of the other keyframes, ascending.
-        before: of an earlier call with fewer keyframes. Where the model has not changed, only
-            frames beside keyframes that are new, or new in the model, are located again.
     """
     count = len(video.frames)
     camera = model.cameras[0]
@@ -72,24 +63,17 @@ def locate_between(
     status = np.full(count, "none", "<U12")
     cam_from_world[key_rows] = model.cam_from_world
     status[key_rows] = "keyframe"
-    keys = np.union1d(key_rows, unmapped)
-    tried = beside_mapped(keys, key_rows, count)
-    if before is not None and before.is_of(model, key_rows):
-        new = np.union1d(np.setdiff1d(keys, before.keys), np.setdiff1d(key_rows, before.key_rows))
-        same = ~beside_mapped(keys, new, count) & (status == "none")
-        cam_from_world[same] = before.cam_from_world[same]
-        status[same] = before.status[same]
-        tried &= ~same
+    tried = beside_mapped(np.union1d(key_rows, unmapped), key_rows, count) & (status == "none")
 
     def locate(segment: tuple[int, int, list[tuple[int, Image]]]) -> int:
         before, after, run = segment
-        if not any(tried[row] and status[row] == "none" for row, _ in run):
+        if not tried[[row for row, _ in run]].any():
             return len(run) - 1
         images = [gray for _, gray in run]
         ahead = _track_model_points(model, before, images)
         back = _track_model_points(model, after, images[::-1])[::-1]
         for (row, gray), (seen_a, xy_a), (seen_b, xy_b) in zip(run, ahead, back, strict=True):
-            if tried[row] and status[row] == "none":
+            if tried[row]:
                 points = model.points[np.r_[seen_a, seen_b]]
                 pose = absolute_pose(np.r_[xy_a, xy_b], points, camera, gray.shape[1], seed)
                 if pose is not None:
@@ -108,7 +92,7 @@ def locate_between(
     jump = _detours(cam_from_world) & (status == "pnp")
     cam_from_world[jump] = np.nan
     status[jump] = "none"
-    return Located(model, key_rows, keys, cam_from_world, status)
+    return Located(model, key_rows, cam_from_world, status)
 
 
 def beside_mapped(keys: IntArray, mapped: IntArray, count: int) -> BoolArray:
