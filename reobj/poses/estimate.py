@@ -408,24 +408,19 @@ def _lost_frames(poses: Poses, tried: BoolArray, video: Any) -> list[str]:
     Args:
         tried: (F,) frames for which PnP was tried.
     """
-    frame = poses.frame
     lost = ~poses.known
-    step = int(np.median(np.diff(frame))) if len(frame) > 1 else 1
+    step = int(np.median(np.diff(poses.frame))) if len(lost) > 1 else 1
     groups = []
     for mask, reason in (
         (lost & tried, "show too few points of the reconstruction"),
         (lost & ~tried, "are next to keyframes that could not be mapped with certainty"),
     ):
-        numbers = frame[mask].tolist()
-        if not numbers:
-            continue
-        files = [str(video.names[number]) for number in numbers[:5]] if video.names else []
-        more = " ..." if len(numbers) > len(files) > 0 else ""
-        named = f": {', '.join(files)}{more}" if files else ""
-        groups.append(f"{spans(numbers, step)} ({len(numbers)}{named}) {reason}")
+        if numbers := poses.frame[mask].tolist():
+            named = f": {listed([video.names[n] for n in numbers])}" if video.names else ""
+            groups.append(f"{spans(numbers, step)} ({len(numbers)}{named}) {reason}")
     if not groups:
         return []
     return [
-        f"{lost.sum()} of {len(frame)} frames have no camera: frames {'; frames '.join(groups)}; "
+        f"{lost.sum()} of {len(lost)} frames have no camera: frames {'; frames '.join(groups)}; "
         f"{ADVICE}, or --poses"
     ]

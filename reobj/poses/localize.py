@@ -108,27 +108,28 @@ def beside_mapped(keys: IntArray, mapped: IntArray, count: int) -> BoolArray:
     return np.asarray(before | after, bool)
 
 
+MAX_SEGMENT = 1000  # frames of a segment held in memory: .3 GB of 640x480
+
+
 def _segments(
-    key_rows: IntArray, grays: Iterator[Image], most: int = 1000
+    key_rows: IntArray, grays: Iterator[Image]
 ) -> Iterator[tuple[int, int, list[tuple[int, Image]]]]:
     """Cut the video at the mapped keyframes.
 
-    Args:
-        most: frames of a segment held in memory: .3 GB of 640x480.
     Yields:
         the image of the model before and after (-1: none), and (row, gray image) of both and of all
         frames between them. The middle of a longer segment is left out.
     """
     image_of = {int(row): image for image, row in enumerate(key_rows)}
     before = -1
-    run = deque[tuple[int, Image]](maxlen=most)
+    run = deque[tuple[int, Image]](maxlen=MAX_SEGMENT)
     for row, gray in enumerate(grays):
         run.append((row, gray))
         image = image_of.get(row, -1)
-        if image >= 0 or (before >= 0 and len(run) == most):
+        if image >= 0 or (before >= 0 and len(run) == MAX_SEGMENT):
             yield before, image, list(run)
             before = image
-            run = deque([(row, gray)], maxlen=most)
+            run = deque([(row, gray)], maxlen=MAX_SEGMENT)
     if before >= 0:
         yield before, -1, list(run)
 
@@ -158,26 +159,22 @@ def _track_model_points(
     return tracked
 
 
+MIN_INLIERS = 15  # of an accepted pose (chosen; COLMAP registers images from 30 on)
+MIN_RATIO = 0.5  # of inliers among the tracked points (chosen; COLMAP: .25 of raw matches)
+
+
 def absolute_pose(
-    xy: Array,
-    points: Array,
-    camera: Camera,
-    resized_width: int,
-    seed: int,
-    min_inliers: int = 15,
-    min_ratio: float = 0.5,
+    xy: Array, points: Array, camera: Camera, resized_width: int, seed: int
 ) -> Array | None:
     """Estimate the pose of a frame from 3D points and their pixels (PnP, RANSAC, refinement).
 
     Args:
         xy: (n, 2) native pixels, COLMAP's. points: (n, 3) in world. resized_width: pixels of the
             image in which the points were tracked; INLIER_PX is in its pixels.
-        min_inliers: of an accepted pose (chosen; COLMAP registers images from 30 on).
-        min_ratio: of inliers among the tracked points (chosen; COLMAP: .25 of raw matches).
     Returns:
         cam_from_world (3, 4); None with too few inliers or an inlier behind the camera.
     """
-    if len(xy) < min_inliers:
+    if len(xy) < MIN_INLIERS:
         return None
     error_px = INLIER_PX * camera.width / resized_width
     ransac = {"max_error": error_px, "confidence": 0.999, "random_seed": seed}
@@ -186,21 +183,21 @@ def absolute_pose(
     estimate = import_pycolmap().estimate_and_refine_absolute_pose(
         xy, points, camera.to_pycolmap(), estimation_options={"ransac": ransac}
     )
-    if estimate is None or estimate["num_inliers"] < max(min_inliers, min_ratio * len(xy)):
+    if estimate is None or estimate["num_inliers"] < max(MIN_INLIERS, MIN_RATIO * len(xy)):
         return None
     pose: Array = estimate["cam_from_world"].matrix()
     depth = points[estimate["inlier_mask"]] @ pose[2, :3] + pose[2, 3]
     return pose if np.isfinite(pose).all() and (depth > 0).all() else None
 
 
-def _detours(cam_from_world: Array, most: float = 5.0) -> BoolArray:
+MAX_DETOUR = 5.0  # units (chosen; lower: frames of a shaking camera are lost)
+
+
+def _detours(cam_from_world: Array) -> BoolArray:
     """Mark frames (F,) whose centre is far from both neighbours, while these are near each other.
 
     The unit of the detour is the distance of the neighbours or the median step of the trajectory,
     whichever is longer.
-
-    Args:
-        most: units of a detour that is none (chosen; lower: frames of a shaking camera are lost).
     """
     known = np.flatnonzero(np.isfinite(cam_from_world).all((1, 2)))
     detour = np.zeros(len(cam_from_world), bool)
@@ -209,7 +206,7 @@ def _detours(cam_from_world: Array, most: float = 5.0) -> BoolArray:
         step = np.linalg.norm(np.diff(centre, axis=0), axis=1)  # (N-1,)
         direct = np.linalg.norm(centre[2:] - centre[:-2], axis=1)  # (N-2,)
         usual = np.maximum(direct, np.median(step))
-        detour[known[1:-1]] = step[1:] + step[:-1] - direct > most * usual
+        detour[known[1:-1]] = step[1:] + step[:-1] - direct > MAX_DETOUR * usual
     return detour
 
 

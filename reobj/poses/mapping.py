@@ -115,7 +115,7 @@ class MapperSearch:
             messages. pairs: their verified matches.
         focal: of all images, as far as it is known before mapping. guess: used in its place where
             the matches no longer determine it.
-        show: is called with the name of the step, the number of registered images and of all.
+        show: as `send_progress`, of registered images.
     """
 
     def __init__(
@@ -420,7 +420,6 @@ JOINT_PX = 3 * INLIER_PX
 # Distance of joined points over their depth, median of two models, above which the other joins
 # contradict theirs (chosen: drift of a window stays below)
 CONTRADICTION = 0.1
-FINISHED = "finished"  # step of a window
 
 
 def _path(ids: list[int], pairs: MatchedPairs) -> list[int]:
@@ -484,34 +483,27 @@ def _map_windows(
     Returns:
         models of all windows; messages; ids of the images that have the focal length of the models.
     """
-    done = [0] * len(windows)
-    total = sum(map(len, windows))
     lock = threading.Lock()
 
     def map_window(k: int) -> tuple[list[Any], list[str], list[str], list[int]]:
         ids = windows[k]
         path = whole.database.parent / f"window{k}" / "database.db"
         path.parent.mkdir(exist_ok=True)
-
-        def show(step: str, registered: int, count: int) -> None:
-            # adjustment, verification and second mapper take as long as the first, or longer
-            share = registered if step == FINISHED else registered // 2
-            with lock:
-                done[k] = max(done[k], share)
-                send_progress("mapping", sum(done), total)
-
         frames = {i: whole.frames[i] for i in ids}
-        known = (whole.focal, whole.guess, whole.seed, show)
+        known = (whole.focal, whole.guess, whole.seed, lambda *_: None)
         search = MapperSearch(path, frames, whole.pairs.only(ids), *known)
         with lock:
             copy_database(whole.database, path, ids)
         found = search.run()
         path.unlink()
-        show(FINISHED, len(ids), len(ids))
         return *found, search.ids
 
+    results = []
+    send_progress("mapping", 0, len(windows))
     with ThreadPoolExecutor(2) as pool:  # mappers use one core each: reproducible
-        results = list(pool.map(map_window, range(len(windows))))
+        for found in pool.map(map_window, range(len(windows))):
+            results.append(found)
+            send_progress("mapping", len(results), len(windows))
     models = [model for found, *_ in results for model in found]
     messages = [text for _, found, _, _ in results for text in found]
     if not models:
@@ -614,16 +606,15 @@ class _Piece:
 
 def _common_points(one: _Piece, other: _Piece, pairs: MatchedPairs) -> IntArray:
     """Return the points (n, 2) of two models that are the same keypoint, or matching ones."""
-    ids = one.arrays.ids, other.arrays.ids
     found = [np.empty((0, 2), np.int64)]
-    for number in np.intersect1d(*ids).tolist():
+    for number in one.point_of.keys() & other.point_of.keys():
         found.append(np.column_stack([one.point_of[number], other.point_of[number]]))
-    first, second = pairs.image_ids.T
-    for swap, (a, b) in enumerate(((first, second), (second, first))):
-        for row in np.flatnonzero(np.isin(a, ids[0]) & np.isin(b, ids[1])).tolist():
-            match = pairs.inliers[row]
-            points = one.point_of[int(a[row])][match[:, swap]]
-            found.append(np.column_stack([points, other.point_of[int(b[row])][match[:, 1 - swap]]]))
+    for (a, b), match in zip(pairs.image_ids.tolist(), pairs.inliers, strict=True):
+        for i, j, ends in ((a, b, match.T), (b, a, match.T[::-1])):
+            if i in one.point_of and j in other.point_of:
+                found.append(
+                    np.column_stack([one.point_of[i][ends[0]], other.point_of[j][ends[1]]])
+                )
     table = np.concatenate(found)
     return np.unique(table[(table >= 0).all(1)], axis=0)
 
