@@ -407,6 +407,7 @@ def find_repeated(
     before: Mapping[int, int],
     map_all_of: int = MAP_ALL_OF,
     map_more_to: int = MAP_MORE_TO,
+    block: int = BLOCK,
 ) -> dict[int, int]:
     """Find for each keyframe the mapped one whose view it repeats.
 
@@ -435,14 +436,14 @@ def find_repeated(
     words = visual_words(database, sorted(compared), seed)
     limit_px = np.inf if before else REPEATED_FLOW * width
     search = _ViewSearch(database, words, view_of, limit_px, seed)
-    search.add(first, "views")
+    search.add(first, "views", block)
     is_repeat = {number: view not in (0, number) for number, view in view_of.items()}
     for one, number, other in zip(ids, ids[1:], ids[2:], strict=False):
         if number not in view_of and is_repeat.get(one) and is_repeat.get(other):
             view_of[number] = 0
     rest = [number for number in ids if number not in view_of]
     extract(rest)
-    search.add(rest, "views again")
+    search.add(rest, "views again", block)
     return view_of
 
 
@@ -467,10 +468,10 @@ class _ViewSearch:
         self.mapped = np.array([i for i, view in view_of.items() if i == view], np.int64)
         self.vlad = vlad_vectors(database, self.mapped.tolist(), words)
 
-    def add(self, numbers: Sequence[int], step: str) -> None:
-        """Find whether keyframes repeat the view of one that is mapped already; show the step."""
-        for start in range(0, len(numbers), BLOCK):
-            block = numbers[start : start + BLOCK]
+    def add(self, numbers: Sequence[int], step: str, size: int) -> None:
+        """Find whether keyframes repeat the view of one that is mapped already, `size` at once."""
+        for start in range(0, len(numbers), size):
+            block = numbers[start : start + size]
             self._add_block(block)
             send_progress(step, start + len(block), len(numbers))
 
