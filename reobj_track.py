@@ -1537,7 +1537,7 @@ def _last_config(out: str | Path) -> Config:
 # What an interrupted stage leaves for the next run, besides the results of the stages before it
 KEPT = {
     "detect": "the frames detected so far",
-    "poses": "the features and matches so far",
+    "poses": "nothing",
     "track": "the frames up to the last save",  # `collect_tracks` says how many
     "map": "nothing",
     "objects": "nothing",

@@ -923,10 +923,9 @@ def reconstructed(lab: Lab, value: Any) -> rt.Poses:
 
     def made(*args: Any, **known: Any) -> sfm.Mapped:
         bound = signature.bind(*args, **known).arguments
-        seeds.append(bound["seed"])
+        seeds.append(bound["job"].seed)
         found = rt.Poses(CAMERA, keys, keys / 30, arc(9)[keys], np.full(3, "keyframe"), "user")
-        work = Path(bound["work_dir"])
-        (work / "mapping").mkdir(parents=True, exist_ok=True)
+        work = bound["child"].folder.parent
         write_colmap(work / "sparse", found, [video.names[k] for k in keys])
         return sfm.Mapped([work / "sparse"], [])
 
