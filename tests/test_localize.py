@@ -148,7 +148,7 @@ def test_a_reversal_of_the_camera_is_no_jump():
 # ---- Gaps ----------------------------------------------------------------------------------------
 
 
-def filled(cams, lost, max_gap=15, left_out=(), frame=None, time_s=None):
+def filled(cams, lost, left_out=(), frame=None, time_s=None):
     """Poses and status after `fill_gaps`, by a model of every fifth frame."""
     frame = np.arange(len(cams)) if frame is None else frame
     keys = np.setdiff1d(np.arange(0, len(cams), 5), lost)
@@ -156,7 +156,7 @@ def filled(cams, lost, max_gap=15, left_out=(), frame=None, time_s=None):
     known[lost], status[lost] = np.nan, "none"
     time_s = frame / 30 if time_s is None else time_s
     located = Located(true_model(cams, keys), keys, known, status)
-    return fill_gaps(located, frame, time_s, max_gap, 1.0, left_out)
+    return fill_gaps(located, frame, time_s, 1.0, left_out)
 
 
 def test_gaps_of_an_even_motion_are_filled_and_never_beyond():
@@ -167,7 +167,6 @@ def test_gaps_of_an_even_motion_are_filled_and_never_beyond():
     assert np.isnan(poses[:2]).all() and np.isin(status[:2], "none").all()
     assert (status[15:18] == "interpolated").all() and (status[18:] == "pnp").all()
     for refused in (
-        filled(cams, lost, max_gap=2),
         filled(cams, lost, left_out=[16]),
         filled(cams, lost, frame=10 * np.arange(40)),  # every 10th frame: 39 are missing
     ):

@@ -54,8 +54,6 @@ def run(folder, images, progress=Progress, **changes):
     """Reconstruct; messages, and the models of all components."""
     with Child(folder / "mapping", folder / "pycolmap.log") as child:
         mapped = reconstruct(job_of(folder, images, **changes), child, progress)
-    names = ["sparse", *(f"sparse_part{k}" for k in range(1, len(mapped.models)))]
-    assert mapped.models == [folder / name for name in names[: len(mapped.models)]]
     return mapped.messages, [read_sparse_model(model) for model in mapped.models]
 
 

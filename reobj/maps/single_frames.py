@@ -27,7 +27,6 @@ from reobj.maps.placement import (
     refine_similarity,
 )
 from reobj.maps.room_map import MapPoints
-from reobj.poses.estimate import MAX_GAP
 from reobj.poses.keyframes import ResizedVideo
 from reobj.poses.localize import fill_gaps, locate_between
 from reobj.sources.video import Video
@@ -239,6 +238,6 @@ def locate_rest(placement: Placement, video: Video, line: Progress, size_px: int
     none = np.empty(0, np.int64)
     located = locate_between(model, rows, none, resized, 0, line)
     shrink = min(1.0, size_px / max(poses.camera.width, poses.camera.height))
-    cam_from_world, status = fill_gaps(located, poses.frame, poses.time_s, MAX_GAP, shrink)
+    cam_from_world, status = fill_gaps(located, poses.frame, poses.time_s, shrink)
     status[rows] = "pnp"
     return dataclasses.replace(poses, cam_from_world=cam_from_world, status=status)

@@ -192,19 +192,14 @@ def adjusted(model: Any, calibrate: bool) -> Adjusted:
         free = import_pycolmap().Reconstruction(model)
         is_determined = _calibrate(free)
         arrays = read_arrays(free)
-        centre_sigma, focal_sigma = _sigmas(arrays, True)
+        centre_sigma, focal_sigma = relative_sigmas(arrays, True)
         low, high = FOCAL_RANGE
         is_plausible = low <= arrays.focal_over_size <= high
         if is_determined and focal_sigma <= MAX_FOCAL_SIGMA and is_plausible:
             return Adjusted(free, arrays, True, centre_sigma)
     refine(model)
     arrays = read_arrays(model)
-    return Adjusted(model, arrays, False, _sigmas(arrays, False)[0])
-
-
-def _sigmas(arrays: ModelArrays, free_camera: bool) -> tuple[float, float]:
-    """Return `relative_sigmas`, zero for a model of too many images."""
-    return (0.0, 0.0) if len(arrays.ids) > MAX_DENSE else relative_sigmas(arrays, free_camera)
+    return Adjusted(model, arrays, False, relative_sigmas(arrays, False)[0])
 
 
 def refine(model: Any) -> None:
@@ -265,11 +260,14 @@ def relative_sigmas(arrays: ModelArrays, free_camera: bool) -> tuple[float, floa
         arrays: of an adjusted model. free_camera: its intrinsics were adjusted too.
     Returns:
         the largest of a camera centre over the extent of the trajectory; that of the log of the
-        focal length, 0 if it is not free. Infinite if the observations do not determine the model.
+        focal length, 0 if it is not free. Infinite if the observations do not determine the model;
+        0 for more than MAX_DENSE images.
     Ref: Triggs et al., Bundle Adjustment - A Modern Synthesis, 1999, sections 6 and 9.
     """
     if len(arrays.ids) < 3 or not len(arrays.image):
         return np.inf, np.inf
+    if len(arrays.ids) > MAX_DENSE:
+        return 0.0, 0.0
     pose, by_pose, by_point, by_camera = _weighted_jacobians(arrays)
     by_camera = by_camera.reshape(-1, by_camera.shape[2])[:, : None if free_camera else 0]
     poses = 6 * len(pose)

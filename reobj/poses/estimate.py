@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from reobj.cameras import Camera, Poses, SparseModel, import_pycolmap, read_sparse_model
-from reobj.files import Progress, spans
+from reobj.files import Progress, part_path, spans
 from reobj.poses.intrinsics import parse_camera
 from reobj.poses.keyframes import (
     MAX_FLOW,
@@ -35,7 +35,6 @@ from reobj.poses.sfm import Child, MakeProgress, Mapped, MappingJob, listed, rec
 from reobj.types import Array, BoolArray, IntArray, ReobjError, nearest_of, option
 
 MAX_KEYFRAMES = 6000  # a longer video has wider steps
-MAX_GAP = 15  # consecutive lost frames that are interpolated: half a second at 30 Hz
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,35 +107,24 @@ def estimate_poses(
     if getattr(video, "is_live", False):
         raise ReobjError("a live camera has no poses: record a video first, or use --poses none")
     folder = work_dir / "mapping"
-    first_models = work_dir / "first"
+    for old in work_dir.glob("sparse*"):
+        shutil.rmtree(old)
     with Child(folder, work_dir / "pycolmap.log") as child:
         made = _Reconstruction(video, config, boxes_to_mask, child, progress)
         keys = made.keyframes()
         best = made.attempt(keys, {})
         if extra := made.add_keyframes(best.more_keyframes()):
-            _move_models(best.mapped.models, first_models)
             second = made.attempt(sorted([*keys, *extra]), best.mapped.view_of)
-            if second.pairs > best.pairs:
-                best = second
-            else:
-                _move_models(sorted(first_models.iterdir()), work_dir)
-    for scratch in (folder, first_models):
-        shutil.rmtree(scratch, ignore_errors=True)
+            best = second if second.pairs > best.pairs else best
+    for k, model in enumerate(best.mapped.models):
+        model.replace(part_path(work_dir / "sparse", k))
+    shutil.rmtree(folder, ignore_errors=True)
     poses = best.poses
     messages = best.mapped.messages
     if poses.known.any():
         messages = [*messages, *_breaks(poses), *_lost_frames(poses, best.tried, video)]
     messages = [*_frames_far_apart(poses, video.config.every), *messages]
     return dataclasses.replace(poses, messages=tuple(messages))
-
-
-def _move_models(models: list[Path], folder: Path) -> None:
-    """Move COLMAP models into a folder, replacing those in it."""
-    for old in folder.glob("sparse*"):
-        shutil.rmtree(old)
-    folder.mkdir(exist_ok=True)
-    for model in models:
-        model.replace(folder / model.name)
 
 
 class _Reconstruction:
@@ -255,7 +243,7 @@ class _Reconstruction:
             unmapped = np.setdiff1d(key_rows, rows)
             located = locate_between(model, rows, unmapped, video, self.config.seed, line)
             shrink = min(1.0, self.config.size_px / max(self.size))
-            filled, how = fill_gaps(located, frame, time_s, MAX_GAP, shrink, unmapped)
+            filled, how = fill_gaps(located, frame, time_s, shrink, unmapped)
             own = (how != "none") & (component < 0)
             own[rows] = True  # keyframes of the model
             cam_from_world[own] = filled[own]

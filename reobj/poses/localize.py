@@ -210,6 +210,7 @@ def _detours(cam_from_world: Array) -> BoolArray:
     return detour
 
 
+MAX_GAP = 15  # consecutive lost frames that are interpolated: half a second at 30 Hz
 # Gap lengths, before and after it, in which the error is measured (chosen; higher: other motion)
 NEAR_GAPS = 2.0
 
@@ -218,11 +219,10 @@ def fill_gaps(
     located: Located,
     frame: IntArray,
     time_s: Array,
-    max_gap: int,
     shrink: float,
     unmapped: Sequence[int] | IntArray = (),
 ) -> tuple[Array, npt.NDArray[np.str_]]:
-    """Interpolate the poses of at most `max_gap` consecutive lost frames where the error is small.
+    """Interpolate the poses of at most MAX_GAP consecutive lost frames where the error is small.
 
     It must be below `INLIER_PX`, as that of PnP (`_interpolation_px`). There is no
     extrapolation, and no interpolation past a row of `unmapped`, a keyframe that mapping rejected.
@@ -241,7 +241,7 @@ def fill_gaps(
     known = np.flatnonzero(np.isfinite(cam_from_world).all((1, 2)))
     for k in np.flatnonzero(np.diff(known) > 1).tolist():
         a, b = known[k : k + 2].tolist()
-        if frame[b] - frame[a] - 1 > max_gap or any(a < row < b for row in unmapped):
+        if frame[b] - frame[a] - 1 > MAX_GAP or any(a < row < b for row in unmapped):
             continue
         camera = model.cameras[0]
         points = _points_around(model, located.key_rows, a, b)

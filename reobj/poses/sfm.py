@@ -18,6 +18,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -278,7 +279,8 @@ class MappingJob:
             repeated = [i for i in ids if view_of[i] in inside and view_of[i] != i]
             added = register(model, database, [*repeated, *weak], self.seed)
             weak = [number for number in weak if number not in added]
-        paths = [folder / f"sparse{k}" for k in range(len(models))]
+        new = Path(tempfile.mkdtemp(dir=folder))
+        paths = [new / str(k) for k in range(len(models))]
         for model, out in zip(models, paths, strict=True):
             self._write(model, out)
         matched = every_pair.image_ids[every_pair.enough]
@@ -296,26 +298,19 @@ class MappingJob:
             for p in image.points2D if (scale != 1).any() else ():
                 p.xy = p.xy * scale
         rescale(model.camera(1), self.size)
-        folder.mkdir(exist_ok=True)
+        folder.mkdir()
         model.write(str(folder))
 
 
 def reconstruct(job: MappingJob, child: Child, progress: MakeProgress) -> Mapped:
-    """Reconstruct keyframes into COLMAP models beside the child's folder."""
-    work_dir = child.folder.parent
-    for old in work_dir.glob("sparse*"):
-        shutil.rmtree(old)
+    """Reconstruct keyframes into COLMAP models in a new folder of the child's."""
     if (count := len(job.frame_of)) < 3:
         problem = "no image has texture that can be tracked (black, blank or blurred)"
         return Mapped([], [without_poses(f"only {count} different views" if count else problem)])
     found: Mapped | str = child.run(job, progress)
     if isinstance(found, str):
         return Mapped([], [f"no camera poses: the reconstruction {found}; give --poses"])
-    models = [
-        model.replace(work_dir / (f"sparse_part{k}" if k else "sparse"))
-        for k, model in enumerate(found.models)
-    ]
-    return dataclasses.replace(found, models=models)
+    return found
 
 
 # ---- Points of supplied poses --------------------------------------------------------------------
