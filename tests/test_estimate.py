@@ -42,15 +42,10 @@ def test_a_walk_gets_a_pose_for_every_frame(walk):
     assert len(poses.points) > 300 and poses.colors.any() and len(poses.colors) == len(poses.points)
     assert (poses.camera.width, poses.camera.height) == video.size
     assert sorted(p.name for p in folder.iterdir()) == ["pycolmap.log", "sparse"]
-
-
-def test_the_sparse_model_holds_the_keyframes(walk):
-    video, _, folder, poses = walk
     back = rt.read_poses(folder / "sparse", video)
     keys = poses.status == "keyframe"
     np.testing.assert_array_equal(back.known, keys)
     np.testing.assert_allclose(back.cam_from_world[keys], poses.cam_from_world[keys], atol=1e-9)
-    np.testing.assert_allclose(back.camera.params, poses.camera.params)
 
 
 def seen_job(monkeypatch, video, folder, **changes):

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -17,8 +15,6 @@ import reobj_track as rt
 from reobj.poses.intrinsics import camera_line, parse_camera, stated_camera
 from reobj.results.workspace import Workspace
 
-SHARED = Path(os.environ.get("REOBJ_SHARED", Path(rt.__file__).resolve().parent.parent / "shared"))
-DATA = SHARED / "data"
 PINHOLE = rt.Camera("PINHOLE", *SIZE, (500, 510, 320, 240))
 OPENCV = rt.Camera("OPENCV", *SIZE, (500, 510, 320, 240, -0.1, 0.02, 0.001, 0.002))
 FR2 = (520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172)  # TUM RGB-D
@@ -365,23 +361,3 @@ def test_a_changed_camera_file_gives_another_reconstruction(tmp_path, monkeypatc
         poses, _ = stage.reconstruct_cached(video, config, workspace)
         assert poses.camera == parse_camera(content, SIZE)
     assert len(cameras) == 2  # the first two are the same camera
-
-
-@pytest.mark.skipif(not DATA.is_dir(), reason="no real recordings: set REOBJ_SHARED")
-@pytest.mark.parametrize(
-    "name, size, model, focal",
-    [
-        ("hololens_kitchen/intrinsics.json", (540, 360), "PINHOLE", 495.56775700934577),
-        ("hololens_kitchen/K.txt", (540, 360), "PINHOLE", 495.5677570093457689),
-        ("redkitchen_7scenes/intrinsics.json", (640, 480), "PINHOLE", 530.0),
-        ("studio_room/intrinsics.json", (1920, 1080), "OPENCV", 903.3096914819945),
-        ("studio_room/transforms.json", (1920, 1080), "OPENCV", 903.3096914819945),
-        ("tum_fr3_office/intrinsics.json", (640, 480), "PINHOLE", 535.4),
-    ],
-)
-def test_the_cameras_of_real_recordings_are_read(name, size, model, focal):
-    camera = parse_camera(str(DATA / name), size)
-    assert camera.model == model and camera.K[0, 0] == pytest.approx(focal)
-    if "K.txt" not in name:  # the others state their size
-        half = parse_camera(str(DATA / name), (size[0] // 2, size[1] // 2))
-        assert half.K[0, 0] == pytest.approx(focal / 2)

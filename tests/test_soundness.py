@@ -106,15 +106,6 @@ def test_coincident_cameras_do_not_fix_the_scale():
     assert step[:2].max() < 0.05 * step[3:].min()
 
 
-def test_points_at_a_camera_centre_have_no_weight():
-    """Accidental matches are triangulated there; their derivatives would be infinite."""
-    scene = Scene(count=6, points=300)
-    sigma, _ = relative_sigmas(read_arrays(noisy(scene, 0.5, 0)), True)
-    model = noisy(scene, 0.5, 0)
-    model.point3D(min(model.point3D_ids())).xyz = centres_of(model)[0] + 1e-9
-    assert relative_sigmas(read_arrays(model), True)[0] == pytest.approx(sigma, rel=0.1)
-
-
 # ---- Two mappers ---------------------------------------------------------------------------------
 
 

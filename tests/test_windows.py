@@ -15,12 +15,10 @@ from reobj.poses.features import MatchedPairs, read_pairs
 from reobj.poses.mapping import (
     Focal,
     MapperSearch,
-    _merged_poses,
     _path,
     aligned,
     map_keyframes,
     split,
-    triangulated,
 )
 from reobj.poses.verification import FocalSource
 
@@ -65,21 +63,14 @@ def pieces(world, windows):
 # ---- Windows -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("count", [281, 500, 1000, 5999])
+@pytest.mark.parametrize("count", [3, 40, 250, 281, 1000, 5999])
 def test_windows_cover_all_keyframes_overlap_and_are_even(count):
     ids = [3 * k for k in range(count)]
     windows = split(ids)
-    assert len(windows) > 1 and sorted({*itertools.chain(*windows)}) == ids
-    assert all(window == sorted(window) for window in windows)
-    for one, other in itertools.pairwise(windows):
-        assert one[-40:] == other[:40]
+    assert sorted({*itertools.chain(*windows)}) == ids and (len(windows) > 1) == (count > 280)
+    assert all(one[-40:] == other[:40] for one, other in itertools.pairwise(windows))
     sizes = [len(window) for window in windows]
-    assert max(sizes) - min(sizes) <= 1 and 120 <= min(sizes) and max(sizes) <= 280
-
-
-@pytest.mark.parametrize("count", [3, 39, 40, 41, 200, 250])
-def test_few_keyframes_are_one_window(count):
-    assert split(range(count)) == [list(range(count))]
+    assert max(sizes) - min(sizes) <= 1 and min(120, count) <= min(sizes) <= max(sizes) <= 280
 
 
 def matched(ids, near):
@@ -87,13 +78,6 @@ def matched(ids, near):
     found = [pair for pair in itertools.combinations(sorted(ids), 2) if near(*pair)]
     matches = [np.zeros((50, 2), np.int64)] * len(found)
     return MatchedPairs(np.array(found), matches, dict.fromkeys(ids), np.ones((len(found), 3, 3)))
-
-
-def test_keyframes_of_a_video_stay_in_the_order_of_time():
-    """Also where a later part shows the first again, so that another order has nearer matches."""
-    ids = numbers(1, 60)
-    pairs = matched(ids, lambda a, b: b - a <= 3 or a + b == 61)
-    assert _path(ids, pairs) == ids
 
 
 def test_shuffled_photos_of_a_line_are_put_back_in_a_line():
@@ -189,22 +173,6 @@ def error_percent(model, world):
     ids = sorted(model.reg_image_ids())
     poses = np.array([model.image(i).cam_from_world().matrix() for i in ids])
     return ate_percent(poses, world.cams[[i - 1 for i in ids]])
-
-
-def test_joined_pieces_have_all_images_at_their_places_and_points_of_both(tmp_path):
-    world = walk(16)
-    pairs = world.pairs()
-    world.write(tmp_path / "database.db", numbers(1, 16), pairs)
-    windows = [numbers(1, 9), numbers(7, 16)]
-    models = pieces(world, windows)
-    (group,) = aligned(models, pairs)
-    model = triangulated(*_merged_poses(models, group), tmp_path / "database.db", 0)
-    assert sorted(model.reg_image_ids()) == numbers(1, 16)
-    assert error_percent(model, world) < 0.5
-    tracks = [{e.image_id for e in point.track.elements} for point in model.points3D.values()]
-    across = [track for track in tracks if min(track) < 7 and max(track) > 9]
-    assert len(tracks) > 500 and len(across) > 100
-    assert model.compute_mean_reprojection_error() < 2
 
 
 # ---- All of it -----------------------------------------------------------------------------------
