@@ -404,7 +404,9 @@ def _lost_frames(poses: Poses, tried: BoolArray, video: Any) -> list[str]:
         (lost & ~tried, "are next to keyframes that could not be mapped with certainty"),
     ):
         if numbers := poses.frame[mask].tolist():
-            named = f": {listed([video.names[n] for n in numbers])}" if video.names else ""
+            files = [video.names[n] for n in numbers[:5]] if video.names else []
+            named = f": {', '.join(files)}" if files else ""
+            named += " ..." if len(numbers) > len(files) > 0 else ""
             groups.append(f"{spans(numbers, step)} ({len(numbers)}{named}) {reason}")
     if not groups:
         return []
