@@ -113,7 +113,7 @@ def estimate_poses(
         made = _Reconstruction(video, config, boxes_to_mask, child, progress)
         keys = made.keyframes()
         best = made.attempt(keys, {})
-        if extra := made.add_keyframes(best.more_keyframes()):
+        if extra := made.add_keyframes(sorted({*best.more_keyframes()} - {*keys})):
             second = made.attempt(sorted([*keys, *extra]), best.mapped.view_of)
             best = second if second.pairs > best.pairs else best
     for k, model in enumerate(best.mapped.models):
