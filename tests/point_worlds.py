@@ -32,6 +32,7 @@ class PointWorld:
         rng = np.random.default_rng(seed)
         world = DotWorld(size=size)
         world.points = points
+        self.size = size
         self.camera = world.camera
         self.points = points
         self.cams = np.asarray(cams)

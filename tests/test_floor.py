@@ -47,8 +47,9 @@ def tilted(deg, axis=0):
     return Rotation.from_rotvec(np.radians(deg) * np.eye(3)[axis]).apply(UP)
 
 
-@pytest.mark.parametrize(("noise", "on_floor"), [(0.003, 400), (0.02, 400), (0.02, 120)])
-@pytest.mark.parametrize("tilt_deg", [0, 3])
+@pytest.mark.parametrize(
+    ("noise", "on_floor", "tilt_deg"), [(0.003, 400, 0), (0.02, 400, 3), (0.02, 120, 3)]
+)
 def test_the_floor_is_found_within_its_sigma(noise, on_floor, tilt_deg):
     """Not the table top, which has more points; gravity is a few degrees off."""
     errors = []
@@ -66,11 +67,6 @@ def test_the_floor_is_found_within_its_sigma(noise, on_floor, tilt_deg):
     assert np.mean(np.abs(errors) < 2) >= 0.85
 
 
-def test_more_noise_increases_the_sigma():
-    quiet, loud = (find_floor(room(0, 150, n), UP, cameras(), 1.0)[0] for n in (0.003, 0.03))
-    assert quiet is not None and loud is not None and quiet.sigma < loud.sigma
-
-
 def test_unit_and_axes_of_the_world_do_not_matter():
     turn = Rotation.from_euler("zyx", [30, 100, -20], degrees=True)
     points, centres = room(), cameras()
@@ -82,14 +78,6 @@ def test_unit_and_axes_of_the_world_do_not_matter():
     np.testing.assert_allclose(moved.normal, turn.apply(plain.normal), atol=2e-3)
     np.testing.assert_allclose(moved.middle, 20 * turn.apply(plain.middle) + 7, atol=0.1)
     assert moved.sigma == pytest.approx(20 * plain.sigma, rel=0.3)
-
-
-def test_texture_does_not_outvote_area():
-    """A carpet with thousands of points lies 2 cm above the rest of the floor."""
-    rng = np.random.default_rng(1)
-    carpet = np.column_stack([rng.uniform(-0.6, 0.6, (6000, 2)), rng.normal(0.02, 0.004, 6000)])
-    floor, _ = find_floor(np.concatenate([room(0, 600), carpet]), UP, cameras(), 1.0)
-    assert floor is not None and abs(floor.middle[2]) < 0.01
 
 
 def table_top(size=0.7):
@@ -107,10 +95,8 @@ TABLE = np.array([0, 0, 0.74])
     ("points", "centres", "metres", "reason"),
     [
         (table_top(), ORBIT, 1.0, "may be a table top"),
-        (table_top() * 4, ORBIT * 4, 0.25, "may be a table top"),  # not metric
         (table_top(), ORBIT, None, "scale is unknown"),
         (room(on_floor=0, table=False, wrong=0), cameras(), 1.0, "no plane|points lie|no near"),
-        (room(), cameras(9.0), 1.0, "m below the cameras"),
         (room(), cameras(), 0.1, "m below the cameras"),  # a doll's house
         (room()[:50], cameras(), 1.0, "50 points, 100 are needed"),
         (room() + HIGHER, cameras(), 1.0, "0 points below the cameras"),
@@ -152,6 +138,7 @@ def poses_in_room(**changes):
 
 def test_points_that_only_two_frames_observed_do_not_count():
     poses = poses_in_room()
+    assert floor_of(poses, None, 1.0) == (None, "gravity is unknown")
     count = len(poses.points)
     ghost = poses.points[:500] - TABLE  # a second level below
     seen = np.column_stack([np.tile([0, 1], 500), np.repeat(np.arange(500) + count, 2)])
@@ -178,11 +165,6 @@ def poses_in_two_parts():
     )  # fmt: skip
 
 
-def test_the_floor_is_that_of_the_largest_component():
-    floor, _ = floor_of(poses_in_two_parts(), UP, 1.0)
-    assert floor is not None and abs(floor.middle[2]) < 0.03
-
-
 def test_every_component_has_its_own_floor():
     scale = quadrics.Scale(1.0, 0.05, "priors")
     fit = SimpleNamespace(scale=scale, up=UP, up_source="cameras")  # the used attributes of a fit
@@ -195,24 +177,6 @@ def test_every_component_has_its_own_floor():
     assert back.to_json() == world.to_json()
     np.testing.assert_array_equal(back.parts[1].floor.middle, world.parts[1].floor.middle)
     assert describe_world(poses_in_two_parts(), [fit, None], []).parts[1].floor is None
-
-
-def test_without_gravity_there_is_no_floor():
-    assert floor_of(poses_in_room(), None, 1.0) == (None, "gravity is unknown")
-
-
-def test_the_floor_is_saved_and_loaded():
-    world = describe_world(poses_in_room(), [None], [])
-    back = decode(rt.World, world.to_json())
-    assert world.floor is not None and back.floor is not None and back.floor_reason == ""
-    for name in ("offset", "sigma", "tilt_sigma_deg", "inliers"):
-        assert getattr(back.floor, name) == getattr(world.floor, name)
-    np.testing.assert_array_equal(back.floor.normal, world.floor.normal)
-    np.testing.assert_array_equal(back.floor.middle, world.floor.middle)
-    assert back.to_json() == world.to_json()
-    entry = world.to_json()
-    del entry["floor"], entry["floor_reason"]  # an older file
-    assert decode(rt.World, entry).floor is None
 
 
 def test_the_reason_for_a_missing_floor_is_saved():

@@ -8,16 +8,17 @@ import pytest
 from pose_worlds import FakeVideo, textured_room
 
 from reobj.files import Progress
-from reobj.poses.keyframes import FlowOptions, ResizedVideo, follow_points, pick_keyframes
+from reobj.poses.keyframes import (
+    MAX_FLOW,
+    ImageFile,
+    ResizedVideo,
+    follow_points,
+    pick_keyframes,
+)
 
 
-def rows(images, most=150, size_px=640, **options):
-    return [
-        k.row
-        for k in pick_keyframes(
-            ResizedVideo(FakeVideo(images), size_px), most, FlowOptions(**options)
-        )
-    ]
+def rows(images, most=150, max_flow=MAX_FLOW):
+    return pick_keyframes(ResizedVideo(FakeVideo(images), 640), most, max_flow)
 
 
 @pytest.fixture(scope="module")
@@ -107,3 +108,13 @@ def test_points_that_fail_the_backward_check_are_dropped():
     moved = (ahead - xy)[left & kept]
     np.testing.assert_allclose(moved, np.tile([3, -2], (len(moved), 1)), atol=0.1)
     assert follow_points(old, new, np.empty((0, 2)))[1].shape == (0,)
+
+
+def test_images_in_a_file_are_read_by_their_numbers(tmp_path):
+    images = np.random.default_rng(0).integers(0, 255, (3, 12, 16, 3)).astype(np.uint8)
+    file = ImageFile(tmp_path / "new" / "images.raw")
+    for number in (5, 2, 9, 2):  # one of them again
+        file.add(number, images[number % 3])
+    assert file.shape == (12, 16, 3)
+    for number in (9, 5, 2):
+        np.testing.assert_array_equal(file[number], images[number % 3])

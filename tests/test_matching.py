@@ -12,17 +12,12 @@ from reobj.cameras import invert_rigid
 from reobj.poses.supplied.frame_assignment import (
     FrameAssignment,
     SourceFrames,
-    _assignment,
     by_numbers,
     interpolated,
     rows_by_time,
     source_of,
 )
 from reobj.sources.video import InputConfig
-
-
-def source(frame: list[int], time_s: list[float], count: int, timed: bool = True) -> SourceFrames:
-    return SourceFrames(np.array(frame), np.array(time_s), count, timed=timed)
 
 
 def rows_of(found: list[FrameAssignment]) -> dict[str, tuple[list[int], int]]:
@@ -106,9 +101,3 @@ def test_numbers_with_an_offset_from_the_images() -> None:
     assert found["number0"] == ([0, 1, 2], 0) and found["number"] == ([1, 2, -1], 1)
     found = rows_of(by_numbers(np.array([1, 2, 3]), from_1, "numbers"))
     assert set(found) <= {"number", "order"} and found["number"] == ([0, 1, 2], 0)
-
-
-def test_numbers_after_the_last_frame_are_counted() -> None:
-    seen = source([0, 1, 2], [0, 0.1, 0.2], 3)
-    found = _assignment("number", "numbers", np.array([-1, 0, 2, 3, 4]), seen)
-    assert found.row.tolist() == [1, -1, 2] and found.outside == 3

@@ -11,8 +11,6 @@ from pose_worlds import FakeVideo, motion, supplied, textured_room
 import reobj_track as rt
 from reobj.cameras import invert_rigid
 from reobj.files import Progress
-from reobj.poses import sfm
-from reobj.poses.child_job import Child
 from reobj.poses.features import choose_posed_pairs
 from reobj.poses.keyframes import choose_posed_keyframes, path_steps, sharpest_images
 from reobj.poses.sfm import triangulate
@@ -45,7 +43,7 @@ def test_points_lie_on_the_walls_of_the_supplied_poses(corner):
     assert len(off) > 200 and np.median(off) < 0.02 and np.percentile(off, 95) < 0.1
     assert (np.abs(z - 6) < 0.1).sum() > 50 and (np.abs(y - 1.2) < 0.1).sum() > 30
     np.testing.assert_array_equal(poses.cam_from_world, given.cam_from_world)
-    assert poses.messages == () and {p.suffix for p in folder.iterdir()} == {".log", ".lock"}
+    assert poses.messages == () and {p.suffix for p in folder.iterdir()} == {".log"}
 
 
 def test_points_come_with_the_frames_that_observed_them_and_their_colour(corner):
@@ -63,16 +61,13 @@ def test_points_come_with_the_frames_that_observed_them_and_their_colour(corner)
     assert np.abs(seen - own).mean() < 0.6 * np.abs(seen - other).mean()
 
 
-def test_the_scale_is_that_of_the_poses_and_two_runs_agree(corner, tmp_path):
+def test_the_scale_is_that_of_the_poses(corner, tmp_path):
     _, given, video, _, poses = corner
     cams = given.cam_from_world.copy()
     cams[:, :, 3] *= 50
     larger = run(video, dataclasses.replace(given, cam_from_world=cams), tmp_path)
     assert len(larger.points) == pytest.approx(len(poses.points), rel=0.1)
     assert np.median(larger.points[:, 2]) == pytest.approx(50 * np.median(poses.points[:, 2]), 0.05)
-    again = run(video, given, tmp_path)
-    np.testing.assert_array_equal(again.points, poses.points)
-    np.testing.assert_array_equal(again.visibility, poses.visibility)
 
 
 @pytest.mark.parametrize("mistake", ["inverted", "of other frames"])
@@ -113,40 +108,15 @@ def test_nothing_to_triangulate_gives_a_message(images, tmp_path):
     assert "0 images have a pose" in run(video, unknown, tmp_path).messages[0]
 
 
-def test_an_aborted_child_gives_a_message(corner, tmp_path, monkeypatch):
-    _, given, video, _, _ = corner
-
-    def stop(module, folder, log_path):
-        return Child("reobj.poses.nothing", folder, log_path)
-
-    monkeypatch.setattr(sfm, "Child", stop)
-    (message,) = run(video, given, tmp_path).messages
-    assert "the triangulation stopped (exit code 1), see" in message
-    assert "nothing" in (tmp_path / "points.log").read_text()
-
-
-def test_progress_comes_from_the_child(corner, tmp_path):
-    stages = []
-
-    def progress(stage, total):
-        stages.append((stage, total))
-        return Progress(stage, total)
-
-    run(corner[2], corner[1], tmp_path, progress=progress)
-    names = ["keyframes", "features", "match", "triangulating"]
-    assert [stage for stage, _ in stages] == names
-    assert stages[1] == ("features", 9)
-
-
 # ---- Keyframes and pairs -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", ["orbit", "walk", "pan", "forward"])
-def test_keyframes_are_evenly_spread_whatever_the_unit(kind):
-    cams = motion(kind, 600)
+@pytest.mark.parametrize("kind, count", [("orbit", 600), ("pan", 600), ("forward", 3000)])
+def test_keyframes_are_evenly_spread_whatever_the_unit(kind, count):
+    cams = motion(kind, count)
     rows = choose_posed_keyframes(path_steps(supplied(cams)))
     assert 40 <= len(rows) <= 150 and rows[0] == 0 and (np.diff(rows) > 0).all()
-    assert np.diff(rows).max() < 0.15 * 600
+    assert np.diff(rows).max() < 0.15 * count
     cams[:, :, 3] *= 1e-3
     np.testing.assert_array_equal(choose_posed_keyframes(path_steps(supplied(cams))), rows)
 
@@ -157,11 +127,6 @@ def test_few_frames_are_all_keyframes_and_those_without_a_pose_none():
     rows = choose_posed_keyframes(path_steps(supplied(cams)))
     assert rows.tolist() == [i for i in range(13) if i != 5]
     assert choose_posed_keyframes(np.full((4, 6), np.nan)).tolist() == []
-
-
-def test_long_paths_have_wider_keyframe_steps():
-    cams = np.concatenate([motion("orbit", 400), motion("orbit", 400)[::-1]] * 4)
-    assert 60 < len(choose_posed_keyframes(path_steps(supplied(cams)))) <= 150
 
 
 def test_pairs_are_neighbours_and_loop_closures():

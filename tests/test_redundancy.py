@@ -11,8 +11,7 @@ from pose_worlds import sideways, turn_deg
 from scipy.spatial.transform import Rotation
 
 from reobj.cameras import invert_rigid
-from reobj.poses.features import match_pairs
-from reobj.poses.redundancy import RedundancyOptions, find_repeated, register
+from reobj.poses.features import find_repeated, match_pairs, register
 
 pytest.importorskip("pycolmap")
 # At position p the camera is .45 p along the wall; the next position is 35 px of 480 away, more
@@ -20,7 +19,6 @@ pytest.importorskip("pycolmap")
 PLACE = np.array([*range(1, 26), *range(24, -6, -1)])
 IDS = list(range(1, len(PLACE) + 1))
 BACK = range(26, 50)  # ids of views that were there before
-OPTIONS = RedundancyOptions(map_all_of=20, block=6)
 
 
 class There:
@@ -39,9 +37,10 @@ class There:
         self.world.write(self.database, new)
         self.extracted += new
 
-    def find(self, ids=IDS, is_video=True, before=None, options=OPTIONS):
+    def find(self, ids=IDS, is_video=True, before=(), **limits):
+        limits = {"map_all_of": 20, "block": 6} | limits
         return find_repeated(
-            self.database, ids, self.extract, 480, 0, is_video, before, options=options
+            self.database, ids, self.extract, 480, 0, is_video, dict(before), **limits
         )
 
 
@@ -74,7 +73,7 @@ def test_only_keyframes_between_two_repeats_are_left_out_and_cost_no_features(th
 
 def test_few_keyframes_are_all_mapped(tmp_path):
     made = There(tmp_path)
-    view_of = made.find(options=RedundancyOptions(map_all_of=len(IDS), block=6))
+    view_of = made.find(map_all_of=len(IDS))
     assert view_of == {i: i for i in IDS} and made.extracted == IDS
 
 
@@ -104,8 +103,8 @@ def test_keyframes_added_where_many_are_mapped_are_only_registered(tmp_path):
     made = There(tmp_path)
     first = IDS[::3]
     before = made.find(first, is_video=False)
-    options = RedundancyOptions(map_all_of=10, map_more_to=5, block=6)
-    view_of = made.find(IDS[:30], is_video=False, before=before, options=options)
+    limits = {"map_all_of": 10, "map_more_to": 5}
+    view_of = made.find(IDS[:30], is_video=False, before=before, **limits)
     mapped = {i for i in first if before[i] == i}
     assert {view for view in view_of.values()} <= mapped
     match_pairs(made.database, list(itertools.pairwise(sorted(mapped))), 0)

@@ -11,19 +11,16 @@ from point_worlds import PointWorld, wall
 from pose_worlds import ate_percent, sideways
 
 from reobj.cameras import invert_rigid
-from reobj.poses import windows
 from reobj.poses.features import MatchedPairs, read_pairs
-from reobj.poses.mapping import Focal, MapperSearch
-from reobj.poses.verification import FocalSource
-from reobj.poses.windows import (
-    WindowOptions,
-    _merged_poses,
+from reobj.poses.mapping import (
+    Focal,
+    MapperSearch,
     _path,
     aligned,
     map_keyframes,
     split,
-    triangulated,
 )
+from reobj.poses.verification import FocalSource
 
 pycolmap = pytest.importorskip("pycolmap")
 STEP = 0.35
@@ -66,21 +63,14 @@ def pieces(world, windows):
 # ---- Windows -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("count", [281, 500, 1000, 5999])
+@pytest.mark.parametrize("count", [3, 40, 250, 281, 1000, 5999])
 def test_windows_cover_all_keyframes_overlap_and_are_even(count):
     ids = [3 * k for k in range(count)]
     windows = split(ids)
-    assert len(windows) > 1 and sorted({*itertools.chain(*windows)}) == ids
-    assert all(window == sorted(window) for window in windows)
-    for one, other in itertools.pairwise(windows):
-        assert one[-40:] == other[:40]
+    assert sorted({*itertools.chain(*windows)}) == ids and (len(windows) > 1) == (count > 280)
+    assert all(one[-40:] == other[:40] for one, other in itertools.pairwise(windows))
     sizes = [len(window) for window in windows]
-    assert max(sizes) - min(sizes) <= 1 and 120 <= min(sizes) and max(sizes) <= 280
-
-
-@pytest.mark.parametrize("count", [3, 39, 40, 41, 200, 250])
-def test_few_keyframes_are_one_window(count):
-    assert split(range(count)) == [list(range(count))]
+    assert max(sizes) - min(sizes) <= 1 and min(120, count) <= min(sizes) <= max(sizes) <= 280
 
 
 def matched(ids, near):
@@ -90,13 +80,6 @@ def matched(ids, near):
     return MatchedPairs(np.array(found), matches, dict.fromkeys(ids), np.ones((len(found), 3, 3)))
 
 
-def test_keyframes_of_a_video_stay_in_the_order_of_time():
-    """Also where a later part shows the first again, so that another order has nearer matches."""
-    ids = numbers(1, 60)
-    pairs = matched(ids, lambda a, b: b - a <= 3 or a + b == 61)
-    assert _path(ids, pairs) == ids
-
-
 def test_shuffled_photos_of_a_line_are_put_back_in_a_line():
     ids = numbers(5, 84)
     place = dict(zip(ids, np.random.default_rng(0).permutation(80).tolist(), strict=True))
@@ -104,7 +87,7 @@ def test_shuffled_photos_of_a_line_are_put_back_in_a_line():
     found = _path(ids, replace(pairs, is_path=pairs.in_order(ids)))
     assert sorted(found) == ids
     assert np.abs(np.diff([place[i] for i in found])).max() <= 6
-    for window in split(found, WindowOptions(size=20, overlap=5)):
+    for window in split(found, 20, 5):
         along = sorted(place[i] for i in window)
         assert along[-1] - along[0] <= len(along) + 6
 
@@ -112,33 +95,20 @@ def test_shuffled_photos_of_a_line_are_put_back_in_a_line():
 # ---- Joints --------------------------------------------------------------------------------------
 
 
-def test_pieces_that_share_images_are_aligned():
+@pytest.mark.parametrize(
+    "ends, groups",
+    [
+        ([(1, 10), (8, 17), (15, 24)], 1),  # common images
+        ([(1, 12), (13, 24)], 1),  # matches alone
+        ([(1, 10), (15, 24)], 2),  # too few common points
+    ],
+)
+def test_pieces_with_enough_common_points_are_aligned(ends, groups):
     world = walk(24)
-    windows = [numbers(1, 10), numbers(8, 17), numbers(15, 24)]
-    (group,) = aligned(pieces(world, windows), world.pairs())
-    assert sorted(group) == [0, 1, 2] and error_of(group, world) < 0.005
-
-
-def test_pieces_with_matches_and_no_common_image_are_aligned():
-    world = walk(24)
-    windows = [numbers(1, 12), numbers(13, 24)]
-    (group,) = aligned(pieces(world, windows), world.pairs())
-    assert sorted(group) == [0, 1] and error_of(group, world) < 0.005
-
-
-def test_a_joint_needs_enough_common_points():
-    world = walk(24)
-    models = pieces(world, [numbers(1, 11), numbers(14, 24)])
-    pairs = world.pairs()
-    across = (pairs.image_ids[:, 0] <= 11) & (pairs.image_ids[:, 1] >= 14)
-    common = {
-        int(world.observed[pair[0] - 1][row])
-        for pair, match in zip(pairs.image_ids[across], np.array(pairs.inliers, object)[across],
-                               strict=True)
-        for row in match[:, 0].tolist()
-    }  # fmt: skip
-    few, many = (aligned(models, pairs, WindowOptions(points=n)) for n in (len(common) + 1, 100))
-    assert len(common) > 150 and len(few) == 2 and len(many) == 1
+    found = aligned(pieces(world, [numbers(*end) for end in ends]), world.pairs())
+    assert len(found) == groups and sum(map(len, found)) == len(ends)
+    if groups == 1:
+        assert error_of(found[0], world) < 0.005
 
 
 def test_common_points_that_no_similarity_explains_join_nothing():
@@ -168,8 +138,7 @@ def test_two_scenes_stay_two_groups_the_larger_first():
     assert all(error_of(group, world) < 0.01 for group in groups)
 
 
-@pytest.mark.parametrize("reach, alike", [(3, 150), (3, 400)])
-def test_a_false_joint_of_places_that_look_alike_is_dropped(reach, alike):
+def test_a_false_joint_of_places_that_look_alike_is_dropped():
     """The end of the path looks like its beginning: matches of both say that the camera is back.
 
     Around the loop all four joints contradict each other; the false one has the fewest points, or
@@ -178,11 +147,11 @@ def test_a_false_joint_of_places_that_look_alike_is_dropped(reach, alike):
     count = 48
     points = wall(STEP * count)
     shift = (count - 8) * STEP * np.array([1, 0.2, 0.1])
-    first = np.flatnonzero(points[:, 0] < 1.5)[:alike]
-    last = np.arange(len(points))[-alike:]
+    first = np.flatnonzero(points[:, 0] < 1.5)[:400]
+    last = np.arange(len(points))[-400:]
     points[last] = points[first] + shift
     world = PointWorld(sideways(count, STEP), points)
-    pairs = world.pairs(reach)
+    pairs = world.pairs(reach=3)
     ids = pairs.image_ids.tolist()
     for a, b in itertools.product(numbers(1, 8), numbers(count - 7, count)):
         _, one, k = np.intersect1d(world.observed[a - 1], first, return_indices=True)
@@ -191,7 +160,7 @@ def test_a_false_joint_of_places_that_look_alike_is_dropped(reach, alike):
             ids.append([a, b])
             pairs.inliers.append(np.column_stack([one[m], other]))
     pairs = MatchedPairs(np.array(ids), pairs.inliers, pairs.keypoints, np.empty((len(ids), 3, 3)))
-    windows = split(numbers(1, count), WindowOptions(size=14, overlap=4))
+    windows = split(numbers(1, count), 14, 4)
     assert len(aligned(pieces(world, [windows[0], windows[-1]]), pairs)) == 1  # they look alike
     (group,) = aligned(pieces(world, windows), pairs)
     assert sorted(group) == [0, 1, 2, 3] and error_of(group, world) < 0.01
@@ -206,109 +175,19 @@ def error_percent(model, world):
     return ate_percent(poses, world.cams[[i - 1 for i in ids]])
 
 
-def test_joined_pieces_have_all_images_at_their_places_and_points_of_both(tmp_path):
-    world = walk(16)
-    pairs = world.pairs()
-    world.write(tmp_path / "database.db", numbers(1, 16), pairs)
-    windows = [numbers(1, 9), numbers(7, 16)]
-    models = pieces(world, windows)
-    (group,) = aligned(models, pairs)
-    model = triangulated(*_merged_poses(models, group), tmp_path / "database.db", 0)
-    assert sorted(model.reg_image_ids()) == numbers(1, 16)
-    assert error_percent(model, world) < 0.5
-    tracks = [{e.image_id for e in point.track.elements} for point in model.points3D.values()]
-    across = [track for track in tracks if min(track) < 7 and max(track) > 9]
-    assert len(tracks) > 500 and len(across) > 100
-    assert model.compute_mean_reprojection_error() < 2
-
-
-def test_triangulated_points_lie_where_they_are(tmp_path):
-    world = walk(8)
-    world.write(tmp_path / "database.db", numbers(1, 8), world.pairs())
-    camera = world.model([1, 2]).camera(1)
-    pose = {i: world.cams[i - 1] for i in numbers(2, 7)}
-    model = triangulated(pose, camera, tmp_path / "database.db", 0)
-    assert sorted(model.reg_image_ids()) == numbers(2, 7)
-    off = []
-    for point in model.points3D.values():
-        seen = point.track.elements[0]
-        true = world.points[world.observed[seen.image_id - 1][seen.point2D_idx]]
-        off.append(np.linalg.norm(point.xyz - true))
-    assert len(off) > 300 and np.median(off) < 0.05
-    for i, cam in pose.items():
-        np.testing.assert_allclose(model.image(i).cam_from_world().matrix(), cam, atol=1e-9)
-
-
 # ---- All of it -----------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def mapped(tmp_path_factory):
-    """A walk of 20 images, its folder, and a function that maps it there with some options."""
+@pytest.mark.parametrize("size, windows", [(12, ["window0", "window1"]), (200, [])])
+def test_a_walk_mapped_in_windows_is_that_mapped_at_once(tmp_path, size, windows):
     ids = numbers(1, 20)
     world = PointWorld(sideways(20, STEP), wall(STEP * 20, per_metre=100))
-    folder = tmp_path_factory.mktemp("windows")
-
-    def run(name, **options):
-        database = folder / name / "database.db"
-        if not database.exists():
-            database.parent.mkdir()
-            world.write(database, ids, world.pairs())
-        pairs = read_pairs(database)
-        focal = Focal(430 / 480, FocalSource.GIVEN)
-        frames = {i: 10 * i for i in ids}
-        search = MapperSearch(database, frames, pairs, focal, 0.9, 0)
-        return map_keyframes(search, WindowOptions(**options))
-
-    return world, folder, run, run("windows", size=12, overlap=4)
-
-
-def test_a_walk_mapped_in_windows_is_that_mapped_at_once(mapped):
-    world, folder, run, in_windows = mapped
-    for (model,), messages, weak in (in_windows, run("whole")):
-        assert messages == [] and weak == [] and sorted(model.reg_image_ids()) == numbers(1, 20)
-        assert error_percent(model, world) < 0.3
-    assert sorted(path.name for path in folder.glob("*/window*")) == ["window0", "window1"]
-
-
-def test_a_second_call_reads_the_windows_that_are_finished(mapped, monkeypatch):
-    """The same poses without any mapper; a window that is missing is mapped again, no other."""
-    world, folder, run, ((first,), *_) = mapped
-    ran = []
-    search = MapperSearch.run
-
-    def note(self):
-        ran.append(list(self.ids))
-        return search(self)
-
-    monkeypatch.setattr(MapperSearch, "run", note)
-    (again,), messages, _ = run("windows", size=12, overlap=4)
-    assert ran == [] and messages == []
-    for i in numbers(1, 20):
-        found = (model.image(i).cam_from_world().matrix() for model in (again, first))
-        np.testing.assert_allclose(*found, atol=1e-9)
-    for lost in ("all", "window1"):
-        (folder / "windows" / lost / "search.json").unlink()
-    (again,), *_ = run("windows", size=12, overlap=4)
-    assert ran == [numbers(9, 20)] and error_percent(again, world) < 0.3
-
-
-def test_the_progress_of_windows_is_complete_when_the_last_one_is_verified(mapped, monkeypatch):
-    _, _, run, _ = mapped
-    events = []
-    search = MapperSearch.run
-
-    def note(self):
-        found = search(self)
-        events.append("verified")
-        return found
-
-    def send(step, done, total):
-        events.append((step, done / total if total else 0.0))
-
-    monkeypatch.setattr(MapperSearch, "run", note)
-    monkeypatch.setattr(windows, "send_progress", send)
-    run("shown", size=12, overlap=4)
-    last = len(events) - events[::-1].index("verified")
-    before = [event[1] for event in events[:last] if event != "verified"]
-    assert before and max(before) < 1 and ("mapping", 1.0) in events[last:]
+    database = tmp_path / "database.db"
+    world.write(database, ids, world.pairs())
+    focal = Focal(430 / 480, FocalSource.GIVEN)
+    frames = {i: 10 * i for i in ids}
+    search = MapperSearch(database, frames, read_pairs(database), focal, 0.9, 0)
+    (model,), messages, weak = map_keyframes(search, size, 4)
+    assert messages == [] and weak == [] and sorted(model.reg_image_ids()) == ids
+    assert error_percent(model, world) < 0.3
+    assert sorted(path.name for path in tmp_path.glob("window*")) == windows

@@ -8,6 +8,7 @@ mean, size and orientation of the camera centres.
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,6 +33,17 @@ def triangulates(count: Array, squared_sum: Array) -> BoolArray:
     """
     spread = count - squared_sum / np.maximum(count, 1)
     return np.asarray(spread >= 1 - np.cos(np.radians(MIN_TRI_ANGLE_DEG)), bool)
+
+
+def unit_rows(vectors: Array) -> Array:
+    """Return vectors (N, 3) at length 1."""
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+
+
+def skew(x: Array, y: Array, z: Array) -> Array:
+    """Return the matrices (N, 3, 3) of the cross products with vectors (N,), (N,), (N,)."""
+    zero = np.zeros(len(x))
+    return np.moveaxis(np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]), 2, 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,11 +91,20 @@ class ModelArrays:
         mine = np.isin(self.image, rows)
         image = self.image[mine]
         count = len(self.xyz)
-        ray = self.xyz[self.point[mine]] - self.centre[image]  # (m, 3)
-        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+        ray = unit_rows(self.xyz[self.point[mine]] - self.centre[image])  # (m, 3)
         entries = (np.ones(len(image)), (self.point[mine], np.arange(len(image))))
         sums = sparse.csr_matrix(entries, (count, len(image))) @ np.insert(ray, 3, 1, 1)  # (N, 4)
         return triangulates(sums[:, 3], (sums[:, :3] ** 2).sum(1))
+
+    def point_of_keypoints(self, keypoints: Mapping[int, Array]) -> dict[int, IntArray]:
+        """Return the points (n,) of all keypoints (n, 2) by image id, -1: none."""
+        start = np.searchsorted(self.image, np.arange(len(self.ids) + 1))
+        point_of: dict[int, IntArray] = {}
+        for row, number in enumerate(self.ids.tolist()):
+            mine = slice(start[row], start[row + 1])
+            point_of[number] = np.full(len(keypoints[number]), -1)
+            point_of[number][self.keypoint[mine]] = self.point[mine]
+        return point_of
 
     def points_in_cam(self) -> Array:
         """Return the observed points (M, 3) in the frames of their images."""
@@ -171,19 +192,14 @@ def adjusted(model: Any, calibrate: bool) -> Adjusted:
         free = import_pycolmap().Reconstruction(model)
         is_determined = _calibrate(free)
         arrays = read_arrays(free)
-        centre_sigma, focal_sigma = _sigmas(arrays, True)
+        centre_sigma, focal_sigma = relative_sigmas(arrays, True)
         low, high = FOCAL_RANGE
         is_plausible = low <= arrays.focal_over_size <= high
         if is_determined and focal_sigma <= MAX_FOCAL_SIGMA and is_plausible:
             return Adjusted(free, arrays, True, centre_sigma)
     refine(model)
     arrays = read_arrays(model)
-    return Adjusted(model, arrays, False, _sigmas(arrays, False)[0])
-
-
-def _sigmas(arrays: ModelArrays, free_camera: bool) -> tuple[float, float]:
-    """Return `relative_sigmas`, zero for a model of too many images."""
-    return (0.0, 0.0) if len(arrays.ids) > MAX_DENSE else relative_sigmas(arrays, free_camera)
+    return Adjusted(model, arrays, False, relative_sigmas(arrays, False)[0])
 
 
 def refine(model: Any) -> None:
@@ -244,11 +260,14 @@ def relative_sigmas(arrays: ModelArrays, free_camera: bool) -> tuple[float, floa
         arrays: of an adjusted model. free_camera: its intrinsics were adjusted too.
     Returns:
         the largest of a camera centre over the extent of the trajectory; that of the log of the
-        focal length, 0 if it is not free. Infinite if the observations do not determine the model.
+        focal length, 0 if it is not free. Infinite if the observations do not determine the model;
+        0 for more than MAX_DENSE images.
     Ref: Triggs et al., Bundle Adjustment - A Modern Synthesis, 1999, sections 6 and 9.
     """
     if len(arrays.ids) < 3 or not len(arrays.image):
         return np.inf, np.inf
+    if len(arrays.ids) > MAX_DENSE:
+        return 0.0, 0.0
     pose, by_pose, by_point, by_camera = _weighted_jacobians(arrays)
     by_camera = by_camera.reshape(-1, by_camera.shape[2])[:, : None if free_camera else 0]
     poses = 6 * len(pose)
@@ -325,12 +344,11 @@ def _gauge(pose: Array, size: int) -> tuple[Array, Array]:
     """Return the centres (R, 3) and an orthonormal basis (size, 7) of their similarities."""
     rotation = pose[:, :, :3]
     centre = -np.einsum("rji,rj->ri", rotation, pose[:, :, 3])
-    x, y, z = (centre - centre.mean(0)).T
-    zero = np.zeros(len(centre))
+    offset = centre - centre.mean(0)
     basis = np.zeros((len(centre), 6, 7))
     basis[:, :3, :3] = np.eye(3)
-    basis[:, :3, 3:6] = np.moveaxis(np.array([[zero, z, -y], [-z, zero, x], [y, -x, zero]]), 2, 0)
-    basis[:, :3, 6] = np.column_stack([x, y, z])
+    basis[:, :3, 3:6] = -skew(*offset.T)
+    basis[:, :3, 6] = offset
     columns = np.zeros((size, 7))
     columns[: basis.size // 7] = basis.reshape(-1, 7)
     return centre, np.linalg.qr(columns)[0]

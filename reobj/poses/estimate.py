@@ -9,11 +9,8 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import itertools
-import json
-import math
-import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,23 +18,23 @@ from typing import Any
 import numpy as np
 
 from reobj.cameras import Camera, Poses, SparseModel, import_pycolmap, read_sparse_model
-from reobj.files import Progress, atomic, load_cached, load_json, spans
-from reobj.poses.child_job import ImageFile
+from reobj.files import Progress, part_path, spans
 from reobj.poses.intrinsics import parse_camera
 from reobj.poses.keyframes import (
+    MAX_FLOW,
+    MIN_FLOW,
     MIN_KEYFRAMES,
-    FlowOptions,
-    Keyframe,
+    ImageFile,
     ResizedFrame,
     ResizedVideo,
     pick_keyframes,
 )
-from reobj.poses.localize import Located, beside_mapped, fill_gaps, locate_between
+from reobj.poses.localize import beside_mapped, fill_gaps, locate_between
 from reobj.poses.mapping import ADVICE, FOCAL_GUESS
-from reobj.poses.sfm import Mapped, listed, mapping_child, reconstruct
+from reobj.poses.sfm import Child, MakeProgress, Mapped, MappingJob, listed, reconstruct
 from reobj.types import Array, BoolArray, IntArray, ReobjError, nearest_of, option
 
-MAX_GAP = 15  # consecutive lost frames that are interpolated: half a second at 30 Hz
+MAX_KEYFRAMES = 6000  # a longer video has wider steps
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +88,7 @@ def estimate_poses(
     video: Any,
     config: PosesConfig,
     work_dir: Path,
-    progress: Callable[[str, int], Progress] = Progress,
+    progress: MakeProgress = Progress,
     boxes_to_mask: Callable[[int], Array] | None = None,
 ) -> Poses:
     """Reconstruct the cameras of a video of a static scene.
@@ -109,65 +106,19 @@ def estimate_poses(
     """
     if getattr(video, "is_live", False):
         raise ReobjError("a live camera has no poses: record a video first, or use --poses none")
-    size = (int(video.size[0]), int(video.size[1]))
-    camera = parse_camera(config.camera, size, config.camera_format)
-    resized = ResizedVideo(video, config.size_px)
-    first_models = work_dir / "first"
-    with mapping_child(work_dir) as child:
-        store = KeyframeStore(work_dir, _keyframes_key(video, config))
-        keys = store.load(resized)
-        if keys is None:
-            keys = _enough_keyframes(resized, MAX_KEYFRAMES, store, progress)
-            store.save(resized, keys)
-        focal_guess = _exif_focal(video) or FOCAL_GUESS
-        row_of = {_frame_name(video, number): row for row, number in enumerate(resized.frames)}
-
-        def attempt(keys: list[Keyframe], before: Sequence[Located] = ()) -> _Attempt:
-            mapped = reconstruct(
-                store.images_of(keys),
-                [key.row + 1 for key in keys],
-                [key.frame for key in keys],
-                [_frame_name(video, key.frame) for key in keys],
-                [
-                    np.empty((0, 4)) if boxes_to_mask is None
-                    else np.reshape(boxes_to_mask(key.frame), (-1, 4))
-                    for key in keys
-                ],
-                size,
-                camera=camera,
-                focal_guess=focal_guess,
-                is_video=len(resized.frames) >= 3 * len(keys),
-                seed=config.seed,
-                child=child,
-                work_dir=work_dir,
-                progress=progress,
-            )  # fmt: skip
-            models = [read_sparse_model(model) for model in mapped.models]
-            component_rows = [np.array([row_of[name] for name in model.names]) for model in models]
-            matched = [key.row for key in keys if key.row + 1 not in mapped.unmatched]
-            key_rows = np.array(matched, np.int64)
-            line = progress("pnp", len(models) * len(resized.frames))
-            poses, located = _locate_all(
-                models, component_rows, key_rows, resized, config, line, before
-            )
-            return _Attempt(poses, component_rows, key_rows, mapped, located)
-
-        best = attempt(keys)
-        wanted = set(best.more_keyframes())
-        extra = []
-        if wanted:
-            frames = resized.shown(progress("more keyframes", len(resized.frames)))
-            extra = [store.keep(f) for f in frames if f.row in wanted and f.has_texture]
-        if extra:
-            _move_models(best.mapped.models, first_models)
-            second = attempt(sorted([*keys, *extra], key=lambda key: key.row), best.located)
-            if second.pairs > best.pairs:
-                best = second
-            else:
-                _move_models(sorted(first_models.iterdir()), work_dir)
-    for folder in (work_dir / "mapping", first_models):
-        shutil.rmtree(folder, ignore_errors=True)
-    store.remove()
+    folder = work_dir / "mapping"
+    for old in work_dir.glob("sparse*"):
+        shutil.rmtree(old)
+    with Child(folder, work_dir / "pycolmap.log") as child:
+        made = _Reconstruction(video, config, boxes_to_mask, child, progress)
+        keys = made.keyframes()
+        best = made.attempt(keys, {})
+        if extra := made.add_keyframes(sorted({*best.more_keyframes()} - {*keys})):
+            second = made.attempt(sorted([*keys, *extra]), best.mapped.view_of)
+            best = second if second.pairs > best.pairs else best
+    for k, model in enumerate(best.mapped.models):
+        model.replace(part_path(work_dir / "sparse", k))
+    shutil.rmtree(folder, ignore_errors=True)
     poses = best.poses
     messages = best.mapped.messages
     if poses.known.any():
@@ -176,13 +127,146 @@ def estimate_poses(
     return dataclasses.replace(poses, messages=tuple(messages))
 
 
-def _move_models(models: list[Path], folder: Path) -> None:
-    """Move COLMAP models into a folder, replacing those in it."""
-    for old in folder.glob("sparse*"):
-        shutil.rmtree(old)
-    folder.mkdir(exist_ok=True)
-    for model in models:
-        model.replace(folder / model.name)
+class _Reconstruction:
+    """A video whose keyframes are mapped in a child process, once or twice.
+
+    Args:
+        boxes_to_mask: as of `estimate_poses`.
+    """
+
+    def __init__(
+        self,
+        video: Any,
+        config: PosesConfig,
+        boxes_to_mask: Callable[[int], Array] | None,
+        child: Child,
+        progress: MakeProgress,
+    ) -> None:
+        self.size = (int(video.size[0]), int(video.size[1]))
+        self.camera = parse_camera(config.camera, self.size, config.camera_format)
+        self.video = video
+        self.resized = ResizedVideo(video, config.size_px)
+        self.config = config
+        self.boxes_of = boxes_to_mask or (lambda frame: np.empty((0, 4)))
+        self.child = child
+        self.progress = progress
+        self.images = ImageFile(child.folder / "keyframes.raw")
+
+    def _keep(self, frame: ResizedFrame) -> None:
+        self.images.add(frame.row + 1, frame.bgr)
+
+    def keyframes(self) -> list[int]:
+        """Pick keyframes, halving the flow between them while they are fewer than MIN_KEYFRAMES.
+
+        Of so few images all are keyframes: they are photos, with wide steps.
+
+        Returns:
+            their rows.
+        """
+        video = self.resized
+        max_flow = MAX_FLOW
+        line = self.progress("keyframes", self.video.expected)
+        keys = pick_keyframes(video.first_pass(line), MAX_KEYFRAMES, max_flow, self._keep)
+        if not video.frames:
+            raise ReobjError("no readable frame in the video: nothing to reconstruct")
+        if len(video.frames) <= MIN_KEYFRAMES:
+            for frame in video:
+                self._keep(frame)
+            return list(range(len(video.frames)))
+        while len(keys) < MIN_KEYFRAMES and max_flow > 2 * MIN_FLOW:
+            max_flow /= 2
+            frames = video.shown(self.progress("keyframes", len(video.frames)))
+            keys = pick_keyframes(frames, MAX_KEYFRAMES, max_flow, self._keep)
+        return keys
+
+    def add_keyframes(self, rows: Sequence[int]) -> list[int]:
+        """Read the images of more keyframes; return the rows of those with texture."""
+        added = list[int]()
+        if rows:
+            line = self.progress("more keyframes", len(self.resized.frames))
+            for frame in self.resized.shown(line):
+                if frame.row in rows and frame.has_texture:
+                    self._keep(frame)
+                    added.append(frame.row)
+        return added
+
+    def attempt(self, keys: list[int], view_of: Mapping[int, int]) -> _Attempt:
+        """Map keyframes and locate all frames.
+
+        Args:
+            keys: rows of the keyframes. view_of: of the first attempt, with fewer (`Mapped`).
+        """
+        frames = self.resized.frames
+        names = [_frame_name(self.video, number) for number in frames]
+        job = MappingJob(
+            self.images,
+            frame_of={row + 1: frames[row] for row in keys},
+            name_of={row + 1: names[row] for row in keys},
+            boxes_of={row + 1: self.boxes_of(frames[row]) for row in keys},
+            size=self.size,
+            camera=self.camera,
+            focal_guess=_exif_focal(self.video) or FOCAL_GUESS,
+            is_video=len(frames) >= 3 * len(keys),
+            seed=self.config.seed,
+            view_of=view_of,
+        )
+        mapped = reconstruct(job, self.child, self.progress)
+        models = [read_sparse_model(model) for model in mapped.models]
+        row_of = {name: row for row, name in enumerate(names)}
+        rows = [np.array([row_of[name] for name in model.names]) for model in models]
+        key_rows = np.array([row for row in keys if row + 1 not in mapped.unmatched], np.int64)
+        return _Attempt(self._locate(models, rows, key_rows), rows, key_rows, mapped)
+
+    def _locate(
+        self, models: list[SparseModel], component_rows: list[IntArray], key_rows: IntArray
+    ) -> Poses:
+        """Locate all frames, each in the first component of the trajectory that explains it.
+
+        Args:
+            component_rows: row of each image of each model. key_rows: of all keyframes.
+        """
+        video = self.resized
+        frame = np.array(video.frames, np.int64)
+        time_s = np.array(video.times_s, np.float64)
+        cam_from_world = np.full((len(frame), 3, 4), np.nan)
+        status = np.full(len(frame), "none", "<U12")
+        component = np.full(len(frame), -1)
+        line = self.progress("pnp", len(models) * len(frame))
+        if not models:
+            line.close()
+            guess = (FOCAL_GUESS * max(self.size), self.size[0] / 2, self.size[1] / 2)
+            camera = self.camera or Camera("SIMPLE_PINHOLE", *self.size, guess)
+            return Poses(camera, frame, time_s, cam_from_world, status, "none")
+        visibility = []
+        first_point = 0
+        for number, (model, rows) in enumerate(zip(models, component_rows, strict=True)):
+            unmapped = np.setdiff1d(key_rows, rows)
+            located = locate_between(model, rows, unmapped, video, self.config.seed, line)
+            shrink = min(1.0, self.config.size_px / max(self.size))
+            filled, how = fill_gaps(located, frame, time_s, shrink, unmapped)
+            own = (how != "none") & (component < 0)
+            own[rows] = True  # keyframes of the model
+            cam_from_world[own] = filled[own]
+            status[own] = how[own]
+            component[own] = number
+            visibility.append(
+                np.column_stack([rows[model.obs_image], first_point + model.obs_point])
+            )
+            first_point += len(model.points)
+        line.close()
+        known = np.flatnonzero(component >= 0)
+        return Poses(
+            models[0].cameras[0],
+            frame,
+            time_s,
+            cam_from_world,
+            status,
+            "pycolmap",
+            points=np.concatenate([model.points for model in models]),
+            colors=np.concatenate([model.colors for model in models]),
+            visibility=np.concatenate(visibility),
+            part=component[known[nearest_of(np.arange(len(frame)), known)]],
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,20 +276,17 @@ class _Attempt:
     Attributes:
         component_rows: row of each image of each model. key_rows: (K,) of all keyframes with a
             verified match with another one, ascending. mapped: the models and messages.
-        located: the frames by each model.
     """
 
     poses: Poses
     component_rows: list[IntArray]
     key_rows: IntArray
     mapped: Mapped
-    located: list[Located]
 
     @property
     def pairs(self) -> int:
         """Count the pairs of frames with measured poses in one component."""
-        measured = self.poses.known & (self.poses.status != "interpolated")
-        return int((np.bincount(self.poses.part[measured], minlength=1) ** 2).sum())
+        return int((np.bincount(self.poses.part[self.poses.measured], minlength=1) ** 2).sum())
 
     @property
     def tried(self) -> BoolArray:
@@ -217,177 +298,12 @@ class _Attempt:
         """Choose frames for more keyframes: around breaks, and where frames were not located."""
         if not self.component_rows:
             return []
-        lost = np.flatnonzero((self.poses.status == "none") | (self.poses.status == "interpolated"))
+        lost = np.flatnonzero(~self.poses.measured)
         around = rows_around_breaks(self.key_rows.tolist(), self.component_rows)
         return sorted({*around, *rows_of_lost(self.key_rows, lost)})
 
 
-def _locate_all(
-    models: list[SparseModel],
-    component_rows: list[IntArray],
-    key_rows: IntArray,
-    video: ResizedVideo,
-    config: PosesConfig,
-    line: Progress,
-    before: Sequence[Located],
-) -> tuple[Poses, list[Located]]:
-    """Locate all frames, each in the first component of the trajectory that explains it.
-
-    Args:
-        component_rows: row of each image of each model in the video. key_rows: of all keyframes.
-        before: the frames by each model of an earlier call with fewer keyframes.
-    Returns:
-        poses of all frames, and the frames by each model.
-    """
-    frame = np.array(video.frames, np.int64)
-    time_s = np.array(video.times_s, np.float64)
-    cam_from_world = np.full((len(frame), 3, 4), np.nan)
-    status = np.full(len(frame), "none", "<U12")
-    component = np.full(len(frame), -1)
-    if not models:
-        line.close()
-        size = (int(video.video.size[0]), int(video.video.size[1]))
-        guess = (FOCAL_GUESS * max(size), size[0] / 2, size[1] / 2)
-        camera = parse_camera(config.camera, size, config.camera_format) or Camera(
-            "SIMPLE_PINHOLE", *size, guess
-        )
-        return Poses(camera, frame, time_s, cam_from_world, status, "none"), []
-    visibility = []
-    by_model = list[Located]()
-    first_point = 0
-    for number, (model, rows) in enumerate(zip(models, component_rows, strict=True)):
-        unmapped = np.setdiff1d(key_rows, rows)
-        earlier = next((old for old in before if old.is_of(model, rows)), None)
-        by_model.append(locate_between(model, rows, unmapped, video, config.seed, line, earlier))
-        size = model.cameras[0].width, model.cameras[0].height
-        shrink = min(1.0, config.size_px / max(size))
-        located, how = fill_gaps(by_model[-1], frame, time_s, MAX_GAP, shrink, unmapped)
-        own = (how != "none") & (component < 0)
-        own |= np.isin(np.arange(len(frame)), rows)  # keyframes of the model
-        cam_from_world[own] = located[own]
-        status[own] = how[own]
-        component[own] = number
-        visibility.append(np.column_stack([rows[model.obs_image], first_point + model.obs_point]))
-        first_point += len(model.points)
-    line.close()
-    known = np.flatnonzero(component >= 0)
-    poses = Poses(
-        models[0].cameras[0],
-        frame,
-        time_s,
-        cam_from_world,
-        status,
-        "pycolmap",
-        points=np.concatenate([model.points for model in models]),
-        colors=np.concatenate([model.colors for model in models]),
-        visibility=np.concatenate(visibility),
-        part=component[known[nearest_of(np.arange(len(frame)), known)]],
-    )
-    return poses, by_model
-
-
-# ---- Keyframes -----------------------------------------------------------------------------------
-
-
-MAX_KEYFRAMES = 6000  # a longer video has wider steps
-
-
-class KeyframeStore:
-    """The images of keyframes in a file, which also serves the next run after an interruption.
-
-    Args:
-        folder: of the files. key: of the video and the options; keyframes of another are not used.
-    Attributes:
-        file: with an image for each row of the video that was kept. position: of each in it.
-    """
-
-    def __init__(self, folder: Path, key: str) -> None:
-        self.file = ImageFile(folder / "keyframes.raw")
-        self.table = folder / "keyframes.json"
-        self.key = key
-        self.position: dict[int, int] = {}
-
-    def keep(self, frame: ResizedFrame) -> Keyframe:
-        """Write the image of a frame, unless it is in the file."""
-        if not self.position:
-            self.table.unlink(missing_ok=True)  # it describes the file that is replaced
-        if frame.row not in self.position:
-            self.position[frame.row] = len(self.file)
-            self.file.append(frame.bgr)
-        return Keyframe.of(frame)
-
-    def images_of(self, keys: Sequence[Keyframe]) -> ImageFile:
-        """Return the images of some keyframes."""
-        return self.file.select([self.position[key.row] for key in keys])
-
-    def save(self, video: ResizedVideo, keys: Sequence[Keyframe]) -> None:
-        """Keep the choice of keyframes for the next run."""
-        rows = [key.row for key in keys]
-        table = {
-            "key": self.key,
-            "shape": self.file.shape,
-            "rows": rows,
-            "slots": [self.position[row] for row in rows],
-            "frames": video.frames,
-            "times_s": video.times_s,
-        }
-        with atomic(self.table) as part:
-            part.write_text(json.dumps(table), encoding="utf-8")
-
-    def load(self, video: ResizedVideo) -> list[Keyframe] | None:
-        """Read the keyframes that an interrupted run chose; None if there are none.
-
-        Args:
-            video: gets the numbers and times of its frames.
-        """
-        table = load_cached(self.table, load_json)
-        if not isinstance(table, dict) or table.get("key") != self.key:
-            return None
-        count = 1 + max(table["slots"], default=-1)
-        size = count * math.prod(table["shape"])
-        if not self.file.path.exists() or self.file.path.stat().st_size < size:
-            return None
-        os.truncate(self.file.path, size)  # images after them have no number in the table
-        video.frames = table["frames"]
-        video.times_s = table["times_s"]
-        self.file = ImageFile(self.file.path, table["shape"], range(count))
-        self.position = dict(zip(table["rows"], table["slots"], strict=True))
-        return [Keyframe(row, video.frames[row]) for row in table["rows"]]
-
-    def remove(self) -> None:
-        """Remove the files."""
-        self.table.unlink(missing_ok=True)
-        self.file.path.unlink(missing_ok=True)
-
-
-def _keyframes_key(video: Any, config: PosesConfig) -> str:
-    """Identify what the choice of keyframes depends on."""
-    return repr((video.fingerprint, video.config, config.size_px, FlowOptions(), MAX_KEYFRAMES))
-
-
-def _enough_keyframes(
-    video: ResizedVideo,
-    most: int,
-    store: KeyframeStore,
-    progress: Callable[[str, int], Progress],
-) -> list[Keyframe]:
-    """Pick keyframes, halving the flow between them while they are fewer than MIN_KEYFRAMES.
-
-    Of so few images all are keyframes: they are photos, with wide steps.
-    """
-    options = FlowOptions()
-    line = progress("keyframes", video.video.expected)
-    keys = pick_keyframes(video.first_pass(line), most, options, store.keep)
-    if not video.frames:
-        raise ReobjError("no readable frame in the video: nothing to reconstruct")
-    if len(video.frames) <= MIN_KEYFRAMES:
-        return [store.keep(frame) for frame in video]
-    wanted = min(MIN_KEYFRAMES, most // 2)  # thinning leaves half of them
-    while len(keys) < wanted and options.max_flow > 2 * options.min_flow:
-        options = dataclasses.replace(options, max_flow=options.max_flow / 2)
-        frames = video.shown(progress("keyframes", len(video.frames)))
-        keys = pick_keyframes(frames, most, options, store.keep)
-    return keys
+# ---- More keyframes ------------------------------------------------------------------------------
 
 
 MAX_EXTRA = 8  # keyframes added between two at a break (chosen; more take longer)
@@ -406,14 +322,12 @@ def rows_around_breaks(key_rows: list[int], component_rows: list[IntArray]) -> l
     """
     component_of = {int(row): k for k, rows in enumerate(component_rows) for row in rows}
     components = [component_of.get(row, -1) for row in key_rows]
-    broken = [
-        k
-        for k, (one, other) in enumerate(itertools.pairwise(components))
-        if one != other or one < 0
-    ]
-    steps = {s for k in broken for s in (k - 1, k, k + 1) if 0 <= s < len(key_rows) - 1}
-    rows: set[int] = set()
-    for a, b in ((key_rows[s], key_rows[s + 1]) for s in sorted(steps)):
+    steps = set[int]()
+    for k, (one, other) in enumerate(itertools.pairwise(components)):
+        if one != other or one < 0:
+            steps |= {k - 1, k, k + 1} & set(range(len(key_rows) - 1))
+    rows = set[int]()
+    for a, b in ((key_rows[s], key_rows[s + 1]) for s in steps):
         count = min(MAX_EXTRA, b - a - 1)
         rows |= set(np.linspace(a, b, count + 2).round().astype(int)[1:-1].tolist())
     return sorted(rows - set(key_rows))
@@ -482,24 +396,21 @@ def _lost_frames(poses: Poses, tried: BoolArray, video: Any) -> list[str]:
     Args:
         tried: (F,) frames for which PnP was tried.
     """
-    frame = poses.frame
     lost = ~poses.known
-    step = int(np.median(np.diff(frame))) if len(frame) > 1 else 1
+    step = int(np.median(np.diff(poses.frame))) if len(lost) > 1 else 1
     groups = []
     for mask, reason in (
         (lost & tried, "show too few points of the reconstruction"),
         (lost & ~tried, "are next to keyframes that could not be mapped with certainty"),
     ):
-        numbers = frame[mask].tolist()
-        if not numbers:
-            continue
-        files = [str(video.names[number]) for number in numbers[:5]] if video.names else []
-        more = " ..." if len(numbers) > len(files) > 0 else ""
-        named = f": {', '.join(files)}{more}" if files else ""
-        groups.append(f"{spans(numbers, step)} ({len(numbers)}{named}) {reason}")
+        if numbers := poses.frame[mask].tolist():
+            files = [video.names[n] for n in numbers[:5]] if video.names else []
+            named = f": {', '.join(files)}" if files else ""
+            named += " ..." if len(numbers) > len(files) > 0 else ""
+            groups.append(f"{spans(numbers, step)} ({len(numbers)}{named}) {reason}")
     if not groups:
         return []
     return [
-        f"{lost.sum()} of {len(frame)} frames have no camera: frames {'; frames '.join(groups)}; "
+        f"{lost.sum()} of {len(lost)} frames have no camera: frames {'; frames '.join(groups)}; "
         f"{ADVICE}, or --poses"
     ]

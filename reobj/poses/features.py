@@ -1,16 +1,17 @@
 """Features and matches of keyframes in a pycolmap database, and the focal length from matches.
 
 RootSIFT by OpenCV; pairs in sequence and by retrieval, or by supplied poses; verification by
-pycolmap. Results in the database are kept, so that keyframes can be added.
+pycolmap. Results in the database are kept, so that keyframes can be added. Keyframes that repeat
+the view of an earlier one are not mapped but registered by PnP afterwards: they add little to a
+model, and a mapper takes longer for each image in it.
 """
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,44 +22,51 @@ import numpy as np
 import numpy.typing as npt
 
 from reobj.cameras import import_pycolmap
-from reobj.poses.bundle import FOCAL_RANGE
-from reobj.poses.child_job import send_progress
+from reobj.poses.bundle import FOCAL_RANGE, INLIER_PX
 from reobj.types import Array, BoolArray, Floats, Image, IntArray
 
 
+def send_progress(stage: str, done: int, total: int) -> None:
+    """Print a line of progress for `sfm.Child.run`; total 0: the stage has no steps."""
+    print("reobj:", stage, done, total, flush=True)
+
+
+def open_database(path: Path) -> Any:
+    """Open a `pycolmap.Database`, a context manager."""
+    return import_pycolmap().Database.open(str(path))
+
+
 def extract_features(
-    database: Path, images: Any, ids: Sequence[int], boxes: Sequence[Array], camera: Any
+    database: Path, images: Any, ids: Sequence[int], boxes: Mapping[int, Array], camera: Any
 ) -> None:
     """Write keyframes and their RootSIFT features into a database that does not have them yet.
 
     Args:
-        images: K of (h, w, 3), BGR. ids: of each, above 0. boxes: (M, 4) xyxy of each, pixels of
-            the images: no features there. camera: `pycolmap.Camera` with id 1, of all images.
+        images: (h, w, 3), BGR, by id. ids: of the keyframes, above 0. boxes: (M, 4) xyxy by id,
+            pixels of the images: no features there. camera: `pycolmap.Camera` with id 1.
     """
     pc = import_pycolmap()
     threads = cv2.getNumThreads()
-    with contextlib.closing(pc.Database.open(str(database))) as db, ThreadPoolExecutor(2) as pool:
+    with open_database(database) as db, ThreadPoolExecutor(2) as pool:
         if not db.exists_camera(1):
             db.write_camera(camera, use_camera_id=True)
             rig = pc.Rig(rig_id=1)
             rig.add_ref_sensor(camera.sensor_id)
             db.write_rig(rig, use_rig_id=True)
-        todo = [k for k, number in enumerate(ids) if not db.exists_descriptors(number)]
+        todo = [number for number in ids if not db.exists_image(number)]
         cv2.setNumThreads(1)
         if todo:
             send_progress("features", 0, len(todo))
-        features = pool.map(lambda k: root_sift(images[k], np.array(boxes[k])), todo)
-        for done, (k, (xy, descriptors)) in enumerate(zip(todo, features, strict=True), 1):
-            if not db.exists_image(ids[k]):
-                image = pc.Image(name=f"{ids[k]:06d}", camera_id=1, image_id=ids[k])
-                db.write_image(image, use_image_id=True)
-                frame = pc.Frame(frame_id=ids[k], rig_id=1)
-                frame.add_data_id(image.data_id)
-                db.write_frame(frame, use_frame_id=True)
-            if not db.exists_keypoints(ids[k]):
-                db.write_keypoints(ids[k], xy)
+        features = pool.map(lambda number: root_sift(images[number], boxes[number]), todo)
+        for done, (number, (xy, descriptors)) in enumerate(zip(todo, features, strict=True), 1):
+            image = pc.Image(name=f"{number:06d}", camera_id=1, image_id=number)
+            db.write_image(image, use_image_id=True)
+            frame = pc.Frame(frame_id=number, rig_id=1)
+            frame.add_data_id(image.data_id)
+            db.write_frame(frame, use_frame_id=True)
+            db.write_keypoints(number, xy)
             sift = pc.FeatureDescriptors(pc.FeatureExtractorType.SIFT, descriptors)
-            db.write_descriptors(ids[k], sift)
+            db.write_descriptors(number, sift)
             send_progress("features", done, len(todo))
         cv2.setNumThreads(threads)
 
@@ -102,6 +110,8 @@ def choose_pairs(
 ) -> list[tuple[int, int]]:
     """Choose all pairs of a few keyframes, else sequential pairs and retrieved ones.
 
+    Sequential: COLMAP's quadratic overlap.
+
     Args:
         path: ids along the path of the camera, which may pass a keyframe several times.
         ids: of the keyframes, in the order of time. vlad: (K, D) of `vlad_vectors`.
@@ -110,13 +120,16 @@ def choose_pairs(
     count = len(ids)
     if count <= ALL_PAIRS:
         return list(itertools.combinations(ids, 2))
-    pairs = {(ids[i], ids[j]) for i, j in _pairs_from_retrieval(vlad, retrieved)}
-    # COLMAP: quadratic overlap
-    pairs |= {(ids[i], ids[i + (1 << k)]) for k in range(12) for i in range(count - (1 << k))}
+    pairs = {(ids[i], ids[i + (1 << k)]) for k in range(12) for i in range(count - (1 << k))}
     for offset in (1, 2, 4):  # neighbours where the path comes back to earlier keyframes
-        steps = zip(path[:-offset], path[offset:], strict=True)
-        pairs |= {(min(step), max(step)) for step in steps if step[0] != step[1]}
-    return sorted(pairs)
+        pairs |= set(zip(path[:-offset], path[offset:], strict=True))
+    if vlad.shape[1]:  # the most similar keyframes close loops
+        similarity = vlad @ vlad.T  # (K, K)
+        order = np.arange(count)
+        similarity[np.abs(order[:, None] - order) <= 2] = -np.inf  # matched already
+        best = np.argsort(-similarity, axis=1, kind="stable")[:, :retrieved]
+        pairs |= {(ids[i], ids[j]) for i, row in enumerate(best.tolist()) for j in row}
+    return sorted({(min(pair), max(pair)) for pair in pairs if pair[0] != pair[1]})
 
 
 def match_pairs(
@@ -135,24 +148,21 @@ def match_pairs(
     # COLMAP: 100 and 3; the same inliers in less time (measured)
     ransac.min_num_trials = 30
     ransac.dyn_num_trials_multiplier = 1.0
-    with contextlib.closing(pc.Database.open(str(database))) as db:
+    with open_database(database) as db:
         todo = [pair for pair in pairs if not db.exists_two_view_geometry(*pair)]
+    if stage and todo:
+        send_progress(stage, 0, len(todo))
     unit: dict[int, Floats] = {}
+    step = 100  # pairs between two lines of progress; their descriptors are in memory
     with ThreadPoolExecutor(2) as pool:
-        if stage and todo:
-            send_progress(stage, 0, len(todo))
-        step = 100  # pairs between two lines of progress; their descriptors are in memory
         for start in range(0, len(todo), step):
             chunk = todo[start : start + step]
             numbers = {number for pair in chunk for number in pair}
-            with contextlib.closing(pc.Database.open(str(database))) as db:
+            with open_database(database) as db:
                 unit = {n: unit[n] if n in unit else _unit_descriptors(db, n) for n in numbers}
-            one, other = ([unit[pair[side]] for pair in chunk] for side in (0, 1))
-            matches = list(pool.map(_matches, one, other))
-            with contextlib.closing(pc.Database.open(str(database))) as db:
-                for pair, match in zip(chunk, matches, strict=True):
-                    if not db.exists_matches(*pair):
-                        db.write_matches(*pair, match)
+                one, other = ([unit[pair[side]] for pair in chunk] for side in (0, 1))
+                for pair, match in zip(chunk, pool.map(_matches, one, other), strict=True):
+                    db.write_matches(*pair, match)
             listed.write_text("".join(f"{i:06d} {j:06d}\n" for i, j in chunk), encoding="utf-8")
             pc.verify_matches(str(database), str(listed), verification)
             if stage:
@@ -202,15 +212,18 @@ def _distinct(top: Floats, second: Floats) -> BoolArray:
     return np.asarray((angle < MAX_RATIO * rival) & (angle < most), bool)
 
 
-def visual_words(database: Path, ids: Sequence[int], seed: int, count: int = 64) -> Floats:
+WORDS = 64  # visual words (Jegou et al.: 16 to 256)
+
+
+def visual_words(database: Path, ids: Sequence[int], seed: int) -> Floats:
     """Cluster the descriptors of some keyframes.
 
     Args:
-        ids: of the keyframes in the database. count: of words (Jegou et al.: 16 to 256).
+        ids: of the keyframes in the database.
     Returns:
         (W, 128); W is 0 where the keyframes have too few features.
     """
-    with contextlib.closing(import_pycolmap().Database.open(str(database))) as db:
+    with open_database(database) as db:
         found = [db.num_descriptors_for_image(number) for number in ids]
         step = max(1, sum(found) // 6000)  # to cluster all takes long
         offset = -np.cumsum([0, *found[:-1]]) % step
@@ -218,12 +231,12 @@ def visual_words(database: Path, ids: Sequence[int], seed: int, count: int = 64)
             _descriptors(db, number)[first::step]
             for number, first in zip(ids, offset.tolist(), strict=True)
         ]).astype(np.float32)  # fmt: skip
-    if len(sample) < count:
+    if len(sample) < WORDS:
         return np.empty((0, 128), np.float32)
     cv2.setRNGSeed(seed)
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 10, 0.1)
     start = cv2.KMEANS_PP_CENTERS
-    return np.asarray(cv2.kmeans(sample, count, np.empty(0), stop, 1, start)[2], np.float32)
+    return np.asarray(cv2.kmeans(sample, WORDS, np.empty(0), stop, 1, start)[2], np.float32)
 
 
 def vlad_vectors(database: Path, ids: Sequence[int], words: Floats) -> Floats:
@@ -234,7 +247,7 @@ def vlad_vectors(database: Path, ids: Sequence[int], words: Floats) -> Floats:
     Ref: Jegou et al., CVPR 2010.
     """
     vlad = np.zeros((len(ids), *words.shape), np.float32)  # (K, W, 128)
-    with contextlib.closing(import_pycolmap().Database.open(str(database))) as db:
+    with open_database(database) as db:
         for number, sums in zip(ids if len(words) else (), vlad, strict=False):
             rows = _descriptors(db, number)
             # argmin |d - w|^2 = argmax d'w - |w|^2 / 2
@@ -242,23 +255,6 @@ def vlad_vectors(database: Path, ids: Sequence[int], words: Floats) -> Floats:
             np.add.at(sums, nearest, rows - words[nearest])
     vlad /= np.maximum(np.linalg.norm(vlad, axis=2, keepdims=True), 1e-9)
     return vlad.reshape(len(ids), words.size)
-
-
-def _pairs_from_retrieval(vlad: Floats, count: int) -> list[tuple[int, int]]:
-    """Find the pairs of keyframes with the most similar vectors, to close loops.
-
-    Args:
-        vlad: (K, D). count: pairs of each keyframe.
-    Returns:
-        rows of the pairs, the lower first.
-    """
-    if not vlad.shape[1]:
-        return []
-    similarity = vlad @ vlad.T  # (K, K)
-    order = np.arange(len(vlad))
-    similarity[np.abs(order[:, None] - order) <= 2] = -np.inf  # matched already
-    best = np.argsort(-similarity, axis=1, kind="stable")[:, :count]
-    return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(best) for j in row})
 
 
 def choose_posed_pairs(steps: Array) -> IntArray:
@@ -271,19 +267,15 @@ def choose_posed_pairs(steps: Array) -> IntArray:
     Returns:
         (P, 2) rows of the keyframes, the lower one first.
     """
-    count = len(steps)
-    offsets = (1, 2, 4)
-    pairs = {(i, i + offset) for offset in offsets for i in range(count - offset)}
+    rows = np.arange(len(steps))
+    apart = np.abs(rows[:, None] - rows)
     distance = np.linalg.norm(steps[:, None] - steps, axis=2)  # (K, K)
-    rows = np.arange(count)
-    distance[np.abs(rows[:, None] - rows) <= max(offsets)] = np.inf
+    distance[apart <= 4] = np.inf
     nearest = np.argsort(distance, axis=1, kind="stable")[:, :4]  # (K, 4)
-    for i, j in zip(
-        np.repeat(rows, nearest.shape[1]).tolist(), nearest.ravel().tolist(), strict=True
-    ):
-        if distance[i, j] <= 8:
-            pairs.add((min(i, j), max(i, j)))
-    return np.array(sorted(pairs), np.int64).reshape(-1, 2)
+    i, rank = np.nonzero(np.take_along_axis(distance, nearest, 1) <= 8)
+    loops = np.column_stack([i, nearest[i, rank]])
+    pairs = np.concatenate([np.argwhere(np.isin(apart, (1, 2, 4))), loops])
+    return np.unique(np.sort(pairs, 1), axis=0)
 
 
 # ---- Verified matches and their focal length -----------------------------------------------------
@@ -340,7 +332,7 @@ def read_pairs(database: Path) -> MatchedPairs:
     pc = import_pycolmap()
     general = {int(pc.TwoViewGeometryConfiguration.UNCALIBRATED),
                int(pc.TwoViewGeometryConfiguration.CALIBRATED)}  # fmt: skip
-    with contextlib.closing(pc.Database.open(str(database))) as db:
+    with open_database(database) as db:
         pair_ids, geometries = db.read_two_view_geometries()
         keypoints = {
             image.image_id: np.asarray(db.read_keypoints(image.image_id), np.float64)[:, :2]
@@ -358,9 +350,7 @@ def read_pairs(database: Path) -> MatchedPairs:
     )
 
 
-def focal_from_pairs(
-    pairs: MatchedPairs, size: tuple[int, int], min_pairs: int = 10
-) -> float | None:
+def focal_from_pairs(pairs: MatchedPairs, size: tuple[int, int]) -> float | None:
     """Estimate the focal length that turns fundamental matrices into essential ones.
 
     E = K' F K has two equal singular values for the true K. The cost of each focal length on a grid
@@ -369,14 +359,14 @@ def focal_from_pairs(
     determine a fundamental matrix badly: there a pair counts once for each MIN_MATCHES of them.
 
     Args:
-        min_pairs: whose median is trusted (chosen; lower: a few wrong pairs decide).
+        size: (w, h) of the images.
     Returns:
         focal length over the longer side; None with too few pairs.
     Ref: Mendonca and Cipolla, CVPR 1999.
     """
     used = pairs.enough & np.isfinite(pairs.fundamental[:, 0, 0])
     F = pairs.fundamental[used]  # (P, 3, 3)
-    if len(F) < min_pairs:
+    if len(F) < 10:  # chosen; lower: a few wrong pairs decide
         return None
     tried = np.geomspace(*FOCAL_RANGE, 161)  # (S,) 1 % apart
     K = np.zeros((len(tried), 3, 3))
@@ -391,3 +381,163 @@ def focal_from_pairs(
     best = int(cost.argmin())
     is_inside = 0 < best < len(cost) - 1
     return float(tried[best]) if is_inside else None
+
+
+# ---- Repeated views ------------------------------------------------------------------------------
+
+
+MAP_ALL_OF = 100  # keyframes up to which all are mapped (chosen: it takes a minute)
+# Keyframes added in a second attempt are all mapped, but only registered where more than so many
+# are mapped already (chosen: it takes minutes)
+MAP_MORE_TO = 300
+# Median displacement of the matches, over the width: half of that between consecutive keyframes
+REPEATED_FLOW = 0.06
+REPEATED_MATCHES = 3 * MIN_MATCHES  # verified ones, which register a keyframe with certainty
+CANDIDATES = 4  # mapped keyframes with which one is compared (chosen; more take longer)
+BLOCK = 32  # keyframes that are compared at once with those mapped before them
+
+
+def find_repeated(
+    database: Path,
+    ids: Sequence[int],
+    extract: Callable[[Sequence[int]], None],
+    width: int,
+    seed: int,
+    is_video: bool,
+    before: Mapping[int, int],
+    map_all_of: int = MAP_ALL_OF,
+    map_more_to: int = MAP_MORE_TO,
+    block: int = BLOCK,
+) -> dict[int, int]:
+    """Find for each keyframe the mapped one whose view it repeats.
+
+    Keyframes are compared with those mapped before them. Of a video every second one comes first:
+    between two that repeat mapped views the third is left out, as frames are located by either.
+
+    Args:
+        ids: of keyframes, in the order of time. extract: writes the features of some of them into
+            the database. width: of the images, px. is_video: there are frames between keyframes.
+        before: result of an earlier attempt with fewer keyframes, which is kept; or empty.
+    Returns:
+        by id: the keyframe whose view is repeated; its own id: it is to be mapped; 0: left out.
+    """
+    if len(ids) <= map_all_of:
+        extract(ids)
+        return {number: number for number in ids}
+    view_of = dict(before)
+    new = [number for number in ids if number not in view_of]
+    mapped = sum(number == view for number, view in view_of.items())
+    if before and mapped <= map_more_to:  # they are where the steps were too wide
+        extract(new)
+        return view_of | {number: number for number in new}
+    first = [*ids[::2], *ids[1::2][-1:]] if is_video and not before else new
+    extract(first)
+    compared = {*first, *(number for number, view in view_of.items() if view)}
+    words = visual_words(database, sorted(compared), seed)
+    limit_px = np.inf if before else REPEATED_FLOW * width
+    search = _ViewSearch(database, words, view_of, limit_px, seed)
+    search.add(first, "views", block)
+    is_repeat = {number: view not in (0, number) for number, view in view_of.items()}
+    for one, number, other in zip(ids, ids[1:], ids[2:], strict=False):
+        if number not in view_of and is_repeat.get(one) and is_repeat.get(other):
+            view_of[number] = 0
+    rest = [number for number in ids if number not in view_of]
+    extract(rest)
+    search.add(rest, "views again", block)
+    return view_of
+
+
+class _ViewSearch:
+    """Compare keyframes with those that are to be mapped.
+
+    Attributes:
+        words: (W, 128) of `visual_words`. view_of: as of `find_repeated`, is extended.
+        limit_px: largest displacement of a repeated view; infinite: no further one is mapped.
+        mapped: keyframes to map. vlad: (M, D) of them.
+    """
+
+    def __init__(
+        self, database: Path, words: Floats, view_of: dict[int, int], limit_px: float, seed: int
+    ) -> None:
+        self.database = database
+        self.words = words
+        self.view_of = view_of
+        self.limit_px = limit_px
+        self.seed = seed
+        self.keypoints: dict[int, Array] = {}
+        self.mapped = np.array([i for i, view in view_of.items() if i == view], np.int64)
+        self.vlad = vlad_vectors(database, self.mapped.tolist(), words)
+
+    def add(self, numbers: Sequence[int], step: str, size: int) -> None:
+        """Find whether keyframes repeat the view of one that is mapped already, `size` at once."""
+        for start in range(0, len(numbers), size):
+            block = numbers[start : start + size]
+            self._add_block(block)
+            send_progress(step, start + len(block), len(numbers))
+
+    def _add_block(self, block: Sequence[int]) -> None:
+        vlad = vlad_vectors(self.database, block, self.words)
+        ranked = np.argsort(-vlad @ self.vlad.T, axis=1, kind="stable")[:, :CANDIDATES]
+        candidates = dict(zip(block, self.mapped[ranked].tolist(), strict=True))
+        self.view_of |= {number: number for number in block}
+        half = CANDIDATES // 2
+        for few in (slice(half), slice(half, None)):  # the most similar often suffice
+            others = {i: candidates[i][few] for i in block if self.view_of[i] == i}
+            pairs = sorted({(min(i, j), max(i, j)) for i, js in others.items() for j in js})
+            match_pairs(self.database, pairs, self.seed, stage="")
+            with open_database(self.database) as db:
+                for number, js in others.items():
+                    flow = [self._flow(db, j, number) for j in js]
+                    if min(flow, default=np.inf) <= self.limit_px:
+                        self.view_of[number] = js[int(np.argmin(flow))]
+        is_mapped = np.array([self.view_of[number] == number for number in block], bool)
+        self.mapped = np.concatenate([self.mapped, np.array(block, np.int64)[is_mapped]])
+        self.vlad = np.concatenate([self.vlad, vlad[is_mapped]])
+
+    def _flow(self, db: Any, one: int, other: int) -> float:
+        """Return the median displacement of the verified matches, px; infinite with too few."""
+        ends = sorted((one, other))
+        matches = np.asarray(db.read_two_view_geometry(*ends).inlier_matches, np.int64)
+        if len(matches) < REPEATED_MATCHES:
+            return float("inf")
+        for image in ends:
+            if image not in self.keypoints:
+                self.keypoints[image] = np.asarray(db.read_keypoints(image))[:, :2]
+        low, high = (self.keypoints[i][rows] for i, rows in zip(ends, matches.T, strict=True))
+        return float(np.median(np.linalg.norm(low - high, axis=1)))
+
+
+def register(model: Any, database: Path, ids: Sequence[int], seed: int) -> list[int]:
+    """Register images in a model by PnP on its points, which do not change.
+
+    Args:
+        model: `pycolmap.Reconstruction`; gets the images. ids: of images with verified matches.
+    Returns:
+        those that were registered.
+    """
+    if ids:
+        send_progress("registering", 0, 0)
+    pc = import_pycolmap()
+    names = {f"{number:06d}" for number in {*model.reg_image_ids(), *ids}}
+    with open_database(database) as db:
+        initial = db.read_camera(1)
+        db.update_camera(model.camera(1))  # a cache takes it from the database
+        cache = pc.DatabaseCache.create(db, pc.DatabaseCacheOptions({"image_names": names}))
+        db.update_camera(initial)
+    mapper = pc.IncrementalMapper(cache)
+    mapper.begin_reconstruction(model)
+    options = pc.IncrementalMapperOptions(
+        {
+            "abs_pose_max_error": INLIER_PX,
+            "abs_pose_min_num_inliers": MIN_MATCHES,
+            "abs_pose_min_inlier_ratio": 0.5,
+            "abs_pose_refine_focal_length": False,
+            "abs_pose_refine_extra_params": False,
+            "num_threads": 1,
+            "random_seed": seed,
+        }
+    )
+    matched = [number for number in ids if cache.exists_image(number)]  # it has no others
+    registered = [number for number in matched if mapper.register_next_image(options, number)]
+    mapper.end_reconstruction(False)
+    return registered

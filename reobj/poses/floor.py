@@ -38,41 +38,28 @@ class Floor:
 NOISE = 0.012  # of points along the height, over their distance (chosen: 4 cm at 3 m)
 
 
-@dataclass(frozen=True, slots=True)
-class FloorOptions:
-    """The search for a floor, and its checks.
-
-    Attributes:
-        min_points: of a component, and of it below the cameras (chosen; lower: chance planes
-            of few points).
-        tilt_sigma_deg: prior of `up` (chosen: errors of an estimated direction).
-        max_below: fraction of the points below the floor, outliers (measured: at .05 redkitchen
-            gets a floor that lies .08 m high).
-        above: heights in NOISE, whole numbers: points between them count against a plane (chosen:
-            beyond the noise of the floor itself).
-        min_edge: density of points on the plane over that shortly above (chosen; higher: floors
-            with much on them are refused).
-        systematic, systematic_deg: sigmas of the height, over the distance, and of the tilt that
-            are common to all half samples: drift of the cameras, gravity (chosen: 9 mm at 3 m;
-            hololens_kitchen's floor lies .5 deg off its gravity).
-        camera_height_m: of a hand-held camera above a floor (chosen: wide).
-    """
-
-    min_points: int = 100
-    tilt_sigma_deg: float = 2.0
-    max_below: float = 0.03
-    above: tuple[int, int] = (4, 10)
-    min_edge: float = 1.5
-    systematic: float = 0.003
-    systematic_deg: float = 0.3
-    camera_height_m: tuple[float, float] = (0.3, 2.5)
+# Points of a component, and of it below the cameras (chosen; lower: chance planes of few points)
+MIN_POINTS = 100
+UP_SIGMA_DEG = 2.0  # prior of `up` (chosen: errors of an estimated direction)
+# Fraction of the points below the floor, outliers (measured: at .05 redkitchen gets a floor that
+# lies .08 m high)
+MAX_BELOW = 0.03
+# Heights in NOISE, whole numbers: points between them count against a plane (chosen: beyond the
+# noise of the floor itself)
+ABOVE = (4, 10)
+# Density of points on the plane over that shortly above it (chosen; higher: floors with much on
+# them are refused)
+MIN_EDGE = 1.5
+# Sigmas of the height, over the distance, and of the tilt that are common to all half samples:
+# drift of the cameras, gravity (chosen: 9 mm at 3 m; hololens_kitchen's floor lies .5 deg off its
+# gravity)
+COMMON_SIGMA = 0.003
+COMMON_TILT_DEG = 0.3
+CAMERA_HEIGHT_M = (0.3, 2.5)  # of a hand-held camera above a floor (chosen: wide)
 
 
 def floor_of(
-    poses: Poses,
-    up: Array | None,
-    metres_per_unit: float | None,
-    options: FloorOptions = FloorOptions(),
+    poses: Poses, up: Array | None, metres_per_unit: float | None
 ) -> tuple[Floor | None, str]:
     """Find the floor in the largest component of the trajectory; or None and the reason.
 
@@ -84,17 +71,13 @@ def floor_of(
         return None, "gravity is unknown"
     views = np.bincount(largest.visibility[:, 1], minlength=len(largest.points))
     often = views >= 3  # two views may be a false match
-    points = largest.points[often] if often.sum() >= options.min_points else largest.points
+    points = largest.points[often] if often.sum() >= MIN_POINTS else largest.points
     centres = invert_rigid(largest.cam_from_world[largest.known])[:, :, 3]
-    return find_floor(points, up, centres, metres_per_unit, options)
+    return find_floor(points, up, centres, metres_per_unit)
 
 
 def find_floor(
-    points: Array,
-    up: Array,
-    centres: Array,
-    metres_per_unit: float | None,
-    options: FloorOptions = FloorOptions(),
+    points: Array, up: Array, centres: Array, metres_per_unit: float | None
 ) -> tuple[Floor | None, str]:
     """Find the floor under cameras.
 
@@ -104,8 +87,8 @@ def find_floor(
     Returns:
         the floor and ""; or None and the reason.
     """
-    if len(points) < options.min_points or not len(centres):
-        return None, f"{len(points)} points, {options.min_points} are needed"
+    if len(points) < MIN_POINTS or not len(centres):
+        return None, f"{len(points)} points, {MIN_POINTS} are needed"
     if metres_per_unit is None:
         return None, "the scale is unknown: a table top cannot be distinguished from a floor"
     sample = centres[:: -(-len(centres) // 50)]
@@ -114,22 +97,22 @@ def find_floor(
     axes = _axes(up)  # (3, 3) rows: two across, up
     local = _one_per_voxel(points, noise) @ axes.T  # (N, 3) across, across, height
     local = local[local[:, 2] < np.median(centres @ up)]
-    if len(local) < options.min_points:
-        return None, f"{len(local)} points below the cameras, {options.min_points} are needed"
+    if len(local) < MIN_POINTS:
+        return None, f"{len(local)} points below the cameras, {MIN_POINTS} are needed"
     middle = centres.mean(0) @ axes[:2].T  # (2,) across
     local[:, :2] -= middle
-    start = _best_level(local, noise, options)
+    start = _best_level(local, noise)
     if start is None:
         return None, "no near-horizontal plane has many points on it and few below"
-    plane, on_plane = _refine(local, start, noise, options.tilt_sigma_deg)
-    deviation = _half_samples(local, noise, options) - plane  # (H, 3)
+    plane, on_plane = _refine(local, start, noise)
+    deviation = _half_samples(local, noise) - plane  # (H, 3)
     cov = deviation.T @ deviation / max(len(deviation), 1)  # (3, 3)
     normal = np.array([-plane[1], -plane[2], 1.0]) @ axes
     normal /= np.linalg.norm(normal)
     foot = np.array([*middle, plane[0]]) @ axes
     tilt_deg = math.degrees(np.sqrt(np.linalg.eigvalsh(cov[1:, 1:])[-1].clip(0)))
-    sigma = math.hypot(math.sqrt(cov[0, 0]), options.systematic * distance)
-    values = (sigma, math.hypot(tilt_deg, options.systematic_deg))
+    sigma = math.hypot(math.sqrt(cov[0, 0]), COMMON_SIGMA * distance)
+    values = (sigma, math.hypot(tilt_deg, COMMON_TILT_DEG))
     sigma, tilt_sigma_deg = numbers(np.array(values))  # as objects.json has them
     normal = np.array(numbers(normal))
     foot = np.array(numbers(foot, distance))
@@ -137,11 +120,10 @@ def find_floor(
     floor = Floor(normal, offset, foot, sigma, tilt_sigma_deg, int(on_plane.sum()))
     height_m = float(np.median(centres @ floor.normal - floor.offset)) * metres_per_unit
     height = local[:, 2] - np.column_stack([np.ones(len(local)), local[:, :2]]) @ plane
-    ranges = ((-1, 1), options.above)
-    on, above = ((low * noise < height) & (height < high * noise) for low, high in ranges)
-    if on.sum() < options.min_edge * above.sum() * 2 / (options.above[1] - options.above[0]):
+    on, above = ((low * noise < height) & (height < high * noise) for low, high in ((-1, 1), ABOVE))
+    if on.sum() < MIN_EDGE * above.sum() * 2 / (ABOVE[1] - ABOVE[0]):
         return None, "no plane has clearly more points on it than above it"
-    reason = _fault(floor, local, on_plane, noise, height_m, metres_per_unit, options)
+    reason = _fault(floor, local, on_plane, noise, height_m, metres_per_unit)
     return (None, reason) if reason else (floor, "")
 
 
@@ -152,11 +134,10 @@ def _fault(
     noise: float,
     height_m: float,
     metres_per_unit: float,
-    options: FloorOptions,
 ) -> str:
     """Return why a plane is unlikely to be the floor, "" if it is likely."""
     across = local[on_plane, :2]
-    low, high = options.camera_height_m
+    low, high = CAMERA_HEIGHT_M
     if len(across) < max(30, 0.015 * len(local)):
         return f"only {len(across)} points lie on the lowest plane"
     # rms extent less than .3 of that of all points
@@ -187,7 +168,7 @@ def _one_per_voxel(points: Array, size: float) -> Array:
     return points[np.unique(cell, axis=0, return_index=True)[1]]
 
 
-def _best_level(local: Array, noise: float, options: FloorOptions) -> Array | None:
+def _best_level(local: Array, noise: float) -> Array | None:
     """Find the plane with the most points on it minus those shortly above it, and few below.
 
     The search is to three sigmas of `up`, in steps of a degree: it is refined later.
@@ -197,8 +178,8 @@ def _best_level(local: Array, noise: float, options: FloorOptions) -> Array | No
     Returns:
         (3,) a, b, c of height = a + b x + c y; None if there is none.
     """
-    first, last = options.above
-    most = 3 * options.tilt_sigma_deg
+    first, last = ABOVE
+    most = 3 * UP_SIGMA_DEG
     steps = np.arange(-most, most + 1e-6)
     tilts = np.array([(b, c) for b in steps for c in steps if math.hypot(b, c) <= most])
     best = 0.0
@@ -213,8 +194,8 @@ def _best_level(local: Array, noise: float, options: FloorOptions) -> Array | No
         below = {k: lower[last + k : last + k + len(count)] for k in bins}  # bin + k
         on_plane = below[2] - below[0]
         above = (below[last] - below[first]) * 2 / (last - first)  # of as many bins
-        prior = math.exp(-0.5 * (tilt_deg / options.tilt_sigma_deg) ** 2)
-        score = np.where(below[-2] <= options.max_below * len(local), on_plane - above, 0)
+        prior = math.exp(-0.5 * (tilt_deg / UP_SIGMA_DEG) ** 2)
+        score = np.where(below[-2] <= MAX_BELOW * len(local), on_plane - above, 0)
         score = score * prior
         highest = int(score.argmax())
         if score[highest] > best:
@@ -223,9 +204,7 @@ def _best_level(local: Array, noise: float, options: FloorOptions) -> Array | No
     return plane
 
 
-def _refine(
-    local: Array, plane: Array, noise: float, tilt_sigma_deg: float
-) -> tuple[Array, BoolArray]:
+def _refine(local: Array, plane: Array, noise: float) -> tuple[Array, BoolArray]:
     """Fit a plane to the points on it by robust least squares.
 
     Each horizontal cell, 6 `noise` wide, is one measurement, whatever its texture. Objects on the
@@ -246,11 +225,11 @@ def _refine(
             sigma = float(np.clip(np.median(-below) / 0.6745, 0.1 * noise, noise))
         on_plane = np.abs(residual) < 2.5 * sigma
         design, height = _cell_means(cell_of[on_plane], across[on_plane], local[on_plane, 2])
-        plane = _fit_plane(design, height, plane, sigma, tilt_sigma_deg)
+        plane = _fit_plane(design, height, plane, sigma)
     return plane, on_plane
 
 
-def _half_samples(local: Array, noise: float, options: FloorOptions) -> Array:
+def _half_samples(local: Array, noise: float) -> Array:
     """Find the plane (3,) again in half samples of patches of the room.
 
     The scatter of the halves includes correlated errors of neighbouring points (of the cameras, of
@@ -264,16 +243,14 @@ def _half_samples(local: Array, noise: float, options: FloorOptions) -> Array:
     for _ in range(8):  # each half takes as long as the whole room
         in_first = rng.permutation(patch_of.max() + 1) % 2 == 0
         for half in (local[in_first[patch_of]], local[~in_first[patch_of]]):
-            if len(half) and (start := _best_level(half, noise, options)) is not None:
-                planes.append(_refine(half, start, noise, options.tilt_sigma_deg)[0])
+            if len(half) and (start := _best_level(half, noise)) is not None:
+                planes.append(_refine(half, start, noise)[0])
     return np.array(planes).reshape(-1, 3)
 
 
-def _fit_plane(
-    design: Array, height: Array, plane: Array, sigma: float, tilt_sigma_deg: float
-) -> Array:
+def _fit_plane(design: Array, height: Array, plane: Array, sigma: float) -> Array:
     """Update a plane by one robust Gauss-Newton step, with the prior on its tilt."""
-    prior = np.diag([0.0, *[1 / math.tan(math.radians(tilt_sigma_deg)) ** 2] * 2])
+    prior = np.diag([0.0, *[1 / math.tan(math.radians(UP_SIGMA_DEG)) ** 2] * 2])
     residual = height - design @ plane
     weight = 1 / (sigma**2 + residual**2)  # Cauchy's
     information = (design.T * weight) @ design + prior

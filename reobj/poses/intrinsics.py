@@ -261,21 +261,26 @@ def _plain(key: str) -> str:
     return plain if len(plain) > 2 else key
 
 
-def _flat(data: dict[str, Any]) -> dict[str, tuple[str, Any]]:
-    """Return keys as they are written, and values, by `_plain`; also those of nested cameras."""
-    keys: dict[str, tuple[str, Any]] = {}
+def _flat(data: dict[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return values, and keys as they are written, by `_plain`; also those of nested cameras."""
+    values: dict[str, Any] = {}
+    written: dict[str, str] = {}
     for key, value in data.items():
+        plain = _plain(key)
         is_group = isinstance(value, dict) and "data" not in value
-        if is_group and re.fullmatch(f"cam(era)?|.*parameters|{CAMERA_LIKE}", _plain(key)):
-            keys |= _flat(value)
+        if is_group and re.fullmatch(f"cam(era)?|.*parameters|{CAMERA_LIKE}", plain):
+            inner = _flat(value)
+            values |= inner[0]
+            written |= inner[1]
         else:
-            keys[_plain(key)] = str(key), value
-    return keys
+            values[plain] = value
+            written[plain] = str(key)
+    return values, written
 
 
-def _take(keys: dict[str, tuple[str, Any]], *names: str) -> Any:
+def _take(keys: dict[str, Any], *names: str) -> Any:
     """Remove the first of the names that is a key; return its value, or None."""
-    return next((keys.pop(name)[1] for name in names if name in keys), None)
+    return next((keys.pop(name) for name in names if name in keys), None)
 
 
 def _numbers(value: Any) -> list[float]:
@@ -287,7 +292,7 @@ def _numbers(value: Any) -> list[float]:
         return []
 
 
-def _terms(keys: dict[str, tuple[str, Any]], *names: str) -> list[float]:
+def _terms(keys: dict[str, Any], *names: str) -> list[float]:
     """Take the distortion in the order of its names: by name, or from a list; else 0."""
     found = [key for key in keys if key == "D" or re.fullmatch(DISTORTION, key)]
     values = _numbers(_take(keys, *found))
@@ -295,20 +300,20 @@ def _terms(keys: dict[str, tuple[str, Any]], *names: str) -> list[float]:
         raise ReobjError(f"{len(values)} distortion coefficients; expected {','.join(names)}")
     listed = [*values, *[0.0] * len(names)]
     pairs = zip(names, listed, strict=False)
-    return [float(keys.pop(name)[1]) if name in keys else value for name, value in pairs]
+    return [float(keys.pop(name, value)) for name, value in pairs]
 
 
-def _brown_terms(keys: dict[str, tuple[str, Any]]) -> list[float]:
+def _brown_terms(keys: dict[str, Any]) -> list[float]:
     """Take the terms of OpenCV's model; refuse a k4 that may be one of a fisheye lens."""
-    first = _take(keys, "k")  # of SIMPLE_RADIAL
-    keys |= {} if first is None else {"k1": ("k", first)}
-    if not {"k5", "k6"} & keys.keys() and any(_numbers(keys.get("k4", ("", None))[1])):
+    if "k" in keys:  # of SIMPLE_RADIAL
+        keys["k1"] = keys.pop("k")
+    if not {"k5", "k6"} & keys.keys() and any(_numbers(keys.get("k4"))):
         raise ReobjError("k4 without k5 and k6: of a fisheye lens (camera_model OPENCV_FISHEYE), "
                          "or of OpenCV's rational model (k5 and k6 too, if 0)")  # fmt: skip
     return _terms(keys, "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 
-def _pinhole(keys: dict[str, tuple[str, Any]], size: Size) -> tuple[float, ...] | None:
+def _pinhole(keys: dict[str, Any], size: Size) -> tuple[float, ...] | None:
     """Take fx, fy, cx, cy, or a matrix; None without a focal length."""
     matrix = _take(keys, "cameramatrix", "K", "intrinsicmatrix", "mtx", "intrinsics", "intrinsic")
     if matrix is not None:
@@ -328,7 +333,7 @@ def _pinhole(keys: dict[str, tuple[str, Any]], size: Size) -> tuple[float, ...] 
     return tuple(map(float, (fx, fx if fy is None else fy, *centre)))
 
 
-def _lens(keys: dict[str, tuple[str, Any]]) -> str:
+def _lens(keys: dict[str, Any]) -> str:
     """Take the name of the lens model, in capitals; "" without one.
 
     Raises:
@@ -339,16 +344,17 @@ def _lens(keys: dict[str, tuple[str, Any]]) -> str:
     model = lens if model in ("", "PINHOLE") and lens else model
     model = re.sub("[ -]", "_", model.removeprefix("DISTORTION."))  # of RealSense
     if re.fullmatch("(INVERSE|MODIFIED)_BROWN_CONRADY", model):
-        distorted = any(_numbers(keys.get("coeffs", ("", None))[1]))
+        distorted = any(_numbers(keys.get("coeffs")))
         model = model if distorted else "BROWN_CONRADY"
     if model not in (*FISHEYE, *BROWN):
         camera_parameters(model)  # refuses unknown ones
     return model
 
 
-def _refuse_unread(keys: dict[str, tuple[str, Any]], camera: Camera) -> None:
+def _refuse_unread(keys: dict[str, Any], written: dict[str, str], camera: Camera) -> None:
     """Refuse a key that is left, has a number that is not the camera's, and changes cameras."""
-    for plain, (key, value) in keys.items():
+    for plain, value in keys.items():
+        key = written[plain]
         repeated = () if key[1:].isdecimal() else camera.params  # not those of k1, p1
         lost = {*_numbers(value)} - {0.0, *repeated}
         if lost and re.fullmatch(CAMERA_LIKE, plain, re.IGNORECASE):
@@ -377,9 +383,10 @@ def camera_of_keys(data: dict[str, Any], size: Size) -> Camera | None:
     rigs = [name for name, v in data.items() if isinstance(v, dict) and "intrinsics" in v]
     if len(rigs) > 1:  # Kalibr
         raise ReobjError(f"cameras {', '.join(rigs)}; expected one: leave the others out")
-    keys = _flat(data[rigs[0]] if rigs else data)
-    if "k" in keys and len(_numbers(keys["k"][1])) == 9:  # ROS 2: as K and D of ROS 1
+    keys, written = _flat(data[rigs[0]] if rigs else data)
+    if len(_numbers(keys.get("k"))) == 9:  # ROS 2: as K and D of ROS 1
         keys |= {name.upper(): keys.pop(name) for name in ("k", "d") if name in keys}
+        written |= {"K": "k", "D": "d"}
     sides = _numbers(_take(keys, *SIDES)) or [
         _take(keys, letter, letter.upper(), word, f"image{word}", f"img{word}")
         for letter, word in (("w", "width"), ("h", "height"))
@@ -404,24 +411,18 @@ def camera_of_keys(data: dict[str, Any], size: Size) -> Camera | None:
             missing = names[values.index(None)]
             raise ReobjError(f"no {missing} of a {model} camera")
         camera = Camera(model, *_sized(size), tuple(map(float, values)))
-    _refuse_unread(keys, camera)
+    _refuse_unread(keys, written, camera)
     return camera
 
 
-class _Loader(yaml.BaseLoader):  # type: ignore[misc]
-    """All scalars are text (1e-3 is none of YAML 1.1's numbers); tags are ignored; no aliases."""
-
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        if self.check_event(yaml.AliasEvent):
-            raise ReobjError("a YAML alias; expected plain keys and numbers")  # may repeat forever
-        return super().compose_node(parent, index)
-
-
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Read YAML, also OpenCV's with `%YAML:1.0` and `!!opencv-matrix`; all scalars are text."""
+    """Read YAML, also OpenCV's with `%YAML:1.0` and `!!opencv-matrix`; all scalars are text.
+
+    1e-3 is none of YAML 1.1's numbers.
+    """
     text = re.sub(r"\A\s*%YAML.*", "", read_text(path, CAMERA_MAX))
     try:
-        found = list(filter(None, yaml.load_all(text, _Loader)))  # ROS 2 ends with ---
+        found = list(filter(None, yaml.load_all(text, yaml.BaseLoader)))  # ROS 2 ends with ---
     except yaml.YAMLError as error:
         raise ReobjError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from None
     if len(found) != 1 or not isinstance(found[0], dict):
@@ -520,8 +521,4 @@ CAMERAS: Registry[ReadCamera] = Registry("cameras", "--camera-format", [
            _keys_of(lambda path: _of_xml(ElementTree.fromstring(read_text(path)))), units=OWN_PX),
     Format("npz", "OpenCV: arrays `mtx`, `dist`, or as in JSON; `.npy`: matrix K",
            lambda p: p.suffix in (".npz", ".npy"), _keys_of(_arrays), units=OWN_PX),
-    Format("", "DSO's camera.txt", is_dso_camera, None,
-           advice="give its lens as `MODEL WIDTH HEIGHT PARAMS` in pixels (FOV, PINHOLE, OPENCV)"),
-    Format("", "a file of a binary COLMAP model", lambda p: p.suffix == ".bin", None,
-           advice="give cameras.txt (`colmap model_converter --output_type TXT`)"),
 ])  # fmt: skip

@@ -1,20 +1,22 @@
-"""Keyframes of a video: by optical flow, or along supplied poses.
+"""Keyframes of a video: by optical flow, or along supplied poses; their images in a file.
 
 `follow_points` (Lucas-Kanade) is shared with `localize`.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
 from reobj.cameras import Poses, invert_rigid
-from reobj.files import Progress
+from reobj.files import Progress, writing
 from reobj.sources.video import shrunk
 from reobj.types import Array, BoolArray, Image, IntArray
 
@@ -40,17 +42,34 @@ class ResizedFrame:
         return len(_corners(self.gray)) >= 20
 
 
-@dataclass(frozen=True, slots=True)
-class Keyframe:
-    """A frame that is mapped; its row and number as in `ResizedFrame`."""
+class ImageFile:
+    """Images (h, w, 3) of one size in a file, by number; one at a time is in memory.
 
-    row: int
-    frame: int
+    Attributes:
+        path: of the file, which holds the pixels of one image after the other.
+        shape: (h, w, 3); () before the first image. slots: place in the file by number.
+    """
 
-    @staticmethod
-    def of(frame: ResizedFrame) -> Keyframe:
-        """Drop the images of a frame."""
-        return Keyframe(frame.row, frame.frame)
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.shape: tuple[int, ...] = ()
+        self.slots: dict[int, int] = {}
+
+    def __getitem__(self, number: int) -> Image:
+        size = math.prod(self.shape)
+        pixels = np.fromfile(self.path, np.uint8, size, offset=self.slots[number] * size)
+        return pixels.reshape(self.shape)
+
+    def add(self, number: int, image: Image) -> None:
+        """Write an image at the end of the file, unless it is in it."""
+        if number in self.slots:
+            return
+        with writing(self.path):
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with open(self.path, "ab" if self.slots else "wb") as file:
+                file.write(np.ascontiguousarray(image).data)
+        self.shape = image.shape
+        self.slots[number] = len(self.slots)
 
 
 def _square(image: Image, aspect: float) -> Image:
@@ -135,6 +154,11 @@ def follow_points(
     return ahead[:, 0].astype(np.float64), kept
 
 
+def _sharpness(gray: Image) -> float:
+    """Return the variance of the Laplacian of a gray image."""
+    return float(cv2.Laplacian(gray, cv2.CV_32F).var())
+
+
 def _corners(gray: Image) -> Array:
     """Find the corners (N, 2) of an image that can be tracked: 150, as 300 were no better."""
     found = cv2.goodFeaturesToTrack(gray, 150, qualityLevel=0.01, minDistance=max(gray.shape) / 80)
@@ -144,9 +168,8 @@ def _corners(gray: Image) -> Array:
 class _KeyframeFlow:
     """Optical flow since a keyframe: its corners, tracked from frame to frame."""
 
-    def __init__(self, key: ResizedFrame, min_left: float) -> None:
+    def __init__(self, key: ResizedFrame) -> None:
         self.row = key.row
-        self.min_left = min_left
         self.gray = key.gray
         self.start = self.corners = _corners(key.gray)  # (N, 2) in the keyframe, the last frame
         self.count = max(len(self.start), 1)
@@ -160,7 +183,7 @@ class _KeyframeFlow:
             the last that had some.
         """
         ahead, kept = follow_points(self.gray, frame.gray, self.corners)
-        if kept.sum() < self.min_left * self.count and not frame.has_texture:
+        if kept.sum() < MIN_LEFT * self.count and not frame.has_texture:
             return None
         self.start = self.start[kept]
         self.corners = ahead[kept]
@@ -170,31 +193,21 @@ class _KeyframeFlow:
         return float(np.median(flow)) / frame.gray.shape[1] if kept.any() else 0.0, left
 
 
-@dataclass(frozen=True, slots=True)
-class FlowOptions:
-    """What makes a frame the next keyframe.
-
-    Attributes:
-        max_flow: median flow since the last keyframe, over the width (chosen; lower: more
-            keyframes, which take longer).
-        min_flow: flow that counts as motion, over the width (chosen: 10 px of 640).
-        min_left: fraction of the last keyframe's corners that can still be tracked (chosen; higher:
-            more keyframes where the scene changes quickly).
-        max_interval: frames after which any motion makes a keyframe (chosen: 2 s at 30 Hz).
-    """
-
-    max_flow: float = 0.12
-    min_flow: float = 0.015
-    min_left: float = 0.55
-    max_interval: int = 60
+MIN_KEYFRAMES = 40  # with fewer the steps are halved (chosen; lower: too wide to be matched)
+MAX_FLOW = 0.12  # median since the last keyframe, over the width (chosen; lower: more keyframes)
+MIN_FLOW = 0.015  # that counts as motion, over the width (chosen: 10 px of 640)
+# Fraction of the last keyframe's corners that can still be tracked (chosen; higher: more keyframes
+# where the scene changes quickly)
+MIN_LEFT = 0.55
+MAX_INTERVAL = 60  # frames after which any motion makes a keyframe (chosen: 2 s at 30 Hz)
 
 
 def pick_keyframes(
     frames: Iterable[ResizedFrame],
     max_keyframes: int,
-    options: FlowOptions = FlowOptions(),
-    keep: Callable[[ResizedFrame], Keyframe] = Keyframe.of,
-) -> list[Keyframe]:
+    max_flow: float = MAX_FLOW,
+    keep: Callable[[ResizedFrame], None] = lambda frame: None,
+) -> list[int]:
     """Choose keyframes by optical flow, the sharpest near the threshold, with the first and last.
 
     When there are more than `max_keyframes`, every second one is dropped and the thresholds double:
@@ -202,9 +215,11 @@ def pick_keyframes(
     nothing in it can be matched.
 
     Args:
-        keep: stores the image of each chosen frame.
+        max_flow: threshold, as MAX_FLOW. keep: stores the image of each chosen frame.
+    Returns:
+        rows of the keyframes, ascending.
     """
-    keys: list[Keyframe] = []
+    keys: list[int] = []
     replay: deque[ResizedFrame] = deque()  # frames after a keyframe that were read already
     window: list[ResizedFrame] = []  # frames near the threshold
     stream = iter(frames)
@@ -215,54 +230,54 @@ def pick_keyframes(
     while (frame := replay.popleft() if replay else next(stream, None)) is not None:
         if track is None:
             if frame.has_texture:
-                keys = [keep(frame)]
-                track = _KeyframeFlow(frame, options.min_left)
+                keep(frame)
+                keys = [frame.row]
+                track = _KeyframeFlow(frame)
                 last = frame
             continue
         if (update := track.update(frame)) is None:
             continue
         last = frame
         flow, left = update
-        if flow >= 0.7 * wider * options.max_flow:  # near the threshold: the sharpest is chosen
+        if flow >= 0.7 * wider * max_flow:  # near the threshold: the sharpest is chosen
             window.append(frame)
-        late = frame.row - track.row >= wider * options.max_interval and flow > options.min_flow
-        if late or flow > wider * options.max_flow or left < options.min_left**wider:
-            best = max(window or [frame], key=lambda f: cv2.Laplacian(f.gray, cv2.CV_32F).var())
+        late = frame.row - track.row >= wider * MAX_INTERVAL and flow > MIN_FLOW
+        if late or flow > wider * max_flow or left < MIN_LEFT**wider:
+            best = max(window or [frame], key=lambda f: _sharpness(f.gray))
             replay.extendleft(f for f in reversed(window) if f.row > best.row)
-            keys.append(keep(best))
+            keep(best)
+            keys.append(best.row)
             if len(keys) > max_keyframes:
                 keys = keys[::2]
                 wider *= 2
             window = []
-            track = _KeyframeFlow(best, options.min_left)
-    moved = flow > options.min_flow or len(keys) == 1
-    if last is None or last.row == keys[-1].row or not moved:
+            track = _KeyframeFlow(best)
+    moved = flow > MIN_FLOW or len(keys) == 1
+    if last is None or last.row == keys[-1] or not moved:
         return keys
-    return [*keys[: max(max_keyframes - 1, 1)], keep(last)]
+    keep(last)
+    return [*keys[: max(max_keyframes - 1, 1)], last.row]
 
 
 # ---- Keyframes of supplied poses -----------------------------------------------------------------
 
 
-MIN_KEYFRAMES = 40  # with fewer the steps are halved (chosen; lower: too wide to be matched)
+TURN_DEG = 8.0  # rotation between keyframes (chosen: an eighth of a usual field of view)
+SPREAD_STEP = 1 / 8  # translation between them, over the spread (chosen: 7 deg of an orbit)
 
 
-def path_steps(poses: Poses, turn_deg: float = 8.0, spread_step: float = 1 / 8) -> Array:
+def path_steps(poses: Poses) -> Array:
     """Express poses as coordinates (F, 6) in which keyframes are 1 apart; NaN: no pose.
 
     The first three are the viewing direction, the others the camera's centre. Translations are
     relative to the path's rms spread, whatever the scale.
-
-    Args:
-        turn_deg: rotation between keyframes (chosen: an eighth of a usual field of view).
-        spread_step: translation between them, over the spread (chosen: 7 deg of an orbit).
     """
     world_from_cam = invert_rigid(poses.cam_from_world)  # (F, 3, 4)
     centre = world_from_cam[:, :, 3]
     spread = np.sqrt(np.nanvar(centre, axis=0).sum()) if poses.known.any() else 0.0
     # for small angles the distance on the unit sphere is the angle
-    turn = world_from_cam[:, :, 2] / np.radians(turn_deg)
-    return np.column_stack([turn, centre / max(spread_step * spread, 1e-12)])
+    turn = world_from_cam[:, :, 2] / np.radians(TURN_DEG)
+    return np.column_stack([turn, centre / max(SPREAD_STEP * spread, 1e-12)])
 
 
 def choose_posed_keyframes(steps: Array) -> IntArray:
@@ -275,10 +290,10 @@ def choose_posed_keyframes(steps: Array) -> IntArray:
     """
     rows = np.flatnonzero(np.isfinite(steps).all(1))
     length = 1.0
-    chosen = _rows_apart(steps, rows, length)
-    while len(chosen) < min(MIN_KEYFRAMES, len(rows)) and length > 1e-6:
+    while len(chosen := _rows_apart(steps, rows, length)) < min(MIN_KEYFRAMES, len(rows)):
+        if length <= 1e-6:
+            break
         length /= 2
-        chosen = _rows_apart(steps, rows, length)
     while len(chosen) > 150:
         length *= 1.1
         chosen = _rows_apart(steps, rows, length)
@@ -315,7 +330,7 @@ def sharpest_images(
         if key < 0 or frame.image is None:
             continue
         image = shrunk(frame.image, size_px)
-        sharpness = float(cv2.Laplacian(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), cv2.CV_32F).var())
+        sharpness = _sharpness(np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8))
         if key not in best or sharpness > best[key][0]:
             best[key] = (sharpness, row_of[frame.index], image)
     line.close()

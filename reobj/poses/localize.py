@@ -29,21 +29,15 @@ class Located:
     """Poses of all frames by one model.
 
     Attributes:
-        key_rows: (R,) row of each image of the model. keys: rows of all keyframes, ascending.
+        key_rows: (R,) row of each image of the model.
         cam_from_world: (F, 3, 4), NaN where PnP failed or the camera jumped. status: (F,) as in
             `Poses`.
     """
 
     model: SparseModel
     key_rows: IntArray
-    keys: IntArray
     cam_from_world: Array
     status: npt.NDArray[np.str_]
-
-    def is_of(self, model: SparseModel, key_rows: IntArray) -> bool:
-        """True if a model has the same points, and these keyframes among others."""
-        has_images = np.isin(self.key_rows, key_rows).all()
-        return bool(has_images) and np.array_equal(model.points, self.model.points)
 
 
 def locate_between(
@@ -53,7 +47,6 @@ def locate_between(
     video: ResizedVideo,
     seed: int,
     line: Progress,
-    before: Located | None = None,
 ) -> Located:
     """Locate every frame by PnP on points tracked from the keyframes before and after it.
 
@@ -63,8 +56,6 @@ def locate_between(
     Args:
         model: of the keyframes, native pixels. key_rows: (R,) row of each of its images in the
             video, ascending. unmapped: (L,) rows of the other keyframes, ascending.
-        before: of an earlier call with fewer keyframes. Where the model has not changed, only
-            frames beside keyframes that are new, or new in the model, are located again.
     """
     count = len(video.frames)
     camera = model.cameras[0]
@@ -72,24 +63,17 @@ def locate_between(
     status = np.full(count, "none", "<U12")
     cam_from_world[key_rows] = model.cam_from_world
     status[key_rows] = "keyframe"
-    keys = np.union1d(key_rows, unmapped)
-    tried = beside_mapped(keys, key_rows, count)
-    if before is not None and before.is_of(model, key_rows):
-        new = np.union1d(np.setdiff1d(keys, before.keys), np.setdiff1d(key_rows, before.key_rows))
-        same = ~beside_mapped(keys, new, count) & (status == "none")
-        cam_from_world[same] = before.cam_from_world[same]
-        status[same] = before.status[same]
-        tried &= ~same
+    tried = beside_mapped(np.union1d(key_rows, unmapped), key_rows, count) & (status == "none")
 
     def locate(segment: tuple[int, int, list[tuple[int, Image]]]) -> int:
         before, after, run = segment
-        if not any(tried[row] and status[row] == "none" for row, _ in run):
+        if not tried[[row for row, _ in run]].any():
             return len(run) - 1
         images = [gray for _, gray in run]
         ahead = _track_model_points(model, before, images)
         back = _track_model_points(model, after, images[::-1])[::-1]
         for (row, gray), (seen_a, xy_a), (seen_b, xy_b) in zip(run, ahead, back, strict=True):
-            if tried[row] and status[row] == "none":
+            if tried[row]:
                 points = model.points[np.r_[seen_a, seen_b]]
                 pose = absolute_pose(np.r_[xy_a, xy_b], points, camera, gray.shape[1], seed)
                 if pose is not None:
@@ -108,7 +92,7 @@ def locate_between(
     jump = _detours(cam_from_world) & (status == "pnp")
     cam_from_world[jump] = np.nan
     status[jump] = "none"
-    return Located(model, key_rows, keys, cam_from_world, status)
+    return Located(model, key_rows, cam_from_world, status)
 
 
 def beside_mapped(keys: IntArray, mapped: IntArray, count: int) -> BoolArray:
@@ -124,27 +108,28 @@ def beside_mapped(keys: IntArray, mapped: IntArray, count: int) -> BoolArray:
     return np.asarray(before | after, bool)
 
 
+MAX_SEGMENT = 1000  # frames of a segment held in memory: .3 GB of 640x480
+
+
 def _segments(
-    key_rows: IntArray, grays: Iterator[Image], most: int = 1000
+    key_rows: IntArray, grays: Iterator[Image]
 ) -> Iterator[tuple[int, int, list[tuple[int, Image]]]]:
     """Cut the video at the mapped keyframes.
 
-    Args:
-        most: frames of a segment held in memory: .3 GB of 640x480.
     Yields:
         the image of the model before and after (-1: none), and (row, gray image) of both and of all
         frames between them. The middle of a longer segment is left out.
     """
     image_of = {int(row): image for image, row in enumerate(key_rows)}
     before = -1
-    run = deque[tuple[int, Image]](maxlen=most)
+    run = deque[tuple[int, Image]](maxlen=MAX_SEGMENT)
     for row, gray in enumerate(grays):
         run.append((row, gray))
         image = image_of.get(row, -1)
-        if image >= 0 or (before >= 0 and len(run) == most):
+        if image >= 0 or (before >= 0 and len(run) == MAX_SEGMENT):
             yield before, image, list(run)
             before = image
-            run = deque([(row, gray)], maxlen=most)
+            run = deque([(row, gray)], maxlen=MAX_SEGMENT)
     if before >= 0:
         yield before, -1, list(run)
 
@@ -174,26 +159,22 @@ def _track_model_points(
     return tracked
 
 
+MIN_INLIERS = 15  # of an accepted pose (chosen; COLMAP registers images from 30 on)
+MIN_RATIO = 0.5  # of inliers among the tracked points (chosen; COLMAP: .25 of raw matches)
+
+
 def absolute_pose(
-    xy: Array,
-    points: Array,
-    camera: Camera,
-    resized_width: int,
-    seed: int,
-    min_inliers: int = 15,
-    min_ratio: float = 0.5,
+    xy: Array, points: Array, camera: Camera, resized_width: int, seed: int
 ) -> Array | None:
     """Estimate the pose of a frame from 3D points and their pixels (PnP, RANSAC, refinement).
 
     Args:
         xy: (n, 2) native pixels, COLMAP's. points: (n, 3) in world. resized_width: pixels of the
             image in which the points were tracked; INLIER_PX is in its pixels.
-        min_inliers: of an accepted pose (chosen; COLMAP registers images from 30 on).
-        min_ratio: of inliers among the tracked points (chosen; COLMAP: .25 of raw matches).
     Returns:
         cam_from_world (3, 4); None with too few inliers or an inlier behind the camera.
     """
-    if len(xy) < min_inliers:
+    if len(xy) < MIN_INLIERS:
         return None
     error_px = INLIER_PX * camera.width / resized_width
     ransac = {"max_error": error_px, "confidence": 0.999, "random_seed": seed}
@@ -202,21 +183,21 @@ def absolute_pose(
     estimate = import_pycolmap().estimate_and_refine_absolute_pose(
         xy, points, camera.to_pycolmap(), estimation_options={"ransac": ransac}
     )
-    if estimate is None or estimate["num_inliers"] < max(min_inliers, min_ratio * len(xy)):
+    if estimate is None or estimate["num_inliers"] < max(MIN_INLIERS, MIN_RATIO * len(xy)):
         return None
     pose: Array = estimate["cam_from_world"].matrix()
     depth = points[estimate["inlier_mask"]] @ pose[2, :3] + pose[2, 3]
     return pose if np.isfinite(pose).all() and (depth > 0).all() else None
 
 
-def _detours(cam_from_world: Array, most: float = 5.0) -> BoolArray:
+MAX_DETOUR = 5.0  # units (chosen; lower: frames of a shaking camera are lost)
+
+
+def _detours(cam_from_world: Array) -> BoolArray:
     """Mark frames (F,) whose centre is far from both neighbours, while these are near each other.
 
     The unit of the detour is the distance of the neighbours or the median step of the trajectory,
     whichever is longer.
-
-    Args:
-        most: units of a detour that is none (chosen; lower: frames of a shaking camera are lost).
     """
     known = np.flatnonzero(np.isfinite(cam_from_world).all((1, 2)))
     detour = np.zeros(len(cam_from_world), bool)
@@ -225,10 +206,11 @@ def _detours(cam_from_world: Array, most: float = 5.0) -> BoolArray:
         step = np.linalg.norm(np.diff(centre, axis=0), axis=1)  # (N-1,)
         direct = np.linalg.norm(centre[2:] - centre[:-2], axis=1)  # (N-2,)
         usual = np.maximum(direct, np.median(step))
-        detour[known[1:-1]] = step[1:] + step[:-1] - direct > most * usual
+        detour[known[1:-1]] = step[1:] + step[:-1] - direct > MAX_DETOUR * usual
     return detour
 
 
+MAX_GAP = 15  # consecutive lost frames that are interpolated: half a second at 30 Hz
 # Gap lengths, before and after it, in which the error is measured (chosen; higher: other motion)
 NEAR_GAPS = 2.0
 
@@ -237,11 +219,10 @@ def fill_gaps(
     located: Located,
     frame: IntArray,
     time_s: Array,
-    max_gap: int,
     shrink: float,
     unmapped: Sequence[int] | IntArray = (),
 ) -> tuple[Array, npt.NDArray[np.str_]]:
-    """Interpolate the poses of at most `max_gap` consecutive lost frames where the error is small.
+    """Interpolate the poses of at most MAX_GAP consecutive lost frames where the error is small.
 
     It must be below `INLIER_PX`, as that of PnP (`_interpolation_px`). There is no
     extrapolation, and no interpolation past a row of `unmapped`, a keyframe that mapping rejected.
@@ -260,7 +241,7 @@ def fill_gaps(
     known = np.flatnonzero(np.isfinite(cam_from_world).all((1, 2)))
     for k in np.flatnonzero(np.diff(known) > 1).tolist():
         a, b = known[k : k + 2].tolist()
-        if frame[b] - frame[a] - 1 > max_gap or any(a < row < b for row in unmapped):
+        if frame[b] - frame[a] - 1 > MAX_GAP or any(a < row < b for row in unmapped):
             continue
         camera = model.cameras[0]
         points = _points_around(model, located.key_rows, a, b)

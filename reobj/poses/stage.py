@@ -6,9 +6,8 @@ import dataclasses
 import functools
 import hashlib
 import shutil
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -16,24 +15,13 @@ from reobj.cameras import Poses, import_pycolmap, load_poses, save_poses, write_
 from reobj.files import Progress, load_cached, load_npz, part_path
 from reobj.poses.estimate import PosesConfig, estimate_poses
 from reobj.poses.intrinsics import camera_line, parse_camera
-from reobj.poses.sfm import CheckMatches, triangulate
+from reobj.poses.sfm import CheckMatches, MakeProgress, triangulate
 from reobj.poses.supplied.check import Supplied, check_boxes, check_matches, without_frozen
 from reobj.poses.supplied.depth import add_depth
 from reobj.poses.supplied.pose_formats import UPRIGHT
 from reobj.poses.supplied.readers import read_supplied
 from reobj.sources.video import Video, source_fingerprint
 from reobj.types import ReobjError, Tracks
-
-MakeProgress = Callable[[str, int], Progress]  # name and total of a step -> its progress line
-
-
-class StageCache(Protocol):
-    """What is used of the output folder (`results.workspace`): where stages keep their results."""
-
-    cache: Path
-
-    def path(self, stage: str, *key: Any) -> Path:
-        """Return the file for a stage's result under a key: its inputs and options."""
 
 
 def supplied_poses(video: Video, config: PosesConfig) -> Supplied | None:
@@ -52,13 +40,14 @@ def checked_poses(
     tracks: Tracks,
     video: Video,
     config: PosesConfig,
-    workspace: StageCache,
+    workspace: Any,
     progress: MakeProgress = Progress,
 ) -> Poses:
     """Check supplied poses against images or, without matches in them, tracks; add points.
 
     Args:
         tracks: of the video's detections; may be empty.
+        workspace: a `Workspace` (`results.workspace`): where stages keep their results.
     Raises:
         ReobjError: images or tracks contradict the poses.
     """
@@ -76,8 +65,8 @@ def with_points(
     poses: Poses,
     video: Video,
     config: PosesConfig,
-    workspace: StageCache,
-    progress: MakeProgress = Progress,
+    workspace: Any,
+    progress: MakeProgress,
     check: CheckMatches = lambda *_: np.nan,
 ) -> Poses:
     """Add points to poses: triangulated where they have none, from depth maps, or cached.
@@ -85,11 +74,8 @@ def with_points(
     Args:
         check: refuses poses that contradict matched features.
     """
-    if (
-        not video.has_images
-        or not poses.known.any()
-        or (len(poses.visibility) and not config.depth)
-    ):
+    has_points = len(poses.visibility) > 0
+    if not video.has_images or not poses.known.any() or (has_points and not config.depth):
         return poses
     path = _points_path(poses, video, config, workspace)
     if (cached := load_cached(path, load_poses)) is not None:
@@ -114,25 +100,27 @@ def with_points(
     return poses
 
 
-def _points_path(poses: Poses, video: Video, config: PosesConfig, workspace: StageCache) -> Path:
+def _points_path(poses: Poses, video: Video, config: PosesConfig, workspace: Any) -> Path:
     """Return the cache file of poses with points."""
     maps = source_fingerprint(config.depth.partition(":")[0]) if config.depth else ""
     arrays = (poses.cam_from_world, poses.points, poses.visibility, poses.part)
     digest = hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()
     key = (poses.camera, poses.metric, poses.messages, config, maps, digest)
-    return workspace.path("points", video.fingerprint, video.config, *key)
+    path: Path = workspace.path("points", video.fingerprint, video.config, *key)
+    return path
 
 
 def reconstruct_cached(
     video: Video,
     config: PosesConfig,
-    workspace: StageCache,
+    workspace: Any,
     moving: Tracks | None = None,
     progress: MakeProgress = Progress,
 ) -> tuple[Poses, list[Path]]:
     """Reconstruct the cameras of a video, or take them from the output folder's cache.
 
     Args:
+        workspace: as of `checked_poses`.
         moving: tracks of moving objects, where no features are used.
         progress: makes the progress line of a step from its name and total.
     Returns:
@@ -143,28 +131,25 @@ def reconstruct_cached(
     """
     if config.mode == "none":
         raise ReobjError("--poses none leaves nothing to do: leave it out, or use `track`")
-    boxes = np.empty((0, 5))
-    if moving is not None and len(moving):
-        boxes = np.column_stack([moving.frame, moving.xyxy])
+    moving = Tracks.empty() if moving is None else moving
+    boxes = np.column_stack([moving.frame, moving.xyxy])  # (N, 5)
     digest = hashlib.sha256(boxes.round(1).tobytes()).hexdigest()
-    if camera := parse_camera(
-        config.camera, video.size, config.camera_format
-    ):  # a file's content, not its name
+    camera = parse_camera(config.camera, video.size, config.camera_format)
+    if camera is not None:  # a file's content, not its name
         config = dataclasses.replace(config, camera=camera_line(camera))
     without_depth = dataclasses.replace(config, depth="")
     path = workspace.path("poses", video.fingerprint, video.config, without_depth, digest)
     model = path.with_suffix(".sparse")
-    if (cached := load_cached(path, _load_reconstruction)) is not None:
-        models = [part_path(model, k) for k in range(cached.part_count)]
-        return _with_depth(cached, models, video, config, workspace, progress)
-    work_dir = workspace.cache / "sfm"
-    boxes_of = (lambda frame: boxes[boxes[:, 0] == frame, 1:]) if len(boxes) else None
-    poses = estimate_poses(video, config, work_dir, progress=progress, boxes_to_mask=boxes_of)
-    if poses.known.any():
-        for k in range(poses.part_count):
+    poses = load_cached(path, _load_reconstruction)
+    if poses is None:
+        work_dir = workspace.cache / "sfm"
+        boxes_of = (lambda frame: boxes[boxes[:, 0] == frame, 1:]) if len(boxes) else None
+        poses = estimate_poses(video, config, work_dir, progress=progress, boxes_to_mask=boxes_of)
+        for k in range(poses.part_count if poses.known.any() else 0):
             shutil.rmtree(part_path(model, k), ignore_errors=True)
             part_path(work_dir / "sparse", k).replace(part_path(model, k))
-        save_poses(path, poses, models=_digest_of(model, poses.part_count))
+        if poses.known.any():
+            save_poses(path, poses, models=_digest_of(model, poses.part_count))
     models = [part_path(model, k) for k in range(poses.part_count)]
     return _with_depth(poses, models, video, config, workspace, progress)
 
@@ -203,7 +188,7 @@ def _with_depth(
     models: list[Path],
     video: Video,
     config: PosesConfig,
-    workspace: StageCache,
+    workspace: Any,
     progress: MakeProgress,
 ) -> tuple[Poses, list[Path]]:
     """Scale a reconstruction by depth maps, with its COLMAP models, and add their points."""

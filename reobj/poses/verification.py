@@ -33,7 +33,9 @@ from reobj.poses.bundle import (
     INLIER_PX,
     MIN_TRI_ANGLE_DEG,
     ModelArrays,
+    skew,
     triangulates,
+    unit_rows,
 )
 from reobj.poses.features import MIN_MATCHES, MatchedPairs
 from reobj.types import Array, BoolArray, IntArray
@@ -41,35 +43,24 @@ from reobj.types import Array, BoolArray, IntArray
 # ---- Consistency ---------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class ConsistencyOptions:
-    """What connects the images of a model; connections with less are cut.
-
-    Attributes:
-        tied: fraction of the matches of two consecutive images that must be one point of the model
-            (measured: right .38-.98, wrong 0).
-        strongest: pairs with the most matches across a cut of photos; the cut is made if none is
-            tied (measured: right models have one among the first three; one of 10 photos with the
-            wrong one of two poses has none among the first ten).
-        bridge: points, and matches of one pair of images, that connect two groups (COLMAP registers
-            one image from 30 on).
-        group: images; fewer with a weak connection are left to be located by PnP.
-        reobserved, reobserved_count: fraction of the points of one group, and number, that near
-            views of the other must observe again (measured: right .065-.5, wrong 0-.007; right 31
-            and more, the last 30 frames of the example mirrored 0).
-    """
-
-    tied: float = 0.1
-    strongest: int = 5
-    bridge: int = MIN_MATCHES
-    group: int = 3
-    reobserved: float = 0.03
-    reobserved_count: int = 10
+# What connects the images of a model; connections with less, or with fewer points or matches of one
+# pair than MIN_MATCHES, are cut.
+# Fraction of the matches of two consecutive images that must be one point of the model (measured:
+# right .38-.98, wrong 0)
+MIN_SUPPORTED = 0.1
+# Pairs with the most matches across a cut of photos, which is made if none is supported (measured:
+# right models have one among the first three; one of 10 photos with the wrong one of two poses has
+# none among the first ten)
+STRONGEST = 5
+MIN_GROUP = 3  # images; fewer with a weak connection are left to be located by PnP
+# Fraction of the points of one group, and number, that near views of the other must observe again
+# (measured: right .065-.5, wrong 0-.007; right 31 and more, the last 30 frames of the example
+# mirrored 0)
+MIN_REOBSERVED = 0.03
+MIN_REOBSERVED_COUNT = 10
 
 
-def consistent_groups(
-    arrays: ModelArrays, pairs: MatchedPairs, options: ConsistencyOptions = ConsistencyOptions()
-) -> list[IntArray]:
+def consistent_groups(arrays: ModelArrays, pairs: MatchedPairs) -> list[IntArray]:
     """Split the images of a model into consistent groups.
 
     Args:
@@ -78,23 +69,19 @@ def consistent_groups(
         ids of the images of each group, the largest group first; images with too weak a connection
         are in none.
     """
-    explained = count_explained(arrays, pairs)
+    evidence = _Evidence(arrays, pairs)
     groups = list[IntArray]()
-    if pairs.is_path:
-        todo = _runs_of_tied_neighbours(arrays, pairs, explained, options.tied)
-    else:
-        todo = [np.arange(len(arrays.ids))]
+    todo = evidence.runs_of_neighbours() if pairs.is_path else [np.arange(len(arrays.ids))]
     while todo:
         rows = todo.pop()
-        side = None if pairs.is_path else _untied_cut(arrays, rows, pairs, explained, options)
-        if side is None and not pairs.is_path:
-            rows = _tied_photos(arrays, rows, pairs, explained, options.tied)
+        side = None if pairs.is_path else evidence.unsupported_cut(rows)
         if side is None:
-            side = _weak_cut(arrays, rows, pairs, explained, options)
+            rows = rows if pairs.is_path else evidence.supported_photos(rows)
+            side = evidence.weak_cut(rows)
         if side is None:
             groups.append(arrays.ids[rows])
-            continue
-        todo += [rows[s] for s in (side, ~side) if s.sum() >= options.group]
+        else:
+            todo += [rows[s] for s in (side, ~side) if s.sum() >= MIN_GROUP]
     return sorted(groups, key=lambda g: (-len(g), int(g[0])))
 
 
@@ -116,9 +103,7 @@ def count_explained(arrays: ModelArrays, pairs: MatchedPairs) -> IntArray:
     shift = arrays.cam_from_world[:, :, 3]
     turn = rotation[b] @ np.swapaxes(rotation[a], 1, 2)  # (p, 3, 3)
     x, y, z = (shift[b] - np.einsum("pij,pj->pi", turn, shift[a])).T
-    zero = np.zeros(len(x))
-    cross = np.moveaxis(np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]), 2, 0)
-    E = cross @ turn
+    E = skew(x, y, z) @ turn
     count = np.zeros(len(pairs.inliers), np.int64)
     for k, row in enumerate(inside.tolist()):
         match = pairs.inliers[row]
@@ -134,213 +119,191 @@ def count_explained(arrays: ModelArrays, pairs: MatchedPairs) -> IntArray:
     return count
 
 
-def _runs_of_tied_neighbours(
-    arrays: ModelArrays, pairs: MatchedPairs, explained: IntArray, least: float
-) -> list[IntArray]:
-    """Split rows of images where matches of neighbours in time are not triangulated in the model.
+class _Evidence:
+    """A model and the verified matches of its images.
 
-    Consecutive images show the same scene (others may only look alike), so their verified matches
-    must be points of the model (`_tied`). They are not where an image was registered at a
-    look-alike position, at another scale, or not at all. An image that is tied to neither neighbour
-    is left out; it splits the rest unless the images before and after it are tied to each other.
-
-    Args:
-        least: `ConsistencyOptions.tied`.
-    Returns:
-        rows (n,) of each run, ascending.
+    Attributes:
+        explained: (P,) matches of each pair that the model explains.
+        point_of: point of the model of each keypoint by image id, -1: none.
     """
-    every = sorted(pairs.keypoints)  # keyframes in the order of time, registered or not
-    order = np.searchsorted(every, pairs.image_ids)
-    near = np.flatnonzero(pairs.enough & (order[:, 1] - order[:, 0] <= 4))
-    are_tied = _tied(arrays, pairs, explained, near, least).tolist()
-    tied = dict(zip(map(tuple, pairs.image_ids[near].tolist()), are_tied, strict=True))
-    links = [tied.get(pair) for pair in itertools.pairwise(every)]
-    around = zip([None, *links], [*links, None], strict=True)
-    inside = set(arrays.ids.tolist())
-    kept = [k for k, sides in enumerate(around) if every[k] in inside and sides != (False, False)]
-    starts = [
-        n
-        for n, (a, b) in enumerate(itertools.pairwise(kept), 1)
-        if False in links[a:b] and not (b - a > 1 and tied.get((every[a], every[b])))
-    ]
-    rows = np.searchsorted(arrays.ids, [every[k] for k in kept])
-    return [run for run in np.split(rows, starts) if len(run)]
 
+    def __init__(self, arrays: ModelArrays, pairs: MatchedPairs) -> None:
+        self.arrays = arrays
+        self.pairs = pairs
+        self.explained = count_explained(arrays, pairs)
+        self.point_of = arrays.point_of_keypoints(pairs.keypoints)
 
-def _pairs_among(
-    arrays: ModelArrays, rows: IntArray, pairs: MatchedPairs
-) -> tuple[IntArray, IntArray]:
-    """Find the pairs of images `rows` (R,) with enough matches.
+    def runs_of_neighbours(self) -> list[IntArray]:
+        """Split rows of images where matches of neighbours in time are not supported.
 
-    Returns:
-        their rows in `pairs` (E,), and the two images of each, numbers in `rows` (E, 2).
-    """
-    ids = arrays.ids[rows]
-    inside = np.flatnonzero(pairs.enough & np.isin(pairs.image_ids, ids).all(1))
-    return inside, np.searchsorted(ids, pairs.image_ids[inside])
+        Consecutive images show the same scene (others may only look alike), so their verified
+        matches must be points of the model. They are not where an image was registered at a
+        look-alike position, at another scale, or not at all. An image without support by either
+        neighbour is left out; it splits the rest unless the images before and after it support each
+        other.
 
+        Returns:
+            rows (n,) of each run, ascending.
+        """
+        pairs = self.pairs
+        ids = self.arrays.ids
+        every = sorted(pairs.keypoints)  # keyframes in the order of time, registered or not
+        order = np.searchsorted(every, pairs.image_ids)
+        near = np.flatnonzero(pairs.enough & (order[:, 1] - order[:, 0] <= 4))
+        ends = map(tuple, pairs.image_ids[near].tolist())
+        supported = dict(zip(ends, self.supported(near).tolist(), strict=True))
+        links = [supported.get(pair) for pair in itertools.pairwise(every)]
+        around = zip([None, *links], [*links, None], strict=True)
+        inside = set(ids.tolist())
+        kept = [
+            k for k, sides in enumerate(around) if every[k] in inside and sides != (False, False)
+        ]
+        starts = [
+            n
+            for n, (a, b) in enumerate(itertools.pairwise(kept), 1)
+            if False in links[a:b] and not (b - a > 1 and supported.get((every[a], every[b])))
+        ]
+        rows = np.searchsorted(ids, [every[k] for k in kept])
+        return [run for run in np.split(rows, starts) if len(run)]
 
-def _untied_cut(
-    arrays: ModelArrays,
-    rows: IntArray,
-    pairs: MatchedPairs,
-    explained: IntArray,
-    options: ConsistencyOptions,
-) -> BoolArray | None:
-    """Find a cut of photos across which the pairs with the most matches are not in the model.
+    def _pairs_among(self, rows: IntArray) -> tuple[IntArray, IntArray]:
+        """Find the pairs of images `rows` (R,) with enough matches.
 
-    Candidates are the edges of the spanning tree of most matches, which takes the place of the path
-    of a video: each is the pair with the most matches across its cut. A photo that sees the others
-    by points on one plane alone has two possible poses (Necker reversal); where the mapper takes
-    the wrong one, the next photos are added to it, and their matches with all others contradict it.
+        Returns:
+            their rows in `pairs` (E,), and the two images of each, numbers in `rows` (E, 2).
+        """
+        ids = self.arrays.ids[rows]
+        inside = np.flatnonzero(self.pairs.enough & np.isin(self.pairs.image_ids, ids).all(1))
+        return inside, np.searchsorted(ids, self.pairs.image_ids[inside])
 
-    Args:
-        rows: (R,) of the photos, ascending. explained: (P,) matches of each pair.
-    Returns:
-        (R,) True on one side of `rows`, None if there is no such cut.
-    """
-    inside, ends = _pairs_among(arrays, rows, pairs)
-    matches = pairs.matches[inside]
-    shape = (len(rows), len(rows))
-    tree = minimum_spanning_tree(sparse.csr_matrix((1 / matches, ends.T), shape)).tocsr()
-    edges = np.flatnonzero(np.asarray(tree[ends[:, 0], ends[:, 1]]).ravel())
-    tied = _tied(arrays, pairs, explained, inside[edges], options.tied)
-    for edge in edges[~tied]:
-        rest = tree.copy()
-        rest[ends[edge, 0], ends[edge, 1]] = 0
-        rest.eliminate_zeros()
-        component = connected_components(rest, directed=False)[1]
-        side = component == component[ends[edge, 0]]
-        if min(side.sum(), (~side).sum()) < options.group:
-            continue
-        across = np.flatnonzero(side[ends[:, 0]] != side[ends[:, 1]])
-        strongest = across[np.argsort(-matches[across], kind="stable")[: options.strongest]]
-        if not _tied(arrays, pairs, explained, inside[strongest], options.tied).any():
-            return np.asarray(side)
-    return None
+    def unsupported_cut(self, rows: IntArray) -> BoolArray | None:
+        """Find a cut of photos across which the pairs with the most matches are not in the model.
 
+        Candidates are the edges of the spanning tree of most matches, which takes the place of the
+        path of a video: each is the pair with the most matches across its cut. A photo that sees
+        the others by points on one plane alone has two possible poses (Necker reversal); where the
+        mapper takes the wrong one, the next photos are added to it, and their matches with all
+        others contradict it.
 
-def _tied_photos(
-    arrays: ModelArrays, rows: IntArray, pairs: MatchedPairs, explained: IntArray, least: float
-) -> IntArray:
-    """Leave out photos whose matches with the most similar photos are not points of the model.
+        Args:
+            rows: (R,) of the photos, ascending.
+        Returns:
+            (R,) True on one side of `rows`, None if there is no such cut.
+        """
+        inside, ends = self._pairs_among(rows)
+        matches = self.pairs.matches[inside]
+        shape = (len(rows), len(rows))
+        tree = minimum_spanning_tree(sparse.csr_matrix((1 / matches, ends.T), shape)).tocsr()
+        edges = np.flatnonzero(np.asarray(tree[ends[:, 0], ends[:, 1]]).ravel())
+        for edge in edges[~self.supported(inside[edges])]:
+            rest = tree.copy()
+            rest[ends[edge, 0], ends[edge, 1]] = 0
+            rest.eliminate_zeros()
+            component = connected_components(rest, directed=False)[1]
+            side = component == component[ends[edge, 0]]
+            if min(side.sum(), (~side).sum()) < MIN_GROUP:
+                continue
+            across = np.flatnonzero(side[ends[:, 0]] != side[ends[:, 1]])
+            strongest = across[np.argsort(-matches[across], kind="stable")[:STRONGEST]]
+            if not self.supported(inside[strongest]).any():
+                return np.asarray(side)
+        return None
 
-    Of photos without an order the two with which one has the most matches take the place of the
-    image before and after it. A photo that is tied to neither is left out. The others stay
-    together: of the pairs in a right model up to a tenth are wrong (measured), some with many
-    matches.
+    def supported_photos(self, rows: IntArray) -> IntArray:
+        """Leave out photos whose matches with the most similar photos are not in the model.
 
-    Args:
-        rows: (R,) of the photos, ascending. explained: (P,) matches of each pair.
-        least: `ConsistencyOptions.tied`.
-    Returns:
-        those of `rows` that stay, (n,).
-    """
-    inside, ends = _pairs_among(arrays, rows, pairs)
-    pair = np.repeat(inside, 2)  # (2 E,) each pair belongs to two images
-    image = ends.ravel()
-    order = np.lexsort((-pairs.matches[pair], image))
-    rank = np.arange(len(order)) - np.searchsorted(image[order], image[order])
-    nearest = order[rank < 2]
-    judged = np.unique(pair[nearest])
-    tied = np.isin(pair[nearest], judged[_tied(arrays, pairs, explained, judged, least)])
-    return np.delete(rows, np.setdiff1d(image[nearest], image[nearest[tied]]))
+        Of photos without an order the two with which one has the most matches take the place of the
+        image before and after it. A photo without support by either is left out. The others stay
+        together: of the pairs in a right model up to a tenth are wrong (measured), some with many
+        matches.
 
+        Args:
+            rows: (R,) of the photos, ascending.
+        Returns:
+            those of `rows` that stay, (n,).
+        """
+        inside, ends = self._pairs_among(rows)
+        pair = np.repeat(inside, 2)  # (2 E,) each pair belongs to two images
+        image = ends.ravel()
+        order = np.lexsort((-self.pairs.matches[pair], image))
+        rank = np.arange(len(order)) - np.searchsorted(image[order], image[order])
+        nearest = order[rank < 2]
+        judged = np.unique(pair[nearest])
+        supported = np.isin(pair[nearest], judged[self.supported(judged)])
+        return np.delete(rows, np.setdiff1d(image[nearest], image[nearest[supported]]))
 
-def _tied(
-    arrays: ModelArrays, pairs: MatchedPairs, explained: IntArray, rows: IntArray, least: float
-) -> BoolArray:
-    """Mark the pairs of images whose matches are triangulated in the model.
+    def supported(self, rows: IntArray) -> BoolArray:
+        """Mark the pairs (n,) whose matches are triangulated in the model.
 
-    A fraction `least` of the matches must be one point of the model; and an essential matrix of
-    the pair alone must not explain many more of them than the model does.
+        A fraction MIN_SUPPORTED of the matches must be one point of the model; and an essential
+        matrix of the pair alone must not explain many more of them than the model does.
 
-    Args:
-        rows: (n,) of the pairs. explained: (P,) matches of every pair that the model explains.
-    """
-    point_of = {}
-    for row, image_id in enumerate(arrays.ids.tolist()):
-        point_of[image_id] = np.full(len(pairs.keypoints[image_id]), -1)
-        mine = arrays.image == row
-        point_of[image_id][arrays.keypoint[mine]] = arrays.point[mine]
-    tied = np.zeros(len(rows), bool)
-    for k, row in enumerate(rows.tolist()):
-        a, b = pairs.image_ids[row].tolist()
-        if a in point_of and b in point_of:
-            matches = pairs.inliers[row]
-            one = point_of[a][matches[:, 0]]
-            other = point_of[b][matches[:, 1]]
-            enough = np.mean((one == other) & (one >= 0)) >= least
-            tied[k] = enough and not _contradicted(arrays, pairs, row, int(explained[row]))
-    return tied
+        Args:
+            rows: (n,) of the pairs.
+        """
+        supported = np.zeros(len(rows), bool)
+        for k, row in enumerate(rows.tolist()):
+            a, b = self.pairs.image_ids[row].tolist()
+            if a in self.point_of and b in self.point_of:
+                one, other = self.pairs.inliers[row].T
+                points = self.point_of[a][one]
+                same = (points == self.point_of[b][other]) & (points >= 0)
+                supported[k] = np.mean(same) >= MIN_SUPPORTED and not self._contradicted(row)
+        return supported
 
+    def _contradicted(self, row: int) -> bool:
+        """True if an essential matrix of a pair explains many more matches than the model."""
+        matches = self.pairs.inliers[row]
+        explained = int(self.explained[row])
+        if len(matches) - explained < MIN_MATCHES:
+            return False
+        ends = zip(self.pairs.image_ids[row].tolist(), matches.T, strict=True)
+        xy = [self.pairs.keypoints[i][side] for i, side in ends]
+        camera = self.arrays.camera
+        ransac = {"max_error": INLIER_PX, "random_seed": 0}
+        estimate = import_pycolmap().estimate_essential_matrix(*xy, camera, camera, ransac)
+        return bool(estimate is not None and estimate["num_inliers"] - explained >= MIN_MATCHES)
 
-def _contradicted(arrays: ModelArrays, pairs: MatchedPairs, row: int, explained: int) -> bool:
-    """True if an essential matrix of two images explains many more matches than the model."""
-    matches = pairs.inliers[row]
-    a, b = pairs.image_ids[row].tolist()
-    if len(matches) - explained < MIN_MATCHES:
-        return False
-    camera = arrays.camera
-    ransac = {"max_error": INLIER_PX, "random_seed": 0}
-    xy = pairs.keypoints[a][matches[:, 0]], pairs.keypoints[b][matches[:, 1]]
-    estimate = import_pycolmap().estimate_essential_matrix(*xy, camera, camera, ransac)
-    return bool(estimate is not None and estimate["num_inliers"] - explained >= MIN_MATCHES)
+    def weak_cut(self, rows: IntArray) -> BoolArray | None:
+        """Find a cut of the images into two groups whose connection is too weak.
 
+        Candidates are the cuts of the spanning tree of most shared points. A point connects two
+        groups, including their relative scale, if one group triangulates it and the other observes
+        it. A cut is weak if it has too few such points, or if no pair of images across it has as
+        many matches: false matches on symmetric objects add up over images. It is also weak if
+        nearby views across it re-observe too few points: what only distant views share is matched
+        by chance.
 
-def _shared_points(covisibility: Any) -> Array:
-    """Count the points (R, R) that two images share, 0 on the diagonal."""
-    shared = np.asarray((covisibility @ covisibility.T).todense(), np.float64)
-    np.fill_diagonal(shared, 0)
-    return shared
-
-
-def _weak_cut(
-    arrays: ModelArrays,
-    rows: IntArray,
-    pairs: MatchedPairs,
-    explained: IntArray,
-    options: ConsistencyOptions,
-) -> BoolArray | None:
-    """Find a cut of the images into two groups whose connection is too weak.
-
-    Candidates are the cuts of the spanning tree of most shared points. A point connects two groups,
-    including their relative scale, if one group triangulates it and the other observes it. A cut is
-    weak if it has too few such points, or if no pair of images across it has as many matches: false
-    matches on symmetric objects add up over images. It is also weak if nearby views across it
-    re-observe too few points: what only distant views share is matched by chance.
-
-    Args:
-        explained: (P,) matches of each pair.
-    Returns:
-        (n,) True on one side of `rows`, None if there is no weak cut.
-    """
-    covisibility = arrays.covisibility()[rows]
-    shared = _shared_points(covisibility)
-    tree = minimum_spanning_tree(sparse.csr_matrix(np.where(shared > 0, 1 / (shared + 1), 0)))
-    order, parent = breadth_first_order(tree, 0, directed=False)
-    if len(order) < len(rows):  # not even connected
-        return np.isin(np.arange(len(rows)), order)
-    below = np.eye(len(rows), dtype=bool)  # (R, R) the subtree of each image
-    for child in order[:0:-1]:
-        below[parent[child]] |= below[child]
-    cuts = below[order[1:]]  # (R - 1, R) one for each edge of the tree
-    inside = np.flatnonzero(np.isin(pairs.image_ids, arrays.ids[rows]).all(1) & (explained > 0))
-    one, other = np.searchsorted(arrays.ids[rows], pairs.image_ids[inside]).T
-    most = np.zeros(len(cuts), np.int64)  # matches of a pair across each cut
-    for k, cut in enumerate(cuts):
-        most[k] = explained[inside[cut[one] != cut[other]]].max(initial=0)
-    bridge = np.minimum(_bridges(arrays, rows, cuts), most)
-    for cut in np.argsort(bridge, kind="stable"):
-        if bridge[cut] < options.bridge:
-            return np.asarray(cuts[cut])
-    smaller = np.minimum(cuts.sum(1), (~cuts).sum(1))
-    groups = np.flatnonzero(smaller >= options.group)
-    for cut in groups[np.argsort(bridge[groups], kind="stable")[:3]]:  # all would take long
-        expected, reobserved = _count_reobserved(arrays, rows, np.asarray(cuts[cut]))
-        if reobserved < max(options.reobserved * expected, options.reobserved_count):
-            return np.asarray(cuts[cut])
-    return None
+        Returns:
+            (n,) True on one side of `rows`, None if there is no weak cut.
+        """
+        arrays = self.arrays
+        covisibility = arrays.covisibility()[rows]
+        shared = np.asarray((covisibility @ covisibility.T).todense(), np.float64)  # (R, R)
+        np.fill_diagonal(shared, 0)
+        tree = minimum_spanning_tree(sparse.csr_matrix(np.where(shared > 0, 1 / (shared + 1), 0)))
+        order, parent = breadth_first_order(tree, 0, directed=False)
+        if len(order) < len(rows):  # not even connected
+            return np.isin(np.arange(len(rows)), order)
+        below = np.eye(len(rows), dtype=bool)  # (R, R) the subtree of each image
+        for child in order[:0:-1]:
+            below[parent[child]] |= below[child]
+        cuts = below[order[1:]]  # (R - 1, R) one for each edge of the tree
+        ids = self.pairs.image_ids
+        inside = np.isin(ids, arrays.ids[rows]).all(1) & (self.explained > 0)
+        one, other = np.searchsorted(arrays.ids[rows], ids[inside]).T
+        explained = self.explained[inside]
+        most = [explained[cut[one] != cut[other]].max(initial=0) for cut in cuts]  # of one pair
+        bridge = np.minimum(_bridges(arrays, rows, cuts), np.array(most, np.int64))
+        weakest = np.argsort(bridge, kind="stable")
+        if len(cuts) and bridge[weakest[0]] < MIN_MATCHES:
+            return np.asarray(cuts[weakest[0]])
+        smaller = np.minimum(cuts.sum(1), (~cuts).sum(1))
+        for cut in weakest[smaller[weakest] >= MIN_GROUP][:3]:  # all would take long
+            expected, reobserved = _count_reobserved(arrays, rows, np.asarray(cuts[cut]))
+            if reobserved < max(MIN_REOBSERVED * expected, MIN_REOBSERVED_COUNT):
+                return np.asarray(cuts[cut])
+        return None
 
 
 def _bridges(arrays: ModelArrays, rows: IntArray, cuts: BoolArray) -> IntArray:
@@ -348,11 +311,9 @@ def _bridges(arrays: ModelArrays, rows: IntArray, cuts: BoolArray) -> IntArray:
 
     One side must triangulate the point, by `triangulates`, and the other observe it.
     """
-    centre = arrays.centre[rows]
     covisibility = arrays.covisibility()[rows].tocsc()
     entries = covisibility.tocoo()
-    ray = arrays.xyz[entries.col] - centre[entries.row]  # (m, 3)
-    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    ray = unit_rows(arrays.xyz[entries.col] - arrays.centre[rows][entries.row])  # (m, 3)
     rays = [sparse.csc_matrix((u, (entries.row, entries.col)), covisibility.shape) for u in ray.T]
     count = np.zeros(len(cuts), np.int64)
     step = 50  # cuts counted together: memory
@@ -427,54 +388,32 @@ class FocalSource(enum.Enum):
     GUESS = enum.auto()  # EXIF, or a usual one
 
 
-@dataclass(frozen=True, slots=True)
-class SoundnessOptions:
-    """What a model has at least; one with less is refused.
+# Minimum requirements for accepting a model
+MIN_IMAGES = 10  # (COLMAP's min_model_size), or MIN_REGISTERED
+MIN_REGISTERED = 0.5  # fraction of the keyframes of a short video
+MIN_POINTS = 100  # of a model (chosen; higher: short walks are refused)
+# Parallax that rotations of the camera alone cannot explain; walks have more than 4 (chosen; lower:
+# rotation alone at a wrong focal length is accepted)
+MIN_PARALLAX_PX = 3.0
 
-    Attributes:
-        images, registered: number of images (COLMAP's min_model_size), or this fraction of the
-            keyframes of a short video.
-        points: of a model (chosen; higher: short walks are refused).
-        points_per_image: that its median image observes (as COLMAP registers an image from 30 on).
-        parallax_px: that rotations of the camera alone cannot explain; walks have more than 4
-            (chosen; lower: rotation alone at a wrong focal length is accepted).
-    """
-
-    images: int = 10
-    registered: float = 0.5
-    points: int = 100
-    points_per_image: int = MIN_MATCHES
-    parallax_px: float = 3.0
-
-
-@dataclass(frozen=True, slots=True)
-class ConfirmationOptions:
-    """When the cameras of a component are certain, and when a second mapper confirms them.
-
-    Attributes:
-        sure_sigma: `Component.centre_sigma` up to which all centres are certain. Above, it may be
-            one of many nearly equal solutions, and another mapper must find the same (measured:
-            right models of 40 keyframes and more .0001 to .0025, wrong ones of short stretches from
-            .0011 on).
-        guess_sigma: the largest that a second mapper can confirm where the focal length was guessed
-            before mapping: where the camera zoomed, both came to the same wrong scale (measured:
-            one of .0045). Another focal length is evidence of its own: no limit.
-        centre, turn_deg: two mappers agree if no centre differs by more, over the extent, and no
-            camera by more in orientation: half of what the benchmark of broken trajectories calls
-            wrong.
-        images: fraction of the component that the other mapper must have (chosen; lower: components
-            are kept of which most images are not confirmed).
-        joint_points: that each of two pieces triangulates and that prove how they are joined: they
-            fix rotation, shift and scale (measured: right joins 191 to 386, a mirrored stretch 24,
-            a free scale 0 to 3).
-    """
-
-    sure_sigma: float = 0.001
-    guess_sigma: float = 0.004
-    centre: float = 0.05
-    turn_deg: float = 5.0
-    images: float = 0.75
-    joint_points: int = 100
+# `Component.centre_sigma` up to which all centres are certain. Above, the model may be one of many
+# nearly equal solutions, and another mapper must find the same (measured: right models of 40
+# keyframes and more .0001 to .0025, wrong ones of short stretches from .0011 on)
+SURE_SIGMA = 0.001
+# The largest that a second mapper can confirm where the focal length was guessed before mapping:
+# where the camera zoomed, both came to the same wrong scale (measured: one of .0045). Another focal
+# length is evidence of its own: no limit
+GUESS_SIGMA = 0.004
+# Two mappers agree if no centre differs by more, over the extent, and no camera by more in
+# orientation: half of what the benchmark of broken trajectories calls wrong
+SAME_CENTRE = 0.05
+SAME_TURN_DEG = 5.0
+# Fraction of the component that the other mapper must have (chosen; lower: components are kept of
+# which most images are not confirmed)
+CONFIRMED = 0.75
+# Points that each of two pieces triangulates and that prove how they are joined: they fix rotation,
+# shift and scale (measured: right joins 191 to 386, a mirrored stretch 24, a free scale 0 to 3)
+JOINT_POINTS = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -507,7 +446,6 @@ def measured(
     count: int,
     explained: int,
     focal_source: FocalSource,
-    options: SoundnessOptions = SoundnessOptions(),
 ) -> Component:
     """Measure an adjusted model of some of `count` keyframes and name its first problem.
 
@@ -529,12 +467,12 @@ def measured(
         no_depth = "so depth cannot be estimated"
     lens = "give measured intrinsics (--camera); pixels must be square"
     checks = (
-        (images < min(options.registered * count, options.images),
+        (images < min(MIN_REGISTERED * count, MIN_IMAGES),
          f"only {images} of {count} keyframes connect", ""),
-        (points < options.points, f"only {points} points could be triangulated", ""),
-        (seen < options.points_per_image,
+        (points < MIN_POINTS, f"only {points} points could be triangulated", ""),
+        (seen < MIN_MATCHES,
          f"half of the keyframes see {seen:.0f} points or fewer", ""),
-        (parallax_px < options.parallax_px,
+        (parallax_px < MIN_PARALLAX_PX,
          f"the camera only rotates (to {parallax_px:.1f} px), {no_depth}", advice),
         (angle_deg < MIN_TRI_ANGLE_DEG,
          f"half of the points are seen from directions within {angle_deg:.1f} deg", advice),
@@ -552,7 +490,6 @@ def confirmed(
     components: list[Component],
     others: list[Component],
     focal_source: FocalSource,
-    options: ConfirmationOptions = ConfirmationOptions(),
 ) -> list[Component]:
     """Reject components of uncertain cameras unless a second mapper reproduces them.
 
@@ -563,13 +500,13 @@ def confirmed(
     """
     checked = list[Component]()
     for component in components:
-        if not component.problem and component.centre_sigma > options.sure_sigma:
+        if not component.problem and component.centre_sigma > SURE_SIGMA:
             is_guess = focal_source is FocalSource.GUESS
-            can_confirm = not is_guess or component.centre_sigma <= options.guess_sigma
+            can_confirm = not is_guess or component.centre_sigma <= GUESS_SIGMA
             found = [other.arrays for other in others if can_confirm]
-            rows = _reproduced_by(component.arrays, found, options)
+            rows = _reproduced_by(component.arrays, found)
             component = replace(component, kept=component.arrays.ids[rows])
-            if len(rows) < options.images * len(component.arrays.ids):
+            if len(rows) < CONFIRMED * len(component.arrays.ids):
                 problem = (
                     "the camera positions are uncertain, and no second mapper confirms them "
                     f"(largest sigma {100 * component.centre_sigma:.2g} % of the trajectory, "
@@ -581,29 +518,27 @@ def confirmed(
     return sorted(checked, key=lambda c: (bool(c.problem), -c.registered))
 
 
-def _reproduced_by(
-    one: ModelArrays, others: Sequence[ModelArrays], options: ConfirmationOptions
-) -> IntArray:
+def _reproduced_by(one: ModelArrays, others: Sequence[ModelArrays]) -> IntArray:
     """Return the images (rows of one) with the same poses in another mapper's models.
 
     Those may be pieces. A piece only proves the relative poses of its own cameras. What joins it to
     the others are points that both triangulate: of two scenes that look alike there are few, and
     none where a single image, or a pair without a third, connects two scales.
     """
-    pieces = sorted((_same(one, other, options) for other in others), key=len, reverse=True)
+    pieces = sorted((_same(one, other) for other in others), key=len, reverse=True)
     rows = pieces[0] if pieces else np.empty(0, np.int64)
     todo = pieces[1:]
     while joined := [
         piece
         for piece in todo
-        if (one.triangulated_by(rows) & one.triangulated_by(piece)).sum() >= options.joint_points
+        if (one.triangulated_by(rows) & one.triangulated_by(piece)).sum() >= JOINT_POINTS
     ]:
         rows = np.union1d(rows, joined[0])
         todo = [piece for piece in todo if piece is not joined[0]]
     return np.sort(rows)
 
 
-def _same(one: ModelArrays, other: ModelArrays, options: ConfirmationOptions) -> IntArray:
+def _same(one: ModelArrays, other: ModelArrays) -> IntArray:
     """Return the images that another model has, rows (n,) of one; none unless all poses agree.
 
     One is aligned to the other by the mean of the relative orientations, then scale and shift.
@@ -624,7 +559,7 @@ def _same(one: ModelArrays, other: ModelArrays, options: ConfirmationOptions) ->
     end = end - end.mean(0)
     moved *= (moved * end).sum() / max((moved**2).sum(), 1e-12)
     offset = np.linalg.norm(moved - end, axis=1).max() / np.linalg.norm(np.ptp(end, axis=0))
-    agrees = offset <= options.centre and turn_deg.max() <= options.turn_deg
+    agrees = offset <= SAME_CENTRE and turn_deg.max() <= SAME_TURN_DEG
     return rows[: len(ids) if agrees else 0]
 
 
@@ -635,8 +570,7 @@ def _median_tri_angle_deg(arrays: ModelArrays) -> float:
     step = max(1, len(arrays.xyz) // 2000)  # a sample: all points take long
     sample = np.flatnonzero(arrays.point % step == 0)
     sample = sample[np.argsort(arrays.point[sample], kind="stable")]
-    ray = arrays.xyz[arrays.point[sample]] - arrays.centre[arrays.image[sample]]  # (m, 3)
-    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    ray = unit_rows(arrays.xyz[arrays.point[sample]] - arrays.centre[arrays.image[sample]])
     starts = np.flatnonzero(np.diff(arrays.point[sample], prepend=-1))
     cosine = [(u @ u.T).min() for u in np.split(ray, starts[1:])]  # of each point
     return float(np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1))))
@@ -649,8 +583,7 @@ def _parallax_px(arrays: ModelArrays) -> float:
     residual is the pair's parallax. Returned is the 95th percentile over pairs. A camera that only
     rotated looks sound otherwise: a wrong focal length produces triangulation angles.
     """
-    unit = np.insert(arrays.ideal, 2, 1, 1)  # (M, 3)
-    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    unit = unit_rows(np.insert(arrays.ideal, 2, 1, 1))  # (M, 3)
     ends = np.searchsorted(arrays.image, np.arange(len(arrays.ids) + 1))
     residuals = []
     for a, b in itertools.combinations(range(len(arrays.ids)), 2):
@@ -668,50 +601,41 @@ def _parallax_px(arrays: ModelArrays) -> float:
 # ---- Zoom ----------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class ZoomOptions:
-    """When the focal length changes between two consecutive images.
-
-    Attributes:
-        window: images on one side whose points are used (chosen: a zoom bends those further off).
-        resected: images next to a gap whose focal length is measured, on each side.
-        log: least log of the change (measured, mean of both sides: zoomed by 1.25 to 1.5 .15-.30,
-            right models below .03).
-        log_one_side: the same where only one side can be measured: the noise of its depths biases
-            it (measured: zooms .34-.39, right models up to .12).
-        sigmas: of that change over its sigma (chosen; lower: noise of few points counts as a zoom).
-    """
-
-    window: int = 10
-    resected: int = 2
-    log: float = 0.12
-    log_one_side: float = 0.24
-    sigmas: float = 5.0
+# When the focal length changes between two consecutive images
+ZOOM_WINDOW = 10  # images on one side whose points are used (chosen: a zoom bends farther ones)
+RESECTED = 2  # images next to a gap whose focal length is measured, on each side
+# Least log of the change (measured, mean of both sides: zoomed by 1.25 to 1.5 .15-.30, right models
+# below .03)
+ZOOM_LOG = 0.12
+# The same where only one side can be measured: the noise of its depths biases it (measured: zooms
+# .34-.39, right models up to .12)
+ZOOM_LOG_ONE_SIDE = 0.24
+ZOOM_SIGMAS = 5.0  # of that change (chosen; lower: noise of few points counts as a zoom)
 
 
 def constant_focal(
-    models: list[ModelArrays], options: ZoomOptions = ZoomOptions()
+    models: list[ModelArrays], window: int = ZOOM_WINDOW
 ) -> tuple[IntArray, list[tuple[int, int, float]]]:
     """Find the images that were not taken at the most frequent focal length.
 
     A mapper assumes one focal length: it shifts images of a zoomed stretch towards the scene.
 
     Args:
-        models: ids of images ascend in time.
+        models: ids of images ascend in time. window: images, as ZOOM_WINDOW.
     Returns:
         ids of the images of other focal lengths, or of one that cannot be compared; of each change
         the ids of the images before and after it and the ratio of their focal lengths.
     """
-    changes = sorted(change for arrays in models for change in _changes(arrays, options))
+    changes = sorted(change for arrays in models for change in _changes(arrays, window))
     changes = [c for c in changes if not any(_is_side_effect(c, other) for other in changes)]
     ids = np.array(sorted({int(i) for arrays in models for i in arrays.ids}), np.int64)
     starts = np.searchsorted(ids, [after for _, after, _ in changes])
     log = np.zeros(len(ids))
     for k, (start, (_, _, ratio)) in enumerate(zip(starts, changes, strict=True)):
         # else each bends the other's images
-        is_measured = not k or start - starts[k - 1] >= options.window
+        is_measured = not k or start - starts[k - 1] >= window
         log[start:] += np.log(ratio) if is_measured else 10  # as of another camera
-    same = np.abs(log[:, None] - log) < options.log  # (R, R)
+    same = np.abs(log[:, None] - log) < ZOOM_LOG  # (R, R)
     return ids[~same[same.sum(1).argmax()]] if len(ids) else ids, changes
 
 
@@ -726,17 +650,15 @@ def _is_side_effect(one: tuple[int, int, float], other: tuple[int, int, float]) 
     return bool(adjacent and log * other_log > 0 and abs(log) < abs(other_log))
 
 
-def _changes(arrays: ModelArrays, options: ZoomOptions) -> list[tuple[int, int, float]]:
+def _changes(arrays: ModelArrays, window: int) -> list[tuple[int, int, float]]:
     """List the changes of the focal length between consecutive images.
 
     The images next to each gap are resected from points of the other side.
     """
-    window = options.window
-    resected = options.resected
     count = len(arrays.ids)
     changes = list[tuple[int, int, float]]()
     ray = np.insert(arrays.ideal, 2, 1, 1)[:, None] @ arrays.cam_from_world[arrays.image][:, :, :3]
-    ray = ray[:, 0] / np.linalg.norm(ray[:, 0], axis=1, keepdims=True)  # (M, 3) in world
+    ray = unit_rows(ray[:, 0])  # (M, 3) in world
     across = np.eye(3) - ray[:, :, None] * ray[:, None]  # (M, 3, 3)
     start = (across @ arrays.centre[arrays.image][:, :, None])[:, :, 0]
     terms = np.hstack([across.reshape(-1, 9), start, ray, np.ones((len(ray), 1))])  # (M, 16)
@@ -744,15 +666,15 @@ def _changes(arrays: ModelArrays, options: ZoomOptions) -> list[tuple[int, int, 
         before = range(max(0, k - window), k)
         after = range(k, min(k + window, count))
         sides = list[list[list[float]]]()
-        for side, images, sign in ((before, after[:resected], 1), (after, before[-resected:], -1)):
+        for side, images, sign in ((before, after[:RESECTED], 1), (after, before[-RESECTED:], -1)):
             points = _triangulate(arrays, terms, side)
             values = np.array([_log_focal(arrays, image, points) for image in images])
             values = values * [sign, 1]
             sides.append(values[np.isfinite(values[:, 0])].tolist())
         if any(sides):
             log, sigma = np.median(list(itertools.chain(*sides)), axis=0)
-            least = options.log if all(sides) else options.log_one_side
-            if abs(log) > max(least, options.sigmas * sigma):
+            least = ZOOM_LOG if all(sides) else ZOOM_LOG_ONE_SIDE
+            if abs(log) > max(least, ZOOM_SIGMAS * sigma):
                 ids = int(arrays.ids[k - 1]), int(arrays.ids[k])
                 changes.append((*ids, float(np.exp(log))))
     return changes
