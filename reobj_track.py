@@ -151,7 +151,6 @@ from reobj.results.export import EXPORTS, Viewer, export
 from reobj.results.links import Links
 from reobj.results.live import LivePage, open_viewer
 from reobj.results.names import OutputFile
-from reobj.results.overlay import film_layers
 from reobj.results.plausibility import implausible
 from reobj.results.result import Object, Part, Result, VideoInfo, World
 from reobj.results.saving import (
@@ -278,16 +277,9 @@ class TrackerConfig:
 class OutputConfig:
     """Files written."""
 
-    overlay: str = option(
-        "solids",
-        "layers of the overlay video besides boxes: solids, ellipses, trails; none: no video",
-    )
+    overlay: bool = option(True, "write the overlay video, overlay.mp4")
     scene: bool = option(True, "write the viewer, scene.html")
-    cloud: bool = option(
-        False,
-        "dense coloured points in the viewer: from the maps of --depth, else from optical flow, "
-        "about a minute longer",
-    )
+    cloud: bool = option(False, "dense coloured points in the viewer, from the maps of --depth")
     doubtful: bool = option(
         False, "include low-confidence objects in tracks.txt, overlay video and viewer"
     )
@@ -296,9 +288,6 @@ class OutputConfig:
         "interpolate track gaps of up to N frames (0: off); interpolated boxes have score 0. 3D "
         "objects are also projected into frames from nearby viewpoints",
     )
-
-    def __post_init__(self) -> None:
-        film_layers(self.overlay)  # an invalid value is an error before the run starts
 
 
 @dataclass(frozen=True, slots=True)

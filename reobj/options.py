@@ -61,7 +61,7 @@ def with_option(config: C, name: str, value: Any, where: str = "--set ") -> C:
     try:
         if isinstance(value, str) and kind is bool:
             value = {"1": True, "true": True, "yes": True, "on": True, "0": False, "false": False,
-                     "no": False, "off": False}[value.lower()]  # fmt: skip
+                     "no": False, "off": False, "none": False}[value.lower()]  # fmt: skip
         elif isinstance(value, (bool, float)) and kind is int:
             raise TypeError
         value = _text(value) if kind is str else kind(value)

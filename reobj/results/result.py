@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 import quadrics
 from reobj.cameras import Poses
-from reobj.results import notebook, report, saving, table
+from reobj.results import report, saving, scene, table
 from reobj.results.changes import Changes, EarlierSession
 from reobj.results.edits import Edits
 from reobj.results.entries import Object, Part, VideoInfo, World, found_text
@@ -88,7 +88,7 @@ class Result:
 
     def _repr_html_(self) -> str:
         """Show the objects and the viewer in a notebook."""
-        return notebook.to_html(self)
+        return scene.to_html(self)
 
     def object(self, number: int) -> Object:
         """Return the object of a number.
