@@ -542,27 +542,21 @@ def test_a_component_without_scale_is_not_reported_in_metres(parted: rt.Result) 
 # ---- Overlay and viewer ----
 
 
-def ellipse_box(dual_c: np.ndarray) -> np.ndarray:
-    """Corners of the box around a conic, xyxy: x = (c02 -+ sqrt(c02^2 - c00 c22)) / c22."""
-    c = dual_c / dual_c[2, 2]
-    half = np.sqrt([c[0, 2] ** 2 - c[0, 0], c[1, 2] ** 2 - c[1, 1]])
-    return np.concatenate([c[:2, 2] - half, c[:2, 2] + half])
-
-
 def test_the_overlay_draws_each_component_in_its_frames(parted: rt.Result, tmp_path: Path) -> None:
     class Facts:
         config, fps, size = rt.InputConfig(), 30.0, SIZE
         files: tuple[str, ...] = ()
 
     video: Any = Facts()
-    overlay = Overlay(parted, tmp_path / "a.mp4", video, "ellipses")
+    overlay = Overlay(parted, tmp_path / "a.mp4", video)
     overlay.close(False)
-    assert sorted(overlay.outlines) == [f for f in range(64) if f not in (38, 39, 40)]
+    assert sorted(overlay.cameras) == [f for f in range(64) if f not in (38, 39, 40)]
     for frame in (0, 20, 37, 41, 63):
-        ids, dual_c, visible = overlay.outlines[frame]
-        assert Overlay(parted, tmp_path / "b.mp4", video).cameras[frame][1] == ids
-        assert ids == ([1, 2, 3] if frame < BREAK else [4, 5, 6]) and visible.all()
-        boxes = np.array([ellipse_box(c) for c in dual_c])
+        component, pose = overlay.cameras[frame]
+        assert component.ids == ([1, 2, 3] if frame < BREAK else [4, 5, 6])
+        ends = component.solids.ends.reshape(3, -1, 3)
+        pixels = component.poses.camera.project(ends @ pose[:, :3].T + pose[:, 3])
+        boxes = np.concatenate([pixels.min(1), pixels.max(1)], 1)
         seen = parted.tracks.xyxy[parted.tracks.frame == frame]
         np.testing.assert_allclose(boxes, seen, atol=0.2 * (seen[:, 3] - seen[:, 1]).max())
 

@@ -131,7 +131,7 @@ def test_poses_in_every_format(
 )  # fmt: skip
 def test_every_solver(out: Path, solver: str, centre_m: float, size: float, rate: float) -> None:
     """SfMO assumes affine cameras, so its sizes are not checked here: files and overlay only."""
-    pictures = ("--set", "output.overlay=solids", "--set", "output.scene=1")
+    pictures = ("--set", "output.overlay=1", "--set", "output.scene=1")
     assert cli("objects", out, "--solver", solver, *pictures) == 0
     warning = "" if solver == "solids" else f"objects.solver={solver}: "
     assert_right(out, centre_m=centre_m, size=size, hit_rate=rate, warning=warning)

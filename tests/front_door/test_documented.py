@@ -273,11 +273,6 @@ def detected_fast(desk: Path) -> None:
     detected(desk, 0.4, 0.3)
 
 
-def dense(desk: Path) -> None:
-    """The viewer has dense points."""
-    assert '"dense":{"count":' in (desk / "out/scene.html").read_text()
-
-
 def scaled(desk: Path) -> None:
     """The scale follows the chairs, whose heights come out 2 to 10 % too small."""
     scale = info(desk / "out")["world"]["scale"]
@@ -375,9 +370,6 @@ SHOWN = {
         recording, right_identities, f"--detections det.npz {LONG}"
     ),
     TOOL + "objects out --known-size chair=0.82m": Shown(output, scaled, PLAIN, folder="out"),
-    TOOL + "objects OUT --set output.cloud=true": Shown(
-        output, dense, "--set output.overlay=none", NAMED, "out"
-    ),
     TOOL + "eval out --gt gt.txt": Shown(output, evaluated, folder="out"),
     TOOL + "export out --to coco-vid": Shown(output, exported, folder="out"),
     TOOL + "poses VIDEO -o OUT": Shown(recording, located, FIRST, NAMED),

@@ -24,7 +24,7 @@ from simulated import SIZE, fitted, tracks_of, unlinked, walk, with_fitted_covar
 
 import reobj_track as rt
 from front_door.room import ROOM, cli
-from reobj.results import film, overlay, scene
+from reobj.results import overlay, scene
 from reobj.results.export import EXPORTS
 from reobj.results.result import VideoInfo
 from reobj.results.scene import write_pictures
@@ -208,7 +208,7 @@ def test_every_result_is_written_drawn_and_exported(
     result = dataclasses.replace(result, video=VideoInfo(str(source.source), *SIZE, 30.0))
     result.save(out)
     for doubtful in (False, True):
-        assert write_pictures(result, out, source, "solids,ellipses,trails", True, doubtful) == []
+        assert write_pictures(result, out, source, True, True, doubtful) == []
     shown = cv2.VideoCapture(str(next(out.glob("overlay.*"))))
     assert shown.get(cv2.CAP_PROP_FRAME_COUNT) == FRAMES
     json.loads((out / "objects.json").read_text(), parse_constant=pytest.fail)
@@ -239,7 +239,7 @@ def test_no_absurd_covariance_reaches_a_file(
         absurd_covariance(plain), video=VideoInfo(str(source.source), *SIZE, 30.0)
     )
     result = result.save(tmp_path)
-    assert write_pictures(result, tmp_path, source, "none") == []
+    assert write_pictures(result, tmp_path, source, False) == []
     assert "the boxes hardly determine its place and size: objects 1, 2, 3" in " ".join(
         result.summary().split()
     )
@@ -300,7 +300,7 @@ def fails(error: Exception) -> Any:
 BROKEN = [
     (overlay.Overlay, "__init__", ValueError("zip() is longer"), "overlay", ["scene.html"]),
     (overlay.Overlay, "take", ValueError("zip() is longer"), "overlay", ["scene.html"]),
-    (film.FilmWriter, "write", OSError(errno.ENOSPC, "full"), "overlay", ["scene.html"]),
+    (overlay.FilmWriter, "write", OSError(errno.ENOSPC, "full"), "overlay", ["scene.html"]),
     (scene.Pictures, "__init__", KeyError(7), "scene", ["overlay"]),
     (scene.Pictures, "take", cv2.error("no image"), "scene", ["overlay"]),
     (scene, "write_scene", OSError(errno.ENOSPC, "full"), "scene", ["overlay"]),
