@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser as Chromium
     from playwright.sync_api import Page
+
+try:
+    from playwright.sync_api import Error
+except ImportError:  # tests with a browser are skipped then
+    Error = RuntimeError  # type: ignore[misc,assignment]
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 FLAGS = ["--enable-unsafe-swiftshader", "--use-angle=swiftshader", "--disable-gpu"]
@@ -67,10 +74,16 @@ class Browser:
         """Wait until two frames are drawn."""
         self.eval("new Promise(f => requestAnimationFrame(() => requestAnimationFrame(f)))")
 
-    def wait(self, condition: str) -> None:
+    def wait(self, condition: str, seconds: float = 60) -> None:
         """Wait until a JavaScript expression is true, also while the page is read again."""
         safe = f"(() => {{ try {{ return Boolean({condition}) }} catch {{ return false }} }})()"
-        self.page.wait_for_function(safe, timeout=60_000)
+        end = time.monotonic() + seconds
+        is_true = False
+        while not is_true:
+            assert time.monotonic() < end, condition
+            self.page.wait_for_timeout(50)
+            with contextlib.suppress(Error):  # the page is read again
+                is_true = self.eval(safe)
 
     def click(self, x: float, y: float) -> None:
         self.page.mouse.click(x, y)

@@ -358,6 +358,7 @@ def test_a_distance_has_the_sigma_of_both_ends_and_of_the_scale(
         assert browser.eval(f"decimals({sigma})") == decimals(sigma)
     browser.press("Escape")
     assert browser.eval("document.querySelector('.measure text')") is None
+    browser.open(page)  # the scale of the file again
     browser.eval("setMeasure(true); state.hidden = new Set(here.map(o => o.class)); draw()")
     array = "cloud.geometry.attributes.position.array"
     for i in (30, 300):

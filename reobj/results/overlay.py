@@ -87,11 +87,14 @@ def draw_tracks(
     texts = [labels.get(obj, str(obj)) for obj in ids]
     sizes = np.array([_text_size(image, text) for text in texts], int).reshape(-1, 2)
     spots = place_labels(ids, sizes, boxes, (image.shape[1], image.shape[0]), positions)
-    for obj, text, spot, size, box in zip(ids, texts, spots, sizes, boxes, strict=True):
+    for obj, text, spot, size, box in zip(ids, texts, spots, sizes.tolist(), boxes, strict=True):
         if spot is not None:
             color = marks.get(obj, object_color(obj))
-            _draw_leader(image, np.array([*spot, *(spot + size)]), box, color)
-            _draw_label(image, text, spot, color)
+            right, bottom = (spot[0] + size[0], spot[1] + size[1])
+            _draw_leader(image, np.array([*spot, right, bottom]), box, color)
+            cv2.rectangle(image, spot, (right - 1, bottom - 1), color, -1)
+            ink = (0,) * 3 if sum(color) > 380 else (255,) * 3  # black on light colours
+            _draw_text(image, text, spot[0] + 2 * _width_of(image), bottom, ink)
 
 
 def _draw_box(image: Image, box: IntArray, color: Color, thickness: int, dashed: bool) -> None:
@@ -119,7 +122,7 @@ def _draw_dashes(image: Image, line: Array | IntArray, color: Color, thickness: 
 
 
 def _text_size(image: Image, text: str) -> tuple[int, int]:
-    """Return the width and height of a label."""
+    """Return the width and height of a label; its text is readable in a frame of 640 px."""
     width = _width_of(image)
     (wide, high), base = cv2.getTextSize(text, FONT, 0.45 * width, width)
     return wide + 4 * width, high + base + 2 * width
@@ -127,18 +130,8 @@ def _text_size(image: Image, text: str) -> tuple[int, int]:
 
 def _draw_text(image: Image, text: str, left: int, bottom: int, color: Color) -> None:
     width = _width_of(image)
-    scale = 0.45 * width  # readable in a frame of 640 px
-    base = cv2.getTextSize(text, FONT, scale, width)[1]
-    cv2.putText(image, text, (left, bottom - base), FONT, scale, color, width, cv2.LINE_AA)
-
-
-def _draw_label(image: Image, text: str, spot: tuple[int, int], color: Color) -> None:
-    """Draw text on a filled rectangle with its top-left corner at `spot`."""
-    x, y = spot
-    width, height = _text_size(image, text)
-    cv2.rectangle(image, (x, y), (x + width - 1, y + height - 1), color, -1)
-    ink = (0,) * 3 if sum(color) > 380 else (255,) * 3  # black on light colours
-    _draw_text(image, text, x + 2 * _width_of(image), y + height, ink)
+    base = cv2.getTextSize(text, FONT, 0.45 * width, width)[1]
+    cv2.putText(image, text, (left, bottom - base), FONT, 0.45 * width, color, width, cv2.LINE_AA)
 
 
 def place_labels(

@@ -473,18 +473,14 @@ class _Handler(LocalHandler):
 def _range(text: str, size: int) -> tuple[int, int] | None:
     """Return first and last byte of a Range header; None if no byte is in the file.
 
-    >>> _range("bytes=2-", 10), _range("bytes=-3", 10), _range("", 10), _range("bytes=10-", 10)
-    ((2, 9), (7, 9), (0, 9), None)
+    >>> _range("bytes=2-", 10), _range("bytes=2-5", 10), _range("", 10), _range("bytes=10-", 10)
+    ((2, 9), (2, 5), (0, 9), None)
     """
-    found = re.fullmatch(r"bytes=(\d{0,18})-(\d{0,18})", text.replace(" ", ""))
-    if found is None or not (found[1] or found[2]):  # several ranges: the whole file
+    found = re.fullmatch(r"bytes=(\d{1,18})-(\d{0,18})", text)
+    if found is None:  # browsers ask for no other ones: the whole file
         return 0, size - 1
-    if not found[1]:
-        first = max(size - int(found[2]), 0)
-        last = size - 1
-    else:
-        first = int(found[1])
-        last = min(int(found[2] or size), size - 1)
+    first = int(found[1])
+    last = min(int(found[2] or size), size - 1)
     return (first, last) if first <= last else None
 
 
