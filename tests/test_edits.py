@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -14,7 +13,6 @@ import pytest
 from simulated import SIZE, fitted, tracks_of, unlinked, walk, with_columns
 
 import reobj_track as rt
-from reobj.objects.fit import link_and_fit
 from reobj.results.edits import apply_edits, read_edits
 from reobj.results.workspace import Workspace
 
@@ -209,6 +207,12 @@ def folder(parted_folder: Path, tmp_path: Path) -> Path:
     return shutil.copytree(parted_folder, tmp_path / "out")
 
 
+def refit(out: Path, *words: str | Path) -> int:
+    """Run `objects OUT` without pictures."""
+    off = ("--set", "output.overlay=none", "--set", "output.scene=false")
+    return rt.main(["objects", str(out), *map(str, words), *off])
+
+
 def box_of(out: Path, number: int) -> dict[str, Any]:
     """The reference of an object in an output folder: its first box."""
     rows = np.loadtxt(out / "tracks.txt", delimiter=",")
@@ -233,7 +237,7 @@ def test_edits_are_stored_in_the_folder(folder: Path, tmp_path: Path, capsys: An
         {"do": "rename", "object": box_of(folder, 2), "class": "stool"},
         {"do": "delete", "object": box_of(folder, 6)},
     )
-    assert rt.main(["objects", str(folder), "--edits", str(path)]) == 0
+    assert refit(folder, "--edits", path) == 0
     expected = [(1, "chair"), (2, "stool"), (3, "chair"), (4, "chair")]
     result = rt.Result.load(folder)
     assert listed(folder) == expected
@@ -245,14 +249,15 @@ def test_edits_are_stored_in_the_folder(folder: Path, tmp_path: Path, capsys: An
     stored = json.loads((folder / "edits.json").read_text())
     assert stored["edits"] == json.loads(path.read_text())["edits"]
     for options in ([], ["--support", "cylinder"]):
-        assert rt.main(["objects", str(folder), *options]) == 0
+        assert refit(folder, *options) == 0
         assert listed(folder) == expected
         assert "3 corrections by hand applied" in capsys.readouterr().err
-    assert rt.main(["objects", str(folder), "--edits", str(write(path))]) == 0  # none any more
+    assert refit(folder, "--edits", write(path)) == 0  # none any more
     assert [o.id for o in rt.Result.load(folder).objects] == [1, 2, 3, 4, 5, 6]
     assert not (folder / "edits.json").exists()
 
 
+@pytest.mark.slow
 def test_two_halves_that_are_merged_are_one_object(tmp_path: Path, capsys: Any) -> None:
     """The detector gives the middle chair as two halves; the boxes of the merge can be named."""
     poses = walk()
@@ -274,11 +279,11 @@ def test_two_halves_that_are_merged_are_one_object(tmp_path: Path, capsys: Any) 
     tracks = rt.Tracks.joined([with_columns(whole, xyxy=left), right])
     workspace.save_last(unlinked(poses, tracks), poses)
     options = ("--set", "objects.link=false")
-    assert rt.main(["objects", str(out), *options]) == 0
+    assert refit(out, *options) == 0
     assert [o.id for o in rt.Result.load(out).objects] == [1, 2, 3, 4]
     merge = {"do": "merge", "object": box_of(out, 2), "with": box_of(out, 4)}
     path = write(tmp_path / "e.json", merge)
-    assert rt.main(["objects", str(out), "--edits", str(path), *options]) == 0
+    assert refit(out, "--edits", path, *options) == 0
     result = rt.Result.load(out)
     assert [o.id for o in result.objects] == [1, 2, 3]
     rows = result.tracks[result.tracks.track_id == 2]
@@ -288,7 +293,7 @@ def test_two_halves_that_are_merged_are_one_object(tmp_path: Path, capsys: Any) 
     assert result.objects[1].center == pytest.approx(expected.center, abs=0.02)
     assert result.objects[1].size_m == pytest.approx(expected.size_m, abs=0.03)
     rename = {"do": "rename", "object": box_of(out, 2), "class": "stool"}
-    assert rt.main(["objects", str(out), "--edits", str(write(path, merge, rename)), *options]) == 0
+    assert refit(out, "--edits", write(path, merge, rename), *options) == 0
     assert listed(out) == [(1, "chair"), (2, "stool"), (3, "chair")]
 
 
@@ -301,7 +306,7 @@ def test_bad_edits_write_nothing(folder: Path, tmp_path: Path, capsys: Any, bad:
         lost = {"do": "delete", "object": {"id": 1, "frame": 3, "box": [0, 0, 5, 5]}}
         write(path, lost)
     before = state(folder)
-    assert rt.main(["objects", str(folder), "--edits", str(path)]) == 2
+    assert refit(folder, "--edits", path) == 2
     said = capsys.readouterr().err.strip().splitlines()[-1]
     assert said.startswith(f"error: {path}")
     assert state(folder) == before
@@ -324,30 +329,11 @@ def test_given_identities_replace_edits(folder: Path, tmp_path: Path, capsys: An
     before = state(folder)
     assert rt.main(both) == 2 and "one at a time" in capsys.readouterr().err
     assert state(folder) == before
-    assert rt.main(["objects", str(folder), "--edits", str(path)]) == 0
+    assert refit(folder, "--edits", path) == 0
     shutil.copy(folder / "tracks.txt", tmp_path / "tracks.txt")
-    assert rt.main(["objects", str(folder), "--tracks", str(tmp_path / "tracks.txt")]) == 0
+    assert refit(folder, "--tracks", tmp_path / "tracks.txt") == 0
     assert "edits.json removed" in capsys.readouterr().err
     assert not (folder / "edits.json").exists() and len(rt.Result.load(folder).objects) == 5
     last = write(tmp_path / "e.json", {"do": "delete", "object": box_of(folder, 5)})
-    assert rt.main(["objects", str(folder), "--edits", str(last)]) == 0  # upon given identities
+    assert refit(folder, "--edits", last) == 0  # upon given identities
     assert len(rt.Result.load(folder).objects) == 4
-
-
-def test_embeddings_follow_their_rows(tmp_path: Path) -> None:
-    """Those of a deleted object are removed; the others stay aligned with their rows."""
-    poses = walk()
-    tracks = tracks_of(poses)
-    result = unlinked(poses, tracks)
-    rows = np.arange(0, len(tracks), 4)
-    result = dataclasses.replace(result, embedding_row=rows)
-    vectors = np.random.default_rng(0).normal(size=(len(rows), 8)).astype(np.float16)
-    result = dataclasses.replace(result, embeddings=rt.Embeddings(vectors, vectors[:, :0]))
-    box = tracks.xyxy[tracks.track_id == 2][0].tolist()
-    edit = {"do": "delete", "object": {"id": 2, "frame": 0, "box": box}}
-    result = dataclasses.replace(result, edits=read_edits(write(tmp_path / "e.json", edit)))
-    result = link_and_fit(result, rt.ObjectsConfig(link=False))
-    kept = tracks.track_id[rows] != 2
-    assert len(result.tracks) == 80 and SIZE == (640, 480)
-    np.testing.assert_array_equal(result.embeddings.foreground, vectors[kept])
-    np.testing.assert_array_equal(result.tracks.xyxy[result.embedding_row], tracks.xyxy[rows[kept]])

@@ -26,9 +26,6 @@ from front_door.room import ROOM
 from simulated import SIZE, tracks_of, unlinked, walk
 
 import reobj_track as rt
-from reobj.maps.folder_map import FolderMap
-from reobj.maps.stage import session_key
-from reobj.results.edits import read_edits
 from reobj.results.workspace import Workspace
 
 TOOL = Path(rt.__file__)
@@ -297,41 +294,6 @@ def test_undo_restores_the_map(flat: Path) -> None:
     assert in_map(flat) == before
     assert [(o.id, o.class_name) for o in rt.Result.load(flat / "b").located] == shown
     assert not list((flat / "b/cache/undo").iterdir())
-
-
-@pytest.mark.slow
-def test_undo_that_was_killed_is_repeated(flat: Path) -> None:
-    """Server and worker are killed once the map is restored: it is complete, and undo still works.
-
-    The save before it had no end either: the worker finished, but the server did not learn of it.
-    """
-    before = in_map(flat)
-    out = flat / "b"
-    undo_file = out / "cache/undo/1.json"
-    edits = flat / "edits.json"
-    edits.write_bytes(map_edits(flat))
-    room = FolderMap(flat / "flat.map", session_key(Workspace(out).video()), False)
-    room.keep(undo_file.with_suffix(".map"), read_edits(edits))
-    undo_file.write_bytes(edits_of(out))
-    assert rt.main(["objects", str(out), "--edits", str(edits)]) == 0
-    assert in_map(flat)[1:] != before[1:]
-    kill_during_undo(out)
-    assert in_map(flat)[1:] == before[1:] and (out / "edits.json").is_file()
-    with serving(out) as client:
-        assert client.state()["undo"] == 1
-        assert undo(client)[0] == 200 and not client.finished()["failed"]
-    assert in_map(flat) == before and not (out / "edits.json").exists()
-
-
-def kill_during_undo(out: Path) -> None:
-    """Begin to undo; kill server and worker as soon as the worker runs."""
-    with pytest.raises(AssertionError), serving(out) as client:  # the server does not end well
-        assert undo(client)[0] == 200
-        while not (workers := workers_of(client)):
-            time.sleep(0.02)
-        client.process.kill()
-        for worker in workers:
-            os.kill(worker, signal.SIGKILL)
 
 
 def test_undo_that_fails_or_is_ended_leaves_the_map(flat: Path) -> None:
