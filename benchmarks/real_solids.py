@@ -65,9 +65,9 @@ import quadrics
 import reobj_track as rt
 from reobj.files import atomic, load_json
 from reobj.results.evaluation_3d import MIN_HALF_AXIS, align_with_truth, read_true_objects
-from reobj.results.overlay import draw_ellipses, draw_tracks
+from reobj.results.overlay import draw_tracks, outline_of, surface_points
 from reobj.results.truth import LabelledBoxes, Role, read_result, read_truth
-from reobj.types import Array, Image, IntArray, box_iou, rows_by
+from reobj.types import Array, Image, IntArray, box_iou, object_color, rows_by
 
 SOLVERS = ("sfmo", "psfmo", "lfd", "solids")
 TRACKERS = {
@@ -579,10 +579,16 @@ def over(image: Image, scored: Scored, frame: int, title: str) -> Image:
             continue
         at = np.flatnonzero((part.poses.frame == frame) & part.poses.known)
         for k in at:
-            matrix = part.poses.camera.K @ part.poses.cam_from_world[k]
-            dual_c, ok = quadrics.project(part.ellipsoids().dual_quadrics(), matrix[None])
-            ids = [o.id for o in part.located]
-            draw_ellipses(picture, dual_c[0], ok[0], ids, set(rows.track_id.tolist()))
+            for row, found in enumerate(part.located):
+                one = part.ellipsoids()[row]
+                points = surface_points(
+                    one.center_in_world, one.half_axes, one.world_from_obj, "ellipsoid"
+                )
+                outline = outline_of(part.poses.camera, part.poses.cam_from_world[k], points)
+                if outline is not None:
+                    width = 2 if found.id in rows.track_id else 1
+                    line = [outline.round().astype(np.int32)]
+                    cv2.polylines(picture, line, True, object_color(found.id), width, cv2.LINE_AA)
     own = scored.figures()
     text = f"{title}: {own['found']} of {own['true']}, {own['duplicates']} duplicates"
     picture[:24] = 255

@@ -77,10 +77,8 @@ class Pictures:
         dense: frames for dense points; None: without.
     """
 
-    def __init__(
-        self, result: Result, video: Video, dense: DenseFrames | None = None, max_crops: int = 480
-    ) -> None:
-        """Choose the crops, at most 8 of an object and `max_crops` of all, and 60 frames."""
+    def __init__(self, result: Result, video: Video, dense: DenseFrames | None = None) -> None:
+        """Choose the crops, at most 8 of an object and 480 of all, and 60 frames."""
         self.tracks = result.tracks
         self.scale = video.scale
         self.crops: dict[int, list[tuple[int, str]]] = {o.id: [] for o in result.objects}
@@ -88,7 +86,7 @@ class Pictures:
         poses = [part.poses for part in result.parts()]
         self.best: dict[int, int] = {}
         chosen = [np.empty(0, np.int64)]
-        left = max_crops
+        left = 480
         ranked = sorted(result.objects, key=lambda o: -o.frames_seen)
         for doubtful in (False, True):  # low-confidence objects get the remaining crops
             group = [o for o in ranked if (o.status == "doubtful") == doubtful]
@@ -145,13 +143,13 @@ def _distorted(camera: Camera, xy: Array) -> Array:
     return np.asarray(np.nan_to_num(camera.distort(xy), nan=-0.5))
 
 
-def _lens(camera: Camera, columns: int = 64, rows: int = 48) -> dict[str, Any] | None:
+def _lens(camera: Camera) -> dict[str, Any] | None:
     """Return where the corners of a grid over the pinhole picture lie in a frame; None: the same.
 
-    Args:
-        columns, rows: of cells; within one the viewer neglects that its sides are inclined: a tenth
-            of a pixel of the screen at the distortion of a phone.
+    Within a cell the viewer neglects that its sides are inclined: a tenth of a pixel of the screen
+    at the distortion of a phone.
     """
+    columns, rows = (64, 48)
     if camera.model in PINHOLES:
         return None
     x = np.linspace(0, camera.width, columns + 1)
@@ -186,16 +184,13 @@ def _base64(data: bytes) -> str:
     return base64.b64encode(data).decode()
 
 
-def best_pictures(
-    result: Result, video: Video, line: Progress, size_px: int = 160
-) -> dict[int, bytes]:
+def best_pictures(result: Result, video: Video, line: Progress) -> dict[int, bytes]:
     """Return a JPEG of the best box of each object with a shape in the first component.
 
     Args:
-        line: of the progress; its steps are frames. size_px: longest side: 1.7 kB a picture in
-            rendered rooms.
+        line: of the progress; its steps are frames.
     Returns:
-        pictures by identity.
+        pictures by identity, 1.7 kB each in rendered rooms.
     """
     poses = result.of_part(0).poses
     objects = [o for o in result.located if o.part == 0]
@@ -205,8 +200,7 @@ def best_pictures(
     pictures = {}
     for frame in video if len(row) else ():
         for k in row[frames == frame.index].tolist():
-            crop = _crop(frame.image, result.tracks.xyxy[k] * video.scale, size_px)
-            if crop:
+            if crop := _crop(frame.image, result.tracks.xyxy[k] * video.scale, 160):
                 pictures[int(result.tracks.track_id[k])] = crop
         line.step()
     line.close()
@@ -499,16 +493,16 @@ def _runs(mask: BoolArray) -> list[int]:
     return [int(at) for at in runs]
 
 
-def _references(detected: Tracks, most: int = 100) -> list[list[float]]:
-    """Choose boxes of an object, by time: the best one of each tracklet, and `most` spread evenly.
+def _references(detected: Tracks) -> list[list[float]]:
+    """Choose boxes of an object, by time: the best one of each tracklet, and 100 spread evenly.
 
-    Args:
-        most: 100 boxes of 50 objects are .2 MB of the page.
+    100 boxes of 50 objects are .2 MB of the page.
+
     Returns:
         frame, tracklet, x1, y1, x2, y2 of each, native pixels.
     """
     best = [rows[detected.score[rows].argmax()] for rows in rows_by(detected.tracklet_id)]
-    even = np.linspace(0, len(detected) - 1, min(most, len(detected))).round().astype(np.int64)
+    even = np.linspace(0, len(detected) - 1, min(100, len(detected))).round().astype(np.int64)
     row = np.union1d(np.array(best, np.int64), even)
     row = row[np.argsort(detected.frame[row], kind="stable")]
     numbers = zip(detected.frame[row].tolist(), detected.tracklet_id[row].tolist(), strict=True)
@@ -516,16 +510,10 @@ def _references(detected: Tracks, most: int = 100) -> list[list[float]]:
     return [[*pair, *box] for pair, box in zip(numbers, boxes, strict=True)]
 
 
-def _earlier_sessions(
-    sessions: Sequence[EarlierSession], max_pictures: int = 240
-) -> list[dict[str, Any]]:
-    """Collect the earlier recordings for the viewer: objects, changes, pictures.
-
-    Args:
-        max_pictures: of all, the latest ones; 240 are .5 MB of the page.
-    """
+def _earlier_sessions(sessions: Sequence[EarlierSession]) -> list[dict[str, Any]]:
+    """Collect the earlier recordings for the viewer: objects, changes, the latest pictures."""
     entries: list[dict[str, Any]] = []
-    left = max_pictures
+    left = 240  # pictures of all, .5 MB of the page
     for session in reversed(sessions):
         changes = session.changes
         count = len(session.objects)
@@ -619,7 +607,7 @@ def write_pictures(
             with faults.of("video"):
                 for frame in video if sinks and visible else ():
                     for name, sink in sinks:
-                        if name not in faults.found:
+                        if name not in faults:
                             with faults.of(name):
                                 sink.take(frame)
                     line.step()
@@ -627,23 +615,24 @@ def write_pictures(
         finally:
             if film is not None:
                 with faults.of("overlay"):
-                    film.close(line.complete and "overlay" not in faults.found)
-        if pictures is not None and "scene" not in faults.found:
+                    film.close(line.complete and "overlay" not in faults)
+        if pictures is not None and "scene" not in faults:
             with faults.of("scene"):
                 page = dataclasses.replace(result, warnings=[*result.warnings, *faults.messages()])
                 write_scene(page, pictures, out / "scene.html", video, doubtful, command)
     return faults.messages()
 
 
-class _Faults:
-    """Errors while the pictures of a result are written.
+FAULTS = {
+    "video": "no overlay video, and a viewer without later pictures: reading the video again "
+    "failed with {} (--set output.overlay=none omits the overlay)",
+    "overlay": "no overlay video: {} (--set output.overlay=none omits it)",
+    "scene": "no scene.html: {} (--set output.scene=false omits it)",
+}
 
-    Attributes:
-        found: the first error of "video" and of each option of the section `output`.
-    """
 
-    def __init__(self) -> None:
-        self.found: dict[str, Exception] = {}
+class _Faults(dict[str, Exception]):
+    """The first error of each key of FAULTS while the pictures of a result are written."""
 
     @contextlib.contextmanager
     def of(self, name: str) -> Iterator[None]:
@@ -654,19 +643,13 @@ class _Faults:
             if not isinstance(error, ReobjError | OSError) and os.environ.get("REOBJ_RAISE"):
                 raise
             log.debug("pictures: fault in %s", name, exc_info=True)
-            self.found.setdefault(name, error)
+            self.setdefault(name, error)
 
     def messages(self) -> list[str]:
         """Return what is missing, the reason, and the option to omit it."""
-        texts = {
-            "video": "no overlay video, and a viewer without later pictures: reading the video "
-            "again failed with {} (--set output.overlay=none omits the overlay)",
-            "overlay": "no overlay video: {} (--set output.overlay=none omits it)",
-            "scene": "no scene.html: {} (--set output.scene=false omits it)",
-        }
         return [
-            one_line(texts[name].format(f"{type(error).__name__}: {error}"))
-            for name, error in self.found.items()
+            one_line(FAULTS[name].format(f"{type(error).__name__}: {error}"))
+            for name, error in self.items()
         ]
 
 
