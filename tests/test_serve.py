@@ -163,24 +163,15 @@ def ids(out: Path) -> list[int]:
 
 
 def test_saved_corrections_are_applied_and_undone(out: Path) -> None:
-    """Two saves, two undos: the files of a result are those from before, byte for byte."""
+    """After the undo the files of a result are those from before, byte for byte."""
     names = ("tracks.txt", "poses.txt", "objects.ply")
     before = [(out / name).read_bytes() for name in names]
     with serving(out) as client:
-        first = edits_of(out, delete(out, 6))
-        both = edits_of(out, delete(out, 6), delete(out, 2))
-        for text, left in ((first, [1, 2, 3, 4, 5]), (both, [1, 3, 4, 5])):
-            status, answer = client.post(f"/edits?version={client.state()['version']}", text)
-            assert status == 200 and json.loads(answer)["running"], answer
-            state = client.finished()
-            assert not state["failed"] and ids(out) == left
-            assert state["texts"][0] == "starting"
-        assert client.state()["undo"] == 2
-        for left in ([1, 2, 3, 4, 5], [1, 2, 3, 4, 5, 6]):
-            status, _ = client.post(f"/undo?version={client.state()['version']}")
-            assert status == 200 and not client.finished()["failed"] and ids(out) == left
-        status, answer = client.post(f"/undo?version={client.state()['version']}")
-        assert (status, answer) == (409, "nothing to undo")
+        save(client, edits_of(out, delete(out, 6)))
+        assert ids(out) == [1, 2, 3, 4, 5] and client.state()["undo"] == 1
+        status, _ = undo(client)
+        assert status == 200 and not client.finished()["failed"]
+        assert undo(client) == (409, "nothing to undo")
     assert [(out / name).read_bytes() for name in names] == before
     assert not (out / "edits.json").exists() and not (out / "cache/new-edits.json").exists()
 
@@ -208,6 +199,7 @@ def test_corrections_that_fail_change_nothing(out: Path) -> None:
         assert not client.finished()["failed"] and ids(out) == [1, 2, 3, 4, 5]
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_the_worker_too(out: Path) -> None:
     before = {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()}
     with serving(out) as client:
@@ -281,6 +273,7 @@ def undo(client: Client) -> tuple[int, str]:
     return client.post(f"/undo?version={client.state()['version']}")
 
 
+@pytest.mark.slow
 def test_undo_restores_the_map(flat: Path) -> None:
     """Names, merged and deleted objects, and what both recordings saw."""
     before = in_map(flat)
@@ -296,6 +289,7 @@ def test_undo_restores_the_map(flat: Path) -> None:
     assert not list((flat / "b/cache/undo").iterdir())
 
 
+@pytest.mark.slow
 def test_undo_that_fails_or_is_ended_leaves_the_map(flat: Path) -> None:
     """Another run writes into the folder; then Ctrl-C while the worker runs."""
     out = flat / "b"
@@ -314,6 +308,7 @@ def test_undo_that_fails_or_is_ended_leaves_the_map(flat: Path) -> None:
     assert (flat / "flat.map").read_bytes() == saved and (out / "edits.json").is_file()
 
 
+@pytest.mark.slow
 def test_a_map_that_another_command_changed_is_left_alone(flat: Path) -> None:
     """Undo is refused in a line that names the map; map and folder stay as they are."""
     out = flat / "b"
@@ -331,6 +326,7 @@ def test_a_map_that_another_command_changed_is_left_alone(flat: Path) -> None:
     assert [path.read_bytes() for path in files] == content
 
 
+@pytest.mark.slow
 def test_all_recordings_of_the_map_are_browsed(browser: Browser, flat: Path) -> None:
     """Also from the folder of the first recording, whose page was made before the second one."""
     options = "[...$('session').options].map(o => o.textContent)"
@@ -519,6 +515,7 @@ def test_a_file_that_is_not_the_recording_is_not_sent(film_folder: Path, tmp_pat
 # ---- In the browser ----
 
 
+@pytest.mark.slow
 def test_save_and_undo_in_the_browser(browser: Browser, out: Path) -> None:
     """A visit is split at the slider and saved; the page shows the new result, then the old one.
 
@@ -566,6 +563,7 @@ def test_frames_of_an_image_folder_lie_behind_the_shapes(browser: Browser, out: 
 GREEN = "$('back').getContext('2d').getImageData($('back').width / 2, 99, 1, 1).data[1]"
 
 
+@pytest.mark.slow
 def test_the_recording_plays_behind_the_shapes(browser: Browser, film_folder: Path) -> None:
     """The slider shows exactly the frame of its step; during play the frame belongs to the step."""
     with serving(film_folder) as client:

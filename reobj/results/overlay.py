@@ -305,17 +305,16 @@ def draw_wireframes(
     fraction = np.linspace(0, 1, pieces + 1)[:, None]  # (B + 1, 1)
     line = clipped[:, :1] + fraction * (clipped[:, 1:] - clipped[:, :1])  # (n, B + 1, 3)
     pixels = scale * camera.project(line) - 0.5  # OpenCV draws with the pixel's centre at 0
-    solids, first = np.unique(frames.solid[edge], return_index=True)  # their edges are consecutive
-    stop = np.append(first, len(edge))[1:]  # (S,)
-    edges_of = {k: slice(a, b) for k, a, b in zip(solids.tolist(), first, stop, strict=True)}
-    for k in sorted(edges_of, key=lambda k: -ends[edges_of[k], :, 2].mean()):  # nearest last
-        rows = edges_of[k]
-        obj = object_id[k]
-        found = pixels[rows][within[rows]]
-        if not (drawn[k] and len(found) and _fits(straight[rows], image) and _fits(found, image)):
+    solid = frames.solid[edge]  # (n,)
+    wanted = [k for k in np.unique(solid).tolist() if drawn[k]]
+    for k in sorted(wanted, key=lambda k: -ends[solid == k, :, 2].mean()):  # nearest last
+        rows = (solid == k) & within
+        found = pixels[rows]
+        if not (len(found) and _fits(straight[solid == k], image) and _fits(found, image)):
             continue
+        obj = object_id[k]
         lines = np.round(found * (1 << SHIFT)).astype(np.int32)
-        shown = front[rows][within[rows]]
+        shown = front[rows]
         color = object_color(obj)
         dim = tuple(int(0.6 * c) for c in color)
         width = _width_of(image)
@@ -572,17 +571,16 @@ def draw_legend(image: Image, lines: Sequence[tuple[str, str]]) -> None:
         y = top + 4 * px + line_px * k
         right = x + sample_px - 8 * px
         box = np.array([x, y + 4 * px, right, y + line_px - 5 * px])
-        if kind in ("box", "dashed"):
-            _draw_box(image, box, color, 1 + (len(lines) == 1), kind == "dashed")
-        elif kind in ("moved", "new"):
-            _draw_box(image, box + 3 * px * np.array([1, 1, -1, -1]), color, 1, dashed=False)
-            _draw_box(image, box, CHANGE_COLORS[kind], 2, dashed=False)
-        elif kind in ("was", "gone"):
-            _draw_box(image, box, CHANGE_COLORS[kind], 2, dashed=True)
-        else:
+        if kind in ("solid", "thin"):
             middle = y + line_px // 2
             thickness = px if kind == "thin" else 2 * px
             cv2.line(image, (x, middle), (right, middle), color, thickness, cv2.LINE_AA)
+        else:
+            wide = 2 if kind in CHANGE_COLORS or len(lines) == 1 else 1
+            dashed = kind in ("dashed", "was", "gone")
+            _draw_box(image, box, CHANGE_COLORS.get(kind, color), wide, dashed)
+        if kind in ("moved", "new"):
+            _draw_box(image, box + 3 * px * np.array([1, 1, -1, -1]), color, 1, dashed=False)
         _draw_text(image, text, x + sample_px, y + line_px, (255, 255, 255))
 
 
