@@ -10,7 +10,6 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -1061,44 +1060,3 @@ def test_long_videos_are_subsampled(tmp_path: Path) -> None:
     assert data["steps"]["seconds"] * 1334 == pytest.approx(4000 / 30)
     assert data["objects"][0]["seen"] == [10, 11, 100, 100]
     assert len(base64.b64decode(data["poses"])) == 1334 * 48
-
-
-class Source:
-    """A video that counts the reads of its frames, and can be interrupted."""
-
-    has_images = True
-    files = ()
-
-    def __init__(self, video: Any, live: bool = False) -> None:
-        self.config, self.size, self.scale, self.fps = (
-            getattr(video, name) for name in ("config", "size", "scale", "fps")
-        )
-        self.video, self.is_live, self.source, self.expected = video, live, "a.mp4", FRAMES
-        self.read, self.stop_at = 0, -1
-
-    def __iter__(self) -> Iterator[rt.Frame]:
-        assert not self.is_live, "it cannot be read again"
-        for frame in self.video:
-            self.read += 1
-            if self.read == self.stop_at:
-                raise KeyboardInterrupt
-            yield frame
-
-
-def test_one_pass_writes_overlay_and_viewer_atomically(tmp_path: Path) -> None:
-    """If interrupted, neither exists. Otherwise each frame is read once for both."""
-    write_page(tmp_path / "a", scene=False)
-    out, source = tmp_path / "a/out", Source(rt.Video(tmp_path / "a/frames"))
-    result = fitted(tracks_of_walk(poses_of_walk()), None, names=NAMES)
-    source.stop_at = 10
-    with pytest.raises(KeyboardInterrupt):
-        write_pictures(result, out, source)  # type: ignore[arg-type]
-    made = {p.name for p in out.iterdir()}
-    assert not made & {"overlay.mp4", "scene.html"} and not [n for n in made if n[0] == "."]
-    source.read, source.stop_at = 0, -1
-    write_pictures(result, out, source)  # type: ignore[arg-type]
-    assert source.read == FRAMES
-    assert {"overlay.mp4", "scene.html"} <= {p.name for p in out.iterdir()}
-    source.read = 0
-    write_pictures(result, out, source, overlay=False, scene=False)  # type: ignore[arg-type]
-    assert source.read == 0
