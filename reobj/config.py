@@ -19,7 +19,6 @@ from reobj.files import atomic, did_you_mean, read_text
 from reobj.maps.stage import MapConfig
 from reobj.objects.config import ObjectsConfig
 from reobj.poses.estimate import PosesConfig
-from reobj.results.overlay import film_layers
 from reobj.sources.detection_files import DetectConfig
 from reobj.sources.video import InputConfig
 from reobj.tracking.interpolation import STD_POSITION, STD_VELOCITY
@@ -69,16 +68,9 @@ class TrackerConfig:
 class OutputConfig:
     """Files written."""
 
-    overlay: str = option(
-        "solids",
-        "layers of the overlay video besides boxes: solids, ellipses, trails; none: no video",
-    )
+    overlay: bool = option(True, "write the overlay video, overlay.mp4")
     scene: bool = option(True, "write the viewer, scene.html")
-    cloud: bool = option(
-        False,
-        "dense coloured points in the viewer: from the maps of --depth, else from optical flow, "
-        "about a minute longer",
-    )
+    cloud: bool = option(False, "dense coloured points in the viewer, from the maps of --depth")
     doubtful: bool = option(
         False, "include low-confidence objects in tracks.txt, overlay video and viewer"
     )
@@ -89,7 +81,8 @@ class OutputConfig:
     )
 
     def __post_init__(self) -> None:
-        film_layers(self.overlay)  # an invalid value is an error before the run starts
+        if isinstance(self.overlay, str):  # of 0.2.0: layers of the video, or none
+            object.__setattr__(self, "overlay", self.overlay not in ("none", ""))
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,6 +116,8 @@ GONE = {
     "poses.max_gap": "a frame is interpolated where its error is small",
     "poses.max_keyframes": "long videos are reconstructed in windows",
 }
+
+LAYERS = frozenset({"solids", "ellipses", "trails", "boxes"})  # of the overlay video of 0.2.0
 
 # What the value of a flag is, in --help; the flags of other options of type str take a NAME
 VALUES = {
@@ -165,6 +160,8 @@ def with_option(config: C, name: str, value: Any, where: str = "--set ") -> C:
     if name in GONE:
         log.log(NOTE, "%s%s is no option any more and has no effect: %s", where, name, GONE[name])
         return config
+    if name == "output.overlay" and LAYERS.issuperset(str(value).replace(" ", "").split(",")):
+        value = True  # of 0.2.0; the video has one form
     options: Any = every_option(config)
     if name not in options:
         fields = {known.rpartition(".")[2]: known for known in options}
@@ -188,7 +185,7 @@ def _converted(value: Any, kind: type) -> Any:
         return _text(value)
     if kind is bool and isinstance(value, str):
         value = {"1": True, "true": True, "yes": True, "on": True, "0": False, "false": False,
-                 "no": False, "off": False}.get(value.lower())  # fmt: skip
+                 "no": False, "off": False, "none": False}.get(value.lower())  # fmt: skip
     if kind is bool or isinstance(value, bool):
         if type(value) is not kind:
             raise TypeError

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from browser import CHROMIUM, Browser
+from browser import CHROMIUM, FLAGS, Browser
 from front_door.room import CAMERA, FEW, ROOM
 from simulated import SIZE, finished, fitted, tracks_of, unlinked, walk
 
@@ -49,13 +49,13 @@ def no_points(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    """One page of a headless Chromium, for the tests of a file."""
+def browser() -> Iterator[Browser]:
+    """One page of the system's Chromium."""
+    api = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
     if CHROMIUM is None:
         pytest.skip("no chromium here: apt-get install chromium")
-    page = Browser(tmp_path_factory.mktemp("profile"))
-    yield page
-    page.close()
+    with api.sync_playwright() as playwright:
+        yield Browser(playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS))
 
 
 @pytest.fixture(scope="session")

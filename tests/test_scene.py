@@ -10,17 +10,15 @@ import re
 import shutil
 import subprocess
 import sys
-import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from browser import Browser, complaints
+from browser import Browser
 from scipy.spatial.transform import Rotation
-from simulated import fitted, into_part, tracks_of, walk, with_columns
+from simulated import fitted, into_part, tracks_of, walk
 
 import quadrics
 import reobj.results.scene as scene
@@ -106,7 +104,7 @@ def write_page(folder: Path, in_3d: bool = True, scene: bool = True) -> Path:
     link = rt.LinkEvent("join", (2, 6), 0.123456, 1.98765, True)
     result = dataclasses.replace(result, world=dataclasses.replace(result.world, links=(link,)))
     result.save(folder / "out")
-    write_pictures(result, folder / "out", video, overlay="none", scene=scene)
+    write_pictures(result, folder / "out", video, overlay=False, scene=scene)
     return folder / "out/scene.html"
 
 
@@ -133,7 +131,6 @@ class Facts:
 VIDEO: Any = Facts()
 VIEW = """[controls.getAzimuthalAngle(), controls.getPolarAngle(), controls.getDistance(),
     ...controls.target]"""
-SCREENSHOTS = Path(__file__).resolve().parent.parent / "build/screenshots"
 
 
 def center_of(browser: Browser, number: int) -> tuple[float, float]:
@@ -160,74 +157,52 @@ def test_a_click_on_an_object_opens_its_panel(browser: Browser, page: Path) -> N
         wide = browser.eval("""Promise.all([...document.querySelectorAll('.crops img')]
             .map(i => i.decode().then(() => i.naturalWidth)))""")
         assert len(wide) == 8 and min(wide) > 8
-    browser.picture(SCREENSHOTS / "desktop.png")
-    browser.eval("$('close').click()")
-    assert browser.eval("$('panel').innerText") == "" and browser.eval("state.selected") is None
-    assert browser.eval("window.hacked") is None and complaints(browser) == []
+    browser.press("Escape")
+    assert browser.eval("[$('panel').innerText, state.selected]") == ["", None]
+    assert browser.eval("window.hacked") is None and browser.errors == []
 
 
-def test_rejected_objects_are_listed_with_their_reason(browser: Browser, page: Path) -> None:
+def test_the_list_has_reasons_joins_and_statuses(browser: Browser, page: Path) -> None:
     browser.open(page)
-    assert browser.eval("solid.length") == 3
-    row = browser.eval("here[3].row.innerText")
-    assert row.startswith("person 4") and "no solid" in row
+    assert browser.eval("here[3].row.innerText").startswith("person 4")
     browser.eval("here[3].row.click()")
     assert "rejected: objects of this class move" in browser.eval("$('panel').innerText")
     assert "a <b>warning</b>" in browser.eval("$('list').innerText")
-
-
-def test_merges_and_splits_are_listed(browser: Browser, page: Path) -> None:
-    browser.open(page)
-    data = data_of(page)
-    assert data["links"] == [{"kind": "join", "tracklets": [2, 6], "place_iou": 0.12,
-                              "appearance_log_odds": 1.99, "kept": True}]  # fmt: skip
-    browser.eval("""S.links.push(
-        {kind: "join", tracklets: [1, 3], place_iou: 0.2, appearance_log_odds: 0.9, kept: false},
-        {kind: "split", tracklets: [1, 1], place_iou: 0, appearance_log_odds: 1, kept: true})""")
-    browser.eval("select(objects[0])")
-    text = browser.eval("$('panel').innerText")
-    assert "tracklets 1 (object 1), 3 (object 3): overlap in 3D 0.2" in text
-    assert "undone: one solid" in text and "parts of tracklet 1 (object 1) are at different" in text
-    assert "undefined" not in text and "NaN" not in text
     browser.eval("select(objects[1])")
-    assert "overlap in 3D 0.12, log odds of the appearance 1.99" in browser.eval(
-        "$('panel').innerText"
-    )
+    text = browser.eval("$('panel').innerText")
+    assert "overlap in 3D 0.12, log odds of the appearance 1.99" in text
+    state = "[here[2].row.hidden, here[2].group.visible, here[2].group.parts.wire.material.dashed]"
+    browser.eval("S.objects[2].status = 'doubtful'; replay(); draw()")
+    assert browser.eval(state)[:2] == [True, False]
+    assert browser.eval("$('notes').innerText").startswith("1 object of low confidence")
+    browser.eval("$('doubtful').click(); draw()")
+    assert browser.eval(state)[:2] == [False, True]
+    browser.eval("""Object.assign(S.objects[2], { status: 'implausible',
+        reason: 'size is 7.2 sigma' }); replay(); fillScene(); draw()""")
+    assert browser.eval(state) == [False, True, True]
+    assert browser.eval("here[2].row.title") == "size is 7.2 sigma"
+    assert browser.errors == []
 
 
 def test_the_slider_plays_the_cameras(browser: Browser, page: Path) -> None:
     browser.open(page)
-    before = browser.send("Page.captureScreenshot")["data"]
+    before = browser.page.screenshot()
     browser.eval("$('slider').focus()")
-    for kind in ("keyDown", "keyUp"):
-        browser.send("Input.dispatchKeyEvent", type=kind, key="End", windowsVirtualKeyCode=35)
-    browser.settle()
+    browser.press("End")
     assert browser.eval("[state.step, $('clock').textContent]") == [23, "frame 23"]
     assert browser.eval("$('frame').querySelector('img').naturalWidth") > 100
-    assert browser.send("Page.captureScreenshot")["data"] != before
-    seen = "here.filter(o => o.row.classList.contains('now')).map(o => o.id)"
-    assert browser.eval(seen) == [1, 2, 3, 4]
+    assert browser.page.screenshot() != before
     browser.eval("goTo(10)")
+    seen = "here.filter(o => o.row.classList.contains('now')).map(o => o.id)"
     assert browser.eval(seen) == [1, 3, 4]
     browser.eval("goTo(5)")
     assert browser.eval("$('clock').textContent") == "frame 5 (no pose)"
     browser.eval("S.steps.seconds = .2; $('play').click()")
-    moved = "new Promise(f => setInterval(() => state.step !== 5 && f(state.step), 20))"
-    assert browser.eval(moved) == 6
+    assert browser.eval("$('play').getAttribute('aria-label')") == "pause"
+    browser.wait("state.step === 6")
     browser.eval("$('play').click()")
     assert browser.eval("$('play').getAttribute('aria-label')") == "play"
-    assert complaints(browser) == []
-
-
-def test_play_and_pause_are_drawn(browser: Browser, page: Path) -> None:
-    browser.open(page)
-    drawn = "[$('play').innerText, $('play').querySelector('path').getAttribute('d')]"
-    before = browser.eval(drawn)
-    browser.eval("$('play').click()")
-    after = browser.eval(f"[...{drawn}, $('play').getAttribute('aria-label')]")
-    browser.eval("$('play').click()")
-    assert before[0] == after[0] == "" and before[1] != after[1] and after[2] == "pause"
-    assert browser.eval(drawn) == before
+    assert browser.errors == []
 
 
 def test_the_video_frame_is_moved_enlarged_and_closed(browser: Browser, page: Path) -> None:
@@ -240,31 +215,10 @@ def test_the_video_frame_is_moved_enlarged_and_closed(browser: Browser, page: Pa
     browser.drag((x + 40, y + height - 20), (x - 60, y + height - 70), "left")
     assert browser.eval(place) == pytest.approx([x - 100, y - 50, width, height])
     assert browser.eval(VIEW) == view  # the 3D view has not been turned
-    browser.drag((x - 60, y + height - 70), (5, 5), "left")  # not beyond the view
-    inside = "(r => [r.x, r.y])($('view').getBoundingClientRect())"
-    assert browser.eval(place)[:2] == pytest.approx(browser.eval(inside), abs=1)
     browser.eval("$('frame-size').click()")
     assert browser.eval(place)[2] > 1.8 * width
     browser.eval("$('frame-close').click(); goTo(4)")
     assert browser.eval("[$('frame').offsetWidth, $('inset').checked]") == [0, False]
-    browser.eval("$('inset').click()")
-    assert browser.eval("$('frame').offsetWidth") > 0 and complaints(browser) == []
-
-
-def test_the_followed_camera_has_the_projection_of_the_video(browser: Browser, page: Path) -> None:
-    """The viewer's projection against K [R | t]."""
-    browser.open(page)
-    poses = poses_of_walk()
-    browser.eval("setRide(true); goTo(17)")
-    browser.settle()
-    width, height = browser.eval("[canvas.clientWidth, canvas.clientHeight]")
-    scale = min(width / WIDTH, height / HEIGHT)
-    for obj in data_of(page)["objects"][:3]:
-        x, y, z = poses.camera.K @ poses.cam_from_world[17] @ [*obj["center"], 1]
-        expected = [width / 2 + (x / z - WIDTH / 2) * scale, height / 2 + (y / z - 120) * scale]
-        index = obj["id"]
-        found = browser.eval(f"project(solid.find(o => o.id === {index}).at).slice(0, 2)")
-        np.testing.assert_allclose(found, expected, atol=0.1)
 
 
 def test_wireframes_have_the_extent_of_the_shapes(browser: Browser, page: Path) -> None:
@@ -288,53 +242,45 @@ def test_wireframes_have_the_extent_of_the_shapes(browser: Browser, page: Path) 
         np.testing.assert_allclose((np.array(found) - shift) / scale["scale"], true, atol=0.6)
 
 
-def test_a_box_has_twelve_edges_along_its_axes(browser: Browser, page: Path) -> None:
-    browser.open(page)
-    ends = np.array(browser.eval("EDGES.box")).reshape(-1, 2, 3)
-    assert len(ends) == len({tuple(sorted(map(tuple, e))) for e in ends.tolist()}) == 12
-    assert (np.abs(ends) == 1).all() and ((ends[:, 0] != ends[:, 1]).sum(1) == 1).all()
-    for kind in ("cylinder", "ellipsoid"):
-        around = np.array(browser.eval(f"EDGES.{kind}")).reshape(-1, 3)
-        radius = (
-            np.hypot(*around[:, :2].T) if kind == "cylinder" else np.linalg.norm(around, axis=1)
-        )
-        np.testing.assert_allclose(radius, 1)
-
-
 def test_following_a_camera_shows_its_frame(browser: Browser, page: Path) -> None:
     """Only frames with an image and a pose are shown, aligned with the camera's pixels."""
     browser.open(page)
-    browser.eval("S.thumbs = S.thumbs.filter(([frame]) => frame % 4 === 0)")
-    browser.eval("goTo(10); setRide(true)")
+    browser.eval("S.thumbs = S.thumbs.filter(([frame]) => frame % 4 === 0); goTo(10)")
+    browser.eval("setRide(true)")
     browser.settle()
-    assert browser.eval("[state.step, $('back').dataset.frame, $('back').hidden]") == [
-        8,
-        "8",
-        False,
-    ]
+    shown = "[state.step, $('back').dataset.frame, $('back').hidden]"
+    assert browser.eval(shown) == [8, "8", False]
     rect = browser.eval("pictureRect()")
     box = browser.eval("(({left, top, width}) => [left, top, width])($('back').style)")
     expected = [rect["x"], rect["y"], WIDTH * rect["scale"]]
     np.testing.assert_allclose([float(x.removesuffix("px")) for x in box], expected, atol=0.01)
     browser.eval("$('boxes').click()")
     browser.settle()
-    count = "document.querySelectorAll('#drawn .box').length"
-    assert browser.eval(count) == 4
-    assert browser.eval(f"S.objects[2].status = 'doubtful'; replay(); draw(); {count}") == 3
-    browser.eval("S.objects[2].status = 'ok'; replay(); draw()")
-    browser.picture(SCREENSHOTS / "ride.png")
+    assert browser.eval("document.querySelectorAll('#drawn .box').length") == 4
     for key, step in (("ArrowRight", 12), ("ArrowLeft", 8)):
         browser.press(key)
         assert browser.eval("state.step") == step
     browser.drag((700, 300), (760, 320), "left")
     assert browser.eval("[state.ride, $('back').hidden]") == [False, True]
-    assert complaints(browser) == []
+    browser.eval("setFollow(true); goTo(22)")
+    x, y, _ = browser.eval("project(cams[22].at)")
+    width, height = browser.eval("[canvas.clientWidth, canvas.clientHeight]")
+    assert 0.2 * width < x < 0.8 * width and 0.1 * height < y < 0.9 * height
+    assert browser.errors == []
 
 
-def test_keys(browser: Browser, page: Path) -> None:
+def test_keys_and_mouse(browser: Browser, page: Path) -> None:
     browser.open(page)
     start = browser.eval(VIEW)
     browser.drag((700, 300), (760, 320), "left")
+    turned = browser.eval(VIEW)
+    assert turned[0] != start[0] and turned[1] != start[1]
+    np.testing.assert_allclose(turned[2:], start[2:])
+    browser.page.mouse.wheel(0, -200)
+    browser.wait(f"{VIEW}[2] < {turned[2]}")
+    zoomed = browser.eval(VIEW)
+    browser.drag((700, 300), (640, 300), "right")
+    assert browser.eval(VIEW)[3:] != zoomed[3:] and browser.eval("state.selected") is None
     browser.press("r")
     np.testing.assert_allclose(browser.eval(VIEW), start)
     browser.press("1")
@@ -347,130 +293,28 @@ def test_keys(browser: Browser, page: Path) -> None:
         assert browser.eval(value) is True, key
         browser.press(key if key in " ?" else "Escape")
         assert browser.eval(value) is False, key
-    browser.eval("goTo(3)")
-    browser.press("ArrowRight")
-    assert browser.eval("state.step") == 4
-    browser.eval("select(here[0])")
-    browser.press("Escape")
-    assert browser.eval("state.selected") is None
     keys = browser.eval("[...document.querySelectorAll('#help kbd')].map(k => k.textContent)")
-    assert {"Space", "←", "→", "Esc", "?", "r", "f"} <= set(keys)
-    assert complaints(browser) == []
-
-
-def test_the_followed_camera_stays_in_view(browser: Browser, page: Path) -> None:
-    browser.open(page)
-    browser.eval("setFollow(true)")
-    from_behind = set()
-    for step in (2, 12, 22):
-        browser.eval(f"goTo({step})")
-        turned = browser.eval(f"""((a, b) => (a - b + 9.5 * Math.PI) % (2 * Math.PI))(yawOf(
-            {{ forward: orbit.position.clone().sub(controls.target).toArray() }}),
-            yawOf(cams[{step}]))""")
-        from_behind.add(round(turned, 6))
-        x, y, _ = browser.eval(f"project(cams[{step}].at)")
-        width, height = browser.eval("[canvas.clientWidth, canvas.clientHeight]")
-        assert 0.2 * width < x < 0.8 * width and 0.1 * height < y < 0.9 * height
-    assert len(from_behind) == 1  # it turns with the camera
-
-
-def test_the_initial_view_frames_points_and_trajectory(browser: Browser, page: Path) -> None:
-    """A distant object has no effect; points and trajectory are in the view and fill it."""
-    browser.open(page)
-    start = browser.eval(VIEW)
-    seen = np.array(browser.eval("room.anchors.map(a => project(a).slice(0, 2))"))
-    size = np.array(browser.eval("[canvas.clientWidth, canvas.clientHeight]"))
-    assert (seen > 0).all() and (seen < size).all()
-    assert (np.ptp(seen, axis=0) / size).max() > 0.8
-    browser.eval("S.objects[0].center = [400, 300, 0]; replay(); enter(0)")
-    np.testing.assert_allclose(browser.eval(VIEW), start)
-    assert (
-        browser.eval("""['#grid', '#bar', '#axes'].map(s => document.querySelector(s))
-        .concat([floorGrid.visible, level.unit]).map(Boolean)""")
-        == [True] * 5
-    )
-    bar = browser.eval("[$('bar').innerText, $('bar').querySelector('i').offsetWidth]")
-    assert bar[0].endswith(" m") and 40 < bar[1] < 200
-
-
-def test_doubtful_objects_are_shown_on_request(browser: Browser, page: Path) -> None:
-    browser.open(page)
-    browser.eval("S.objects[2].status = 'doubtful'; replay(); draw()")
-    state = "[here[2].row.hidden, here[2].group.visible, $('notes').innerText.split(',')[0]]"
-    assert browser.eval(state) == [True, False, "1 object of low confidence"]
-    browser.eval("$('doubtful').click(); draw()")
-    assert browser.eval(state)[:2] == [False, True]
-    browser.eval("S.objects[2].status = 'ok'; replay()")
-
-
-def test_the_title_counts_one_object_in_the_singular(browser: Browser, page: Path) -> None:
-    status = re.compile(r'"status":"\w+"')
-    alone = page.with_name("alone.html")
-    doubtful = status.sub('"status":"doubtful"', page.read_text())
-    alone.write_text(status.sub('"status":"ok"', doubtful, count=1))
-    browser.open(alone)
-    assert browser.eval("document.title").endswith(": 1 object with a shape")
+    assert {"Space", "←", "→", "Esc", "?", "r", "f"} <= set(keys) and browser.errors == []
 
 
 @pytest.mark.parametrize(("width", "height"), [(1280, 800), (390, 844)])
-def test_the_first_view_is_below_the_buttons(
+def test_the_first_view_frames_the_room_below_the_buttons(
     browser: Browser, page: Path, width: int, height: int
 ) -> None:
-    """Points and solids too: nothing is under them until the user moves the view."""
+    """A distant object has no effect; points and trajectory are in the view and fill it."""
     browser.open(page, width, height, phone=width < 700)
-    below = "$('tools').offsetTop + $('tools').offsetHeight"
-    for view in ("reset", "top", "front"):
+    start = browser.eval(VIEW)
+    top = browser.eval("$('tools').offsetTop + $('tools').offsetHeight")
+    size = np.array(browser.eval("[canvas.clientWidth, canvas.clientHeight]"))
+    for view in ("top", "front", "reset"):
         browser.eval(f"VIEWS.{view}(); draw()")
-        tops = "room.anchors.map(a => project(a)[1])"
-        assert browser.eval(f"Math.min(...{tops}) >= {below}"), view
-        assert browser.eval(f"Math.max(...{tops}) <= canvas.clientHeight"), view
-
-
-def test_a_finger_ends_merging_without_a_merge(browser: Browser, page: Path) -> None:
-    """A phone has no Esc; the hint is as wide as its text, up to the width of the view."""
-    browser.open(page, 390, 844, phone=True)
-    browser.eval("select(here[0])")
-    merge = "[...document.querySelectorAll('#panel button')].find(b => /^Merge/.test(b.innerText))"
-    browser.eval(f"{merge}.click()")
-    said = browser.eval("$('hint').textContent")
-    assert said.startswith("tap the object") and "Esc" not in said
-    assert browser.eval("$('hint').offsetWidth > 0.8 * $('view').offsetWidth")
-    browser.eval(f"{merge}.click()")
-    assert browser.eval("[state.merging, $('hint').hidden, pending.length]") == [None, True, 0]
-
-
-def test_corrections_leave_room_for_the_list_on_a_phone(browser: Browser, page: Path) -> None:
-    """Of several that are applied, each with a button, the latest is in view, the others scroll."""
-    browser.open(page, 390, 844, phone=True)
-    for name in ("armchair", "stool", "bench", "seat"):
-        browser.eval(f"S.edits.push(edits.rename(objects[0], '{name}'))")
-    browser.eval("fillEdits()")
-    assert browser.eval("$('edits').offsetHeight") < 140
-    shown = "(o => o.getBoundingClientRect().bottom >= o.lastChild.getBoundingClientRect().bottom)"
-    assert browser.eval(f"{shown}($('edits').querySelector('ol'))")
-    assert browser.eval("$('list').offsetHeight") > 120
-
-
-def test_implausible_objects_are_marked_and_not_counted(browser: Browser, page: Path) -> None:
-    """Dashed and dim, with the reason; neither hidden nor part of the initial view."""
-    browser.open(page)
-    before = browser.eval("room.radius")
-    browser.eval("""Object.assign(S.objects[2], { status: 'implausible',
-        reason: 'size is 7.2 sigma', center: [40, 0, 0.3] });
-        replay(); fillScene(); VIEWS.reset(); draw()""")
-    assert browser.eval("[here[2].row.hidden, here[2].group.visible]") == [False, True]
-    assert browser.eval("here[2].row.innerText").endswith("implausible size")
-    assert browser.eval("here[2].row.title") == "size is 7.2 sigma"
-    dashed = "here.slice(0, 3).map(o => Boolean(o.group.parts.wire.material.dashed))"
-    assert browser.eval(dashed) == [False, False, True]
-    filled = "[here[0], here[2]].map(o => o.group.parts).map(p => [p.faces, p.ellipsoid])"
-    filled = f"{filled}.map(p => p.map(x => x.visible))"
-    assert browser.eval(filled) == [[True, True], [False, False]]
-    browser.eval("select(here[2]); draw()")
-    assert browser.eval(filled)[1] == [True, True]
-    browser.eval("select(null)")
-    assert browser.eval("room.radius") < 1.5 * before
-    assert "suitcase 0" in browser.eval("$('classes').textContent")
+        seen = np.array(browser.eval("room.anchors.map(a => project(a).slice(0, 2))"))
+        assert (seen >= [0, top]).all() and (seen <= size).all(), view
+    assert (np.ptp(seen, axis=0) / size).max() > 0.7
+    browser.eval("S.objects[0].center = [400, 300, 0]; replay(); enter(0)")
+    np.testing.assert_allclose(browser.eval(VIEW), start)
+    bar = browser.eval("[$('bar').innerText, $('bar').querySelector('i').offsetWidth]")
+    assert bar[0].endswith(" m") and 40 < bar[1] < 200
 
 
 def test_a_distance_has_the_sigma_of_both_ends_and_of_the_scale(
@@ -509,127 +353,75 @@ def test_a_distance_has_the_sigma_of_both_ends_and_of_the_scale(
     digits = decimals(sigma)
     text = browser.eval("document.querySelector('.measure text').textContent")
     assert text == f"{value:.{digits}f} ± {sigma:.{digits}f} m"
-    browser.picture(SCREENSHOTS / "measure.png")
-    within = browser.eval("""distanceOf([1, -1].map(s => ({ object: solid[0],
-        at: add(solid[0].at, solid[0].axes[2], s) })))""")  # one object: independent of position
-    size, rel = (data_of(page)["objects"][0][name][2] for name in ("size", "size_rel_sigma"))
-    np.testing.assert_allclose(within, [size, size * np.hypot(rel, 0.1)], rtol=0.01)
+    for sigma in (0.2, 0.046, 0.0099, 0.01, 3.0, 30.0, 0.0):
+        assert browser.eval(f"decimals({sigma})") == decimals(sigma)
     browser.press("Escape")
     assert browser.eval("document.querySelector('.measure text')") is None
-    assert complaints(browser) == []
-
-
-def test_points_can_be_measured(browser: Browser, page: Path) -> None:
-    browser.open(page)
+    browser.open(page)  # the scale of the file again
     browser.eval("setMeasure(true); state.hidden = new Set(here.map(o => o.class)); draw()")
     array = "cloud.geometry.attributes.position.array"
-    at = [browser.eval(f"project([...{array}.slice({i}, {i} + 3)])") for i in (30, 300)]
-    for x, y, _ in at:
-        browser.eval(f"measureAt({x}, {y})")
-    value, sigma = browser.eval("distanceOf(state.measured)")
+    for i in (30, 300):
+        browser.eval(f"measureAt(...project([...{array}.slice({i}, {i} + 3)]).slice(0, 2))")
     noise = data_of(page)["parts"][0]["point_sigma"]
-    assert sigma == pytest.approx(noise * 2**0.5) and 0.1 < value < 8
-    browser.eval("measureAt(3, 3)")
-    assert "nothing there" in browser.eval("$('hint').textContent")
+    assert browser.eval("distanceOf(state.measured)[1]") == pytest.approx(noise * 2**0.5)
+    assert browser.errors == []
 
 
-@pytest.mark.parametrize("sigma", [0.2, 0.1, 0.046, 0.0099, 0.01, 3.0, 30.0, 0.0, float("inf")])
-def test_decimals_are_the_same_in_python_and_javascript(
-    browser: Browser, page: Path, sigma: float
-) -> None:
-    if not browser.eval("typeof decimals === 'function'"):
-        browser.open(page)
-    said = str(sigma).replace("inf", "Infinity")
-    assert browser.eval(f"decimals({said})") == decimals(sigma)
-
-
-def test_the_list_has_names_and_sizes_and_a_search(browser: Browser, page: Path) -> None:
+def test_the_list_is_searched_sorted_and_filtered(browser: Browser, page: Path) -> None:
     browser.open(page)
     objects = data_of(page)["objects"]
     sides = " \u00d7 ".join(side for side, _ in objects[0]["sides"])
     mark = "≈ " if objects[0]["status"] == "prior_dominated" else ""
-    first = browser.eval("here[0].row.innerText").strip()
-    assert first == f"chair 1 · {mark}{sides} m"
+    assert browser.eval("here[0].row.innerText").strip() == f"chair 1 · {mark}{sides} m"
     order = """[...document.querySelectorAll('.row')].filter(r => !r.hidden)
         .map(r => +r.querySelector('b').textContent.split(' ').at(-1))"""
+    opacity = "(draw(), solid.map(o => o.group.parts.wire.material.opacity))"
+    before = browser.eval(opacity)
     for words, found in (("SUIT", [3]), ("case 3", [3]), ("zebra", []), ("", [1, 2, 3, 4])):
         browser.eval(f"$('search').value = '{words}'; $('search').oninput()")
         assert browser.eval(order) == found
-    names = sorted((o["class"], o["id"]) for o in objects)
+        dimmed = np.array(browser.eval(opacity)) < 0.3 * min(before)
+        assert dimmed.tolist() == [number not in found for number in (1, 2, 3)]
     volume = [-float(np.prod(o["size"] or [0])) for o in objects]
-    for key, found in (("name", [i for _, i in names]), ("seen", [1, 3, 4, 2]),
+    names = [i for _, i in sorted((o["class"], o["id"]) for o in objects)]
+    for key, found in (("name", names), ("seen", [1, 3, 4, 2]),
                        ("size", (np.argsort(volume, kind="stable") + 1).tolist())):  # fmt: skip
         browser.eval(f"$('sort').value = '{key}'; $('sort').onchange()")
         assert browser.eval(order) == found
-    assert "seen in frames 0" in browser.eval("$('legend').innerText")
-
-
-def test_a_search_dims_the_other_objects(browser: Browser, page: Path) -> None:
-    browser.open(page)
-    opacity = "(draw(), solid.map(o => o.group.parts.wire.material.opacity))"
-    labels = "[...$('labels').children].map(l => l.textContent)"
-    before = browser.eval(opacity)
-    browser.eval("$('search').value = 'suitcase'; $('search').oninput()")
-    after = browser.eval(opacity)
-    assert after[2] == before[2] and max(after[:2]) < 0.3 * min(before)
-    assert browser.eval(labels) == ["suitcase 3"] and browser.eval("$('none').hidden") is True
-    browser.eval("$('search').value = 'zebra'; $('search').oninput()")
-    assert browser.eval("$('none').innerText") == "no object matches"
-    assert max(browser.eval(opacity)) < 0.3 * min(before)
-    browser.eval("$('search').value = ''; $('search').oninput()")
-    assert browser.eval(opacity) == before and browser.eval("$('none').hidden") is True
-
-
-def test_labels_have_the_colours_of_their_objects(browser: Browser, page: Path) -> None:
-    """The text is black or white, with a contrast of 4.5 at least."""
-    browser.open(page)
-    labels = browser.eval("""[...$('labels').children].map(l => [l.textContent,
-        ...['backgroundColor', 'color'].map(k => getComputedStyle(l)[k].match(/\\d+/g)
-        .map(Number))])""")
-    for text, paper, ink in labels:
-        assert tuple(paper) == object_color(int(text.split()[-1]))[::-1]
-        assert ink in ([0, 0, 0], [255, 255, 255])
-    assert len(labels) >= 2
-
-    def luminance(color: list[int]) -> float:
-        linear = ((np.array(color) / 255 + 0.055) / 1.055) ** 2.4
-        return float(linear @ [0.2126, 0.7152, 0.0722])
-
-    for number in range(1, 40):
-        color = list(object_color(number)[::-1])
-        white = browser.eval(f"inkOn({color})") == "#fff"
-        light = luminance([255 * white] * 3)
-        low = luminance(color)
-        assert (max(light, low) + 0.05) / (min(light, low) + 0.05) > 4.5
-
-
-def test_a_selected_object_keeps_its_colour(browser: Browser, page: Path) -> None:
-    browser.open(page)
-    ink = "[solid[0].group.parts.wire.material.color.getHex(), solid[0].group.parts.halo.visible]"
-    before = browser.eval(f"draw(); {ink}")
-    after = browser.eval(f"select(solid[0]); draw(); {ink}")
-    assert before[0] == after[0] and (before[1], after[1]) == (False, True)
+    state = "(draw(), [here.map(o => o.row.hidden), solid.map(o => o.group.visible)])"
+    button = "[...document.querySelectorAll('{}')].find(b => b.textContent.includes('{}')).click()"
+    for place, name, hidden in (
+        ("#classes label", "suitcase", [3]), ("#classes button", "none", [1, 2, 3, 4]),
+        ("#classes button", "all", []),
+    ):  # fmt: skip
+        browser.eval(button.format(place, name))
+        rows = [i in hidden for i in (1, 2, 3, 4)]
+        assert browser.eval(state) == [rows, [not row for row in rows[:3]]], name
+    browser.eval("select(here[1]);" + button.format("#panel button", "Hide"))
+    assert browser.eval(state)[1] == [True, False, True]
+    browser.eval("select(here[2]);" + button.format("#panel button", "Show only this"))
+    assert browser.eval(state)[1] == [False, False, True]
+    browser.eval("$('show-all').click()")
+    assert browser.eval(state) == [[False] * 4, [True] * 3] and browser.errors == []
 
 
 def test_light_and_dark_follow_the_system(browser: Browser, page: Path) -> None:
+    browser.open(page)
     paper = {}
     for scheme in ("dark", "light"):
-        feature = [{"name": "prefers-color-scheme", "value": scheme}]
-        browser.send("Emulation.setEmulatedMedia", features=feature)
-        if scheme == "dark":
-            browser.open(page)
+        browser.page.emulate_media(color_scheme=scheme)
         browser.settle()
         color = browser.eval("getComputedStyle(document.body).backgroundColor")
         wire = browser.eval("solid[0].group.parts.wire.material.color.getHex()")
         paper[scheme] = sum(map(int, re.findall(r"\d+", color))), wire
     assert paper["dark"][0] < 150 < 600 < paper["light"][0]
-    assert paper["dark"][1] != paper["light"][1] and complaints(browser) == []
+    assert paper["dark"][1] != paper["light"][1] and browser.errors == []
 
 
 def test_corrections_made_in_the_viewer_are_applied(
     browser: Browser, parted_folder: Path, tmp_path: Path
 ) -> None:
-    """Merge, split, rename, delete, undo; the saved file gives the same objects in Python."""
+    """Merge, rename, delete, undo; the saved file gives the same objects in Python."""
     out = shutil.copytree(parted_folder, tmp_path / "out")
     browser.open(out / "scene.html")
     browser.eval("select(here[0])")
@@ -644,22 +436,16 @@ def test_corrections_made_in_the_viewer_are_applied(
     browser.eval("edit(edits.delete(objects.find(o => o.id === 5)))")
     browser.eval("edit(edits.delete(objects.find(o => o.id === 6)))")
     browser.press("u")
-    assert browser.eval("objects.map(o => o.id)") == [1, 2, 3, 6]
     merged = "(o => [o.visits.length, o.tracklets.length])(objects.find(o => o.id === 2))"
     assert browser.eval(merged) == [1, 2]
-    browser.picture(SCREENSHOTS / "edit.png")
-    browser.send("Page.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
-    browser.eval("$('save').click()")
-    file = tmp_path / "edits.json"
-    for _ in range(100):
-        if file.exists():
-            break
-        time.sleep(0.05)
-    assert json.loads(file.read_text()) == json.loads(browser.eval("editsFile()"))
+    shown = browser.eval("objects.map(o => [o.id, o.class])")
+    assert [number for number, _ in shown] == [1, 2, 3, 6]
+    with browser.page.expect_download() as download:
+        browser.eval("$('save').click()")
+    download.value.save_as(tmp_path / "edits.json")
     command = browser.eval("$('saved').querySelector('code').innerText")
     assert command == f"python -m reobj_track objects {parted_folder} --edits edits.json"
-    shown = browser.eval("objects.map(o => [o.id, o.class])")
-    assert rt.main(["objects", str(out), "--edits", str(file)]) == 0
+    assert rt.main(["objects", str(out), "--edits", str(tmp_path / "edits.json")]) == 0
     assert [[o.id, o.class_name] for o in rt.Result.load(out).objects] == shown
     browser.open(out / "scene.html")
     assert browser.eval("[objects.map(o => [o.id, o.class]), S.edits.length]") == [shown, 3]
@@ -669,10 +455,10 @@ def test_corrections_made_in_the_viewer_are_applied(
     assert [e["do"] for e in json.loads(browser.eval("editsFile()"))["edits"]] == [
         "rename", "delete", "split"
     ]  # fmt: skip
-    assert complaints(browser) == []
+    assert browser.errors == []
     browser.click(700, 780)  # else the browser shows no dialog
     before = browser.asked
-    browser.open(out / "scene.html")  # unsaved corrections: the browser shows a dialog
+    browser.page.reload()  # unsaved corrections: the browser shows a dialog
     assert browser.asked == before + 1
 
 
@@ -699,16 +485,11 @@ def test_a_visit_is_split_at_the_slider(
     """The preview has the frames that the split gives in Python, also after a second split."""
     out = shutil.copytree(parted_folder, tmp_path / "out")
     browser.open(out / "scene.html")
-    browser.eval("select(here[1]); goTo(0)")
-    assert browser.eval("$('cut').innerText").startswith("To split a visit, move the slider")
-    browser.eval("goTo(13)")
-    assert browser.eval("$('cut').innerText") == "split at frame 13"
-    browser.eval("$('cut').querySelector('button').click()")
+    browser.eval("select(here[1]); goTo(13); $('cut').querySelector('button').click()")
     assert browser.eval("pending.map(said)") == ["split frames 13\u201339 off 2"]
     browser.eval("select(here.find(o => o.id === 7)); goTo(30)")
     browser.eval("$('cut').querySelector('button').click()")
     browser.eval("edit(edits.rename(objects.find(o => o.id === 8), 'stool'))")
-    browser.picture(SCREENSHOTS / "split.png")
     shown = browser.eval("objects.map(o => [o.id, o.class, o.visits, pairs(o.seen)])")
     assert {i: v for i, _, v, _ in shown if i in (2, 7, 8)} == {
         2: [[0, 12]], 7: [[13, 29]], 8: [[30, 39]],
@@ -717,85 +498,7 @@ def test_a_visit_is_split_at_the_slider(
     (tmp_path / "e.json").write_text(browser.eval("editsFile()"))
     assert rt.main(["objects", str(out), "--edits", str(tmp_path / "e.json")]) == 0
     found = [[o.id, o.class_name, o.visits] for o in rt.Result.load(out).objects]
-    assert found == [row[:3] for row in shown] and complaints(browser) == []
-    browser.eval("saved = true")
-
-
-def test_tracklets_are_listed_below_the_visits(browser: Browser, page: Path) -> None:
-    """Object 2 has two tracklets with a gap of .2 s: one visit. Two boxes are a split preview."""
-    browser.open(page)
-    browser.eval("select(objects[1])")
-    text = browser.eval("$('panel').textContent")
-    assert (
-        "Visits (1), frames0\u201323" in text
-        and "tracklets (2)2: 0\u20138" in text
-        and "6: 15\u201323" in text
-    )
-    assert "split off" not in browser.eval("document.querySelector('.visit').innerText")
-    browser.eval("[...document.querySelectorAll('#panel details button')].at(-1).click()")
-    halves = browser.eval("objects.filter(o => o.edited).map(o => [o.id, o.visits, o.tracks])")
-    assert halves == [[2, [[0, 8]], [2]], [5, [[15, 23]], [6]]]
-    browser.eval("undo(); edit(edits.merge(objects[0], objects[1]))")
-    joined = "(o => [o.visits, o.tracks, o.tracklets.length, o.refs.length])(objects[0])"
-    assert browser.eval(joined) == [[[0, 23]], [1, 2, 6], 3, 42]
-    browser.eval("saved = true")
-    assert complaints(browser) == []
-
-
-def test_classes_can_be_hidden(browser: Browser, page: Path) -> None:
-    browser.open(page)
-    at = center_of(browser, 3)
-    labels = "[...$('labels').children].map(l => l.textContent)"
-    assert "suitcase 3" in browser.eval(labels)
-    browser.eval("$('classes').open = true")
-    x, y = browser.eval("""(r => [r.left + r.width / 2, r.top + r.height / 2])(
-        [...document.querySelectorAll('#classes label')].find(l =>
-        l.innerText.includes('suitcase')).querySelector('input').getBoundingClientRect())""")
-    browser.click(x, y)
-    assert "suitcase 3" not in browser.eval(labels)
-    browser.click(*at)
-    assert browser.eval("state.selected") is None
-    assert browser.eval("here[2].row.hidden") is True
-    click = "[...$('classes').querySelectorAll('button')].find(b => b.textContent === '{}').click()"
-    state = "(draw(), [here.map(o => o.row.hidden), solid.map(o => o.group.visible)])"
-    browser.eval(click.format("none"))
-    assert browser.eval(state) == [[True] * 4, [False] * 3]
-    assert browser.eval("$('none').innerText") == "all objects are hidden"
-    browser.eval(click.format("all"))
-    assert browser.eval(state) == [[False] * 4, [True] * 3]
-    checked = "[...$('classes').querySelectorAll('input')].every(i => i.checked)"
-    assert browser.eval(checked) is True
-
-
-def test_a_double_click_rotates_around_the_object(browser: Browser, page: Path) -> None:
-    """It is selected then, whether or not it was before."""
-    browser.open(page)
-    for number in (3, 3, 1):
-        browser.eval("VIEWS.reset(); draw()")
-        x, y = center_of(browser, number)
-        for count in (1, 2):
-            for kind in ("mousePressed", "mouseReleased"):
-                browser.mouse(kind, x, y, button="left", clickCount=count)
-        browser.settle()
-        assert browser.eval("state.selected?.id") == number
-        target = browser.eval("controls.target.toArray()")
-        np.testing.assert_allclose(target, browser.eval("state.selected.at"), atol=1e-9)
-
-
-def test_an_object_is_hidden_or_shown_alone(browser: Browser, page: Path) -> None:
-    browser.open(page)
-    button = "[...document.querySelectorAll('#panel button')].find(b => b.textContent === '{}')"
-    state = "(draw(), [here.map(o => o.row.hidden), solid.map(o => o.group.visible)])"
-    browser.eval(f"select(here[1]); {button.format('Hide')}.click()")
-    hidden = [[False, True, False, False], [True, False, True]]
-    assert browser.eval(state) == hidden and browser.eval("state.selected") is None
-    assert browser.eval("$('some').innerText") == "1 hidden object: show all"
-    browser.eval(f"select(here[2]); {button.format('Show only this')}.click()")
-    assert browser.eval(state) == [[True, True, False, True], [False, False, True]]
-    assert browser.eval("$('some').innerText") == "only suitcase 3 is shown: show all"
-    browser.eval("$('show-all').click()")
-    assert browser.eval(state) == [[False] * 4, [True] * 3]
-    assert browser.eval("$('some').hidden") is True and complaints(browser) == []
+    assert found == [row[:3] for row in shown] and browser.errors == []
 
 
 def test_a_link_leads_to_the_view_and_the_object(browser: Browser, page: Path) -> None:
@@ -804,45 +507,32 @@ def test_a_link_leads_to_the_view_and_the_object(browser: Browser, page: Path) -
     browser.eval("goTo(7); select(here[1]); $('copy-link').click()")
     browser.settle()
     link, view = browser.eval("[location.href, " + VIEW + "]")
-    browser.open("about:blank")
     browser.open(link)
     np.testing.assert_allclose(browser.eval(VIEW), view, atol=1e-3)
     assert browser.eval("[state.selected.id, frameOf(state.step)]") == [2, 7]
-    for bad in ("#eye=1,2&target=3", "#part=9&eye=1,2,3&target=0,0,0", "#eye=a,b,c&target=0,0,0",
-                "#part=0&eye=1,2,3&target=0,0,0&object=77&frame=-5"):  # fmt: skip
-        browser.open("about:blank")
+    for bad in ("#eye=1,2&target=3", "#part=0&eye=1,2,3&target=0,0,0&object=77&frame=-5"):
         browser.open(link.split("#")[0] + bad)
         assert browser.eval("[state.selected, state.step]") == [None, -1]
-    assert browser.eval("orbit.position.toArray()") == pytest.approx([1, 2, 3])
-    assert complaints(browser) == []
+    assert browser.errors == []
 
 
-def test_a_picture_of_the_view_is_saved(browser: Browser, page: Path, tmp_path: Path) -> None:
-    """It has the pixels of the 3D view, its labels and the paper's colour."""
+def image_of(png: bytes) -> np.ndarray:
+    """A screenshot, BGR."""
+    return np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR))
+
+
+def test_a_picture_of_the_view_is_saved(browser: Browser, page: Path) -> None:
+    """It has the pixels of the 3D view, and its labels."""
     browser.open(page)
-    browser.send("Page.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
-    browser.eval("$('save-picture').click()")
-    file = tmp_path / "a.png"
-    for _ in range(100):
-        if file.exists() and (image := cv2.imread(str(file))) is not None:
-            break
-        time.sleep(0.05)
+    with browser.page.expect_download() as download:
+        browser.eval("$('save-picture').click()")
+    image = image_of(Path(download.value.path()).read_bytes())
     width, height = browser.eval("[$('view').clientWidth, $('view').clientHeight]")
     assert image.shape[:2] == (height, width)
-    x, y = browser.eval("project(solid[2].at).slice(0, 2)")
-    label = image[int(y) - 8 : int(y) + 9, int(x) - 25 : int(x) + 26].reshape(-1, 3)
-    assert (np.abs(label.astype(int) - object_color(3)).max(1) < 3).mean() > 0.3
-    paper = [int(c) for c in browser.eval("css('--paper').match(/[0-9a-f]{2}/g).map(h => "
-                                          "parseInt(h, 16))")][::-1]  # fmt: skip
-    assert image[3, 3].tolist() == paper
-    shown = cv2.imdecode(
-        np.frombuffer(base64.b64decode(browser.send("Page.captureScreenshot")["data"]), np.uint8),
-        cv2.IMREAD_COLOR,
-    )
     left, top = browser.eval("(r => [r.left, r.top])($('view').getBoundingClientRect())")
+    shown = image_of(browser.page.screenshot())
     same = shown[int(top) : int(top) + height, int(left) : int(left) + width].astype(int)
-    assert (np.abs(same - image).max(-1)[60:] < 12).mean() > 0.97
-    assert complaints(browser) == []
+    assert (np.abs(same - image).max(-1)[60:] < 12).mean() > 0.97 and browser.errors == []
 
 
 def test_units_can_be_switched(browser: Browser, page: Path) -> None:
@@ -858,22 +548,13 @@ def test_units_can_be_switched(browser: Browser, page: Path) -> None:
         size = np.array(obj["size_m"]) * per_metre
         sigma = size * obj["size_rel_sigma"]
         digits = decimals(sigma.min())
-        sides = [
-            f"{s:.{digits}f} ± {e:.{digits}f} {unit}" for s, e in zip(size, sigma, strict=True)
-        ]
         text = browser.eval("$('panel').innerText")
-        assert all(side in text for side in sides)
-        row = browser.eval("here[0].row.innerText")
-        assert " \u00d7 ".join(f"{s:.{digits}f}" for s in size) + f" {unit}" in row
+        for s, e in zip(size, sigma, strict=True):
+            assert f"{s:.{digits}f} ± {e:.{digits}f} {unit}" in text
+        assert f" {unit}" in browser.eval("here[0].row.innerText + $('bar').innerText")
         measured = browser.eval("document.querySelector('.measure text').textContent")
         assert measured.endswith(f" {unit}")
         assert float(measured.split()[0]) == pytest.approx(metres * per_metre, rel=0.05)
-        long, width = browser.eval("[$('bar').innerText, $('bar').querySelector('i').offsetWidth]")
-        reach = browser.eval("""orbit.position.distanceTo(controls.target)
-            * 2 * Math.tan(orbit.fov / 360 * Math.PI) / canvas.clientHeight""")
-        assert long.endswith(f" {unit}")
-        assert float(long.split()[0]) == pytest.approx(width * reach * per_metre, rel=0.03)
-    assert browser.eval("state.selected.id") == 1 and complaints(browser) == []
 
 
 def test_the_top_view_is_aligned_with_the_walls(
@@ -885,8 +566,7 @@ def test_the_top_view_is_aligned_with_the_walls(
     across = np.where(rng.random(2000) < 0.5, -2.0, 2.0)
     first = rng.random(2000) < 0.6
     xy = np.stack([np.where(first, along, 1.5 * across), np.where(first, across, along * 2 / 3)], 1)
-    angle = np.radians(31)
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    turn = Rotation.from_euler("z", 31, degrees=True).as_matrix()[:2, :2]
     xy = xy @ turn.T + rng.normal(scale=0.02, size=(2000, 2))
     points = np.column_stack([xy, rng.uniform(0, 2.5, 2000)])
     data = data_of(page)
@@ -898,7 +578,7 @@ def test_the_top_view_is_aligned_with_the_walls(
     ends = [[0.0, 0.0, 1.0], [*turn[:, 0].tolist(), 1.0]]  # along a wall
     a, b = (browser.eval(f"project(level.place({end})).slice(0, 2)") for end in ends)
     off = np.degrees(np.arctan2(b[1] - a[1], b[0] - a[0])) % 90
-    assert min(off, 90 - off) < 1.5 and complaints(browser) == []
+    assert min(off, 90 - off) < 1.5 and browser.errors == []
 
 
 def test_dense_points_are_drawn_from_their_front(
@@ -910,118 +590,71 @@ def test_dense_points_are_drawn_from_their_front(
     rgb = np.tile(np.array([[220, 20, 20]], np.uint8), (len(x), 1))
     wall = Cloud(xyz, rgb, np.tile([0, -1.0, 0], (len(x), 1)), 0.015)
     data = data_of(page)
-    data["parts"][0]["dense"] = scene._dense_points(wall, np.zeros(3), 10**6)
+    data["parts"][0]["dense"] = scene._dense_points(wall, np.zeros(3))
     (tmp_path / "a.html").write_text(scene._page_of(data, None))
     browser.open(tmp_path / "a.html")
-    browser.eval("$('names').click(); $('solids').click(); $('ellipsoids').click()")
-
-    def red() -> float:
-        browser.settle()
-        jpeg = base64.b64decode(browser.send("Page.captureScreenshot")["data"])
-        image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
-        return float((np.abs(image.astype(int) - [20, 20, 220]).max(-1) < 12).mean())
-
+    browser.eval("for (const id of ['names', 'solids', 'ellipsoids']) $(id).click()")
     browser.eval("state.hidden = new Set(here.map(o => o.class)); VIEWS.front()")
-    look = "(b => {{ lookFrom(level.turn([0, {}, 0.3].map(v => v / Math.hypot(1, 0.3)))); }})()"
-    browser.eval(look.format(-1))
-    front = red()
-    browser.eval(look.format(1))
-    behind = red()
-    assert front > 0.03 and behind < 0.001
-    browser.eval(look.format(-1))
+
+    def red(side: int) -> float:
+        browser.eval(f"lookFrom(level.turn([0, {side}, 0.3].map(v => v / Math.hypot(1, 0.3))))")
+        browser.settle()
+        image = image_of(browser.page.screenshot()).astype(int)
+        return float((np.abs(image - [20, 20, 220]).max(-1) < 12).mean())
+
+    assert red(-1) > 0.03 and red(1) < 0.001
     browser.eval("$('dense').click()")
-    assert red() < 0.001 and browser.eval("$('dense-label').hidden") is False
-    browser.open(page)
-    assert browser.eval("$('dense-label').hidden") is True and complaints(browser) == []
+    assert red(-1) < 0.001 and browser.eval("$('dense-label').hidden") is False
+    assert browser.errors == []
 
 
-def test_mouse_turns_zooms_and_pans(browser: Browser, page: Path) -> None:
-    browser.open(page)
-    start = browser.eval(VIEW)
-    browser.drag((700, 300), (760, 320), "left")
-    turned = browser.eval(VIEW)
-    assert turned[0] != start[0] and turned[1] != start[1]
-    np.testing.assert_allclose(turned[2:], start[2:])
-    browser.mouse("mouseWheel", 700, 300, deltaX=0, deltaY=-200)
-    browser.settle()
-    zoomed = browser.eval(VIEW)
-    assert zoomed[2] < turned[2]
-    browser.drag((700, 300), (640, 300), "right")
-    assert browser.eval(VIEW)[3:] != zoomed[3:] and browser.eval("state.selected") is None
-
-
-def test_touch_gestures_on_a_phone_screen(browser: Browser, page: Path) -> None:
+def test_fingers_on_a_phone_screen(browser: Browser, page: Path) -> None:
+    """Turn, zoom, select, rotate around an object, and end merging without a merge."""
     browser.open(page, 390, 844, phone=True)
     start = browser.eval(VIEW)
-    browser.touch("touchStart", (200, 200))
-    browser.touch("touchMove", (260, 200))
-    browser.touch("touchEnd")
+    browser.touch([(200, 200)], [(260, 200)])
     assert browser.eval(VIEW)[0] != start[0]
-    browser.touch("touchStart", (180, 200), (220, 200))
-    browser.touch("touchMove", (120, 200), (280, 200))
-    browser.touch("touchEnd")
+    browser.touch([(180, 200), (220, 200)], [(120, 200), (280, 200)])
     assert browser.eval(VIEW)[2] < start[2] / 2
-    browser.open(page, 390, 844, phone=True)
-    at = center_of(browser, 1)
-    browser.touch("touchStart", at)
-    browser.touch("touchEnd")
-    assert browser.eval("state.selected?.id") == 1
-    assert browser.eval("document.documentElement.scrollWidth") <= 390
-    browser.picture(SCREENSHOTS / "phone.png")
-    assert complaints(browser) == []
+    browser.eval("VIEWS.reset(); draw()")
+    at = center_of(browser, 3)
+    for _ in range(2):
+        browser.touch([at])
+    browser.wait("state.selected?.id === 3")
+    target = browser.eval("controls.target.toArray()")
+    np.testing.assert_allclose(target, browser.eval("state.selected.at"), atol=1e-9)
+    merge = "[...document.querySelectorAll('#panel button')].find(b => /^Merge/.test(b.innerText))"
+    browser.eval(f"{merge}.click()")
+    hint = browser.eval("$('hint').textContent")
+    assert hint.startswith("tap the object") and "Esc" not in hint
+    browser.eval(f"{merge}.click()")
+    assert browser.eval("[state.merging, $('hint').hidden, pending.length]") == [None, True, 0]
+    assert browser.errors == []
 
 
 def test_menus_and_targets_fit_a_phone(browser: Browser, page: Path) -> None:
     """Nothing extends beyond the screen; what a finger taps has 44 px at least."""
     browser.open(page, 390, 844, phone=True)
-    browser.eval("goTo(3); $('show').open = true; $('classes').open = true")
     targets = """[...document.querySelectorAll('button, select, summary, label, ' +
         'input[type=range], input[type=search], input[type=text], .crops figure')]
         .filter(e => e.offsetParent).map(e => [e.id || e.textContent,
         ...(r => [r.left, r.right, r.width, r.height])(e.getBoundingClientRect())])"""
-    menu = "(r => [r.top, r.bottom])($('show').querySelector('div').getBoundingClientRect())"
-    view = "(r => [r.top, r.bottom])($('view').getBoundingClientRect())"
-    top, bottom = browser.eval(menu)
-    first, last = browser.eval(view)
-    assert first <= top < bottom <= last
-    found = browser.eval(targets)
-    browser.picture(SCREENSHOTS / "phone-menu.png")
-    browser.eval("$('show').open = false; select(here[1]); edit(edits.rename(here[1], 'box'))")
-    browser.eval("document.querySelector('#panel details').open = true")
-    found += browser.eval(targets)
-    browser.eval("[...document.querySelectorAll('#panel button')]"
-                 ".find(b => b.textContent.startsWith('Rename')).click()")  # fmt: skip
-    found += browser.eval(targets)
-    browser.eval("$('help').showModal()")
-    found += browser.eval(targets)
-    browser.picture(SCREENSHOTS / "phone-help.png")
+    found = []
+    for action in (
+        "goTo(3); $('show').open = true; $('classes').open = true",
+        "$('show').open = false; select(here[1]); edit(edits.rename(here[1], 'box'));"
+        "document.querySelector('#panel details').open = true",
+        "[...document.querySelectorAll('#panel button')]"
+        ".find(b => b.textContent.startsWith('Rename')).click()",
+        "$('help').showModal()",
+    ):
+        browser.eval(action)
+        found += browser.eval(targets)
+        assert browser.eval("document.documentElement.scrollWidth") <= 390
     assert len(found) > 60
     for name, left, right, width, height in found:
-        assert left >= 0 and right <= 390, name
-        assert min(width, height) >= 43.9, name
-    browser.eval("saved = true")
-    assert complaints(browser) == []
-
-
-def test_help_says_what_fingers_do(browser: Browser, page: Path) -> None:
-    for phone, first in ((True, "Fingers"), (False, "Mouse")):
-        browser.open(page, 390 if phone else 1280, 844, phone=phone)
-        browser.eval("$('help-button').click()")
-        heads = browser.eval("[...document.querySelectorAll('#help h2')].map(h => h.innerText)")
-        assert heads[0] == first and set(heads) == {"Fingers", "Mouse", "Keys"}
-    text = browser.eval("$('help').innerText")
-    assert all(word in text for word in ("two fingers", "pinch", "tap an object", "tap twice"))
-
-
-def test_two_taps_rotate_around_the_object(browser: Browser, page: Path) -> None:
-    browser.open(page, 390, 844, phone=True)
-    at = center_of(browser, 3)
-    for _ in range(2):
-        browser.touch("touchStart", at)
-        browser.touch("touchEnd")
-    browser.wait("state.selected?.id === 3")
-    target = browser.eval("controls.target.toArray()")
-    np.testing.assert_allclose(target, browser.eval("state.selected.at"), atol=1e-9)
+        assert left >= 0 and right <= 390 and min(width, height) >= 43.9, name
+    assert browser.errors == []
 
 
 def test_selecting_a_component_updates_everything(browser: Browser, parted_folder: Path) -> None:
@@ -1031,15 +664,12 @@ def test_selecting_a_component_updates_everything(browser: Browser, parted_folde
         "[solid.map(o => o.id), steps.length, posed.length, +$('slider').max, "
         "cloud.geometry.attributes.position.count]"
     )
-    assert browser.eval("[$('part').hidden, $('part').options.length]") == [False, 2]
     name = parted_folder.parent.name
     assert browser.eval("document.title") == f"{name}: 6 objects with a shape in 2 components"
     assert browser.eval(rows) == [1, 2, 3]
     assert browser.eval(shown) == [[1, 2, 3], 40, 38, 39, 3]
-    assert browser.eval("$('facts').textContent").startswith("cameras of 38 of 40 frames")
     before = browser.eval("[level.size, room.radius]")
-    browser.eval("select(solid[0]); goTo(20)")
-    browser.eval("$('part').value = 1; $('part').onchange()")
+    browser.eval("select(solid[0]); goTo(20); $('part').value = 1; $('part').onchange()")
     browser.settle()
     assert browser.eval(rows) == [4, 5, 6]
     assert browser.eval(shown) == [[4, 5, 6], 24, 23, 23, 3]
@@ -1050,33 +680,11 @@ def test_selecting_a_component_updates_everything(browser: Browser, parted_folde
     assert 0.4 < before[1] / after[1] < 2.5  # metres both
     solid = browser.eval("solid[1].center")
     np.testing.assert_allclose(solid, into_part(1, np.array([[0, 0.1, 0.41]]))[0], atol=0.1)
-    browser.eval("S.parts[1].scale.rel_sigma = .77")
-    browser.click(*center_of(browser, 5))
-    assert browser.eval("$('panel').querySelector('h2').textContent") == "chair 5"
-    assert "from priors, ± 77 %" in browser.eval("$('panel').querySelector('dl').textContent")
-    picture = "document.querySelectorAll('.crops figure')"
-    browser.eval(f"[...{picture}].forEach(f => {{ f.click(); }})")
-    assert browser.eval("S.steps.part[state.step]") == 1
     browser.eval("$('slider').value = 23; $('slider').oninput()")
     assert browser.eval("[state.step, $('clock').textContent]") == [63, "frame 63"]
-    browser.eval("$('play').click()")  # from the end of the component to its first frame
-    moved = "new Promise(f => setInterval(() => state.step !== 63 && f(state.step), 20))"
-    assert 40 <= browser.eval(moved) < 60
-    browser.eval("$('play').click(); goTo(3)")  # of the other component
+    browser.eval("goTo(3)")  # of the other component
     assert browser.eval(f"[+$('part').value, +$('slider').value, {rows}]") == [0, 3, [1, 2, 3]]
-    for phone in (False, True):
-        size = {"width": 390, "height": 780} if phone else {"width": 1280, "height": 800}
-        browser.open(parted_folder / "scene.html", **size, phone=phone)
-        browser.eval("enter(1); goTo(50)")
-        browser.settle()
-        assert browser.eval("document.documentElement.scrollWidth <= innerWidth")
-        browser.picture(SCREENSHOTS / f"parts-{'phone' if phone else 'desktop'}.png")
-    assert complaints(browser) == []
-
-
-def test_a_single_component_has_no_selector(browser: Browser, page: Path) -> None:
-    browser.open(page)
-    assert browser.eval("[$('part').hidden, $('part').offsetWidth]") == [True, 0]
+    assert browser.errors == []
 
 
 def test_a_2d_result_opens(browser: Browser, tmp_path: Path) -> None:
@@ -1087,23 +695,14 @@ def test_a_2d_result_opens(browser: Browser, tmp_path: Path) -> None:
     browser.settle()
     assert browser.eval("document.querySelectorAll('.crops img').length") == 8
     assert browser.eval("here[1].row.querySelectorAll('.bar span:not(.head)').length") == 1
-    rows = "[...document.querySelectorAll('.row')].map((row) => row.className.split(' ')[1])"
-    assert set(browser.eval(rows)) == {"tracked"}
-    assert "tracked" in browser.eval("$('panel').innerText")
-    colors = "[here[0].row, $('list')].map((e) => getComputedStyle(e).color)"
-    assert len(set(browser.eval(colors))) == 1  # not dimmed: there is no other object
-    browser.picture(SCREENSHOTS / "flat.png")
-    assert complaints(browser) == []
+    assert "tracked" in browser.eval("$('panel').innerText") and browser.errors == []
 
 
 def test_without_webgl_the_list_remains(browser: Browser, page: Path) -> None:
-    source = "HTMLCanvasElement.prototype.getContext = () => null"
-    script = browser.send("Page.addScriptToEvaluateOnNewDocument", source=source)
-    browser.open(page)
-    browser.send("Page.removeScriptToEvaluateOnNewDocument", **script)
+    browser.open(page, script="HTMLCanvasElement.prototype.getContext = () => null")
     assert "no WebGL" in browser.eval("$('why').innerText")
     browser.eval("here[1].row.click()")
-    assert "width" in browser.eval("$('panel').innerText") and complaints(browser) == []
+    assert "width" in browser.eval("$('panel').innerText") and browser.errors == []
 
 
 # ---- Changes since a map ----
@@ -1128,31 +727,20 @@ def changes_of_walk(objects: list[rt.Object]) -> Changes:
     )  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def changed_page(page: Path) -> Path:
-    """The page of the small scene after a run with a map."""
-    result = rt.Result.load(page.parent)
-    changes = changes_of_walk(result.objects)
-    out = page.parent.parent / "changed"
+def page_with(page: Path, name: str, **more: Any) -> Path:
+    """The page of the small scene with changes or other recordings."""
+    out = page.parent.parent / name
     out.mkdir()
-    video = rt.Video(page.parent.parent / "frames")
-    write_pictures(dataclasses.replace(result, changes=changes), out, video, overlay="none")
+    result = dataclasses.replace(rt.Result.load(page.parent), **more)
+    write_pictures(result, out, rt.Video(page.parent.parent / "frames"), overlay=False)
     return out / "scene.html"
 
 
-def test_the_recording_that_made_the_map_has_no_new_objects(browser: Browser, page: Path) -> None:
-    """The header says that it made the map; nothing is marked."""
-    result = rt.Result.load(page.parent)
-    new = tuple(Change(o.id, o.class_name, None, np.zeros(3)) for o in result.objects)
-    changes = Changes("flat.map", "monday", new=new)
-    out = page.parent.parent / "first"
-    out.mkdir()
-    video = rt.Video(page.parent.parent / "frames")
-    write_pictures(dataclasses.replace(result, changes=changes), out, video, overlay="none")
-    browser.open(out / "scene.html")
-    assert browser.eval("$('since').textContent") == f"map flat.map: made with {len(new)} objects"
-    assert browser.eval("here.map(markOf).filter(Boolean)") == []
-    assert browser.eval("$('kinds').hidden")
+@pytest.fixture(scope="module")
+def changed_page(page: Path) -> Path:
+    """The page of the small scene after a run with a map."""
+    changes = changes_of_walk(rt.Result.load(page.parent).objects)
+    return page_with(page, "changed", changes=changes)
 
 
 def test_an_arrow_leads_from_the_ghost_to_the_moved_object(
@@ -1161,32 +749,27 @@ def test_an_arrow_leads_from_the_ghost_to_the_moved_object(
     """Ghost: the former shape at the former place; the tip of the arrow is the present centre."""
     browser.open(changed_page)
     moved = browser.eval("""(g => ({ at: g.at, to: g.object.at, shown: g.group.visible,
-        wire: g.group.parts.wire.visible, dashed: g.group.parts.wire.material.dashed,
+        dashed: g.group.parts.wire.material.dashed,
         matrix: g.group.matrix.elements, arrow: g.arrow.map(n => n.visible),
         start: [...g.arrow[0].geometry.attributes.instanceStart.array],
         tip: new THREE.Vector3(0, .5, 0).applyMatrix4(g.arrow[1].matrix).toArray() }))
         (ghosts.find(g => g.kind === "moved"))""")
-    assert np.subtract(moved["at"], moved["to"]) @ np.subtract(moved["at"], moved["to"]) == (
-        pytest.approx(1, abs=1e-5)
-    )
+    distance = np.linalg.norm(np.subtract(moved["at"], moved["to"]))
+    assert distance == pytest.approx(1, abs=1e-5)
     np.testing.assert_allclose(moved["start"][:3], moved["at"], atol=1e-5)
     np.testing.assert_allclose(moved["tip"], moved["to"], atol=1e-5)
-    assert moved["shown"] and moved["wire"] and moved["dashed"] and moved["arrow"] == [True] * 2
+    assert moved["shown"] and moved["dashed"] and moved["arrow"] == [True] * 2
     half = data_of(changed_page)["objects"][0]["half_axes"]
     columns = np.array(moved["matrix"]).reshape(4, 4)[:3, :3]
     np.testing.assert_allclose(np.linalg.norm(columns, axis=1), half, rtol=1e-5)
     turned = columns[0] @ browser.eval("level.turn([Math.SQRT1_2, Math.SQRT1_2, 0])")
     assert turned == pytest.approx(half[0], rel=1e-5)  # the former rotation, 45 degrees
-    drawn = browser.eval("draw(); [former.children.length, former.parent === root]")
-    assert drawn == [5, True]  # three ghosts, shaft and tip
-    before = browser.send("Page.captureScreenshot")["data"]
-    browser.eval("$('names').click()")
-    browser.settle()
-    with_arrow = browser.send("Page.captureScreenshot")["data"]
-    browser.eval("ghosts.forEach(g => g.arrow.forEach(n => { n.material.opacity = 0; })); redraw()")
-    browser.settle()
-    assert len({before, with_arrow, browser.send("Page.captureScreenshot")["data"]}) == 3
-    assert complaints(browser) == []
+    browser.eval("edit(edits.merge(objects[0], objects[1]))")
+    assert browser.eval("ghosts.map(g => [g.id, g.object?.id ?? null, g.arrow.length])") == [
+        [1, 1, 2], [9, None, 0], [7, None, 0]
+    ]  # fmt: skip
+    browser.eval("undo(); edit(edits.delete(objects[0]))")
+    assert browser.eval("ghosts.map(g => g.id)") == [9, 7] and browser.errors == []
 
 
 def test_gone_and_new_objects_are_marked(browser: Browser, changed_page: Path) -> None:
@@ -1199,10 +782,6 @@ def test_gone_and_new_objects_are_marked(browser: Browser, changed_page: Path) -
     halos = "(draw(), solid.map(o => [o.id, o.group.parts.halo.visible]))"
     assert browser.eval(halos) == [[1, True], [2, False], [3, True]]
     gone = "ghosts.find(g => g.kind === 'gone')"
-    assert browser.eval(f"[{gone}.group.visible, {gone}.group.parts.wire.visible]") == [True, True]
-    red, green, blue = browser.eval(f"{gone}.color")
-    assert max(red, green, blue) - min(red, green, blue) < 20  # grey
-    assert browser.eval("ghosts.find(g => g.kind === 'not_seen').group.visible") is False
     browser.eval("$('names').click(); draw()")  # labels could lie above
     x, y = browser.eval(f"""(r => [...project({gone}.at).slice(0, 2), r.left, r.top])(
         $('view').getBoundingClientRect()).reduce((s, v, i) => (s[i % 2] += v, s), [0, 0])""")
@@ -1210,13 +789,10 @@ def test_gone_and_new_objects_are_marked(browser: Browser, changed_page: Path) -
     assert browser.eval("state.ghost?.id") == 9 and browser.eval("state.selected") is None
     text = browser.eval("$('panel').innerText")
     assert f"{EVIL} 9" in text and "seen through in 3 views" in text
-    browser.press("Escape")
-    assert browser.eval("[state.ghost, $('panel').innerText]") == [None, ""]
     browser.eval("select(here[0])")
     text = browser.eval("$('panel').innerText")
     assert "moved 1.00 ± 0.03 m" in text and "12 own points agree" in text
-    assert "may also be\n9" in text
-    assert browser.eval("window.hacked") is None and complaints(browser) == []
+    assert browser.eval("window.hacked") is None and browser.errors == []
 
 
 def test_the_list_shows_and_filters_changes(browser: Browser, changed_page: Path) -> None:
@@ -1230,106 +806,38 @@ def test_the_list_shows_and_filters_changes(browser: Browser, changed_page: Path
         f"map flat.map: 1 stayed, 1 moved (chair 1 by 1.00 m), 1 gone ({EVIL} 9), "
         "1 new (suitcase 3), 1 not seen"
     )
-    chips = "[...document.querySelectorAll('#kinds label')]"
-    assert browser.eval(f"{chips}.map(l => l.innerText)") == [
-        "moved 1", "gone 1", "new 1", "stayed 1", "not seen 1"
-    ]  # fmt: skip
-
-    def click(kind: str) -> None:
-        browser.eval(f"{chips}.find(l => l.innerText.startsWith('{kind}'))"
-                     ".querySelector('input').click()")  # fmt: skip
-        browser.settle()
-
     visible = "[solid, ghosts].map(list => list.filter(o => o.group.visible).map(o => o.id))"
     assert browser.eval(visible) == [[1, 2, 3], [1, 9]]
-    click("stayed")
-    click("not seen")
-    assert browser.eval(rows) == [*every[:3], [7, "not seen"], [4, ""]]
-    assert browser.eval(visible) == [[1, 3], [1, 9, 7]]
-    click("moved")  # with its ghost and arrow
-    assert browser.eval(visible) == [[3], [9, 7]]
-    click("gone")
-    assert browser.eval(visible) == [[3], [7]]
-    browser.eval("$('search').value = 'not seen'; $('search').oninput()")
-    assert browser.eval(rows) == [[7, "not seen"]]
-    browser.eval("$('search').value = ''; $('search').oninput(); $('changes').click()")
+    for kind, shown in (
+        ("stayed", [[1, 3], [1, 9]]), ("not seen", [[1, 3], [1, 9, 7]]),
+        ("moved", [[3], [9, 7]]), ("gone", [[3], [7]]),
+    ):  # fmt: skip
+        box = f"l => l.innerText.startsWith('{kind}')).querySelector('input')"
+        browser.eval(f"[...document.querySelectorAll('#kinds label')].find({box}.click()")
+        browser.settle()
+        assert browser.eval(visible) == shown, kind
+    browser.eval("$('changes').click()")
     browser.settle()  # off: like a page without a map
     assert browser.eval(rows) == [[1, ""], [3, ""], [2, ""], [4, ""]]
-    assert browser.eval(visible) == [[1, 2, 3], []]
-    assert browser.eval("$('kinds').hidden") is True
-    assert browser.eval("[...$('labels').children].every(l => !l.className)") is True
-    assert complaints(browser) == []
+    assert browser.eval(visible) == [[1, 2, 3], []] and browser.errors == []
 
 
-def test_ghosts_follow_corrections(browser: Browser, changed_page: Path) -> None:
-    """A deleted object leaves its former place without an arrow; a merged one keeps its change."""
-    browser.open(changed_page)
-    browser.eval("edit(edits.merge(objects[0], objects[1]))")
-    assert browser.eval("ghosts.map(g => [g.id, g.object?.id ?? null, g.arrow.length])") == [
-        [1, 1, 2], [9, None, 0], [7, None, 0]
-    ]  # fmt: skip
-    browser.eval("undo(); edit(edits.delete(objects[0]))")
-    assert browser.eval("ghosts.map(g => g.id)") == [9, 7]
-    browser.eval("undo()")
-    assert browser.eval("ghosts.map(g => g.id)") == [1, 9, 7]
-    assert complaints(browser) == []
-
-
-def test_changes_are_shown_on_a_phone_and_without_webgl(
-    browser: Browser, changed_page: Path
+@pytest.mark.parametrize(
+    ("facts", "text"),
+    [
+        (("tuesday", "3 of 24 frames agree with it", 3, 24), "not placed; 3 of 24 frames agree"),
+        (("monday",), "made with 1 object"),
+    ],
+)
+def test_a_map_that_shows_no_changes_is_named(
+    browser: Browser, page: Path, facts: tuple[Any, ...], text: str
 ) -> None:
-    browser.open(changed_page, 390, 844, phone=True)
-    assert browser.eval("document.documentElement.scrollWidth") <= 390
-    assert browser.eval("$('view').clientHeight") > 240
-    browser.picture(SCREENSHOTS / "changes-phone.png")
-    source = "HTMLCanvasElement.prototype.getContext = () => null"
-    script = browser.send("Page.addScriptToEvaluateOnNewDocument", source=source)
-    browser.open(changed_page)
-    browser.send("Page.removeScriptToEvaluateOnNewDocument", **script)
-    browser.eval("ghosts.find(g => g.kind === 'gone').row.click()")
-    assert "seen through in 3 views" in browser.eval("$('panel').innerText")
-    assert complaints(browser) == []
-
-
-def test_a_refused_map_is_named(browser: Browser, page: Path, tmp_path: Path) -> None:
-    result = rt.Result.load(page.parent)
-    changes = Changes("flat.map", "tuesday", "3 of 24 frames agree with it", 3, 24)
-    video = rt.Video(page.parent.parent / "frames")
-    refused = dataclasses.replace(result, changes=changes)
-    write_scene(refused, Pictures(refused, video), tmp_path / "scene.html", video)
-    browser.open(tmp_path / "scene.html")
-    assert browser.eval("$('since').innerText") == (
-        "map flat.map: not placed; 3 of 24 frames agree with it"
-    )
-    hidden = "[$('kinds'), $('changes-label')].map(e => e.hidden)"
-    assert browser.eval(f"[ghosts.length, {hidden}]") == [0, [True, True]]
-    assert complaints(browser) == []
-
-
-def test_ghosts_are_shifted_with_their_world(tmp_path: Path, browser: Browser) -> None:
-    """A world far from its origin: the page subtracts the same origin from former places."""
-    shift = np.array([5e5, 4e6, 100.0])
-    poses = poses_of_walk()
-    result = fitted(tracks_of_walk(poses), poses, names=NAMES)
-    result.objects[:3] = [
-        dataclasses.replace(o, center=o.center + shift) for o in result.objects[:3]
-    ]
-    cams = poses.cam_from_world.copy()
-    cams[:, :, 3] -= cams[:, :, :3] @ shift
-    far = dataclasses.replace(poses, cam_from_world=cams, points=poses.points + shift)
-    changes = changes_of_walk(result.objects)
-    result = dataclasses.replace(result, poses=far, fits=None, changes=changes)
-    write_scene(result, Pictures(result, VIDEO), tmp_path / "scene.html", VIDEO)
-    assert np.linalg.norm(data_of(tmp_path / "scene.html")["parts"][0]["origin"]) > 1e6
-    browser.open(tmp_path / "scene.html")
-    browser.eval("draw()")
-    gap = browser.eval("(g => Math.hypot(...add(g.at, g.object.at, -1)))(ghosts[0])")
-    assert gap == pytest.approx(1, abs=1e-3)
-
-
-def jpeg_of(color: tuple[int, int, int]) -> bytes:
-    """A small picture of one colour (BGR)."""
-    return cv2.imencode(".jpg", np.full((40, 60, 3), color, np.uint8))[1].tobytes()
+    """Refused, or made by this recording: its objects are not marked as new."""
+    new = (Change(1, "chair", None, np.zeros(3)),) if len(facts) == 1 else ()
+    browser.open(page_with(page, facts[0], changes=Changes("flat.map", *facts, new=new)))
+    assert text in browser.eval("$('since').innerText")
+    hidden = "[ghosts.length, $('kinds').hidden, here.map(markOf).filter(Boolean)]"
+    assert browser.eval(hidden) == [0, True, []] and browser.errors == []
 
 
 @pytest.fixture(scope="module")
@@ -1350,90 +858,55 @@ def page_with_sessions(page: Path) -> Path:
     shape = Shape("box", chair.half_axes, chair.quat_wxyz)
     move = Change(1, "chair", start.center, middle.center, 1.0, before_shape=shape)
     tuesday = Changes("flat.map", "tuesday", stayed=(Change(2, EVIL),), moved=(move,))
-    shots = ({1: jpeg_of((0, 0, 255)), 9: jpeg_of((0, 0, 255))}, {1: jpeg_of((0, 255, 0))})
-    earlier = (
-        EarlierSession(
-            "monday", "2026-03-02T10:15:20+00:00", (start, second, gone), None, shots[0]
-        ),
-        EarlierSession(
-            "tuesday", "2026-03-03T11:30:00+00:00", (middle, second, gone), tuesday, shots[1]
-        ),
+    red, green = (
+        cv2.imencode(".jpg", np.full((40, 60, 3), color, np.uint8))[1].tobytes()
+        for color in ((0, 0, 255), (0, 255, 0))
     )
-    out = page.parent.parent / "sessions"
-    out.mkdir()
-    video = rt.Video(page.parent.parent / "frames")
-    shown = dataclasses.replace(result, changes=changes, earlier=earlier)
-    write_pictures(shown, out, video, overlay="none")
-    return out / "scene.html"
+    times = ("2026-03-02T10:15:20+00:00", "2026-03-03T11:30:00+00:00")
+    earlier = (
+        EarlierSession("monday", times[0], (start, second, gone), None, {1: red, 9: red}),
+        EarlierSession("tuesday", times[1], (middle, second, gone), tuesday, {1: green}),
+    )
+    return page_with(page, "sessions", changes=changes, earlier=earlier)
 
 
-SWITCH = "(value => {{ $('session').value = value; $('session').onchange(); }})({})"
-
-
-def test_the_objects_of_other_recordings_are_shown(
-    browser: Browser, page_with_sessions: Path
-) -> None:
+def test_other_recordings_are_shown(browser: Browser, page_with_sessions: Path) -> None:
+    """Their objects, changes and pictures; corrections are those of this recording."""
     browser.open(page_with_sessions)
+    switch = "(value => {{ $('session').value = value; $('session').onchange(); }})({})"
     options = browser.eval("[...$('session').options].map(o => o.text)")
     assert options == ["this recording: tuesday", "monday, 2026-03-02 10:15",
                        "tuesday, 2026-03-03 11:30"]  # fmt: skip
-    assert browser.eval("$('session').hidden") is False
-    here = """(draw(), [solid.map(o => [o.id, o.group.visible]), ghosts.map(g => [g.id, g.kind]),
-        [...document.querySelectorAll('.row')].filter(r => !r.hidden).length])"""
-    now = browser.eval(here)
-    assert now[0] == [[1, True], [2, True], [3, True]]
-    gap = "(([a, b]) => Math.hypot(...add(a, b, -1)))([solid[0].at, {}])"
-    browser.eval("window.chair = solid[0].at")
-    browser.eval(SWITCH.format(0))  # Monday: no changes, the lamp, no suitcase
-    assert browser.eval(here) == [[[1, True], [2, True], [9, True]], [], 3]
-    assert browser.eval(gap.format("chair")) == pytest.approx(2, abs=1e-5)
-    text = browser.eval("$('since').innerText")
-    assert "monday (2026-03-02 10:15 UTC)" in text and "First recording of the map: 3" in text
-    browser.eval("select(solid[0])")
-    text = browser.eval("$('panel').innerText")
-    assert "2.00 m from here" in text and "Correct it" not in text and "Visits" not in text
-    browser.press("Delete")  # corrections are those of this recording
-    assert browser.eval("[pending.length, solid.length]") == [0, 3]
-    browser.eval("select(solid[2])")
-    assert "now\ngone" in browser.eval("$('panel').innerText")
-    browser.picture(SCREENSHOTS / "earlier.png")
-    browser.eval(SWITCH.format(1))  # Tuesday: the chair moved, with an arrow from Monday's place
-    assert browser.eval(here)[1] == [[1, "moved"]]
-    assert browser.eval(gap.format("ghosts[0].at")) == pytest.approx(1, abs=1e-5)
-    assert "chair 1 moved 1.00 m" in browser.eval("$('labels').innerText")
-    browser.press("Escape")
-    browser.eval(SWITCH.format(-1))
-    assert browser.eval(here) == now and browser.eval(gap.format("chair")) == 0
-    assert "1 moved (chair 1" in browser.eval("$('since').innerText")
-    assert browser.eval("window.hacked") is None and complaints(browser) == []
-
-
-def test_pictures_before_and_after_a_change(browser: Browser, page_with_sessions: Path) -> None:
-    """The last picture of the map, and the best one of this recording; on request of the map."""
-    browser.open(page_with_sessions)
     sessions = data_of(page_with_sessions)["earlier"]
-    shown = """[...document.querySelectorAll('.pair img')].map(i => i.src.split(',')[1])"""
+    pair = "[...document.querySelectorAll('.pair img')].map(i => i.src.split(',')[1])"
     browser.eval("select(here[0])")
-    before, after = browser.eval(shown)
+    before, after = browser.eval(pair)
     assert before == sessions[1]["pictures"]["1"]  # Tuesday's
     chair = data_of(page_with_sessions)["objects"][0]
     assert [chair["best"], after] in chair["crops"]
-    assert browser.eval("$('panel').querySelector('h3').innerText") == "Before and after"
-    browser.eval("select(here[1])")  # it stayed
-    assert browser.eval(shown) == []
     browser.eval("selectGhost(ghosts.find(g => g.kind === 'gone'))")
-    assert browser.eval(shown) == [sessions[0]["pictures"]["9"]]
-    browser.eval(SWITCH.format(0) + "; select(solid[0])")
-    assert browser.eval(shown) == [sessions[0]["pictures"]["1"]]
-    assert complaints(browser) == []
-
-
-def test_a_page_has_the_latest_pictures_of_the_map() -> None:
-    shots = [{i: bytes([k]) for i in (1, 2, 3)} for k in range(3)]
-    sessions = [EarlierSession(str(k), "", (), None, shots[k]) for k in range(3)]
-    entries = scene._earlier_sessions(sessions, max_pictures=4)
-    assert [e["name"] for e in entries] == ["0", "1", "2"]
-    assert [list(e["pictures"]) for e in entries] == [[], ["1"], ["1", "2", "3"]]
+    assert browser.eval(pair) == [sessions[0]["pictures"]["9"]]
+    here = """(draw(), [solid.map(o => [o.id, o.group.visible]), ghosts.map(g => [g.id, g.kind]),
+        [...document.querySelectorAll('.row')].filter(r => !r.hidden).length])"""
+    now = browser.eval(here)
+    gap = "(([a, b]) => Math.hypot(...add(a, b, -1)))([solid[0].at, {}])"
+    browser.eval("window.chair = solid[0].at")
+    browser.eval(switch.format(0))  # Monday: no changes, the lamp, no suitcase
+    assert browser.eval(here) == [[[1, True], [2, True], [9, True]], [], 3]
+    assert browser.eval(gap.format("chair")) == pytest.approx(2, abs=1e-5)
+    assert "First recording of the map: 3" in browser.eval("$('since').innerText")
+    browser.eval("select(solid[0])")
+    text = browser.eval("$('panel').innerText")
+    assert "2.00 m from here" in text and "Correct it" not in text and "Visits" not in text
+    browser.press("Delete")
+    assert browser.eval("[pending.length, solid.length]") == [0, 3]
+    browser.eval(switch.format(1))  # Tuesday: the chair moved, with an arrow from Monday's place
+    assert browser.eval(here)[1] == [[1, "moved"]]
+    assert browser.eval(gap.format("ghosts[0].at")) == pytest.approx(1, abs=1e-5)
+    browser.press("Escape")
+    browser.eval(switch.format(-1))
+    assert browser.eval(here) == now and browser.eval(gap.format("chair")) == 0
+    assert browser.eval("window.hacked") is None and browser.errors == []
 
 
 def test_the_best_pictures_show_the_objects(tmp_path: Path) -> None:
@@ -1454,22 +927,6 @@ def test_the_best_pictures_show_the_objects(tmp_path: Path) -> None:
     assert crop[40:-40, 40:-40].mean((0, 1)) == pytest.approx([0, 255, 0], abs=9)
 
 
-def test_without_a_map_the_page_has_no_changes(browser: Browser, page: Path) -> None:
-    assert "changes" not in data_of(page)
-    browser.open(page)
-    shown = "['since', 'kinds', 'changes-label', 'session'].map(id => $(id).offsetParent === null)"
-    assert browser.eval(shown) == [True] * 4
-    assert browser.eval("[former.children.length, $('sort').value, $('labels').innerHTML]")[:2] == [
-        0, "id"
-    ]  # fmt: skip
-    assert browser.eval("document.querySelectorAll('.kind').length") == 0
-
-
-def test_sources_of_the_map_page_are_small(page: Path, changed_page: Path) -> None:
-    """The data of five changes take less than 5 kB."""
-    assert 500 < changed_page.stat().st_size - page.stat().st_size < 5000
-
-
 # ---- Without a browser ----
 
 
@@ -1477,25 +934,18 @@ def test_same_input_gives_the_same_page(page: Path, tmp_path: Path) -> None:
     assert write_page(tmp_path / "a").read_bytes() == page.read_bytes()
 
 
-def test_names_are_escaped_in_the_data(page: Path) -> None:
+def test_the_page_is_complete_and_escaped(page: Path) -> None:
+    """Strict JSON without "<", no address besides names of XML, the licence of three.js."""
     text = page.read_text()
     assert EVIL not in text and text.count("</script>") == text.count("<script") == 4
-    assert data_of(page)["objects"][1]["class"] == EVIL
+    data = text.split('id="data">')[1].split("</script>")[0]
+    assert json.loads(data, parse_constant=pytest.fail)["objects"][1]["class"] == EVIL
     hosts = set(re.findall(r"https?://([\w.]+)", text))
-    assert hosts == {"www.w3.org"} and "default-src 'none'" in text  # names of XML
-
-
-def test_the_page_contains_the_licence_of_three() -> None:
-    """Its text goes with the code; without data the page leaves room for 3 MB of them."""
-    text, folder = page_text(), Path(scene.__file__).with_name("page")
+    assert hosts == {"www.w3.org"} and "default-src 'none'" in text
+    folder = Path(scene.__file__).with_name("page")
     licence = (folder / "three.LICENSE.txt").read_text().strip()
     assert "Permission is hereby granted" in licence and licence in text
-    assert text.index(licence) < text.index((folder / "three.min.js").read_text().strip())
-    assert len(text) < 7e5 and "@{" not in text and text.count("@DATA@") == 1
-    own = text.split((folder / "three.min.js").read_text().strip())[1]
-    used = set(re.findall(r"THREE\.(\w+)", own))
-    assert used == set(re.findall(r"\b[A-Z]\w+", "".join(
-        re.findall(r"{(.*?)}", (folder / "three.entry.js").read_text(), re.S))))  # fmt: skip
+    assert len(page_text()) < 7e5 and "@{" not in text
 
 
 def test_the_page_contains_the_scene(page: Path) -> None:
@@ -1519,51 +969,6 @@ def test_the_page_contains_the_scene(page: Path) -> None:
     assert data["camera"] == {"width": 320, "height": 240, "fx": 250, "fy": 250,
                               "cx": 170, "cy": 112, "lens": None}  # fmt: skip
     assert 0.02 < part["point_sigma"] < 0.1 and "floor" not in part  # too few points for a floor
-
-
-def test_the_data_are_strict_json(page: Path) -> None:
-    """Browsers refuse NaN and Infinity; frame 5 has no pose."""
-
-    def refuse(constant: str) -> None:
-        raise AssertionError(constant)
-
-    text = page.read_text().split('id="data">')[1].split("</script>")[0]
-    json.loads(text, parse_constant=refuse)
-    assert "<" not in text  # names cannot end the script
-
-
-def test_the_viewer_can_be_disabled(tmp_path: Path) -> None:
-    assert not write_page(tmp_path / "off", scene=False).exists()
-
-
-def test_three_minutes_stay_below_ten_megabytes(tmp_path: Path) -> None:
-    """5,400 frames, 50 objects, 100,000 points, and incompressible images."""
-    frames, objects = 5400, 50
-    rng = np.random.default_rng(0)
-    at = poses_of_walk()
-    frame, obj = (a.ravel() for a in np.mgrid[:frames, :objects])
-    corner = rng.uniform(0, 100, (len(frame), 2))
-    box = np.hstack([corner, corner + rng.uniform(30, 130, (len(frame), 2))])
-    score = np.full(len(frame), 0.9)
-    tracks = rt.Tracks(frame, obj + 1, obj + 1, box, score, 0 * obj, obj)
-    poses = dataclasses.replace(
-        at,
-        frame=np.arange(frames),
-        time_s=np.arange(frames) / 30,
-        cam_from_world=np.repeat(at.cam_from_world, frames // FRAMES, 0),
-        status=np.full(frames, "pnp"),
-        points=rng.normal(size=(100_000, 3)),
-        colors=rng.integers(0, 255, (100_000, 3)).astype(np.uint8),
-    )
-    result = dataclasses.replace(fitted(tracks, None, names=("chair",)), poses=poses)
-    cv2.imwrite(str(tmp_path / "0.png"), np.zeros((HEIGHT, WIDTH, 3), np.uint8))
-    video = rt.Video(tmp_path / "0.png")
-    pictures = Pictures(result, video)
-    noise = rng.integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8)
-    for index in sorted({*frame[pictures.wanted].tolist(), *pictures.whole}):
-        pictures.take(rt.Frame(int(index), index / 30, noise))
-    write_scene(result, pictures, tmp_path / "scene.html", video)
-    assert 2e6 < (tmp_path / "scene.html").stat().st_size < 10e6
 
 
 def test_crops_show_the_object(tmp_path: Path) -> None:
@@ -1597,21 +1002,6 @@ def test_crops_show_different_views() -> None:
     assert set(tracks.track_id[diverse_rows(tracks, found, None, 30)]) == {3}
 
 
-def test_views_from_other_directions_are_shown() -> None:
-    """The camera is static for 21 frames, then has three other viewpoints, one frame each."""
-    poses = poses_of_walk()
-    tracks = tracks_of_walk(poses)
-    found = rt.Object(3, "suitcase", 1.0, "ok", "", center=np.array(CENTERS[2]))
-    cams = np.repeat(poses.cam_from_world[:1], FRAMES, 0)
-    eyes = np.array([[4.0, 0, 1], [0, 4, 1], [0, 0, 5]]) + found.center
-    cams[-3:, :, 3] = -np.einsum("fij,fj->fi", cams[-3:, :, :3], eyes)
-    still = dataclasses.replace(poses, cam_from_world=cams)
-    own = np.flatnonzero(tracks.track_id == 3)
-    tracks.xyxy[own] = [0, 0, 50, 50]  # equally good
-    late = [(tracks.frame[diverse_rows(tracks, found, p, 4)] > 20).sum() for p in (still, None)]
-    assert late[0] >= 2 and late[1] == 1  # by time alone: the last one
-
-
 def test_views_come_from_the_cameras_of_the_component(parted: rt.Result) -> None:
     wanted = set(Pictures(parted, VIDEO).wanted.tolist())
     for o in parted.objects:
@@ -1620,26 +1010,6 @@ def test_views_come_from_the_cameras_of_the_component(parted: rt.Result) -> None
             for poses in (parted.poses.of_part(o.part), parted.poses.of_part(1 - o.part))
         ]
         assert chosen[0] != chosen[1] and wanted >= set(chosen[0])
-
-
-def test_frames_are_downscaled_without_boxes(tmp_path: Path) -> None:
-    """A frame of 960 px is shown with 640; boxes are stored in pixels of the video."""
-    cv2.imwrite(str(tmp_path / "0.png"), np.zeros((720, 960, 3), np.uint8))
-    zero, one = np.zeros(1, np.int64), np.ones(1, np.int64)
-    box = np.array([[300.0, 300, 600, 600]])
-    result = fitted(rt.Tracks(zero, one, one, box, np.ones(1), zero, zero), None)
-    video = rt.Video(tmp_path / "0.png")
-    pictures = Pictures(result, video)
-    for frame in video:
-        pictures.take(frame)
-    ((_, text),) = pictures.frames
-    image = cv2.imdecode(np.frombuffer(base64.b64decode(text), np.uint8), cv2.IMREAD_COLOR)
-    assert image.shape == (480, 640, 3) and image.max() < 9
-    write_scene(result, pictures, tmp_path / "a.html", video)
-    data = data_of(tmp_path / "a.html")
-    ((frame, _),) = data["thumbs"]
-    boxes = np.frombuffer(base64.b64decode(data["objects"][0]["boxes"]), "<f4")
-    assert (frame, boxes.tolist()) == (0, [300, 300, 600, 600])
 
 
 def test_background_frames_are_undistorted(tmp_path: Path) -> None:
@@ -1663,39 +1033,6 @@ def test_background_frames_are_undistorted(tmp_path: Path) -> None:
     rows = shown[30:-30].astype(float)
     found = (rows * (np.arange(WIDTH) + 0.5)).sum(1) / rows.sum(1)
     np.testing.assert_allclose(found, 60, atol=0.7)
-
-
-def test_the_best_crop_comes_first() -> None:
-    tracks = tracks_of_walk(poses_of_walk())
-    own = np.flatnonzero(tracks.track_id == 3)
-    tracks.xyxy[own[7]] = [0, 0, 300, 200]  # the largest box
-    found = rt.Object(3, "suitcase", 1.0, "rejected", "")
-    assert diverse_rows(tracks, found, None, 3)[0] == own[7]
-    weak = with_columns(tracks, score=np.where(np.arange(len(tracks)) == own[7], 0.01, 0.9))
-    assert diverse_rows(weak, found, None, 3)[0] != own[7]
-
-
-def test_doubtful_objects_take_no_crops_from_others() -> None:
-    result = fitted(tracks_of_walk(poses_of_walk()), None, names=NAMES)
-    result.objects[:2] = [dataclasses.replace(o, status="doubtful") for o in result.objects[:2]]
-    pictures = Pictures(result, VIDEO, max_crops=18)
-    of = result.tracks.track_id[pictures.wanted]
-    assert np.bincount(of, minlength=5).tolist() == [0, 1, 1, 8, 8]
-
-
-def test_crops_come_from_requested_frames_only() -> None:
-    """Each crop has the number of its frame and is stored once."""
-    tracks = tracks_of_walk(poses_of_walk())
-    pictures = Pictures(fitted(tracks, None, names=NAMES), VIDEO)
-    rows = pictures.wanted
-    wanted = set(zip(tracks.frame[rows].tolist(), tracks.track_id[rows].tolist(), strict=True))
-    image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    for index in range(FRAMES):
-        pictures.take(rt.Frame(index, index / 30, image))
-    cut = [(f, i) for i, crops in pictures.crops.items() for f, _ in crops]
-    assert set(cut) == wanted and len(cut) == len(wanted) and {i for _, i in cut} == {1, 2, 3, 4}
-    assert all(4 <= len(crops) <= 8 for crops in pictures.crops.values())
-    assert [f for f, _ in pictures.frames] == list(range(FRAMES))
 
 
 def test_up_is_estimated_from_level_cameras(tmp_path: Path) -> None:
@@ -1723,54 +1060,3 @@ def test_long_videos_are_subsampled(tmp_path: Path) -> None:
     assert data["steps"]["seconds"] * 1334 == pytest.approx(4000 / 30)
     assert data["objects"][0]["seen"] == [10, 11, 100, 100]
     assert len(base64.b64decode(data["poses"])) == 1334 * 48
-
-
-class Source:
-    """A video that counts the reads of its frames, and can be interrupted."""
-
-    has_images = True
-    files = ()
-
-    def __init__(self, video: Any, live: bool = False) -> None:
-        self.config, self.size, self.scale, self.fps = (
-            getattr(video, name) for name in ("config", "size", "scale", "fps")
-        )
-        self.video, self.is_live, self.source, self.expected = video, live, "a.mp4", FRAMES
-        self.read, self.stop_at = 0, -1
-
-    def __iter__(self) -> Iterator[rt.Frame]:
-        assert not self.is_live, "it cannot be read again"
-        for frame in self.video:
-            self.read += 1
-            if self.read == self.stop_at:
-                raise KeyboardInterrupt
-            yield frame
-
-
-def test_one_pass_writes_overlay_and_viewer_atomically(tmp_path: Path) -> None:
-    """If interrupted, neither exists. Otherwise each frame is read once for both."""
-    write_page(tmp_path / "a", scene=False)
-    out, source = tmp_path / "a/out", Source(rt.Video(tmp_path / "a/frames"))
-    result = fitted(tracks_of_walk(poses_of_walk()), None, names=NAMES)
-    source.stop_at = 10
-    with pytest.raises(KeyboardInterrupt):
-        write_pictures(result, out, source)  # type: ignore[arg-type]
-    made = {p.name for p in out.iterdir()}
-    assert not made & {"overlay.mp4", "scene.html"} and not [n for n in made if n[0] == "."]
-    source.read, source.stop_at = 0, -1
-    write_pictures(result, out, source)  # type: ignore[arg-type]
-    assert source.read == FRAMES
-    assert {"overlay.mp4", "scene.html"} <= {p.name for p in out.iterdir()}
-    source.read = 0
-    write_pictures(result, out, source, overlay="none", scene=False)  # type: ignore[arg-type]
-    assert source.read == 0
-
-
-def test_a_live_source_has_a_page_without_pictures(tmp_path: Path) -> None:
-    result = fitted(tracks_of_walk(poses_of_walk()), None, names=NAMES)
-    result.warnings.append("a live source cannot be read twice: identities only")
-    write_pictures(result, tmp_path, Source(VIDEO, live=True))  # type: ignore[arg-type]
-    assert [p.name for p in tmp_path.iterdir()] == ["scene.html"]
-    data = data_of(tmp_path / "scene.html")
-    assert data["thumbs"] == [] and "identities only" in data["why_flat"]
-    assert [o["crops"] for o in data["objects"]] == [[]] * 4

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import http.client
 import json
 import os
@@ -25,13 +24,8 @@ import pytest
 from browser import Browser
 from front_door.room import ROOM
 from simulated import SIZE, tracks_of, unlinked, walk
-from test_scene import SCREENSHOTS, complaints
 
 import reobj_track as rt
-from reobj.maps.corrections import FolderMap
-from reobj.maps.listing import earlier_sessions
-from reobj.maps.stage import session_key
-from reobj.results.edits import read_edits
 from reobj.results.workspace import Workspace
 
 TOOL = Path(rt.__file__)
@@ -146,7 +140,7 @@ def film_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     given = unlinked(poses, tracks_of(poses))
     workspace.bind(rt.Video(path))
     workspace.save_last(given, given.poses)
-    assert rt.main(["objects", str(workspace.out), "--set", "output.overlay=none"]) == 0
+    assert rt.main(["objects", str(workspace.out), *WITHOUT_FILM]) == 0
     return workspace.out
 
 
@@ -169,24 +163,15 @@ def ids(out: Path) -> list[int]:
 
 
 def test_saved_corrections_are_applied_and_undone(out: Path) -> None:
-    """Two saves, two undos: the files of a result are those from before, byte for byte."""
+    """After the undo the files of a result are those from before, byte for byte."""
     names = ("tracks.txt", "poses.txt", "objects.ply")
     before = [(out / name).read_bytes() for name in names]
     with serving(out) as client:
-        first = edits_of(out, delete(out, 6))
-        both = edits_of(out, delete(out, 6), delete(out, 2))
-        for text, left in ((first, [1, 2, 3, 4, 5]), (both, [1, 3, 4, 5])):
-            status, answer = client.post(f"/edits?version={client.state()['version']}", text)
-            assert status == 200 and json.loads(answer)["running"], answer
-            state = client.finished()
-            assert not state["failed"] and ids(out) == left
-            assert state["texts"][0] == "starting"
-        assert client.state()["undo"] == 2
-        for left in ([1, 2, 3, 4, 5], [1, 2, 3, 4, 5, 6]):
-            status, _ = client.post(f"/undo?version={client.state()['version']}")
-            assert status == 200 and not client.finished()["failed"] and ids(out) == left
-        status, answer = client.post(f"/undo?version={client.state()['version']}")
-        assert (status, answer) == (409, "nothing to undo")
+        save(client, edits_of(out, delete(out, 6)))
+        assert ids(out) == [1, 2, 3, 4, 5] and client.state()["undo"] == 1
+        status, _ = undo(client)
+        assert status == 200 and not client.finished()["failed"]
+        assert undo(client) == (409, "nothing to undo")
     assert [(out / name).read_bytes() for name in names] == before
     assert not (out / "edits.json").exists() and not (out / "cache/new-edits.json").exists()
 
@@ -214,25 +199,7 @@ def test_corrections_that_fail_change_nothing(out: Path) -> None:
         assert not client.finished()["failed"] and ids(out) == [1, 2, 3, 4, 5]
 
 
-def test_a_file_that_cannot_be_written_does_not_block_later_corrections(out: Path) -> None:
-    """One line for the user; the next save works."""
-    obstacle = out / "cache/new-edits.json"
-    with serving(out) as client:
-        path = f"/edits?version={client.state()['version']}"
-        obstacle.mkdir()
-        status, answer = client.post(path, edits_of(out, delete(out, 6)))
-        assert status == 409 and "new-edits.json" in answer and "\n" not in answer
-        assert client.state()["failed"] and not client.state()["running"]
-        obstacle.rmdir()
-        assert client.post(path, edits_of(out, delete(out, 6)))[0] == 200
-        assert not client.finished()["failed"] and ids(out) == [1, 2, 3, 4, 5]
-        obstacle.mkdir()
-        assert client.post(f"/undo?version={client.state()['version']}")[0] == 409
-        obstacle.rmdir()
-        assert client.post(f"/undo?version={client.state()['version']}")[0] == 200
-        assert not client.finished()["failed"] and ids(out) == [1, 2, 3, 4, 5, 6]
-
-
+@pytest.mark.slow
 def test_ctrl_c_ends_the_worker_too(out: Path) -> None:
     before = {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()}
     with serving(out) as client:
@@ -243,21 +210,6 @@ def test_ctrl_c_ends_the_worker_too(out: Path) -> None:
     assert after == before
     with Workspace.open(out):  # no process holds its lock
         pass
-
-
-def test_open_does_not_wait_for_a_browser_in_the_terminal(out: Path, tmp_path: Path) -> None:
-    """Such a browser (lynx, w3m) shows the page before `webbrowser.open` returns."""
-    script = tmp_path / "browser.py"
-    fetch = "urllib.request.urlopen(sys.argv[1], timeout=60).status"
-    script.write_text(f"import sys, urllib.request\nprint({fetch}, file=open('status', 'w'))\n")
-    command = f"sh -c 'cd {tmp_path} && {sys.executable} browser.py %s > said 2>&1'"
-    with serving(out, "--open", BROWSER=command):
-        said = tmp_path / "said"
-        for _ in range(200):
-            if said.exists() and said.read_text().endswith("\n"):
-                break
-            time.sleep(0.1)
-    assert said.read_text().endswith("HTTP Error 403: Forbidden\n")  # it keeps no cookie
 
 
 # ---- Corrections of a recording with a map ----
@@ -321,6 +273,7 @@ def undo(client: Client) -> tuple[int, str]:
     return client.post(f"/undo?version={client.state()['version']}")
 
 
+@pytest.mark.slow
 def test_undo_restores_the_map(flat: Path) -> None:
     """Names, merged and deleted objects, and what both recordings saw."""
     before = in_map(flat)
@@ -336,40 +289,7 @@ def test_undo_restores_the_map(flat: Path) -> None:
     assert not list((flat / "b/cache/undo").iterdir())
 
 
-def test_undo_that_was_killed_is_repeated(flat: Path) -> None:
-    """Server and worker are killed once the map is restored: it is complete, and undo still works.
-
-    The save before it had no end either: the worker finished, but the server did not learn of it.
-    """
-    before = in_map(flat)
-    out = flat / "b"
-    undo_file = out / "cache/undo/1.json"
-    edits = flat / "edits.json"
-    edits.write_bytes(map_edits(flat))
-    room = FolderMap(flat / "flat.map", session_key(Workspace(out).video()), False)
-    room.keep(undo_file.with_suffix(".map"), read_edits(edits))
-    undo_file.write_bytes(edits_of(out))
-    assert rt.main(["objects", str(out), "--edits", str(edits)]) == 0
-    assert in_map(flat)[1:] != before[1:]
-    kill_during_undo(out)
-    assert in_map(flat)[1:] == before[1:] and (out / "edits.json").is_file()
-    with serving(out) as client:
-        assert client.state()["undo"] == 1
-        assert undo(client)[0] == 200 and not client.finished()["failed"]
-    assert in_map(flat) == before and not (out / "edits.json").exists()
-
-
-def kill_during_undo(out: Path) -> None:
-    """Begin to undo; kill server and worker as soon as the worker runs."""
-    with pytest.raises(AssertionError), serving(out) as client:  # the server does not end well
-        assert undo(client)[0] == 200
-        while not (workers := workers_of(client)):
-            time.sleep(0.02)
-        client.process.kill()
-        for worker in workers:
-            os.kill(worker, signal.SIGKILL)
-
-
+@pytest.mark.slow
 def test_undo_that_fails_or_is_ended_leaves_the_map(flat: Path) -> None:
     """Another run writes into the folder; then Ctrl-C while the worker runs."""
     out = flat / "b"
@@ -388,6 +308,7 @@ def test_undo_that_fails_or_is_ended_leaves_the_map(flat: Path) -> None:
     assert (flat / "flat.map").read_bytes() == saved and (out / "edits.json").is_file()
 
 
+@pytest.mark.slow
 def test_a_map_that_another_command_changed_is_left_alone(flat: Path) -> None:
     """Undo is refused in a line that names the map; map and folder stay as they are."""
     out = flat / "b"
@@ -405,18 +326,7 @@ def test_a_map_that_another_command_changed_is_left_alone(flat: Path) -> None:
     assert [path.read_bytes() for path in files] == content
 
 
-def test_corrections_that_fail_leave_the_map(flat: Path) -> None:
-    """The rename is possible, the deletion after it is not."""
-    data = json.loads(map_edits(flat))
-    data["edits"][1]["object"]["box"] = [1, 2, 3, 4]
-    before = (flat / "flat.map").read_bytes()
-    with serving(flat / "b") as client:
-        client.post(f"/edits?version={client.state()['version']}", json.dumps(data).encode())
-        state = client.finished()
-        assert state["failed"] and state["undo"] == 0
-    assert (flat / "flat.map").read_bytes() == before
-
-
+@pytest.mark.slow
 def test_all_recordings_of_the_map_are_browsed(browser: Browser, flat: Path) -> None:
     """Also from the folder of the first recording, whose page was made before the second one."""
     options = "[...$('session').options].map(o => o.textContent)"
@@ -430,34 +340,7 @@ def test_all_recordings_of_the_map_are_browsed(browser: Browser, flat: Path) -> 
             assert second.startswith(f"room.mp4 {other}, ")
             browser.eval("$('session').value = 0; $('session').onchange()")
             assert browser.eval("here.map(o => o.id)") == numbers[number]
-            assert own_complaints(browser) == []
-
-
-def test_a_loaded_result_has_the_recordings_of_the_map(flat: Path) -> None:
-    """So has the page that a notebook makes of it; a damaged file costs these only."""
-    (flat / "b/scene.html").unlink()
-    result = rt.Result.load(flat / "b")
-    room = rt.RoomMap.load(flat / "flat.map")
-    (session,) = result.earlier
-    (true,) = earlier_sessions(room, flat / "flat.map", room.session(2).fingerprint)
-    assert (session.name, session.date) == (true.name, true.date) == ("room.mp4 0-80", true.date)
-    assert session.changes is None and len(true.objects) > 3
-    for found, expected in zip(session.objects, true.objects, strict=True):
-        assert (found.id, found.class_name) == (expected.id, expected.class_name)
-        np.testing.assert_allclose(found.center, expected.center, rtol=1e-5)
-        np.testing.assert_allclose(found.size_m, expected.size_m, rtol=1e-5)
-    page = result._repr_html_()
-    assert "room.mp4 0-80" in page and "First recording of the map" in page
-    (flat / "b/cache/earlier.json").write_text('{"sessions": [{"name": 3}]}')
-    assert rt.Result.load(flat / "b").earlier == ()
-
-
-def test_a_folder_without_its_map_shows_the_page_of_its_fit(flat: Path) -> None:
-    (flat / "flat.map").unlink()
-    with serving(flat / "b") as client:
-        page = client.get("/")[2].decode()
-        data = json.loads(page.split('id="data">')[1].split("</script>")[0])
-        assert [s["name"] for s in data["earlier"]] == ["room.mp4 0-80"]
+            assert browser.errors == []
 
 
 # ---- What is refused ----
@@ -472,6 +355,9 @@ def test_requests_without_the_token_are_refused(out: Path) -> None:
         assert client.ask(f"/?token={wrong}")[0] == 403
         assert client.ask("/", Cookie=f"reobj_{client.port}=\u00e9")[0] == 403
         assert client.ask("/", Cookie=f"reobj_1={client.token}")[0] == 403  # of another port
+        mine = f"reobj_{client.port}={client.token}"
+        for other in ('layout={"a": [1, 2]}', "flag", "x=\u00e9"):  # cookies of other programs
+            assert client.ask("/state", Cookie=f"{other}; {mine}")[0] == 200, other
         status, headers, _ = client.ask(f"/?token={client.token}")
         assert (status, headers["Location"]) == (303, "/")
         assert re.fullmatch(rf"reobj_{client.port}={client.token}; HttpOnly; .*Path=/",
@@ -486,16 +372,6 @@ def test_requests_without_the_token_are_refused(out: Path) -> None:
             assert headers["Referrer-Policy"] == "no-referrer"
             assert headers["Cross-Origin-Resource-Policy"] == "same-origin"
             assert headers["Content-Security-Policy"] == "frame-ancestors 'none'"
-
-
-def test_cookies_of_other_programs_do_not_matter(out: Path) -> None:
-    """Cookies do not distinguish ports: the browser sends those of all programs on 127.0.0.1."""
-    with serving(out) as client:
-        mine = f"reobj_{client.port}={client.token}"
-        for other in ('layout={"a": [1, 2]}', "user@host=1", "flag", "a=b c", "x=\u00e9", "k[0]="):
-            assert client.ask("/state", Cookie=f"{other}; {mine}")[0] == 200, other
-            assert client.ask("/state", Cookie=f"{mine};{other}")[0] == 200, other
-            assert client.ask("/state", Cookie=other)[0] == 403
 
 
 def test_a_broken_request_leaves_no_traceback(out: Path) -> None:
@@ -561,63 +437,41 @@ def test_no_address_is_a_path(out: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "fault",
+    ("fault", "said"),
     [
-        "no folder",
-        "no page",
-        "link",
-        "old page",
-        "foreign",
-        "not a number",
-        "deep",
-        "port",
-        "range",
+        ("no folder", "no output folder of reobj_track"),
+        ("no page", "make it with `objects"),
+        ("link", "is a link out of the folder"),
+        ("old page", "`objects OUT` makes it again"),
+        ("foreign", "not a viewer that this version wrote"),
+        ("not a number", "not a viewer"),
+        ("port", "in use"),
+        ("range", "0 to 65535 are possible"),
     ],
 )
-def test_bad_input_is_one_line(out: Path, tmp_path: Path, capsys: Any, fault: str) -> None:
+def test_bad_input_is_one_line(
+    out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], fault: str, said: str
+) -> None:
     page = out / "scene.html"
-    words = ["serve", str(out)]
-    if fault == "no folder":
-        words[1] = str(tmp_path / "none")
-    if fault == "no page":
-        page.unlink()
+    words = ["serve", str(tmp_path / "none" if fault == "no folder" else out)]
+    text = {
+        "old page": page.read_text().replace('"version":1,', "", 1),
+        "not a number": page.read_text().replace('"version":1,', '"version":1,"x":NaN,', 1),
+        "foreign": "<script>alert(1)</script>",
+    }.get(fault, page.read_text())
+    page.unlink()
     if fault == "link":
-        page.rename(tmp_path / "elsewhere.html")
         page.symlink_to(tmp_path / "elsewhere.html")
-    if fault == "old page":
-        page.write_text(page.read_text().replace('"version":1,', "", 1))
-    if fault == "not a number":
-        page.write_text(page.read_text().replace('"version":1,', '"version":1,"x":NaN,', 1))
-    if fault == "deep":
-        deep = f'"version":1,"x":{"[" * 99999}{"]" * 99999},'
-        page.write_text(page.read_text().replace('"version":1,', deep, 1))
-    if fault == "foreign":
-        page.write_text("<script>alert(1)</script>")
-    said = {
-        "no folder": "no output folder of reobj_track", "no page": "make it with `objects",
-        "link": "is a link out of the folder", "old page": "`objects OUT` makes it again",
-        "foreign": "not a viewer that this version wrote", "port": "in use",
-        "not a number": "not a viewer", "deep": "not a viewer",
-        "range": "0 to 65535 are possible",
-    }  # fmt: skip
-    if fault == "port":
-        with serving(out) as client:
-            code = rt.main([*words, "--port", str(client.port)])
-    else:
-        code = rt.main([*words, "--port", "70000"] if fault == "range" else words)
-    text = capsys.readouterr().err
-    assert code == 2 and said[fault] in text and text.count("\n") == 1 and text[:7] == "error: "
+    if fault != "no page":
+        page.write_text(text)
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = {"port": taken.getsockname()[1], "range": 70000}.get(fault, 0)
+        assert rt.main([*words, "--port", str(port)]) == 2
+    error = capsys.readouterr().err
+    assert said in error and error.count("\n") == 1 and error[:7] == "error: "
     assert not (tmp_path / "none").exists()
-
-
-def test_scripts_of_the_file_are_not_run(browser: Browser, out: Path) -> None:
-    """The page is made of the data of scene.html: what somebody added to it stays outside."""
-    page = out / "scene.html"
-    page.write_text(
-        page.read_text().replace("</body>", "<script>window.hacked = 1</script></body>")
-    )
-    with serving(out) as client:
-        assert b"hacked" not in client.get("/")[2]
 
 
 # ---- The recording ----
@@ -631,13 +485,12 @@ def test_the_recording_is_sent_in_ranges(film_folder: Path) -> None:
         assert (status, text, headers["Accept-Ranges"]) == (200, data, "bytes")
         assert headers["Content-Type"] == "video/webm"
         for asked, first, last in (
-            ("bytes=0-", 0, size - 1), ("bytes=5-9", 5, 9), ("bytes=-7", size - 7, size - 1),
-            (f"bytes=3-{size + 99}", 3, size - 1), (f"bytes=-{size + 9}", 0, size - 1),
+            ("bytes=0-", 0, size - 1), ("bytes=5-9", 5, 9), (f"bytes=3-{size + 99}", 3, size - 1),
         ):  # fmt: skip
             status, headers, text = client.get("/recording", Range=asked)
             assert (status, text) == (206, data[first : last + 1])
             assert headers["Content-Range"] == f"bytes {first}-{last}/{size}"
-        for asked in (f"bytes={size}-", "bytes=9-5", "bytes=-0"):
+        for asked in (f"bytes={size}-", "bytes=9-5"):
             status, headers, text = client.get("/recording", Range=asked)
             assert (status, text, headers["Content-Range"]) == (416, b"", f"bytes */{size}")
         assert client.ask("/recording")[0] == 403
@@ -662,35 +515,24 @@ def test_a_file_that_is_not_the_recording_is_not_sent(film_folder: Path, tmp_pat
 # ---- In the browser ----
 
 
+@pytest.mark.slow
 def test_save_and_undo_in_the_browser(browser: Browser, out: Path) -> None:
-    """A visit is split at the slider and saved; the page shows the new result, then the old one."""
+    """A visit is split at the slider and saved; the page shows the new result, then the old one.
+
+    The page is made of the data of scene.html: a script that somebody added to it does not run.
+    """
+    page = out / "scene.html"
+    page.write_text(page.read_text().replace("</body>", "<script>hacked = 1</script></body>"))
     with serving(out) as client:
         browser.open(client.url, 1440, 900)
-        here = "[location.href, $('edits').hidden]"
-        assert browser.eval(here) == [f"{client.origin}/", True]
+        here = "[location.href, $('edits').hidden, typeof hacked]"
+        assert browser.eval(here) == [f"{client.origin}/", True, "undefined"]
         browser.eval("select(here[1]); goTo(13)")
         browser.eval("$('cut').querySelector('button').click()")
-        names = "[...$('edits').querySelectorAll('button')].map(b => b.textContent)"
-        assert browser.eval(names) == ["Undo", "Undo the last save", "Save"]
-        browser.eval("window.old = 1; window.texts = new Set(); $('save').click()")
-        browser.wait("job.running && $('save').disabled && $('job').textContent")
+        browser.eval("window.old = 1; $('save').click()")
         browser.wait("!window.old && !job.running && S.edits.length === 1")
         assert ids(out) == [1, 2, 3, 4, 5, 6, 7]
-        shown = "objects.map(o => [o.id, o.visits])"
-        assert browser.eval(shown)[-1] == [7, [[13, 39]]]
-        assert browser.eval("objects[1].center && objects[6].status") in ("ok", "prior_dominated")
-        for phone in (False, True):
-            for scheme in ("light", "dark"):
-                feature = [{"name": "prefers-color-scheme", "value": scheme}]
-                browser.send("Emulation.setEmulatedMedia", features=feature)
-                browser.open(client.url, *((390, 844) if phone else (1440, 900)), phone=phone)
-                browser.eval("select(here[1])")
-                browser.settle()
-                assert browser.eval("document.documentElement.scrollWidth <= innerWidth")
-                browser.picture(
-                    SCREENSHOTS / f"served-{'phone' if phone else 'desktop'}-{scheme}.png"
-                )
-        browser.send("Emulation.setEmulatedMedia", features=[])
+        assert browser.eval("objects.map(o => [o.id, o.visits])")[-1] == [7, [[13, 39]]]
         browser.eval("window.old = 1; $('undo-saved').click()")
         browser.wait("!window.old && !job.running && S.edits.length === 0")
         assert browser.eval("objects.map(o => o.id)") == ids(out) == [1, 2, 3, 4, 5, 6]
@@ -699,16 +541,7 @@ def test_save_and_undo_in_the_browser(browser: Browser, out: Path) -> None:
         browser.wait("job.failed")
         fault = browser.eval("[$('job').textContent, $('job').className, $('save').disabled]")
         assert "no object has the box" in fault[0] and fault[1:] == ["fault", False]
-        browser.eval("saved = true")
-        assert own_complaints(browser) == []
-
-
-def own_complaints(browser: Browser) -> list[str]:
-    """Errors of the page, besides its requests to its server."""
-    expected = ("asked the network for http://127.0.0.1:", "Canvas2D: Multiple readback")
-    found = [e for e in complaints(browser) if not e.startswith(expected)]
-    browser.errors.clear()
-    return found
+        assert browser.errors == []
 
 
 def test_frames_of_an_image_folder_lie_behind_the_shapes(browser: Browser, out: Path) -> None:
@@ -724,12 +557,13 @@ def test_frames_of_an_image_folder_lie_behind_the_shapes(browser: Browser, out: 
         browser.press("ArrowRight")
         browser.wait("$('back').dataset.frame === '22'")
         assert abs(browser.eval(green) - (60 + 2 * 22)) < 4
-        assert own_complaints(browser) == []
+        assert browser.errors == []
 
 
 GREEN = "$('back').getContext('2d').getImageData($('back').width / 2, 99, 1, 1).data[1]"
 
 
+@pytest.mark.slow
 def test_the_recording_plays_behind_the_shapes(browser: Browser, film_folder: Path) -> None:
     """The slider shows exactly the frame of its step; during play the frame belongs to the step."""
     with serving(film_folder) as client:
@@ -762,7 +596,7 @@ def test_the_recording_plays_behind_the_shapes(browser: Browser, film_folder: Pa
         for step, value in browser.eval("[...seen]"):
             assert abs(value - 20 * step) < 8, step
         assert browser.eval("[playing, film.paused]") == [None, True]
-        assert own_complaints(browser) == []
+        assert browser.errors == []
 
 
 def test_a_recording_beside_the_page_is_used_too(
@@ -778,37 +612,6 @@ def test_a_recording_beside_the_page_is_used_too(
     assert browser.eval("[filmed, $('back').hidden]") == [False, True]
     shutil.copy(film_folder.parent / "walk #1.webm", tmp_path)
     browser.open(page)
-    browser.eval("goTo(4); setRide(true)")
+    browser.eval("goTo(4); setRide(true); $('boxes').click()")
     browser.wait("filmed && backdrop?.step === 4 && $('back').dataset.frame === '4'")
-    image = cv2.imdecode(np.frombuffer(_screenshot(browser), np.uint8), cv2.IMREAD_COLOR)
-    x, y = browser.eval(
-        "(r => [r.left + r.width / 2, r.top + 99])($('back').getBoundingClientRect())"
-    )
-    assert abs(int(image[int(y), int(x), 1]) - 80) < 30
-    browser.errors.clear()
-
-
-def _screenshot(browser: Browser) -> bytes:
-    browser.eval(
-        "for (const id of ['solids', 'ellipsoids', 'names']) $(id).checked = false; draw()"
-    )
-    browser.settle()
-    return base64.b64decode(browser.send("Page.captureScreenshot")["data"])
-
-
-def test_boxes_are_drawn_at_every_step(browser: Browser, film_folder: Path) -> None:
-    """Undistorted, as the pictures; boxes that fill a gap are faint."""
-    browser.open(film_folder / "scene.html")
-    browser.eval("S.thumbs = []; goTo(5); setRide(true); $('boxes').click(); draw()")
-    boxes = "[...document.querySelectorAll('#drawn .box')].map(b => +b.getAttribute('x'))"
-    assert len(browser.eval(boxes)) == 3
-    browser.eval("S.objects[0].filled = [5, 5]; draw()")
-    kinds = "[...document.querySelectorAll('#drawn .box')].map(b => b.classList.contains('filled'))"
-    assert browser.eval(kinds) == [True, False, False]
-    result = rt.Result.load(film_folder)
-    rows = result.tracks[result.tracks.frame == 5]
-    rows = rows[np.argsort(rows.track_id)]
-    data = browser.eval("[1, 2, 3].map(id => boxOf(id, 5))")
-    moved = np.array(data)[:, :4].astype(float) - rows.xyxy
-    assert 1 < np.abs(moved).max() < 30
-    assert browser.eval("boxOf(1, 99)") is None
+    assert browser.eval("document.querySelectorAll('#drawn .box').length") == 3

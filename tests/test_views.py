@@ -80,11 +80,6 @@ def test_boxes_are_undistorted_as_pycolmap_does() -> None:
     assert views.boxes[1, 0, 2] > 200  # left of the middle: outwards is to the left
 
 
-def test_no_tracks_make_empty_views() -> None:
-    views = gather_views(rt.Tracks.empty(), walk(3), np.empty(0, np.int64), 0, 0.0)
-    assert views.boxes.shape == (3, 0, 4) and views.score.shape == (3, 0)
-
-
 def test_cameras_of_views_project_like_the_poses() -> None:
     poses = walk(6)
     tracks = tracks_of(poses, 0.0)
@@ -115,14 +110,6 @@ def test_points_in_boxes_project_into_them() -> None:
                 expected.append((b, p, in_cam[2]))
     assert len(expected) > 50 and (points @ pose[2, :3] + pose[2, 3] < 0).any()
     np.testing.assert_allclose(np.column_stack(found), expected)
-
-
-def test_no_points_or_no_boxes_make_no_pairs() -> None:
-    pose = CAMERA.K @ walk(3).cam_from_world[1]
-    box, point, depth = points_in_boxes(np.empty((0, 3)), pose, np.array([[0.0, 0, 9, 9]]))
-    assert box.shape == point.shape == depth.shape == (0,)
-    box, point, depth = points_in_boxes(np.zeros((4, 3)), pose, np.empty((0, 4)))
-    assert box.shape == point.shape == depth.shape == (0,)
 
 
 def sparse_walk(count: int = 7, **options: Any) -> rt.Poses:
@@ -166,14 +153,6 @@ def test_boxes_of_a_frame_get_their_points_with_depth() -> None:
     box, point, depth = VisiblePoints(poses).in_boxes(4, boxes)
     assert list(zip(box.tolist(), point.tolist(), strict=True)) == [(0, 2), (2, 0), (2, 2)]
     np.testing.assert_allclose(depth, in_cam[[2, 0, 2], 2])
-
-
-def test_poses_without_points() -> None:
-    visible = VisiblePoints(walk(3))
-    assert visible.in_frame(1).tolist() == []
-    assert [len(column) for column in visible.in_boxes(1, np.array([[0.0, 0, 640, 480]]))] == [
-        0
-    ] * 3
 
 
 CHAIRS = chair_solids()
@@ -230,19 +209,3 @@ def test_a_point_belongs_to_the_nearest_then_smallest_object() -> None:
     assert [len(own) for own in rows_of(points_on(views, poses, solids), points)] == [12, 0, 0]
     solids.center_in_world[0, 0] = solids.half_axes[0, 0] = np.nan  # unknown: the others are nearer
     assert [len(own) for own in rows_of(points_on(views, poses, solids), points)] == [0, 12, 0]
-
-
-def test_many_points_are_subsampled_evenly() -> None:
-    points = CHAIRS.center_in_world[1] + np.linspace(-0.1, 0.1, 250)[:, None]
-    poses, views = seen_points(points)
-    found = rows_of(points_on(views, poses, CHAIRS), points)
-    assert found == [[], [*range(0, 250, 3)], []]
-
-
-def test_without_points_no_object_has_points() -> None:
-    poses = walk(4)
-    tracks = tracks_of(poses, 0.0)
-    views = gather_views(tracks, poses, tracks.track_id - 1, 3, 0.0)
-    assert not np.isfinite(points_on(views, poses, CHAIRS)).any()
-    assert points_on(gather_views(rt.Tracks.empty(), poses, np.empty(0, np.int64), 0, 0.0), poses,
-                     CHAIRS[[]]).shape[::2] == (0, 3)  # fmt: skip

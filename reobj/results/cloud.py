@@ -1,83 +1,113 @@
-"""Dense coloured points for the viewer, of frames with known cameras.
+"""Dense coloured points for the viewer, from depth maps of the frames.
 
-`FlowFrames`: for up to 60 frames, the flow (DIS: Kroeger et al., ECCV 2016) to three others is
-triangulated. A pixel becomes a point where flow there and back agree, the point projects onto both
-pixels, the rays have enough parallax, and two of the three depths agree. Points are then averaged
-in voxels. Points of depth maps: `depth_cloud`.
+The pixels of up to 60 maps, subsampled to 320 px, become points, except those at edges of depth.
+A point is left out if more of the four maps from nearby see through it than have a surface there.
+Points are then averaged in voxels.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
-from reobj.cameras import Poses
-from reobj.sources.video import shrunk
-from reobj.types import Array, BoolArray, Image, IntArray
+from reobj.cameras import Poses, invert_rigid
+from reobj.poses.supplied.depth import (
+    DepthMaps,
+    compared,
+    composed,
+    find_depth_maps,
+    look_up_depth,
+    moved,
+    points_of,
+    smooth_pixels,
+)
+from reobj.sources.video import Video, shrunk
+from reobj.types import Image, IntArray, ReobjError, log
 
-REFERENCES = 60  # frames whose pixels become points
-SIZE_PX = 480  # longer side of the frames
-RETURN_PX = 1.5  # flow there and back
-REPROJECTION_PX = 1.0
-PARALLAX_DEG = 1.5
-DEPTH_SHARE = 0.03  # by which two depths of a pixel may differ
-BASELINE = (0.03, 0.12, 0.35)  # least, best, greatest, as a share of the median depth
-ANGLE_DEG = 25.0  # between the optical axes of two frames
+REFERENCES = 60  # maps whose pixels become points
+SIZE_PX = 480  # longer side of the frames that give the colours
+NEIGHBOURS = 4  # maps that a point is compared with
 CELLS = 300  # voxels over the radius of the room; fewer where there would be too many points
-MOST = 500_000  # points of a cloud
+MOST = 500_000  # points of a cloud, 8 MB in the page
+
+Reals = npt.NDArray[np.floating[Any]]
 
 
 @dataclass(frozen=True, slots=True)
 class Cloud:
-    """Dense points of a component.
+    """Dense points of a component, the most observed ones first.
 
     Attributes:
         xyz: (N, 3), world. rgb: (N, 3) uint8. seen_from: (N, 3) unit vectors towards the cameras
             that observed them, mean. voxel: side, world units.
     """
 
-    xyz: Array
+    xyz: Reals
     rgb: npt.NDArray[np.uint8]
-    seen_from: Array
+    seen_from: Reals
     voxel: float
 
-    def __len__(self) -> int:
-        """Number of points."""
-        return len(self.xyz)
 
-    def of_rows(self, rows: IntArray) -> Cloud:
-        """Return the points of rows."""
-        return Cloud(self.xyz[rows], self.rgb[rows], self.seen_from[rows], self.voxel)
+Points = tuple[Reals, npt.NDArray[np.uint8], Reals]  # world, RGB, directions to the camera (N, 3)
 
 
-Points = tuple[Array, npt.NDArray[np.uint8], Array]  # world, RGB, directions to the camera (N, 3)
+def dense_frames(poses: Poses | None, video: Video, depth: str) -> DenseFrames | None:
+    """Return the frames for a dense cloud; None, with a warning: there can be none.
+
+    Args:
+        depth: folder of maps, as `find_depth_maps` reads it.
+    """
+    try:
+        if not depth:
+            raise ReobjError("they are made from depth maps; give these with --depth FOLDER")
+        if poses is None or not (poses.metric or poses.scale):
+            raise ReobjError("--depth: the scale of the cameras is unknown")
+        return DenseFrames(poses, find_depth_maps(depth, poses, video))
+    except ReobjError as error:
+        log.warning("no dense points: %s", error)
+        return None
 
 
 class DenseFrames:
-    """Frames of a recording for a dense cloud, and the cloud of each component.
+    """Frames whose depth maps become points, and the cloud of each component.
 
     Attributes:
-        rows: of the frames whose pixels become points. wanted: numbers of the frames to keep.
-        images: these, undistorted, by number. spacing: usual distance of the points of a frame,
-            world units; no voxel is smaller.
+        rows: of the frames. wanted: their numbers. images: these, undistorted, by number.
+        maps: depth (h, w) in m and K (3, 3) by row. metres: per world unit.
+        spacing: usual distance of the points of a frame, world units; no voxel is smaller.
     """
 
-    REASON = ""  # why there may be no points
-    spacing = 0.0
+    def __init__(self, poses: Poses, maps: DepthMaps) -> None:
+        """Choose frames, and read their maps.
 
-    def __init__(self, poses: Poses, rows: Iterable[int]) -> None:
+        Args:
+            poses: in metres, or with the scale of a map.
+        Raises:
+            ReobjError: a map cannot be read, or no frame with a map has a pose.
+        """
+        known = np.array([row for row in sorted(maps.files) if poses.known[row]], np.int64)
+        if not len(known):
+            raise ReobjError("--depth: no frame with a depth map has a pose")
+        even = np.linspace(0, len(known) - 1, min(REFERENCES, len(known))).round().astype(np.int64)
         self.poses = poses
-        self.rows = list(rows)
-        self.wanted = {int(poses.frame[row]) for row in self.rows}
+        self.rows: list[int] = known[even].tolist()
+        self.wanted = set(poses.frame[self.rows].tolist())
         self.images: dict[int, Image] = {}
-        self.centers = -np.einsum(
-            "nji,nj->ni", poses.cam_from_world[:, :, :3], poses.cam_from_world[:, :, 3]
-        )  # (F, 3)
+        self.color_from_depth = invert_rigid(maps.depth_from_color)
+        self.maps = {row: maps.read(row) for row in self.rows}
+        self.metres = 1.0 if poses.metric or poses.scale is None else poses.scale[0]
+        pixels = [self._median_depth(row) / self.maps[row][1][0, 0] for row in self.rows]
+        self.spacing = float(np.median(pixels)) / self.metres
+        cam_from_world = poses.cam_from_world.copy()
+        cam_from_world[:, :, 3] *= self.metres
+        self.centers = invert_rigid(cam_from_world)[:, :, 3]  # (F, 3), m
+        self.depth_from_world = {
+            row: composed(maps.depth_from_color, cam_from_world[row]) for row in self.rows
+        }  # in metres
 
     def take(self, number: int, image: Image) -> None:
         """Keep an undistorted frame."""
@@ -85,169 +115,59 @@ class DenseFrames:
 
     def cloud(self, part: int) -> Cloud | None:
         """Return the cloud of a component; None: no frame of it gives points."""
-        found = [
-            points
-            for row in self.rows
-            if self.poses.part[row] == part and (points := self._points(row)) is not None
-        ]
-        if not found:
-            return None
-        xyz, rgb, seen_from = (np.concatenate(column) for column in zip(*found, strict=True))
-        cloud = _voxels(xyz, rgb, seen_from, self.spacing) if len(xyz) else None
-        return cloud if cloud is not None and len(cloud) else None
+        rows = [row for row in self.rows if self.poses.part[row] == part]
+        found = [self._points(row) for row in rows if int(self.poses.frame[row]) in self.images]
+        xyz, rgb, seen_from = (
+            np.concatenate(column) for column in zip(_NO_POINTS, *found, strict=True)
+        )
+        return _voxels(xyz, rgb, seen_from, self.spacing) if len(xyz) else None
 
-    def _points(self, row: int) -> Points | None:
-        """Return the points of a frame."""
-        raise NotImplementedError
-
-    def _image(self, row: int) -> Image | None:
-        return self.images.get(int(self.poses.frame[row]))
-
-    def _K(self, image: Image) -> Array:
-        return self.poses.camera.resized((image.shape[1], image.shape[0])).K
-
-
-def evenly(rows: IntArray) -> IntArray:
-    """Choose at most `REFERENCES` rows."""
-    even = np.linspace(0, len(rows) - 1, min(REFERENCES, len(rows))).round().astype(np.int64)
-    return np.asarray(rows[even])
-
-
-class FlowFrames(DenseFrames):
-    """Frames whose optical flow is triangulated."""
-
-    REASON = "too few frames have a good baseline to others"
-
-    def __init__(self, poses: Poses) -> None:
-        """Choose frames: `REFERENCES`, and after each the next two with a good baseline."""
-        super().__init__(poses, evenly(np.flatnonzero(poses.known)).tolist())
-        self.points = [poses.of_part(part).points for part in range(poses.part_count)]
-        self.depth = {row: self._median_depth(row) for row in self.rows}
-        partners = [self._after(row, share) for row in self.rows for share in (0.1, 0.2)]
-        self.used = sorted({*self.rows, *(row for row in partners if row >= 0)})
-        self.wanted = {int(poses.frame[row]) for row in self.used}
+    def _points(self, row: int) -> Points:
+        """Return the points of a frame that other maps confirm."""
+        image = self.images[int(self.poses.frame[row])]
+        depth, K = self.maps[row]
+        in_depth = points_of(depth, K, smooth_pixels(depth))
+        K_color = self.poses.camera.resized((image.shape[1], image.shape[0])).K
+        xyw = moved(in_depth, self.color_from_depth) @ K_color.T
+        xy = np.floor(xyw[:, :2] / np.maximum(xyw[:, 2:], 1e-9)).astype(np.int64)
+        inside = (xyw[:, 2] > 0) & ((xy >= 0) & (xy < image.shape[1::-1])).all(1)
+        world_from_depth = invert_rigid(self.depth_from_world[row])
+        world = moved(in_depth[inside], world_from_depth)  # (N, 3), m
+        xy = xy[inside]
+        votes = np.zeros(len(world), np.int64)
+        for other in self._neighbours(row):
+            there = moved(world, self.depth_from_world[other])
+            agrees, seen_through = compared(look_up_depth(*self.maps[other], there), there[:, 2])
+            votes += agrees.astype(np.int64) - seen_through
+        good = votes >= 0
+        towards = world_from_depth[:, 3] - world[good]
+        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+        xyz = (world[good] / self.metres).astype(np.float32)
+        return xyz, image[xy[good, 1], xy[good, 0], ::-1], towards.astype(np.float32)
 
     def _median_depth(self, row: int) -> float:
-        """Return the median depth of the sparse points in a frame; NaN: fewer than 20."""
-        pose = self.poses.cam_from_world[row]
-        points = self.points[self.poses.part[row]]  # (N, 3), of the same world
-        points = points[:: len(points) // 5000 + 1]
-        x = points @ pose[:, :3].T + pose[:, 3]
-        x = x[x[:, 2] > 0]
-        uv = x @ self.poses.camera.K.T / x[:, 2:]
-        size = (self.poses.camera.width, self.poses.camera.height)
-        inside = ((uv[:, :2] > 0) & (uv[:, :2] < size)).all(1)
-        return float(np.median(x[inside, 2])) if inside.sum() >= 20 else math.nan
-
-    def _after(self, row: int, share: float) -> int:
-        """Return the first later frame whose baseline is a share of the median depth; -1: none."""
-        far = np.linalg.norm(self.centers - self.centers[row], axis=1) > share * self.depth[row]
-        same = self.poses.part == self.poses.part[row]
-        later = np.flatnonzero(far & same & self.poses.known)
-        later = later[later > row]
-        return int(later[0]) if len(later) else -1
+        """Return the median depth of a map, m; of an empty one 1."""
+        depth = self.maps[row][0]
+        return float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
 
     def _neighbours(self, row: int) -> list[int]:
-        """List up to three frames whose baseline and direction are best for flow."""
-        others = np.array([r for r in self.used if r != row and self._image(r) is not None], int)
-        if not len(others) or not self.depth[row] > 0:
-            return []
-        least, best, greatest = BASELINE
+        """List the maps of the component whose cameras are nearest, by place and direction."""
+        others = [r for r in self.rows if r != row and self.poses.part[r] == self.poses.part[row]]
         axis = self.poses.cam_from_world[:, 2, :3]
-        cos = axis[others] @ axis[row]
-        base = np.linalg.norm(self.centers[others] - self.centers[row], axis=1) / self.depth[row]
-        good = (base > least) & (base < greatest) & (cos > math.cos(math.radians(ANGLE_DEG)))
-        good &= self.poses.part[others] == self.poses.part[row]
-        cost = np.abs(np.log(base[good] / best)) + 4 * (1 - cos[good])
-        return [int(r) for r in others[good][np.argsort(cost, kind="stable")[:3]]]
-
-    def _points(self, row: int) -> Points | None:
-        image = self._image(row)
-        others = self._neighbours(row)
-        if image is None or len(others) < 2:
-            return None
-        rays = _rays(self._K(image), image.shape[1], image.shape[0])  # (H, W, 3)
-        depths = np.stack([self._depth_map(row, other, rays) for other in others])  # (n, H, W)
-        depth = _agreed(depths)
-        ok = depth < 6 * self.depth[row]
-        pose = self.poses.cam_from_world[row]
-        xyz = (rays[ok] * depth[ok][:, None] - pose[:, 3]) @ pose[:, :3]
-        towards = self.centers[row] - xyz
-        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-        return xyz.astype(np.float32), image[ok][:, ::-1], towards.astype(np.float32)
-
-    def _depth_map(self, row: int, other: int, rays: Array) -> Array:
-        """Triangulate the flow from a frame to another one: depth (H, W); NaN: refused."""
-        image = self._image(row)
-        target = self._image(other)
-        assert image is not None and target is not None
-        there, ok = _flow(image, target)
-        pose, moved = self.poses.cam_from_world[[row, other]]
-        rotation = moved[:, :3] @ pose[:, :3].T
-        K = self._K(image).astype(np.float32)
-        # K (R z ray + t) is at the pixel `there`: two linear equations for z
-        q = rays @ (K @ rotation.astype(np.float32)).T  # (H, W, 3)
-        s = (K @ (moved[:, 3] - rotation @ pose[:, 3])).astype(np.float32)
-        a = q[..., :2] - there * q[..., 2:]
-        c = there * s[2] - s[:2]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            depth = (a * c).sum(-1) / (a * a).sum(-1)
-            seen = q * depth[..., None] + s
-            error = np.linalg.norm(seen[..., :2] / seen[..., 2:] - there, axis=-1)
-            point = rays * depth[..., None]
-            base = pose[:, :3] @ (self.centers[other] - self.centers[row])
-            ray = point - base.astype(np.float32)
-            cos = (point * ray).sum(-1)
-            cos /= np.linalg.norm(point, axis=-1) * np.linalg.norm(ray, axis=-1)
-            ok &= (depth > 0) & (seen[..., 2] > 0) & (error < REPROJECTION_PX)
-            ok &= cos < math.cos(math.radians(PARALLAX_DEG))
-        return np.where(ok, depth, np.nan)
+        base = np.linalg.norm(self.centers[others] - self.centers[row], axis=1)
+        cost = base / self._median_depth(row) + 4 * (1 - axis[others] @ axis[row])  # chosen
+        return [others[k] for k in np.argsort(cost, kind="stable")[:NEIGHBOURS]]
 
 
-def _rays(K: Array, width: int, height: int) -> Array:
-    """Return the rays of the pixels in the camera, with depth 1: (H, W, 3) float32."""
-    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    pixels = np.stack([x, y, np.ones_like(x)], -1)
-    return np.asarray((pixels @ np.linalg.inv(K).T).astype(np.float32))
+_NO_POINTS: Points = (
+    np.empty((0, 3), np.float32),
+    np.empty((0, 3), np.uint8),
+    np.empty((0, 3), np.float32),
+)
 
 
-def _flow(image: Image, target: Image) -> tuple[Array, BoolArray]:
-    """Return where the pixels of an image are in another one (H, W, 2), and whether it is sure."""
-    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    first, second = (cv2.cvtColor(i, cv2.COLOR_BGR2GRAY) for i in (image, target))
-    height, width = first.shape
-    flow, back = (
-        np.asarray(dis.calc(a, b, np.zeros((height, width, 2), np.float32)), np.float32)
-        for a, b in ((first, second), (second, first))
-    )
-    pixel = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).astype(np.float32)
-    there = pixel + flow
-    outside = (1e3, 1e3)
-    returned = cv2.remap(
-        back,
-        there[..., 0],
-        there[..., 1],
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_CONSTANT,
-        borderValue=outside,
-    )
-    ok = np.asarray(np.abs(flow + returned).sum(-1) < RETURN_PX)
-    return np.asarray(there + np.float32(0.5)), ok
-
-
-def _agreed(depths: Array) -> Array:
-    """Return the mean (H, W) of depths (n, H, W) that agree; inf: fewer than two do."""
-    count = np.isfinite(depths).sum(0)
-    middle = np.maximum((count - 1) // 2, 0)[None]
-    median = np.take_along_axis(np.sort(depths, 0), middle, 0)[0]  # NaN are last
-    near = np.abs(depths / median - 1) < DEPTH_SHARE
-    agree = near.sum(0)
-    mean = np.where(near, depths, 0).sum(0) / np.maximum(agree, 1)
-    return np.where(agree >= 2, mean, np.inf)
-
-
-def _voxels(xyz: Array, rgb: npt.NDArray[np.uint8], seen_from: Array, least: float = 0.0) -> Cloud:
-    """Average points in voxels; distant and isolated ones are left out, the most observed first.
+def _voxels(xyz: Reals, rgb: npt.NDArray[np.uint8], seen_from: Reals, least: float) -> Cloud | None:
+    """Average points in voxels; distant and isolated ones are left out; None: all are.
 
     Args:
         least: side of a voxel.
@@ -256,19 +176,17 @@ def _voxels(xyz: Array, rgb: npt.NDArray[np.uint8], seen_from: Array, least: flo
     extent = np.percentile(np.abs(xyz - middle), 95, axis=0)
     voxel = max(float(np.linalg.norm(extent)) / CELLS, least)
     near = (np.abs(xyz - middle) <= 2 * np.maximum(extent, voxel)).all(1)  # a wall has no extent
-    xyz = xyz[near]
-    rgb = rgb[near]
-    seen_from = seen_from[near]
-    key = _cells(xyz, voxel)
+    columns = [values[near] for values in (xyz, rgb, seen_from)]
+    key = _cells(columns[0], voxel)
     while (filled := len(np.unique(key))) > MOST:
         voxel *= 1.01 * math.sqrt(filled / MOST)  # of a surface
-        key = _cells(xyz, voxel)
+        key = _cells(columns[0], voxel)
     order = np.argsort(key, kind="stable")
     start = np.flatnonzero(np.diff(key[order], prepend=-1))
     count = np.diff(start, append=len(key))
     mean = [
         np.add.reduceat(values[order].astype(np.float32), start) / count[:, None]
-        for values in (xyz, rgb, seen_from)
+        for values in columns
     ]
     _, coarse, near_by = np.unique(
         _cells(mean[0], 3 * voxel), return_inverse=True, return_counts=True
@@ -276,12 +194,11 @@ def _voxels(xyz: Array, rgb: npt.NDArray[np.uint8], seen_from: Array, least: flo
     rows = np.flatnonzero(near_by[coarse] >= 4)  # of 27 voxels; a surface fills 9
     rows = rows[np.argsort(-count[rows], kind="stable")]
     seen = mean[2] / np.maximum(np.linalg.norm(mean[2], axis=1, keepdims=True), 1e-6)
-    cloud = Cloud(mean[0], mean[1].round().astype(np.uint8), seen, voxel)
-    return cloud.of_rows(rows)
+    cloud = Cloud(mean[0][rows], mean[1][rows].round().astype(np.uint8), seen[rows], voxel)
+    return cloud if len(rows) else None
 
 
-def _cells(xyz: Array, size: float) -> IntArray:
+def _cells(xyz: Reals, size: float) -> IntArray:
     """Return the number of the cell of each point."""
     cell = ((xyz - xyz.min(0)) / size).astype(np.int64)
-    side = cell.max(0) + 1
-    return np.asarray((cell[:, 0] * side[1] + cell[:, 1]) * side[2] + cell[:, 2])
+    return np.asarray(np.ravel_multi_index(tuple(cell.T), tuple(cell.max(0) + 1)))

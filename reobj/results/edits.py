@@ -40,7 +40,6 @@ Coordinate = Annotated[float, msgspec.Meta(ge=-COORDINATE_MAX, le=COORDINATE_MAX
 
 # Two boxes of a merged object in one frame (chosen)
 DUPLICATE_IOU = 0.6  # above it they show the same (as in the association)
-CONTAINED = 0.9  # fraction of the smaller one from which on it is a detail of the larger one
 LARGEST_GAP = 0.1  # between boxes of parts, over the side of the box around both
 LEAST_COVERED = 0.55  # by the boxes of parts, of the box around both
 
@@ -85,14 +84,9 @@ class Edit(
     def __post_init__(self) -> None:
         """Check the keys of the kind of edit, the order of frames, and the class."""
         msgspec.structs.force_setattr(self, "class_name", self.class_name.strip())
-        given = " and ".join(
-            key
-            for key, value in (
-                ("with", self.other), ("frames", self.frames), ("visits", self.visits),
-                ("class", self.class_name),
-            )
-            if value
-        )  # fmt: skip
+        values = {"with": self.other, "frames": self.frames, "visits": self.visits,
+                  "class": self.class_name}  # fmt: skip
+        given = " and ".join(key for key, value in values.items() if value)
         if given not in KEYS[self.do]:
             expected = " or ".join(KEYS[self.do]) or "nothing"
             found = f"{given or 'nothing'} besides object"
@@ -222,11 +216,7 @@ class _Tables:
     """Columns of tracks during the application of edits; deleted rows have identity 0."""
 
     def __init__(
-        self,
-        tracks: Tracks,
-        class_names: tuple[str, ...],
-        last: IntArray | None = None,
-        highest: int = 0,
+        self, tracks: Tracks, class_names: tuple[str, ...], last: IntArray | None, highest: int
     ) -> None:
         self.tracks = tracks
         self.last = tracks.track_id if last is None else last
@@ -334,34 +324,26 @@ class _Tables:
 def joined_box(boxes: Array) -> Array:
     """Return the box (4,) of one object by its boxes (K, 4) in one frame, the best one first.
 
-    Boxes of its parts, which adjoin or overlap, are joined. Of duplicates the better one counts, of
-    two boxes one of which contains the other the larger one; boxes elsewhere do not count.
+    Boxes of its parts, which adjoin or overlap, are joined. Of duplicates the better one counts;
+    boxes elsewhere do not count.
     """
     whole: Array = boxes[0]
     others = list(boxes[1:])
     k = 0
     while k < len(others):
-        wider = _with_part(whole, others[k])
-        if wider is None:
+        low = np.minimum(whole, others[k])
+        high = np.maximum(whole, others[k])
+        around = np.append(low[:2], high[2:])  # (4,) the box around both
+        side = low[2:] - high[:2]  # (2,) of what they share, < 0: a gap
+        common = side.clip(0).prod()
+        covered = box_area(whole) + box_area(others[k]) - common
+        adjoins = (side >= -LARGEST_GAP * (around[2:] - around[:2])).all()
+        if common > DUPLICATE_IOU * covered or not (
+            adjoins and covered >= LEAST_COVERED * box_area(around)
+        ):
             k += 1
         else:  # those before may adjoin it now
-            whole = wider
+            whole = around
             del others[k]
             k = 0
     return whole
-
-
-def _with_part(whole: Array, part: Array) -> Array | None:
-    """Return a box (4,) with a part of the object; None if the part adds nothing, or lies apart."""
-    side = np.minimum(whole[2:], part[2:]) - np.maximum(whole[:2], part[:2])  # (2,) < 0: a gap
-    around = np.append(np.minimum(whole[:2], part[:2]), np.maximum(whole[2:], part[2:]))  # (4,)
-    area = float(box_area(whole))
-    other = float(box_area(part))
-    common = float(side.clip(0).prod())
-    if common > DUPLICATE_IOU * (area + other - common):
-        return None
-    if common >= CONTAINED * min(area, other):
-        return part if other > area else None
-    adjoins = (side >= -LARGEST_GAP * (around[2:] - around[:2])).all()
-    covered = area + other - common >= LEAST_COVERED * box_area(around)
-    return around if adjoins and covered else None

@@ -14,9 +14,9 @@ import cv2
 
 from reobj.cameras import Poses
 from reobj.results.export import Viewer, live_labels
-from reobj.results.local_server import LocalHandler, LocalServer
 from reobj.results.overlay import draw_tracks
 from reobj.results.result import Result, VideoInfo
+from reobj.results.serve import LocalHandler, LocalServer
 from reobj.sources.video import Video, shrunk
 from reobj.types import NOTE, Frame, ReobjError, Tracks, log
 
@@ -43,17 +43,16 @@ class LivePage:
     """A page with the latest frame and its identities, while a video is tracked.
 
     Attributes:
-        followed: the frames were shown while the video was tracked. url: of the page.
+        followed: the frames were shown while the video was tracked.
     """
 
-    def __init__(self, open_browser: bool = True) -> None:
+    def __init__(self) -> None:
         self.followed = False
-        self._server = _Server()
-        self.url = self._server.url
+        self._server = _Server(0, _Handler)
         threading.Thread(target=self._server.serve_forever, daemon=True).start()
-        log.log(NOTE, "live view: %s (in 3D with rerun: pip install rerun-sdk)", self.url)
-        if open_browser:
-            self._server.open_browser()
+        url = self._server.url
+        log.log(NOTE, "live view: %s (in 3D with rerun: pip install rerun-sdk)", url)
+        self._server.open_browser()
 
     def follow(
         self, steps: Iterable[tuple[Frame, Tracks]], names: Sequence[str], video: Video,
@@ -64,7 +63,7 @@ class LivePage:
         positions: dict[int, int] = {}
         shown_s = -EVERY_S
         for frame, tracks in steps:
-            if self._server.watchers and time.monotonic() - shown_s > EVERY_S:
+            if time.monotonic() - shown_s > EVERY_S:
                 shown_s = time.monotonic()
                 texts = live_labels(tracks, names)
                 labels = dict(zip(tracks.track_id.tolist(), texts, strict=True))
@@ -88,44 +87,21 @@ class _Server(LocalServer):
     """The server of the page.
 
     Attributes:
-        watchers: number of browsers that show the pictures.
+        picture: the latest one, a JPEG; None: not yet; b"": there are no more.
+        changed: notified of each picture.
     """
 
-    def __init__(self) -> None:
-        super().__init__(0, _Handler)
-        self.watchers = 0
-        self._changed = threading.Condition()
-        self._number = 0
-        self._picture: bytes | None = None
+    picture: bytes | None = None
+
+    def __init__(self, port: int, handler: type[LocalHandler]) -> None:
+        super().__init__(port, handler)
+        self.changed = threading.Condition()
 
     def put(self, picture: bytes) -> None:
-        """Replace the picture, a JPEG; b"": there are no more."""
-        with self._changed:
-            self._picture = picture
-            self._number += 1
-            self._changed.notify_all()
-
-    def pictures(self) -> Iterator[bytes]:
-        """Yield the latest picture as soon as it is another one, until there are no more."""
-        seen = 0
-
-        def is_new() -> bool:
-            return self._number > seen
-
-        with self._changed:
-            self.watchers += 1
-        try:
-            while True:
-                with self._changed:
-                    self._changed.wait_for(is_new)
-                    seen = self._number
-                    picture = self._picture
-                if not picture:
-                    return
-                yield picture
-        finally:
-            with self._changed:
-                self.watchers -= 1
+        """Replace the picture."""
+        with self.changed:
+            self.picture = picture
+            self.changed.notify_all()
 
 
 class _Handler(LocalHandler):
@@ -148,6 +124,12 @@ class _Handler(LocalHandler):
 
     def _pictures(self) -> None:
         self._head(HTTPStatus.OK, None, "multipart/x-mixed-replace; boundary=frame")
-        for picture in self.server.pictures():
-            head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(picture)}\r\n\r\n"
-            self.wfile.write(head.encode() + picture + b"\r\n")
+        picture: bytes | None = None
+        while picture != b"":
+            with self.server.changed:
+                while self.server.picture is picture:
+                    self.server.changed.wait()
+                picture = self.server.picture
+            if picture:
+                head = f"Content-Type: image/jpeg\r\nContent-Length: {len(picture)}\r\n\r\n"
+                self.wfile.write(b"--frame\r\n" + head.encode() + picture + b"\r\n")

@@ -13,9 +13,10 @@ import numpy.typing as npt
 
 import quadrics
 from reobj.files import atomic
-from reobj.types import Array, object_color
+from reobj.types import Array, IntArray, object_color
 
 CYLINDER_SIDES = 48  # sides of the prism that approximates a cylinder: looks round
+Mesh = tuple[Array, IntArray]  # points (P, 3), triangles (T, 3)
 
 
 def write_ply(
@@ -31,55 +32,65 @@ def write_ply(
     Args:
         support: shape of each, "box", "cylinder" or "ellipsoid"; None: all are ellipsoids.
     """
-    vertices = []
-    faces = []
-    start = 0
-    count = 0
-    shapes = [None] * len(ellipsoids) if support is None else support
-    meshes = {
-        None: _sphere_mesh(2),
-        "box": _box_mesh(),
-        "cylinder": _cylinder_mesh(),
-    }  # 512 triangles a sphere
-    for k, (identity, shape) in enumerate(zip(object_id, shapes, strict=True)):
-        unit, triangles = meshes.get(shape, meshes[None])  # (P, 3), (T, 3)
-        points = (ellipsoids.half_axes[k] * unit) @ ellipsoids.world_from_obj[k].T
-        vertex = np.zeros(len(unit), [("xyz", "<f8", 3), ("rgb", "u1", 3)])
-        vertex["xyz"] = points + ellipsoids.center_in_world[k]
-        vertex["rgb"] = object_color(identity)[::-1]
-        face = np.zeros(len(triangles), [("n", "u1"), ("i", "<i4", 3)])
-        face["n"] = 3
-        face["i"] = triangles + start
-        vertices.append(vertex.tobytes())
-        faces.append(face.tobytes())
-        start += len(unit)
-        count += len(triangles)
-    names = [f"property double {n}\n" for n in "xyz"]
-    names += [f"property uchar {n}\n" for n in ("red", "green", "blue")]
+    meshes = [unit_mesh(shape) for shape in support or [None] * len(ellipsoids)]
+    points = [
+        ellipsoids.half_axes[k] * unit @ ellipsoids.world_from_obj[k].T
+        + ellipsoids.center_in_world[k]
+        for k, (unit, _) in enumerate(meshes)
+    ]
+    start = np.cumsum([0, *map(len, points)])
+    colors = [object_color(identity)[::-1] for identity in object_id]
+    rgb = np.repeat(np.array(colors, np.uint8).reshape(-1, 3), np.diff(start), axis=0)
+    corners = [triangles + first for (_, triangles), first in zip(meshes, start, strict=False)]
+    faces = np.concatenate([np.empty((0, 3), np.int64), *corners])
     content = "ellipsoids" if support is None else "solids"
-    header = (
-        f"ply\nformat binary_little_endian 1.0\ncomment reobj_track {content}\n"
-        f"element vertex {start}\n{''.join(names)}"
-        f"element face {count}\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    with atomic(path) as part:
-        part.write_bytes(header.encode() + b"".join(vertices) + b"".join(faces))
+    xyz = np.concatenate([np.empty((0, 3)), *points])
+    _write(path, xyz, rgb, f"comment reobj_track {content}\n", faces)
 
 
 def write_point_ply(path: Path, points: Array, colors: npt.NDArray[np.uint8]) -> None:
     """Write points (N, 3) with RGB colours (N, 3) as PLY, binary little endian."""
+    _write(path, points, colors)
+
+
+def _write(
+    path: Path,
+    points: Array,
+    colors: npt.NDArray[np.uint8],
+    comment: str = "",
+    faces: IntArray | None = None,
+) -> None:
     vertex = np.zeros(len(points), [("xyz", "<f8", 3), ("rgb", "u1", 3)])
     vertex["xyz"] = points
     vertex["rgb"] = colors
     names = [f"property double {n}\n" for n in "xyz"]
     names += [f"property uchar {n}\n" for n in ("red", "green", "blue")]
-    header = f"element vertex {len(points)}\n{''.join(names)}end_header\n"
+    header = f"ply\nformat binary_little_endian 1.0\n{comment}"
+    header += f"element vertex {len(points)}\n{''.join(names)}"
+    content = vertex.tobytes()
+    if faces is not None:
+        header += f"element face {len(faces)}\nproperty list uchar int vertex_indices\n"
+        face = np.zeros(len(faces), [("n", "u1"), ("i", "<i4", 3)])
+        face["n"] = 3
+        face["i"] = faces
+        content += face.tobytes()
     with atomic(path) as part:
-        head = "ply\nformat binary_little_endian 1.0\n" + header
-        part.write_bytes(head.encode() + vertex.tobytes())
+        part.write_bytes(f"{header}end_header\n".encode() + content)
 
 
-def _box_mesh() -> tuple[Array, npt.NDArray[np.int64]]:
+def unit_mesh(shape: str | None, detail: int = 3) -> Mesh:
+    """Triangulate a unit solid: points (P, 3), triangles (T, 3) facing outwards.
+
+    Args:
+        shape: "box" (half sides 1), "cylinder" (radius and half height 1), else a sphere.
+        detail: of the sphere: 8 x 4^detail triangles.
+    """
+    if shape == "box":
+        return _box_mesh()
+    return _cylinder_mesh() if shape == "cylinder" else _sphere_mesh(detail)
+
+
+def _box_mesh() -> Mesh:
     """Triangulate the cube of half side 1: points (8, 3), triangles (12, 3) facing outwards."""
     points = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij")).reshape(3, 8).T
     quads = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
@@ -87,35 +98,32 @@ def _box_mesh() -> tuple[Array, npt.NDArray[np.int64]]:
     return points.astype(np.float64), np.array(faces)
 
 
-def _cylinder_mesh() -> tuple[Array, npt.NDArray[np.int64]]:
+def _cylinder_mesh() -> Mesh:
     """Triangulate the upright cylinder of radius and half height 1, facing outwards."""
-    number = np.arange(CYLINDER_SIDES)
-    angle = 2 * np.pi * number / CYLINDER_SIDES
-    following = (number + 1) % CYLINDER_SIDES
+    a = np.arange(CYLINDER_SIDES)
+    angle = 2 * np.pi * a / CYLINDER_SIDES
+    b = (a + 1) % CYLINDER_SIDES
     ring = np.column_stack([np.cos(angle), np.sin(angle)])
     low, high = (np.column_stack([ring, np.full(CYLINDER_SIDES, z)]) for z in (-1.0, 1.0))
     points = np.concatenate([low, high, [[0, 0, -1.0], [0, 0, 1.0]]])
-    a = number
-    b = following
-    c = following + CYLINDER_SIDES
-    d = number + CYLINDER_SIDES
+    c = b + CYLINDER_SIDES
+    d = a + CYLINDER_SIDES
     bottom = np.full(CYLINDER_SIDES, 2 * CYLINDER_SIDES)
-    top = np.full(CYLINDER_SIDES, 2 * CYLINDER_SIDES + 1)
-    faces = [(a, b, c), (a, c, d), (bottom, b, a), (top, d, c)]
+    faces = [(a, b, c), (a, c, d), (bottom, b, a), (bottom + 1, d, c)]
     return points, np.concatenate([np.column_stack(f) for f in faces])
 
 
-def _sphere_mesh(detail: int) -> tuple[Array, npt.NDArray[np.int64]]:
-    """Triangulate the unit sphere: points (P, 3), triangles (T, 3) of a subdivided octahedron."""
+def _sphere_mesh(detail: int) -> Mesh:
+    """Triangulate the unit sphere, a subdivided octahedron."""
     points = np.concatenate([np.eye(3), -np.eye(3)])
     faces = np.array([[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2],
                       [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])  # fmt: skip
-    for _ in range(detail + 1):
+    for _ in range(detail):
         edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], 2).reshape(-1, 2)
         edges, edge_of = np.unique(edges, axis=0, return_inverse=True)
         middle = points[edges].sum(1)  # (E, 3)
-        (a, b, c) = faces.T
-        (ab, bc, ca) = len(points) + edge_of.reshape(-1, 3).T
+        a, b, c = faces.T
+        ab, bc, ca = len(points) + edge_of.reshape(-1, 3).T
         points = np.concatenate([points, middle / np.linalg.norm(middle, axis=1, keepdims=True)])
         faces = np.array([(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)])  # (4, 3, T)
         faces = faces.transpose(2, 0, 1).reshape(-1, 3)

@@ -138,9 +138,9 @@ class Result:
 
     def _repr_html_(self) -> str:
         """Show the objects and the viewer in a notebook."""
-        from reobj.results import notebook  # the viewer needs this module
+        from reobj.results import scene  # it needs this module
 
-        return notebook.to_html(self)
+        return scene.to_html(self)
 
     def object(self, number: int) -> Object:
         """Return the object of a number.

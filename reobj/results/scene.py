@@ -2,7 +2,8 @@
 
 Its sources are in page/, beside this file; page.html includes the other files.
 
-`write_pictures` reads the video once for the overlay video and the pictures of the viewer.
+`write_pictures` reads the video once for the overlay video and the pictures of the viewer;
+`to_html` shows a result in a notebook.
 """
 
 from __future__ import annotations
@@ -10,10 +11,12 @@ from __future__ import annotations
 import base64
 import contextlib
 import dataclasses
+import html
 import json
 import math
 import os
 import re
+import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,14 +31,13 @@ from reobj.cameras import Camera, Poses, invert_rigid, place_of, undistort_boxes
 from reobj.files import Progress, atomic, base64_text, read_text, rounded, significant
 from reobj.poses.floor import NOISE
 from reobj.results.changes import EarlierSession
-from reobj.results.cloud import MOST, Cloud, DenseFrames
-from reobj.results.depth_cloud import dense_frames
+from reobj.results.cloud import Cloud, DenseFrames, dense_frames
 from reobj.results.entries import Object, World, recording_name, visit_gap
 from reobj.results.export_source import centred
-from reobj.results.overlay import Overlay, film_layers
+from reobj.results.overlay import Overlay
 from reobj.results.result import Result, sides
 from reobj.sources.image_files import IMAGE_FPS
-from reobj.sources.video import Video, shrunk
+from reobj.sources.video import ImagelessVideo, Video, shrunk
 from reobj.types import (
     Array,
     BoolArray,
@@ -50,8 +52,8 @@ from reobj.types import (
     rows_by,
 )
 
-PAGE_MAX = 15_000_000  # bytes of a page with dense points
-POINT_BYTES = 16  # of a dense point in the page: 12 as base64
+PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
+VIEWER_PX = 600  # height of the viewer in a notebook: one on a laptop shows it whole
 PAGE_VERSION = 1  # of the page's data: `serve` shows them in the page of this version
 
 
@@ -69,14 +71,8 @@ class Pictures:
         dense: frames for dense points; None: without.
     """
 
-    def __init__(
-        self,
-        result: Result,
-        video: Video,
-        max_crops: int = 480,
-        dense: DenseFrames | None = None,
-    ) -> None:
-        """Choose the crops, at most 8 of an object and `max_crops` of all, and 60 frames."""
+    def __init__(self, result: Result, video: Video, dense: DenseFrames | None = None) -> None:
+        """Choose the crops, at most 8 of an object and 480 of all, and 60 frames."""
         self.tracks = result.tracks
         self.scale = video.scale
         self.crops: dict[int, list[tuple[int, str]]] = {o.id: [] for o in result.objects}
@@ -84,7 +80,7 @@ class Pictures:
         poses = [part.poses for part in result.parts()]
         self.best: dict[int, int] = {}
         chosen = [np.empty(0, np.int64)]
-        left = max_crops
+        left = 480
         ranked = sorted(result.objects, key=lambda o: -o.frames_seen)
         for doubtful in (False, True):  # low-confidence objects get the remaining crops
             group = [o for o in ranked if (o.status == "doubtful") == doubtful]
@@ -102,7 +98,7 @@ class Pictures:
             shown = shown[cameras.known[np.searchsorted(cameras.frame, shown)]]
         self.whole = set(shown[:: math.ceil(len(shown) / 60) or 1].tolist())
         self.camera = None if cameras is None else cameras.camera
-        self.grid: npt.NDArray[np.float32] | None = None  # of undistorted pixels, made once
+        self.grid: npt.NDArray[np.float32] | None = None  # (h, w, 2) distorted pixels, made once
         self.time_s: dict[int, float] = {}
         self.dense = dense
 
@@ -114,54 +110,45 @@ class Pictures:
             crop = _crop(frame.image, box * self.scale, 112)
             if crop:
                 self.crops[int(obj)].append((frame.index, _base64(crop)))
-        dense = self.dense is not None and frame.index in self.dense.wanted
+        dense = self.dense if self.dense and frame.index in self.dense.wanted else None
         if not dense and frame.index not in self.whole:
             return
         image = self._undistorted(shrunk(frame.image, 640))
         if frame.index in self.whole:
             self.frames.append((frame.index, _base64(_jpeg(image))))
-        if self.dense is not None and dense:
-            self.dense.take(frame.index, image)
+        if dense:
+            dense.take(frame.index, image)
 
     def _undistorted(self, image: Image) -> Image:
         """Undistort a small picture, so that projected solids coincide with their objects."""
         camera = self.camera
-        if camera is None or camera.model in ("PINHOLE", "SIMPLE_PINHOLE"):
+        if camera is None or camera.model in PINHOLES:
             return image
-        if self.grid is None:
-            self.grid = _distorted_grid(camera, image.shape[1], image.shape[0])
+        if self.grid is None:  # OpenCV's pixels: the centre of the first one is (0, 0)
+            height, width = image.shape[:2]
+            xy = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1)
+            self.grid = (_distorted(camera.resized((width, height)), xy) - 0.5).astype(np.float32)
         x, y = np.moveaxis(self.grid, -1, 0)
         return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR), np.uint8)
 
 
-def _distorted_grid(camera: Camera, width: int, height: int) -> npt.NDArray[np.float32]:
-    """Return the distorted pixel of each pixel of a pinhole picture, (height, width, 2) float32.
-
-    In OpenCV's pixels: the centre of the first one is (0, 0).
-    """
-    small = camera.resized((width, height))
-    xy = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).reshape(-1, 2)
-    distorted = _distorted(small, np.asarray(xy + 0.5, np.float64)) - 0.5
-    return distorted.reshape(height, width, 2).astype(np.float32)
-
-
 def _distorted(camera: Camera, xy: Array) -> Array:
-    """Return the distorted pixels (N, 2) of pixels (N, 2) of the pinhole camera; -.5: none."""
+    """Return the distorted pixels (..., 2) of pixels of the pinhole camera; -.5: none."""
     return np.asarray(np.nan_to_num(camera.distort(xy), nan=-0.5))
 
 
-def _lens(camera: Camera, columns: int = 64, rows: int = 48) -> dict[str, Any] | None:
+def _lens(camera: Camera) -> dict[str, Any] | None:
     """Return where the corners of a grid over the pinhole picture lie in a frame; None: the same.
 
-    Args:
-        columns, rows: of cells; within one the viewer neglects that its sides are inclined: a tenth
-            of a pixel of the screen at the distortion of a phone.
+    Within a cell the viewer neglects that its sides are inclined: a tenth of a pixel of the screen
+    at the distortion of a phone.
     """
-    if camera.model in ("PINHOLE", "SIMPLE_PINHOLE"):
+    columns, rows = (64, 48)
+    if camera.model in PINHOLES:
         return None
     x = np.linspace(0, camera.width, columns + 1)
     y = np.linspace(0, camera.height, rows + 1)
-    corners = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+    corners = np.stack(np.meshgrid(x, y), -1)
     share = _distorted(camera, corners) / [camera.width, camera.height]
     return {"columns": columns, "rows": rows, "grid": base64_text(share, "<f4")}
 
@@ -191,16 +178,13 @@ def _base64(data: bytes) -> str:
     return base64.b64encode(data).decode()
 
 
-def best_pictures(
-    result: Result, video: Video, line: Progress, size_px: int = 160
-) -> dict[int, bytes]:
+def best_pictures(result: Result, video: Video, line: Progress) -> dict[int, bytes]:
     """Return a JPEG of the best box of each object with a shape in the first component.
 
     Args:
-        line: of the progress; its steps are frames. size_px: longest side: 1.7 kB a picture in
-            rendered rooms.
+        line: of the progress; its steps are frames.
     Returns:
-        pictures by identity.
+        pictures by identity, 1.7 kB each in rendered rooms.
     """
     poses = result.of_part(0).poses
     objects = [o for o in result.located if o.part == 0]
@@ -210,8 +194,7 @@ def best_pictures(
     pictures = {}
     for frame in video if len(row) else ():
         for k in row[frames == frame.index].tolist():
-            crop = _crop(frame.image, result.tracks.xyxy[k] * video.scale, size_px)
-            if crop:
+            if crop := _crop(frame.image, result.tracks.xyxy[k] * video.scale, 160):
                 pictures[int(result.tracks.track_id[k])] = crop
         line.step()
     line.close()
@@ -301,6 +284,8 @@ def write_scene(
     poses = result.poses
     count = len(np.unique(result.tracks.frame) if poses is None else poses.frame)
     seconds = video.config.every / (video.fps or IMAGE_FPS) * count / max(1, len(steps))
+    is_file = video.has_images and not video.is_live and not video.files  # it can be played
+    fps = result.video.fps or IMAGE_FPS  # for frames that were not read
     of_part = np.zeros(len(steps), int) if poses is None else poses.part_of(steps)  # (S,)
     # every n-th point: 20,000 are .4 MB of the page
     thin = math.ceil(0 if poses is None else len(poses.points) / 20_000) or 1
@@ -318,7 +303,7 @@ def write_scene(
             _scene_object(o, origins[o.part], result, steps, pictures) for o in result.objects
         ],
         "thumbs": pictures.frames,
-        "film": Path(str(video.source)).name if _is_file(video) else "",
+        "film": Path(str(video.source)).name if is_file else "",
         "doubtful": doubtful,
         "size": {"width": result.video.width, "height": result.video.height},
         "visit_gap": visit_gap(result.tracks.frame, result.video.fps),
@@ -327,7 +312,7 @@ def write_scene(
         "why_flat": _why_flat(result),
         "steps": {
             "frame": steps.tolist(),
-            "time": _times(result, pictures, steps),
+            "time": [round(pictures.time_s.get(at, at / fps), 4) for at in steps.tolist()],
             "frame_s": 1 / (video.fps or IMAGE_FPS),
             "seconds": seconds,
             "part": of_part.tolist(),
@@ -341,56 +326,33 @@ def write_scene(
     if (changes := result.changes) is not None:
         marked = dataclasses.replace(changes, new=()) if changes.made_the_map else changes
         data["changes"] = marked.to_json() | {"summary": changes.summary()}
+    if pictures.dense is not None:
+        clouds = [pictures.dense.cloud(k) for k in range(len(parts))]
+        for entry, origin, cloud in zip(data["parts"], origins, clouds, strict=True):
+            entry |= {} if cloud is None else {"dense": _dense_points(cloud, origin)}
+        if not any(clouds):
+            log.warning("no dense points: the depth maps contradict each other; are units, "
+                        "intrinsics and poses right?")  # fmt: skip
     if result.earlier:
         data["earlier"] = _earlier_sessions(result.earlier)
         for entry in data["objects"]:
             entry["best"] = pictures.best.get(entry["id"])
-    text = _page_of(data, None)
-    if pictures.dense is not None:
-        _add_dense_points(data["parts"], pictures.dense, origins, len(text.encode()))
-        text = _page_of(data, None)
     with atomic(path) as part:
-        part.write_text(text, encoding="utf-8")
+        part.write_text(_page_of(data, None), encoding="utf-8")
 
 
-def _add_dense_points(
-    parts: list[dict[str, Any]], dense: DenseFrames, origins: Sequence[Array], size: int
-) -> None:
-    """Add dense points to the components of a page, as many as its limit leaves room for.
-
-    Args:
-        parts: data of the components, completed in place. origins: (3,) of each, in its world.
-            size: bytes of the page without dense points.
-    """
-    left = min(MOST, (PAGE_MAX - 1000 * len(parts) - size) // POINT_BYTES)
-    if left <= 0:
-        limit = f"{size / 1e6:.1f} MB without them, {PAGE_MAX / 1e6:g} MB is the limit"
-        log.warning("no dense points: the page has %s", limit)
-        return
-    found = False
-    for k, origin in enumerate(origins):
-        cloud = dense.cloud(k) if left > 0 else None
-        if cloud is not None:
-            parts[k]["dense"] = _dense_points(cloud, origin, left)
-            left -= parts[k]["dense"]["count"]
-            found = True
-    if not found:
-        log.warning("no dense points: %s", dense.REASON)
-
-
-def _dense_points(cloud: Cloud, origin: Array, most: int) -> dict[str, Any]:
-    """Return dense points for the page, at most `most`: the most observed ones.
+def _dense_points(cloud: Cloud, origin: Array) -> dict[str, Any]:
+    """Return dense points for the page.
 
     Positions are 16-bit integers from `low` in steps of `step` world units, then colours are three
     bytes, then directions towards the cameras three signed bytes.
     """
-    chosen = cloud.of_rows(np.arange(min(most, len(cloud))))
-    xyz = chosen.xyz - origin
+    xyz = cloud.xyz - origin
     low = xyz.min(0)
     step = max(float(np.ptp(xyz, axis=0).max()) / 65535, np.finfo(float).tiny)
     data = ((xyz - low) / step).round().clip(0, 65535).astype("<u2").tobytes()
-    data += chosen.rgb.tobytes() + (chosen.seen_from * 127).round().astype(np.int8).tobytes()
-    facts = {"count": len(chosen), "low": low.tolist(), "step": step, "voxel": chosen.voxel}
+    data += cloud.rgb.tobytes() + (cloud.seen_from * 127).round().astype(np.int8).tobytes()
+    facts = {"count": len(xyz), "low": low.tolist(), "step": step, "voxel": cloud.voxel}
     return facts | {"data": _base64(data)}
 
 
@@ -427,17 +389,6 @@ def served_page(
     if others is not None and isinstance(changes, dict) and not changes.get("refused"):
         data["earlier"] = _earlier_sessions(others)
     return _page_of(data, served)
-
-
-def _is_file(video: Video) -> bool:
-    """Whether the recording is a video file, which the viewer can play."""
-    return video.has_images and not video.is_live and not video.files
-
-
-def _times(result: Result, pictures: Pictures, steps: IntArray) -> list[float]:
-    """Return the times of the steps in the recording, s; by the frame rate where not read."""
-    fps = result.video.fps or IMAGE_FPS
-    return [round(pictures.time_s.get(step, step / fps), 4) for step in steps.tolist()]
 
 
 def _scene_cameras(result: Result, steps: IntArray, origins: Array) -> dict[str, Any]:
@@ -536,16 +487,16 @@ def _runs(mask: BoolArray) -> list[int]:
     return [int(at) for at in runs]
 
 
-def _references(detected: Tracks, most: int = 100) -> list[list[float]]:
-    """Choose boxes of an object, by time: the best one of each tracklet, and `most` spread evenly.
+def _references(detected: Tracks) -> list[list[float]]:
+    """Choose boxes of an object, by time: the best one of each tracklet, and 100 spread evenly.
 
-    Args:
-        most: 100 boxes of 50 objects are .2 MB of the page.
+    100 boxes of 50 objects are .2 MB of the page.
+
     Returns:
         frame, tracklet, x1, y1, x2, y2 of each, native pixels.
     """
     best = [rows[detected.score[rows].argmax()] for rows in rows_by(detected.tracklet_id)]
-    even = np.linspace(0, len(detected) - 1, min(most, len(detected))).round().astype(np.int64)
+    even = np.linspace(0, len(detected) - 1, min(100, len(detected))).round().astype(np.int64)
     row = np.union1d(np.array(best, np.int64), even)
     row = row[np.argsort(detected.frame[row], kind="stable")]
     numbers = zip(detected.frame[row].tolist(), detected.tracklet_id[row].tolist(), strict=True)
@@ -553,16 +504,10 @@ def _references(detected: Tracks, most: int = 100) -> list[list[float]]:
     return [[*pair, *box] for pair, box in zip(numbers, boxes, strict=True)]
 
 
-def _earlier_sessions(
-    sessions: Sequence[EarlierSession], max_pictures: int = 240
-) -> list[dict[str, Any]]:
-    """Collect the earlier recordings for the viewer: objects, changes, pictures.
-
-    Args:
-        max_pictures: of all, the latest ones; 240 are .5 MB of the page.
-    """
+def _earlier_sessions(sessions: Sequence[EarlierSession]) -> list[dict[str, Any]]:
+    """Collect the earlier recordings for the viewer: objects, changes, the latest pictures."""
     entries: list[dict[str, Any]] = []
-    left = max_pictures
+    left = 240  # pictures of all, .5 MB of the page
     for session in reversed(sessions):
         changes = session.changes
         count = len(session.objects)
@@ -615,7 +560,7 @@ def write_pictures(
     result: Result,
     out: Path,
     video: Video,
-    overlay: str = "solids",
+    overlay: bool = True,
     scene: bool = True,
     doubtful: bool = False,
     progress: Progress | None = None,
@@ -629,13 +574,11 @@ def write_pictures(
     have no images: then there is no overlay video, and the viewer has no pictures.
 
     Args:
-        overlay: layers of the overlay video (`film_layers`); "none": no video.
         doubtful: include low-confidence objects in the overlay video; in the viewer, which always
             contains them, show them initially.
         progress: the line of the stage, whose steps are the frames.
         command: fits the objects again; the viewer shows it with the file of corrections.
-        cloud: dense points in the viewer. depth: folder of the depth maps that they are made from;
-            "": from optical flow.
+        cloud: dense points in the viewer. depth: folder of the depth maps that they are made from.
     Returns:
         messages about files that could not be written, with the option to omit them. With the
         environment variable REOBJ_RAISE, as in our tests, bugs are raised instead.
@@ -644,51 +587,46 @@ def write_pictures(
     shown = result if doubtful else result.without_doubtful()
     faults = _Faults()
     film = pictures = None
-    complete = False
-    line = progress or Progress("write", video.expected)
-    with line:
-        if film_layers(overlay) and visible:
+    with progress or Progress("write", video.expected) as line:
+        if overlay and visible:
             with faults.of("overlay"):
-                film = Overlay(shown, out / "overlay.mp4", video, overlay)
+                film = Overlay(shown, out / "overlay.mp4", video)
         if scene:
             with faults.of("scene"):
-                poses = result.poses
-                dense = None
-                if cloud and visible and poses is not None and poses.known.any():
-                    dense = dense_frames(poses, video, depth)
-                pictures = Pictures(result, video, dense=dense)
-        found = (("overlay", film), ("scene", pictures))
-        sinks = [(name, sink) for name, sink in found if sink and visible]
+                dense = dense_frames(result.poses, video, depth) if cloud and visible else None
+                pictures = Pictures(result, video, dense)
+        sinks = [(name, sink) for name, sink in (("overlay", film), ("scene", pictures)) if sink]
+        line.complete = False
         try:
             with faults.of("video"):
-                for frame in video if sinks else ():
+                for frame in video if sinks and visible else ():
                     for name, sink in sinks:
-                        if name not in faults.found:
+                        if name not in faults:
                             with faults.of(name):
                                 sink.take(frame)
                     line.step()
-            complete = "video" not in faults.found
+                line.complete = True
         finally:
             if film is not None:
                 with faults.of("overlay"):
-                    film.close(complete and "overlay" not in faults.found)
-        if pictures is not None and "scene" not in faults.found:
+                    film.close(line.complete and "overlay" not in faults)
+        if pictures is not None and "scene" not in faults:
             with faults.of("scene"):
                 page = dataclasses.replace(result, warnings=[*result.warnings, *faults.messages()])
-                write_scene(page, pictures, out / "scene.html", video, doubtful, command=command)
-        line.complete = complete
+                write_scene(page, pictures, out / "scene.html", video, doubtful, command)
     return faults.messages()
 
 
-class _Faults:
-    """Errors while the pictures of a result are written.
+FAULTS = {
+    "video": "no overlay video, and a viewer without later pictures: reading the video again "
+    "failed with {} (--set output.overlay=none omits the overlay)",
+    "overlay": "no overlay video: {} (--set output.overlay=none omits it)",
+    "scene": "no scene.html: {} (--set output.scene=false omits it)",
+}
 
-    Attributes:
-        found: the first error of "video" and of each option of the section `output`.
-    """
 
-    def __init__(self) -> None:
-        self.found: dict[str, Exception] = {}
+class _Faults(dict[str, Exception]):
+    """The first error of each key of FAULTS while the pictures of a result are written."""
 
     @contextlib.contextmanager
     def of(self, name: str) -> Iterator[None]:
@@ -699,17 +637,48 @@ class _Faults:
             if not isinstance(error, ReobjError | OSError) and os.environ.get("REOBJ_RAISE"):
                 raise
             log.debug("pictures: fault in %s", name, exc_info=True)
-            self.found.setdefault(name, error)
+            self.setdefault(name, error)
 
     def messages(self) -> list[str]:
         """Return what is missing, the reason, and the option to omit it."""
-        texts = {
-            "video": "no overlay video, and a viewer without later pictures: reading the video "
-            "again failed with {} (--set output.overlay=none omits the overlay)",
-            "overlay": "no overlay video: {} (--set output.overlay=none omits it)",
-            "scene": "no scene.html: {} (--set output.scene=false omits it)",
-        }
         return [
-            one_line(texts[name].format(f"{type(error).__name__}: {error}"))
-            for name, error in self.found.items()
+            one_line(FAULTS[name].format(f"{type(error).__name__}: {error}"))
+            for name, error in self.items()
         ]
+
+
+# ---- In a notebook -----------------------------------------------------------------------------
+
+
+def to_html(result: Result) -> str:
+    """Return the report of a result and its viewer in an iframe, for a notebook.
+
+    The viewer is the scene.html of the folder, else a page without pictures; without either it is
+    left out. Its page is part of the HTML (.7 MB, with pictures up to 10 MB), so that it works
+    where the notebook's server does not serve the folder. The iframe is sandboxed: scripts of the
+    page cannot reach the notebook.
+    """
+    text = f"<pre>{html.escape(result.summary())}</pre>"
+    if page := viewer_page(result):
+        text += '<iframe sandbox="allow-scripts allow-downloads" '
+        text += f'srcdoc="{html.escape(page)}" style="width:100%;height:{VIEWER_PX}px;border:0">'
+        text += "</iframe>"
+    return text
+
+
+def viewer_page(result: Result) -> str:
+    """Return the page of the viewer: that of the folder, else without pictures.
+
+    Without a folder and without cameras there is nothing to show: "".
+    """
+    if result.out is not None and (result.out / "scene.html").is_file():
+        return (result.out / "scene.html").read_text(encoding="utf-8")
+    if result.poses is None or not result.poses.known.any():
+        return ""
+    info = result.video
+    video = ImagelessVideo(info.path, (info.width, info.height))
+    video.fps = info.fps
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "scene.html"
+        write_scene(result, Pictures(result, video), path, video)
+        return path.read_text(encoding="utf-8")

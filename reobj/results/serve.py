@@ -1,38 +1,50 @@
 """`serve OUT`: the viewer on this machine, where saved corrections are applied at once.
 
-The standard library's HTTP server on 127.0.0.1. It has a fixed list of addresses: the page, the
-recording, frames of an image folder, the state of the worker, corrections, undo. No address is a
-path of a file.
+The standard library's HTTP server on 127.0.0.1, with a token in every request. It has a fixed list
+of addresses: the page, the recording, frames of an image folder, the state of the worker,
+corrections, undo. No address is a path of a file. `live` uses the same server.
 """
 
 from __future__ import annotations
 
 import contextlib
+import hmac
 import json
 import os
 import re
+import secrets
 import subprocess
+import sys
 import threading
-from collections.abc import Callable, Sequence
+import webbrowser
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 import cv2
 
 from reobj.files import atomic
 from reobj.results.changes import EarlierSession
-from reobj.results.edits import HEADER, Edits, read_edits
+from reobj.results.edits import HEADER, read_edits
 from reobj.results.entries import OutputFile
-from reobj.results.local_server import LocalHandler, LocalServer
 from reobj.results.scene import served_page
 from reobj.results.workspace import Workspace
 from reobj.sources.image_files import read_image
 from reobj.sources.video import Video, shrunk, source_fingerprint
 from reobj.types import ReobjError, log, one_line
 
+HOST = "127.0.0.1"
+HEADERS = {
+    "Cache-Control": "no-store",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Content-Security-Policy": "frame-ancestors 'none'",
+}
 EDITS_MAX = 16 << 20  # bytes of a file of corrections; 10,000 splits take 3 MB
 FRAME_PX = 1280  # longer side of the frames of an image folder
 CHUNK = 1 << 18  # bytes of the recording that are in memory
@@ -41,57 +53,121 @@ PROGRESS_S = 0.5  # between two lines of progress of the worker
 VIDEO_TYPES = {".webm": "video/webm", ".mkv": "video/webm", ".ogv": "video/ogg"}  # else mp4
 
 
-class Recording:
-    """The recording of an output folder, as far as it is unchanged: a video file, or images.
+# ---- A server for the user of this machine -----------------------------------------------------
 
-    Attributes:
-        file: of a video; None. images: files of an image folder by frame number.
-    """
 
-    def __init__(self, workspace: Workspace) -> None:
-        self.file: Path | None = None
-        self.images: list[Path] = []
-        source, config = workspace.source
-        # the fingerprint holds the time of the file: who made up this folder cannot know it
-        if workspace.fingerprint != source_fingerprint(source):
-            return
+class LocalHandler(BaseHTTPRequestHandler):
+    """Answer requests that name this server and have its token; refuse all others."""
+
+    server: LocalServer
+    protocol_version = "HTTP/1.1"
+    server_version = "reobj_track"
+    sys_version = ""
+    timeout = 60  # s, of a connection without a request
+
+    def log_message(self, text: str, *args: Any) -> None:
+        """Log requests with --debug, without the token."""
+        log.debug("serve: %s", one_line((text % args).replace(self.server.token, "TOKEN")))
+
+    def _may_read(self) -> bool:
+        """Check the address, the host, which a page of another server cannot give, the token."""
         try:
-            video = Video(source, config)
-        except ReobjError:
-            return
-        if video.files:
-            self.images = video.files
-        elif not video.is_live and Path(source).is_file():
-            self.file = Path(source)
+            urlsplit(self.path)
+        except ValueError:  # such as http://[
+            self._refuse(HTTPStatus.BAD_REQUEST, "no address")
+            return False
+        if self.headers.get("Host", "").lower() not in self.server.hosts:
+            self._refuse(HTTPStatus.FORBIDDEN, "unknown host")
+            return False
+        if not any(hmac.compare_digest(t, self.server.token.encode()) for t in self._tokens()):
+            self._refuse(HTTPStatus.FORBIDDEN, "no token: open the address that was printed")
+            return False
+        return True
 
-    def frame(self, number: int) -> bytes:
-        """Return a frame of an image folder as JPEG; b"": there is none."""
-        image = read_image(self.images[number]) if number < len(self.images) else None
-        if image is None:
-            return b""
-        return cv2.imencode(".jpg", shrunk(image, FRAME_PX))[1].tobytes()
+    def _tokens(self) -> list[bytes]:
+        """Return the tokens of the address and of the cookie."""
+        found = parse_qs(urlsplit(self.path).query).get("token", [])
+        # SimpleCookie reads none if another program on 127.0.0.1 has set one that it cannot read
+        for cookie in self.headers.get("Cookie", "").split(";"):
+            name, _, value = cookie.strip().partition("=")
+            if name == self.server.cookie:
+                found.append(value)
+        return [token.encode("utf-8", "replace") for token in found]
+
+    def _token_moved(self) -> bool:
+        """Move the token of the address to a cookie, by another request of the browser."""
+        if not urlsplit(self.path).query:
+            return False
+        cookie = f"{self.server.cookie}={self.server.token}; HttpOnly; SameSite=Lax; Path=/"
+        more = {"Location": "/", "Set-Cookie": cookie}
+        self._answer(HTTPStatus.SEE_OTHER, b"", "text/plain", more)
+        return True
+
+    def _json(self, data: dict[str, Any]) -> None:
+        self._answer(HTTPStatus.OK, json.dumps(data).encode(), "application/json")
+
+    def _refuse(self, status: HTTPStatus, why: str) -> None:
+        self._answer(status, f"{one_line(why)}\n".encode(), "text/plain; charset=utf-8")
+
+    def _answer(
+        self, status: HTTPStatus, body: bytes, kind: str, more: dict[str, str] | None = None
+    ) -> None:
+        self._head(status, len(body), kind, more)
+        self.wfile.write(body)
+
+    def _head(
+        self, status: HTTPStatus, length: int | None, kind: str, more: dict[str, str] | None = None
+    ) -> None:
+        """Send the head of an answer of `length` bytes; None: until the connection is closed."""
+        self.send_response(status)
+        end = {"Connection": "close"} if length is None else {"Content-Length": str(length)}
+        headers = {"Content-Type": kind} | end
+        for name, value in (HEADERS | headers | (more or {})).items():
+            self.send_header(name, value)
+        self.end_headers()
 
 
-class FolderMap(Protocol):
-    """The map of an output folder: what `reobj.maps.corrections.FolderMap` does here.
+class LocalServer(ThreadingHTTPServer):
+    """A server on 127.0.0.1.
 
     Attributes:
-        frozen: corrections of the folder do not change it.
+        token: that every request must have. hosts, origins: names of this server.
     """
 
-    frozen: bool
+    daemon_threads = True
+    allow_reuse_address = os.name == "posix"  # elsewhere it lets two programs use one port
 
-    def others(self) -> Sequence[EarlierSession]:
-        """Return the other recordings that the map has now."""
+    def __init__(self, port: int, handler: type[LocalHandler]) -> None:
+        self.token = secrets.token_urlsafe(32)
+        try:
+            super().__init__((HOST, port), handler)
+        except (OSError, OverflowError) as error:
+            why = getattr(error, "strerror", None) or "0 to 65535 are possible"
+            raise ReobjError(f"--port {port}: {why}; give another one, or none") from error
+        number = self.server_address[1]
+        self.cookie = f"reobj_{number}"  # cookies do not distinguish ports
+        self.hosts = {f"{name}:{number}" for name in (HOST, "localhost")}
+        self.origins = {f"http://{host}" for host in self.hosts}
 
-    def keep(self, copy: Path, edits: Edits) -> None:
-        """Copy the map before corrections are applied."""
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Log a connection that the browser closed with --debug; print other errors."""
+        error = sys.exception()
+        if isinstance(error, ConnectionError):
+            log.debug("serve: %s", error)
+        else:
+            super().handle_error(request, client_address)
 
-    def applied(self, copy: Path) -> None:
-        """Note that the corrections after this copy were applied."""
+    @property
+    def url(self) -> str:
+        """Address of the page with its token."""
+        return f"http://{HOST}:{self.server_address[1]}/?token={self.token}"
 
-    def restore(self, copy: Path) -> Callable[[], None]:
-        """Replace the map by a copy; return a function that undoes it."""
+    def open_browser(self) -> None:
+        """Open the page in the browser; in a thread, as one in the terminal returns at its end."""
+        threading.Thread(target=webbrowser.open, args=(self.url,), daemon=True).start()
+
+
+# ---- Corrections -------------------------------------------------------------------------------
 
 
 class Corrections:
@@ -103,12 +179,10 @@ class Corrections:
 
     Args:
         command: program and first arguments that run the tool. find_map: returns the map of the
-            folder; None: it has none.
+            folder, a `reobj.maps.corrections.FolderMap`; None: it has none.
     """
 
-    def __init__(
-        self, out: Path, command: Sequence[str], find_map: Callable[[], FolderMap | None]
-    ) -> None:
+    def __init__(self, out: Path, command: Sequence[str], find_map: Callable[[], Any]) -> None:
         self.out = out
         self.folder = out / "cache" / "undo"
         self._command = command
@@ -148,19 +222,23 @@ class Corrections:
         Raises:
             ReobjError: they are invalid, or others are being applied.
         """
-        self._start()
-        try:
+        with self._starting():
             new = self._temporary(text)
             edits = read_edits(new)
             before = self.out / OutputFile.EDITS
-            old = before.read_bytes() if before.is_file() else _no_edits()
+            no_edits = json.dumps(HEADER | {"edits": []}).encode()
+            old = before.read_bytes() if before.is_file() else no_edits
+            stack = self._stack()
+            entry = self.folder / f"{1 + int(stack[-1].stem) if stack else 1}.json"
+            _remove(entry)
             room = self._changed_map()
-            entry = self._push(old, room, edits)
-        except (ReobjError, OSError) as error:
-            raise self._not_started(error) from error
-        copy = entry.with_suffix(".map")
-        done = _nothing if room is None else partial(room.applied, copy)
-        self._run(new, done, partial(self._drop, entry, room))
+            copy = entry.with_suffix(".map")
+            if room is not None:
+                room.keep(copy, edits)
+            with atomic(entry) as part:
+                part.write_bytes(old)
+            done = None if room is None else partial(room.applied, copy)
+            self._run(new, done, partial(self._drop, entry, room))
 
     def undo(self) -> None:
         """Start to restore the map and the corrections before the last ones.
@@ -168,22 +246,16 @@ class Corrections:
         Raises:
             ReobjError: there are none, others are being applied, or the map has changed since.
         """
-        self._start()
-        stack = self._stack()
-        if not stack:
-            self._end("")
-            raise ReobjError("nothing to undo")
-        entry = stack[-1]
-        copy = entry.with_suffix(".map")
-        put_back = _nothing
-        try:
+        with self._starting():
+            stack = self._stack()
+            if not stack:
+                raise ReobjError("nothing to undo")
+            entry = stack[-1]
+            copy = entry.with_suffix(".map")
             edits = self._temporary(entry.read_bytes())
             room = self._changed_map()
-            if room is not None and copy.is_file():
-                put_back = room.restore(copy)
-        except (ReobjError, OSError) as error:
-            raise self._not_started(error) from error
-        self._run(edits, partial(_remove, entry), put_back)
+            put_back = None if room is None or not copy.is_file() else room.restore(copy)
+            self._run(edits, partial(_remove, entry), put_back)
 
     def stop(self) -> None:
         """End the worker; the result and the map stay as they were."""
@@ -194,13 +266,21 @@ class Corrections:
         if self._thread is not None:
             self._thread.join(STOP_S)
 
-    def _start(self) -> None:
+    @contextlib.contextmanager
+    def _starting(self) -> Iterator[None]:
+        """Begin a job; an error of the block ends it."""
         with self._lock:
             if self._is_running:
                 raise ReobjError("corrections are being applied; wait for them")
             self._is_running = True
             self._failed = False
             self._text = "starting"
+        try:
+            yield
+        except (ReobjError, OSError) as error:
+            fault = one_line(str(error))
+            self._end(fault)
+            raise ReobjError(fault) from error
 
     def _end(self, fault: str) -> None:
         with self._lock:
@@ -208,14 +288,8 @@ class Corrections:
             self._failed = bool(fault)
             self._text = fault
 
-    def _not_started(self, error: Exception) -> ReobjError:
-        """End a job whose files cannot be read or written; return the error for the user."""
-        fault = one_line(str(error))
-        self._end(fault)
-        return ReobjError(fault)
-
-    def _changed_map(self) -> FolderMap | None:
-        """Return the map that corrections of the folder change."""
+    def _changed_map(self) -> Any:
+        """Return the map that corrections of the folder change; None: they change none."""
         room = self._find_map()
         return None if room is None or room.frozen else room
 
@@ -226,18 +300,7 @@ class Corrections:
             part.write_bytes(text)
         return path
 
-    def _push(self, old: bytes, room: FolderMap | None, edits: Edits) -> Path:
-        """Store the corrections that are going to be replaced, and the map; return their file."""
-        number = 1 + max((int(path.stem) for path in self._stack()), default=0)
-        entry = self.folder / f"{number}.json"
-        _remove(entry)
-        if room is not None:
-            room.keep(entry.with_suffix(".map"), edits)
-        with atomic(entry) as part:
-            part.write_bytes(old)
-        return entry
-
-    def _drop(self, entry: Path, room: FolderMap | None) -> None:
+    def _drop(self, entry: Path, room: Any) -> None:
         """Restore the map after corrections that failed, and remove what would undo them."""
         try:
             if room is not None:
@@ -245,17 +308,22 @@ class Corrections:
         finally:
             _remove(entry)
 
-    def _run(self, edits: Path, done: Callable[[], None], failed: Callable[[], None]) -> None:
+    def _run(
+        self, edits: Path, done: Callable[[], None] | None, failed: Callable[[], None] | None
+    ) -> None:
         """Start the worker; `done` is called after its success, `failed` after an error."""
         arguments = (edits, done, failed)
         self._thread = threading.Thread(target=self._work, args=arguments, daemon=True)
         self._thread.start()
 
-    def _work(self, edits: Path, done: Callable[[], None], failed: Callable[[], None]) -> None:
+    def _work(
+        self, edits: Path, done: Callable[[], None] | None, failed: Callable[[], None] | None
+    ) -> None:
         """Apply a file of edits in a child process, as the command line does."""
         fault = self._applied(edits)
         try:
-            failed() if fault else done()
+            if (after := failed if fault else done) is not None:
+                after()
         except (OSError, ReobjError) as error:
             fault = fault or one_line(str(error))
         finally:
@@ -299,28 +367,19 @@ class Corrections:
         return line.removeprefix("error: ") or f"the worker ended with {process.returncode}"
 
 
-def _nothing() -> None:
-    """Do nothing, where there is no map."""
-
-
 def _remove(entry: Path) -> None:
     """Remove stored corrections with their map: what is left without the first one is unused."""
     for suffix in (".json", ".map", ".digests"):
         entry.with_suffix(suffix).unlink(missing_ok=True)
 
 
-def _no_edits() -> bytes:
-    """Return a file of edits that removes all."""
-    return json.dumps(HEADER | {"edits": []}).encode()
+# ---- The pages ---------------------------------------------------------------------------------
 
 
 class _Handler(LocalHandler):
     """Answer a request of the page; every other one is refused."""
 
     server: Server
-
-    def do_HEAD(self) -> None:
-        self.do_GET()
 
     def do_GET(self) -> None:
         if not self._may_read():
@@ -331,9 +390,9 @@ class _Handler(LocalHandler):
             self._page()
         elif path == "/state":
             self._json(self.server.corrections.state())
-        elif path == "/recording" and self.server.recording.file is not None:
-            self._recording(self.server.recording.file)
-        elif frame and (picture := self.server.recording.frame(int(frame[1]))):
+        elif path == "/recording" and self.server.recording is not None:
+            self._recording(self.server.recording)
+        elif frame and (picture := self.server.frame(int(frame[1]))):
             self._answer(HTTPStatus.OK, picture, "image/jpeg")
         else:
             self._refuse(HTTPStatus.NOT_FOUND, "no such page")
@@ -402,56 +461,63 @@ class _Handler(LocalHandler):
                 more["Content-Range"] = f"bytes {first}-{last}/{size}"
             kind = VIDEO_TYPES.get(path.suffix.lower(), "video/mp4")
             self._head(status, last + 1 - first, kind, more)
-            if self.command != "HEAD":
-                self._copy(file, first, last)
-
-    def _copy(self, file: BinaryIO, first: int, last: int) -> None:
-        """Send bytes of a file; the browser may end the connection when it has enough."""
-        file.seek(first)
-        left = last + 1 - first
-        with contextlib.suppress(OSError):
-            while left > 0 and (data := file.read(min(CHUNK, left))):
-                self.wfile.write(data)
-                left -= len(data)
-        if left > 0:
-            self.close_connection = True
+            file.seek(first)
+            left = last + 1 - first
+            with contextlib.suppress(OSError):  # the browser has enough
+                while left > 0 and (data := file.read(min(CHUNK, left))):
+                    self.wfile.write(data)
+                    left -= len(data)
+            self.close_connection = left > 0
 
 
 def _range(text: str, size: int) -> tuple[int, int] | None:
     """Return first and last byte of a Range header; None if no byte is in the file.
 
-    >>> _range("bytes=2-", 10), _range("bytes=-3", 10), _range("", 10), _range("bytes=10-", 10)
-    ((2, 9), (7, 9), (0, 9), None)
+    >>> _range("bytes=2-", 10), _range("bytes=2-5", 10), _range("", 10), _range("bytes=10-", 10)
+    ((2, 9), (2, 5), (0, 9), None)
     """
-    found = re.fullmatch(r"bytes=(\d{0,18})-(\d{0,18})", text.replace(" ", ""))
-    if found is None or not (found[1] or found[2]):  # several ranges: the whole file
+    found = re.fullmatch(r"bytes=(\d{1,18})-(\d{0,18})", text)
+    if found is None:  # browsers ask for no other ones: the whole file
         return 0, size - 1
-    if not found[1]:
-        first = max(size - int(found[2]), 0)
-        last = size - 1
-    else:
-        first = int(found[1])
-        last = min(int(found[2] or size), size - 1)
+    first = int(found[1])
+    last = min(int(found[2] or size), size - 1)
     return (first, last) if first <= last else None
 
 
 class Server(LocalServer):
-    """The server of one output folder; for the arguments see `Corrections`."""
+    """The server of one output folder; for the arguments see `Corrections`.
+
+    Attributes:
+        recording: the video file, as far as it is unchanged; None. images: files of an image folder
+            by frame number.
+    """
 
     def __init__(
-        self,
-        out: Path,
-        port: int,
-        command: Sequence[str],
-        find_map: Callable[[], FolderMap | None],
+        self, out: Path, port: int, command: Sequence[str], find_map: Callable[[], Any]
     ) -> None:
         self.viewer = out / "scene.html"
         self._find_map = find_map
+        self.recording: Path | None = None
+        self.images: list[Path] = []
         with Workspace.open(out) as workspace:
-            self.recording = Recording(workspace)
+            source, config = workspace.source
+            # the fingerprint holds the time of the file: who made up this folder cannot know it
+            if workspace.fingerprint == source_fingerprint(source):
+                with contextlib.suppress(ReobjError):
+                    video = Video(source, config)
+                    self.images = video.files
+                    if not video.files and not video.is_live and Path(source).is_file():
+                        self.recording = Path(source)
         self.corrections = Corrections(out, command, find_map)
         self.page()
         super().__init__(port, _Handler)
+
+    def frame(self, number: int) -> bytes:
+        """Return a frame of an image folder as JPEG; b"": there is none."""
+        image = read_image(self.images[number]) if number < len(self.images) else None
+        if image is None:
+            return b""
+        return cv2.imencode(".jpg", shrunk(image, FRAME_PX))[1].tobytes()
 
     def page(self) -> str:
         """Return the page.
@@ -465,8 +531,8 @@ class Server(LocalServer):
         if path.resolve().parent != path.parent.resolve():
             raise ReobjError(f"{path}: is a link out of the folder")
         served = {
-            "recording": "recording" if self.recording.file else "",
-            "frames": bool(self.recording.images),
+            "recording": "recording" if self.recording else "",
+            "frames": bool(self.images),
             "state": self.corrections.state(),
         }
         return served_page(path, served, self._others())

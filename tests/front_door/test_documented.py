@@ -305,7 +305,7 @@ def test_documented_command(
 QUICK = rt.Config(
     input=rt.InputConfig(every=4, stop=64),
     poses=rt.PosesConfig(mode="poses.txt", camera=CAMERA, size_px=160),
-    output=rt.OutputConfig(overlay="none", scene=False),
+    output=rt.OutputConfig(overlay=False, scene=False),
 )
 
 

@@ -157,7 +157,7 @@ def test_every_result_is_written_drawn_and_exported(
     result = dataclasses.replace(result, video=VideoInfo(str(source.source), *SIZE, 30.0))
     result.save(out)
     for doubtful in (False, True):
-        assert write_pictures(result, out, source, "solids,ellipses,trails", True, doubtful) == []
+        assert write_pictures(result, out, source, True, True, doubtful) == []
     shown = cv2.VideoCapture(str(next(out.glob("overlay.*"))))
     assert shown.get(cv2.CAP_PROP_FRAME_COUNT) == FRAMES
     json.loads((out / "objects.json").read_text(), parse_constant=pytest.fail)
