@@ -12,6 +12,7 @@ from pose_worlds import FakeVideo, motion, supplied
 
 import reobj_track as rt
 from reobj.cameras import invert_rigid
+from reobj.files import Progress
 from reobj.poses import stage
 from reobj.poses.supplied.depth import add_depth, depth_scale, find_depth_maps, smooth_pixels
 from reobj.results.workspace import Workspace
@@ -347,9 +348,9 @@ def test_depth_in_a_run_and_its_cache(tmp_path, walk, supplied_poses):
     folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS)
     config = rt.PosesConfig(depth=str(folder))
     given = metric(walk) if supplied_poses else with_points(walk, 0.5)
-    found = [stage.with_points(given, video, config, workspace) for _ in range(2)]
+    found = [stage.with_points(given, video, config, workspace, Progress) for _ in range(2)]
     assert found[0].metric and len(found[0].points) > 3000
     np.testing.assert_array_equal(found[0].points, found[1].points)
     np.testing.assert_allclose(found[0].cam_from_world, walk.cam_from_world, rtol=0.02, atol=1e-9)
     if not supplied_poses:
-        assert stage.with_points(given, video, rt.PosesConfig(), workspace) is given
+        assert stage.with_points(given, video, rt.PosesConfig(), workspace, Progress) is given

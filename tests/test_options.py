@@ -85,7 +85,7 @@ WRONG = [
     ("tracker", "high_score", "nan", "expected a number, 0 or more, found"),
     ("tracker", "high_score", "-1", "expected a number, 0 or more, found"),
     ("output", "scene", "maybe", "expected true or false, found 'maybe'"),
-    ("output", "overlay", "solid", "expected boxes, solids, ellipses, trails"),
+    ("output", "overlay", "solid", "expected true or false"),
 ]
 
 

@@ -225,6 +225,9 @@ class CountingDetector:
 
     def __init__(self, *args: object) -> None: ...
 
+    def __call__(self, image: np.ndarray) -> rt.Detections:
+        return next(self.detect([image]))
+
     def detect(self, images: list[np.ndarray]) -> Iterator[rt.Detections]:
         cls = type(self)
         for _ in images:
@@ -599,7 +602,7 @@ def test_boxes_in_3d_of_another_program(tmp_path: Path, capsys: pytest.CaptureFi
     rows = text.splitlines()
     for name, changed, command, said in (
         ("a", text, "track", "3D boxes in the world, which need its cameras: `run` with --det"),
-        ("b", re.sub(r"(?m)^(\d+),", r"9\g<1>000000000,", text), "run", "no time stamp ("),
+        ("b", re.sub(r"(?m)^(\d+),", r"9\g<1>000000000,", text), "run", "at its time stamp ("),
         ("c", text.replace(",1,0,0,0,", ",1,1,0,0,"), "run", "line 2: extents"),
         ("d", re.sub("(?m),[^,]*$", "", text), "run", "3D boxes without the columns prob"),
         ("e", "\n".join([rows[0], *(re.sub("^([0-9]+),[^,]*", r"\1,9e4", r) for r in rows[1:])]),
