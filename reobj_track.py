@@ -289,6 +289,11 @@ class OutputConfig:
         "objects are also projected into frames from nearby viewpoints",
     )
 
+    def __post_init__(self) -> None:
+        given: Any = self.overlay
+        if isinstance(given, str):  # "none" or layers, as in earlier versions
+            object.__setattr__(self, "overlay", given != "none")
+
 
 @dataclass(frozen=True, slots=True)
 class Config:

@@ -324,7 +324,7 @@ def whole_chain(seq: Sequence, out: Path, poses: str) -> IntArray:
     config = rt.Config(
         input=rt.InputConfig(every=seq.every),
         poses=rt.PosesConfig(mode=poses),
-        output=rt.OutputConfig(overlay="none", scene=False, fill_gaps=0),  # detections only
+        output=rt.OutputConfig(overlay=False, scene=False, fill_gaps=0),  # detections only
     )
     result = rt.run(
         seq.images, out / seq.name, config, detections=lambda image: next(at), overwrite=True

@@ -46,7 +46,7 @@ def true_objects() -> list[Entry]:
 
 def run(folder: Path, detections: Path, **options: int) -> Entry:
     """objects.json of the clip with its true cameras."""
-    output = rt.OutputConfig(overlay="none", scene=False)
+    output = rt.OutputConfig(overlay=False, scene=False)
     poses = rt.PosesConfig(mode=str(ROOM / "poses.txt"), camera=CAMERA)
     config = rt.Config(input=rt.InputConfig(**options), poses=poses, output=output)
     rt.run(ROOM / "room.mp4", folder, config, detections=detections)
@@ -223,7 +223,7 @@ def turn(path: Path, work: Path) -> None:
         pictures.append(cv2.warpPerspective(image, warp, size))
         cv2.imwrite(str(folder / f"{i:03d}.png"), pictures[-1])
     (work / "none.csv").write_text("frame,x1,y1,x2,y2,score,class\n0,10,10,90,90,0.9,chair\n")
-    output = rt.OutputConfig(overlay="none", scene=False)
+    output = rt.OutputConfig(overlay=False, scene=False)
     result = rt.run(folder, work / "turn", rt.Config(output=output), detections=work / "none.csv")
     print("turn:", *result.warnings, sep="\n  ")
     strip = cv2.hconcat([cv2.resize(pictures[i], (200, 150)) for i in (0, 13, 26, 39)])

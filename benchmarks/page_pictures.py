@@ -13,16 +13,14 @@ from __future__ import annotations
 
 import argparse
 import sys
-import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
-import numpy as np
+from playwright.sync_api import sync_playwright
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
-from browser import Browser
+from browser import CHROMIUM, FLAGS, Browser
 
 PICTURES = {  # file: dark, x of the chair in the frame (0 left, 1 right), frame, more
     "scene.jpg": (False, 0.3, 20, ""),
@@ -47,23 +45,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("-o", "--output", type=Path, default=Path("docs/img"))
     parser.add_argument("--quality", type=int, default=72, help="JPEG quality, 1 to 100")
     args = parser.parse_args(argv)
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
-        browser = Browser(Path(profile))
+    with sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        browser = Browser(chromium)
         for name, (dark, x, frame, more) in PICTURES.items():
-            scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
-            browser.send("Emulation.setEmulatedMedia", features=[scheme])
-            browser.open(args.out / "scene.html")
+            scheme = "dark" if dark else "light"
+            browser.open(args.out / "scene.html", color_scheme=scheme)
             select_chair(browser, x, frame)
             browser.eval(f"VIEWS.reset(); {more}")
             time.sleep(LEAST_WAIT_S)
             browser.settle()
-            png = Path(profile) / "page.png"
-            browser.picture(png)
             path = args.output / name
-            image = np.asarray(cv2.imread(str(png)))
-            cv2.imwrite(str(path), image, [cv2.IMWRITE_JPEG_QUALITY, args.quality])
+            browser.page.screenshot(path=path, type="jpeg", quality=args.quality)
             print(f"{path}: {path.stat().st_size / 1e3:.0f} kB")
-        browser.close()
     return 0
 
 

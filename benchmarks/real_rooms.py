@@ -241,7 +241,7 @@ def configured(case: Case, data: Path, out: Path) -> rt.Config:
     """Make the options of a case: the defaults, without pictures."""
     config = rt.Config(
         detect=dataclasses.replace(DETECTOR, min_score=case.min_score),
-        output=rt.OutputConfig(overlay="none", scene=False),
+        output=rt.OutputConfig(overlay=False, scene=False),
     )
     if not case.supplied:
         return config

@@ -317,7 +317,7 @@ def tag(name: str) -> str:
 
 def configured(rec: Recording, own_cameras: bool = False) -> rt.Config:
     """The defaults without pictures and filled gaps, with the true cameras."""
-    output = rt.OutputConfig(overlay="none", scene=False, fill_gaps=0)
+    output = rt.OutputConfig(overlay=False, scene=False, fill_gaps=0)
     return rt.Config(output=output, poses=rt.PosesConfig() if own_cameras else rec.poses)
 
 

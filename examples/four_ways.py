@@ -73,7 +73,7 @@ def supervision(video: rt.Video) -> Identities:
 
 def chain(video: rt.Video) -> Identities:
     """4. The whole pipeline: identities, cameras and the shape of each object."""
-    config = rt.Config(input=video.config, output=rt.OutputConfig(overlay="none", scene=False))
+    config = rt.Config(input=video.config, output=rt.OutputConfig(overlay=False, scene=False))
     with tempfile.TemporaryDirectory() as out:
         result = rt.run(video.source, out, config, detections=DETECTIONS)
     for found in result.objects:

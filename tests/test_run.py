@@ -249,7 +249,7 @@ def test_embeddings_keep_their_rows_where_gaps_are_filled(
 ) -> None:
     lines = detections.read_text().splitlines(keepends=True)
     detections.write_text("".join(x for x in lines if x.split(",")[0] not in ("4", "5")))
-    output = rt.OutputConfig(overlay="none", scene=False)
+    output = rt.OutputConfig(overlay=False, scene=False)
     config = rt.Config(output=output, tracker=rt.TrackerConfig(embed_every=2))
     result = rt.run(clip, tmp_path / "out", config, detections=detections, in_3d=False)
     before = Workspace.open(tmp_path / "out").load_last()
@@ -406,7 +406,7 @@ def test_masks_are_not_kept_while_tracking(
         masks = np.ones((1, *image.shape[:2]), bool)
         return rt.Detections(np.array([[100, 60, 140, 110.0]]), np.ones(1), np.zeros(1, int), masks)
 
-    output = rt.OutputConfig(overlay="none", scene=False)
+    output = rt.OutputConfig(overlay=False, scene=False)
     config = rt.Config(output=output, embed=rt.EmbedConfig(model="none"))
     rt.run(clip, tmp_path / "out", config, detections=masked, in_3d=False)
     assert len(kept) == FRAMES
@@ -423,7 +423,7 @@ def test_a_function_detects_once_and_confident_people_are_masked(
         calls.append(1)
         return [[100, 60, 140, 110, 0.9, 0], [10, 60, 50, 110, 0.2, 0], [200, 9, 240, 90, 0.9, 56]]
 
-    output = rt.OutputConfig(overlay="none", scene=False)
+    output = rt.OutputConfig(overlay=False, scene=False)
     config = rt.Config(output=output, embed=rt.EmbedConfig(model="none"))
     rt.run(clip, tmp_path / "out", config, detections=people)
     assert len(calls) == FRAMES and len(stages.poses) == FRAMES
@@ -678,7 +678,7 @@ def test_overlay_cut_by_a_full_disk_is_not_kept(
         cwd=Path(rt.__file__).parent,
     )
     assert done.returncode == 0, done.stderr
-    assert "/overlay." in done.stderr and done.stderr.count("\n") == 1
+    assert "overlay.mp4" in done.stderr and done.stderr.count("\n") == 1
     assert (
         "warning: no overlay video: OSError" in done.stderr and "output.overlay=none" in done.stderr
     )
