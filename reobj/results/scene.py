@@ -613,7 +613,7 @@ def write_pictures(
         if pictures is not None and "scene" not in faults:
             with faults.of("scene"):
                 page = dataclasses.replace(result, warnings=[*result.warnings, *faults.messages()])
-                write_scene(page, pictures, out / "scene.html", video, doubtful, command)
+                write_scene(page, pictures, out / "scene.html", video, doubtful, command=command)
     return faults.messages()
 
 

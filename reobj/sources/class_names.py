@@ -38,14 +38,22 @@ def load_class_names(path: str | Path) -> tuple[str, ...]:
     if isinstance(entries := data.get("categories"), list):
         named = [entry for entry in entries if isinstance(entry, dict)]
         data = {"names": {entry.get("id"): entry.get("name") for entry in named}}
-    return names_by_number(data.get("names", data), where)
+    names = names_by_number(given := data.get("names", data), where)
+    if "nc" in data and str(data["nc"]) not in (str(len(names)), str(len(given))):
+        raise ReobjError(f"{path}: nc is {data['nc']}, but there are {len(names)} names")
+    return names
 
 
 def _of_lines(path: Path) -> list[str] | dict[str, str]:
-    """Read a name a line, or a number and a name in all lines."""
+    """Read a name a line, or a number and a name: all lines have one, or none has."""
     lines = [line.strip() for line in read_lines(path) if line.strip()]
     numbered = [match for line in lines if (match := re.fullmatch(r"(\d+)[\s:,]+(\S.*)", line))]
-    return {m[1]: m[2] for m in numbered} if len(numbered) == len(lines) else lines
+    named = {match[1]: match[2] for match in numbered}
+    if numbered and len(named) < len(lines):
+        raise ReobjError(f"{path}: {len(numbered)} of {len(lines)} lines are a number and a name "
+                         f"({numbered[0][0]!r:.40}); expected different numbers in all, or in none"
+                         )  # fmt: skip
+    return named or lines
 
 
 def is_yaml(path: Path) -> bool:

@@ -540,6 +540,8 @@ def read_source_3d(source: Source) -> RecordedDetections:
     video = source.video
     table = read_columns(path)
     role_of = {"time_ns": "time", "prob": "score", "name": "class"}
+    if missing := [name for name in (*BOXES_3D, *role_of) if name not in table.cells]:
+        raise ReobjError(f"{path}, line 1: 3D boxes without the columns {', '.join(missing)}")
     table.cells = {role_of.get(name, name): cells for name, cells in table.cells.items()}
     time_s = _seconds(table)
     if source.describes:

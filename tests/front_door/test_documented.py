@@ -223,7 +223,7 @@ NAMED = {"VIDEO": "phone.mp4", "OUT": "out"}
 FIRST = f"--every 4 --stop 80 {QUICKLY}"
 SHOWN = {
     TOOL + "run phone.mp4 -o out": Shown(
-        recording, more="--offline", code=2, says="--detector fast"
+        recording, more="--offline", code=2, says="set REOBJ_MODELS"
     ),
     TOOL + "run phone.mp4 -o out --detections det.json": Shown(
         recording, right, f"{SHORT} {SUPPLIED}", warning="det.json: images and classes of instan"

@@ -80,4 +80,4 @@ def test_true_boxes_without_a_class_do_not_count(
     assert cli("eval", out, "--gt", tmp_path / "gt.txt") == 0
     said = " ".join(capsys.readouterr().out.split())
     assert re.search(r"all 100\.0 100\.0 100\.0", said) and "not found" not in said
-    assert "8 without a class (below 0) do not count, nor do boxes on them" in said
+    assert "8 true boxes without a class (below 0) do not count, nor do boxes on them" in said
