@@ -68,6 +68,8 @@ from reobj.appearance.reid import (
 )  # fmt: skip
 from reobj.cameras import Camera, Poses, checked_pose, viewing_rays
 from reobj.config import Config, OutputConfig, TrackerConfig, as_config
+from reobj.evaluation.tracks import evaluate
+from reobj.export.registry import export
 from reobj.files import load_cached, load_npz, restore_state, save_npz, state_arrays
 from reobj.maps.fusion import class_ids, ellipsoid_map_of, embeddings_of, object_state
 from reobj.maps.room_map import RoomMap
@@ -78,8 +80,6 @@ from reobj.poses.stage import poses_key, supplied_poses
 from reobj.poses.supplied.readers import read_poses
 from reobj.results.changes import Change, Changes
 from reobj.results.edits import read_edits
-from reobj.results.evaluation import evaluate
-from reobj.results.export import export
 from reobj.results.result import Object, Part, Result, World, load_tracked, save_tracked
 from reobj.results.stages import collect_tracks, detections_key
 from reobj.results.workspace import Workspace

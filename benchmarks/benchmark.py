@@ -383,8 +383,8 @@ def python_of(venvs: Path, group: str) -> Path:
 def scores(stream: Stream, identity: IntArray, until: int) -> dict[str, float]:
     """Identity scores of the first frames (objects count while in view, detected or not)."""
     sys.path.insert(0, os.environ.get("REOBJ_TRACK", str(ROOT)))
-    from reobj.results.evaluation import score_tracks
-    from reobj.results.truth import labelled
+    from reobj.evaluation.tracks import score_tracks
+    from reobj.evaluation.truth import labelled
 
     kept = identity > 0
     truth = stream.truth[stream.truth[:, 0] <= until]

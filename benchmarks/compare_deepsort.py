@@ -49,9 +49,9 @@ from splits import MARK, SPLITS, add_choosing, held_out, room_name, usable
 
 sys.path.insert(0, os.environ.get("REOBJ_TRACK", str(Path(__file__).resolve().parent.parent)))
 import reobj_track as rt
+from reobj.evaluation.tracks import return_ranks, score_tracks
+from reobj.evaluation.truth import LabelledBoxes, labelled, read_truth
 from reobj.files import atomic
-from reobj.results.evaluation import return_ranks, score_tracks
-from reobj.results.truth import LabelledBoxes, labelled, read_truth
 from reobj.sources.tables import read_mot_rows
 from reobj.sources.weights import IMAGENET_MEAN, IMAGENET_STD, onnx_session, own_models
 from reobj.types import Image

@@ -12,9 +12,9 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
+from reobj.evaluation.truth import TRUTH
 from reobj.poses.intrinsics import CAMERAS
 from reobj.poses.supplied.readers import POSES
-from reobj.results.truth import TRUTH
 from reobj.sources.detection_files import DETECTIONS
 from reobj.sources.onnx_layouts import layouts_table
 

@@ -17,6 +17,8 @@ from typing import Any, NoReturn
 import quadrics
 from reobj import __version__
 from reobj.config import Config, add_flags, config_from_args, list_options
+from reobj.evaluation.tracks import evaluate, score_report
+from reobj.export.registry import EXPORTS, export
 from reobj.files import atomic, did_you_mean, wrapped
 from reobj.maps.corrections import FolderMap, corrected
 from reobj.maps.listing import MAP_EXPORTS, export_map, listing
@@ -31,10 +33,7 @@ from reobj.poses.stage import (
     write_supplied_model,
 )
 from reobj.results.entries import OutputFile
-from reobj.results.evaluation import evaluate, score_report
-from reobj.results.export import EXPORTS, export
 from reobj.results.saving import copy_models, replaced, validate_objects, write_trajectories
-from reobj.results.serve import Server
 from reobj.results.workspace import Workspace
 from reobj.sources.video import Video
 from reobj.sources.weights import list_models, model_path
@@ -48,6 +47,7 @@ from reobj.types import (
     printable,
     without_secrets,
 )
+from reobj.viewer.serve import Server
 
 Arguments = argparse.Namespace
 LEVEL_NAMES = {

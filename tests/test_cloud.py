@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from simulated import fitted
 
-import reobj.results.cloud as cloud
+import reobj.viewer.cloud as cloud
 import reobj_track as rt
-from reobj.results.scene import write_pictures
+from reobj.viewer.scene import write_pictures
 
 WIDTH = 320
 HEIGHT = 240

@@ -17,7 +17,7 @@ from simulated import chair_solids, walk
 from test_recorded import coco_string
 
 import reobj_track as rt
-from reobj.results.export_labels import BOXER_HEADER
+from reobj.export.labels import BOXER_HEADER
 from reobj.sources.recorded import RecordedDetections
 
 

@@ -14,15 +14,15 @@ from scipy.spatial.transform import Rotation
 
 import quadrics
 import reobj_track as rt
-from reobj.results.evaluation import (
+from reobj.evaluation.objects import read_true_objects, score_objects
+from reobj.evaluation.tracks import (
     return_ranks,
     score_report,
     score_tracks,
     visits,
 )
-from reobj.results.evaluation_3d import read_true_objects, score_objects
+from reobj.evaluation.truth import LabelledBoxes, labelled
 from reobj.results.result import VideoInfo
-from reobj.results.truth import LabelledBoxes, labelled
 from reobj.results.workspace import Workspace
 from reobj.types import Embeddings
 

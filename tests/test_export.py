@@ -20,7 +20,7 @@ from simulated import walk
 
 import reobj_track as rt
 from reobj.cameras import invert_rigid
-from reobj.results.export import EXPORTS, Viewer
+from reobj.export.registry import EXPORTS, Viewer
 from reobj.results.result import VideoInfo
 
 NO_PICTURES = ("--set", "output.overlay=0", "--set", "output.scene=0")

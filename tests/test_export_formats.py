@@ -16,7 +16,7 @@ from simulated import SIZE, chair_solids, walk
 
 import reobj_track as rt
 from reobj.cameras import invert_rigid
-from reobj.results.export import EXPORTS
+from reobj.export.registry import EXPORTS
 from reobj.results.result import write_objects
 from reobj.results.workspace import Workspace
 from reobj.types import object_color

@@ -11,7 +11,7 @@ import pytest
 from browser import Browser
 
 import reobj_track as rt
-from reobj.results.overlay import FilmWriter, film_fps
+from reobj.viewer.overlay import FilmWriter, film_fps
 
 SIZE = (320, 240)
 FRAMES = 30

@@ -14,7 +14,8 @@ from simulated import SIZE, chair_solids, walk
 import quadrics
 import reobj_track as rt
 from reobj.results.changes import Change, Changes, Shape
-from reobj.results.overlay import (
+from reobj.types import box_iou, object_color
+from reobj.viewer.overlay import (
     CHANGE_COLORS,
     Overlay,
     draw_legend,
@@ -25,7 +26,6 @@ from reobj.results.overlay import (
     surface_points,
     wireframes,
 )
-from reobj.types import box_iou, object_color
 
 
 def grey(width: int = 200, height: int = 120) -> np.ndarray:

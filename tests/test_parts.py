@@ -25,7 +25,7 @@ from simulated import (
 
 import reobj_track as rt
 from reobj.cameras import invert_rigid
-from reobj.results.evaluation_3d import score_objects
+from reobj.evaluation.objects import score_objects
 
 CENTERS = chair_solids().center_in_world
 

@@ -20,9 +20,9 @@ from simulated import chair_solids, walk
 import quadrics
 import reobj_track as rt
 from reobj.config import read_config
+from reobj.evaluation.objects import read_true_objects
+from reobj.evaluation.truth import read_truth
 from reobj.results.edits import apply_edits, read_edits
-from reobj.results.evaluation_3d import read_true_objects
-from reobj.results.truth import read_truth
 from reobj.results.workspace import Workspace
 from reobj.sources.video import ImagelessVideo
 

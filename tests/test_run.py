@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 import quadrics
 import reobj_track as rt
 from reobj.config import read_config
-from reobj.results.export_labels import BOXER_HEADER
+from reobj.export.labels import BOXER_HEADER
 from reobj.results.saving import validate_objects
 
 ROOT = Path(__file__).resolve().parent.parent

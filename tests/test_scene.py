@@ -21,14 +21,15 @@ from scipy.spatial.transform import Rotation
 from simulated import fitted, into_part, tracks_of, walk
 
 import quadrics
-import reobj.results.scene as scene
+import reobj.viewer.scene as scene
 import reobj_track as rt
 from reobj.cameras import invert_rigid
 from reobj.files import Progress, decimals
 from reobj.results.changes import Change, Changes, EarlierSession, Shape
-from reobj.results.cloud import Cloud
 from reobj.results.result import VideoInfo
-from reobj.results.scene import (
+from reobj.types import object_color
+from reobj.viewer.cloud import Cloud
+from reobj.viewer.scene import (
     Pictures,
     best_pictures,
     diverse_rows,
@@ -36,7 +37,6 @@ from reobj.results.scene import (
     write_pictures,
     write_scene,
 )
-from reobj.types import object_color
 
 EVIL = "</script><script>window.hacked=1</script><img src=x onerror=hacked=1>"
 

@@ -12,11 +12,11 @@ import numpy as np
 
 import quadrics
 from reobj import __version__
+from reobj.export.source import formula_safe
 from reobj.files import atomic, cut, numbers, rounded, spans, texts_with_sigma
 from reobj.maps.fusion import ObjectState, object_state, scale_of, shapes_of, state_before
 from reobj.maps.room_map import MapObject, Observation, RoomMap, Session
 from reobj.results.changes import Change, Changes, EarlierSession, Shape
-from reobj.results.export_source import formula_safe
 from reobj.results.ply import write_ply
 from reobj.results.result import Object
 from reobj.types import Array, ReobjError, visible_name

@@ -32,9 +32,9 @@ from reobj.maps.update import Recording, add_recording
 from reobj.results.changes import Changes
 from reobj.results.entries import recording_name
 from reobj.results.result import Result
-from reobj.results.scene import best_pictures
 from reobj.sources.video import Video, content_fingerprint, files_of
 from reobj.types import NOTE_START, ReobjError, option
+from reobj.viewer.scene import best_pictures
 
 
 @dataclass(frozen=True, slots=True)

@@ -138,7 +138,7 @@ class Result:
 
     def _repr_html_(self) -> str:
         """Show the objects and the viewer in a notebook."""
-        from reobj.results import scene  # it needs this module
+        from reobj.viewer import scene  # it needs this module
 
         return scene.to_html(self)
 

@@ -18,11 +18,11 @@ from scipy.spatial.transform import Rotation
 from simulated import SIZE, fitted, tracks_of, unlinked, walk, with_fitted_covariance
 
 import reobj_track as rt
-from reobj.results import overlay, scene
-from reobj.results.export import EXPORTS
+from reobj.export.registry import EXPORTS
 from reobj.results.result import VideoInfo
-from reobj.results.scene import write_pictures
 from reobj.results.workspace import Workspace
+from reobj.viewer import overlay, scene
+from reobj.viewer.scene import write_pictures
 
 FRAMES = 6
 

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from reobj.cameras import Camera, invert_rigid, quat_wxyz_from_matrix
+from reobj.export.source import UprightWorld, distortion, upright_world
 from reobj.files import atomic
-from reobj.results.export_source import UprightWorld, distortion, upright_world
 from reobj.results.result import Object, Result
 from reobj.types import Array, ReobjError, Tracks, object_color, visible_name
 

@@ -28,13 +28,11 @@ import numpy.typing as npt
 
 import quadrics
 from reobj.cameras import Camera, Poses, invert_rigid, place_of, undistort_boxes
+from reobj.export.source import centred
 from reobj.files import Progress, atomic, base64_text, read_text, rounded, significant
 from reobj.poses.floor import NOISE
 from reobj.results.changes import EarlierSession
-from reobj.results.cloud import Cloud, DenseFrames, dense_frames
 from reobj.results.entries import Object, World, recording_name, visit_gap
-from reobj.results.export_source import centred
-from reobj.results.overlay import Overlay
 from reobj.results.result import Result, sides
 from reobj.sources.image_files import IMAGE_FPS
 from reobj.sources.video import ImagelessVideo, Video, shrunk
@@ -51,6 +49,8 @@ from reobj.types import (
     one_line,
     rows_by,
 )
+from reobj.viewer.cloud import Cloud, DenseFrames, dense_frames
+from reobj.viewer.overlay import Overlay
 
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
 VIEWER_PX = 600  # height of the viewer in a notebook: one on a laptop shows it whole

@@ -31,11 +31,11 @@ from reobj.files import atomic
 from reobj.results.changes import EarlierSession
 from reobj.results.edits import HEADER, read_edits
 from reobj.results.entries import OutputFile
-from reobj.results.scene import served_page
 from reobj.results.workspace import Workspace
 from reobj.sources.image_files import read_image
 from reobj.sources.video import Video, shrunk, source_fingerprint
 from reobj.types import ReobjError, log, one_line
+from reobj.viewer.scene import served_page
 
 HOST = "127.0.0.1"
 HEADERS = {

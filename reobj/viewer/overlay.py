@@ -21,9 +21,9 @@ from scipy.spatial.transform import Rotation
 
 import quadrics
 from reobj.cameras import Camera, Poses
+from reobj.export.source import centred
 from reobj.files import cut
 from reobj.results.changes import Change
-from reobj.results.export_source import centred
 from reobj.results.ply import unit_mesh
 from reobj.results.result import Result
 from reobj.sources.image_files import IMAGE_FPS

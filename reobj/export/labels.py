@@ -13,14 +13,14 @@ import numpy as np
 
 from reobj import __version__
 from reobj.cameras import place_of
-from reobj.files import atomic, staged
-from reobj.results.export_source import (
+from reobj.export.source import (
     formula_safe,
     frames_read,
     label_names,
     upright_world,
     warn_of_components,
 )
+from reobj.files import atomic, staged
 from reobj.results.result import Object, Result, object_table
 from reobj.sources.image_files import IMAGE_FPS
 from reobj.types import Tracks, object_classes, rows_by, visible_name

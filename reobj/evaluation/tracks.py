@@ -16,12 +16,8 @@ import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
 
 from reobj import __version__
-from reobj.files import wrapped
-from reobj.formats import AUTO
-from reobj.results.entries import OutputFile
-from reobj.results.evaluation_3d import score_objects
-from reobj.results.result import Result
-from reobj.results.truth import (
+from reobj.evaluation.objects import score_objects
+from reobj.evaluation.truth import (
     LabelledBoxes,
     Role,
     check_counts,
@@ -29,6 +25,10 @@ from reobj.results.truth import (
     read_truth,
     with_common_names,
 )
+from reobj.files import wrapped
+from reobj.formats import AUTO
+from reobj.results.entries import OutputFile
+from reobj.results.result import Result
 from reobj.results.workspace import Workspace
 from reobj.sources.video import InputConfig
 from reobj.types import (

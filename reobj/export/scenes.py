@@ -11,8 +11,7 @@ import numpy as np
 
 from reobj import __version__
 from reobj.cameras import CV_FROM_GL, Camera, Poses, invert_rigid
-from reobj.files import atomic, staged
-from reobj.results.export_source import (
+from reobj.export.source import (
     UprightWorld,
     centred,
     distortion,
@@ -21,6 +20,7 @@ from reobj.results.export_source import (
     upright_world,
     video_of,
 )
+from reobj.files import atomic, staged
 from reobj.results.ply import write_ply, write_point_ply
 from reobj.results.result import Result
 from reobj.sources.image_files import IMAGE_FPS

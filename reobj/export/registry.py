@@ -17,23 +17,23 @@ import cv2
 import numpy as np
 
 from reobj.cameras import Poses
-from reobj.files import atomic
-from reobj.results.export_labels import (
+from reobj.export.labels import (
     export_boxer,
     export_coco_vid,
     export_csv,
     export_cvat,
     export_yolo,
 )
-from reobj.results.export_ros import export_mcap
-from reobj.results.export_scene import export_glb, export_nerfstudio, export_ply, export_usd
-from reobj.results.export_source import (
+from reobj.export.mcap import export_mcap
+from reobj.export.scenes import export_glb, export_nerfstudio, export_ply, export_usd
+from reobj.export.source import (
     far_origin,
     frames_read,
     shifted,
     upright_world,
     video_of,
 )
+from reobj.files import atomic
 from reobj.results.result import Result, VideoInfo
 from reobj.sources.image_files import IMAGE_FPS
 from reobj.sources.video import Video

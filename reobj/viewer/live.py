@@ -13,12 +13,12 @@ from urllib.parse import urlsplit
 import cv2
 
 from reobj.cameras import Poses
-from reobj.results.export import Viewer, live_labels
-from reobj.results.overlay import draw_tracks
+from reobj.export.registry import Viewer, live_labels
 from reobj.results.result import Result, VideoInfo
-from reobj.results.serve import LocalHandler, LocalServer
 from reobj.sources.video import Video, shrunk
 from reobj.types import NOTE, Frame, ReobjError, Tracks, log
+from reobj.viewer.overlay import draw_tracks
+from reobj.viewer.serve import LocalHandler, LocalServer
 
 EVERY_S = 0.1  # least time between two pictures of the page
 PICTURE_PX = 1280  # longer side

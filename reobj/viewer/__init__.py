@@ -1,0 +1,1 @@
+"""Pictures of results: the viewer scene.html, the overlay video, local servers."""
