@@ -5,25 +5,53 @@ python docs/make_formats.py
 
 from __future__ import annotations
 
-import dataclasses
 import re
 import sys
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
 from reobj.evaluation.truth import TRUTH
+from reobj.formats import Format
 from reobj.poses.intrinsics import CAMERAS
 from reobj.poses.supplied.readers import POSES
 from reobj.sources.detection_files import DETECTIONS
-from reobj.sources.onnx_layouts import layouts_table
+from reobj.sources.onnx_layouts import ENTRIES
 
 PAGE = Path(__file__).parent / "input_formats.md"
+
+
+def table(rows: Iterable[tuple[str, ...]]) -> str:
+    """Format rows as a Markdown table; the first one is its head."""
+    head, *others = rows
+    return "".join(f"| {' | '.join(row)} |\n" for row in (head, ("---",) * len(head), *others))
+
+
+def formats_table(formats: Sequence[Format[Any]]) -> str:
+    """Format the formats that are read, and name the others."""
+    rows = [("format", "written by", "frames", "units", "not read")]
+    rows += [(f"`{f.name}`", f.title, f.frames, f.units, f.unread) for f in formats if f.read]
+    others = [f.title for f in formats if not f.read]
+    text = f"\nRefused, with what to do instead: {'; '.join(others)}.\n" if others else ""
+    return table(rows) + text
+
+
+def layouts_table() -> str:
+    """Format the layouts of ONNX models."""
+    rows = [("layout", "models", "outputs", "image", "not read")]
+    for entry in ENTRIES:
+        image = f"{entry.fit}, {entry.pixels.title}"
+        rows.append((f"`{entry.name}`", entry.title, entry.shape, image, entry.unread))
+    return table(rows)
+
+
 TABLES = {
-    "detections": DETECTIONS.table(),
-    "ground truth": dataclasses.replace(TRUTH, formats=TRUTH.readable).table(),
-    "poses": POSES.table(),
-    "cameras": CAMERAS.table(),
+    "detections": formats_table(DETECTIONS.formats),
+    "ground truth": formats_table(TRUTH.readable),
+    "poses": formats_table(POSES.formats),
+    "cameras": formats_table(CAMERAS.formats),
     "layouts": layouts_table(),
 }
 

@@ -182,16 +182,6 @@ class Registry(Generic[R]):
         raise ReobjError(f"{probe.path}: no known format of {self.what}{probe.found}; expected one "
                          f"of {', '.join(near)} ({self.flag}; docs/input_formats.md)")  # fmt: skip
 
-    def table(self) -> str:
-        """Return the Markdown table of docs/input_formats.md."""
-        rows = [("format", "written by", "frames", "units", "not read"), ("---",) * 5]
-        rows += [
-            (f"`{entry.name}`" if entry.read else "", entry.title, entry.frames, entry.units,
-             entry.unread if entry.read else f"the file; {entry.advice}")
-            for entry in sorted(self.formats, key=lambda entry: entry.read is None)
-        ]  # fmt: skip
-        return "\n".join(f"| {' | '.join(row)} |" for row in rows) + "\n"
-
 
 # ---- Names of images -----------------------------------------------------------------------------
 

@@ -440,15 +440,6 @@ def find_layout(model: ModelProbe, declared: str, names_of: str) -> Layout:
     return layout
 
 
-def layouts_table() -> str:
-    """Return the Markdown table of docs/input_formats.md."""
-    rows = [("layout", "models", "outputs", "image", "not read"), ("---",) * 5]
-    for entry in ENTRIES:
-        image = f"{entry.fit}, {entry.pixels.title}"
-        rows.append((f"`{entry.name}`", entry.title, entry.shape, image, entry.unread))
-    return "".join(f"| {' | '.join(row)} |\n" for row in rows)
-
-
 # ---- The detector -------------------------------------------------------------------------------
 
 
