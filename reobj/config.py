@@ -286,9 +286,6 @@ def write_config(config: Any, path: str | Path) -> None:
         part.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-ESCAPED_BYTE = r"\\\\udc([89a-f][0-9a-f])"  # of a path, as `_toml` writes it
-
-
 def _toml(value: str | float) -> str:
     """Format a value: strings as in JSON, with DEL escaped too; numbers as in Python.
 

@@ -464,12 +464,6 @@ def _read_kitti(path: Path, size: Size) -> Camera:
     return brown_camera(size, *_focal_and_centre(rows[0, :, :3]))
 
 
-def is_dso_camera(probe: Probe) -> bool:
-    """Test for DSO's four lines: lens, size, crop mode, size."""
-    rows = _text_rows(probe)
-    return len(rows) >= 3 and len(rows[0]) >= 5 and len(rows[1]) == 2
-
-
 def _read_rows(path: Path, size: Size) -> Camera:
     return _camera_of_rows(_rows(read_text(path, CAMERA_MAX)), size)
 

@@ -229,9 +229,6 @@ class TimeUnit(enum.Enum):
     ns = 1e9
 
 
-LEAST_STAMP = 1e9  # lower whole numbers are counters; chosen: s since 1970 have ten digits
-
-
 def is_date(time_s: float) -> bool:
     """Test whether a time in s since 1970 is a plausible date: from 2000 to 2100."""
     return 946684800 < time_s < 4102444800
