@@ -19,7 +19,7 @@ import cv2
 import msgspec
 import numpy as np
 
-from reobj.files import load_json, shortened
+from reobj.files import MEMORY_MAX, check_unpacked, load_json, shortened
 from reobj.formats import frames_by_name
 from reobj.sources.recorded import (
     CORNERS,
@@ -389,9 +389,12 @@ def read_cvat(source: Source) -> RecordedDetections:
 
 def _cvat_root(path: Path) -> ET.Element:
     """Parse the annotations in an XML file or a zip archive."""
+    most = MEMORY_MAX // 16  # bytes, 800,000 boxes: the parser needs ten times as much memory
     if not zipfile.is_zipfile(path):
+        check_unpacked(path.stat().st_size, most)
         return ET.fromstring(path.read_bytes())
     with zipfile.ZipFile(path) as packed:
+        check_unpacked(packed.getinfo("annotations.xml").file_size, most)
         return ET.fromstring(packed.read("annotations.xml"))
 
 
