@@ -48,8 +48,8 @@ AGREEING = 5  # least images that agree on one similarity; of few images, half
 TURN_DEG = 5.0
 SHIFT = 0.1
 SHOWN = 50  # points of the map that an image should show again, to count as a view of it
-# Least fraction that agrees of the images that should show the map. (Recordings of the room: .6 to 1,
-# one with mirrored images .03.)
+# Least fraction that agrees of the images that should show the map. (Recordings of the room:
+# .6 to 1, one with mirrored images .03.)
 CONFIRMED = 0.25
 RIVAL = 0.5  # fraction of the images that agree, elsewhere, that makes both positions ambiguous
 

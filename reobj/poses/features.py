@@ -387,8 +387,8 @@ def focal_from_pairs(pairs: MatchedPairs, size: tuple[int, int]) -> float | None
 
 
 MAP_ALL_OF = 100  # keyframes up to which all are mapped (chosen: it takes a minute)
-# Keyframes added in a second attempt are all mapped, but only registered where more than this number
-# are mapped already (chosen: it takes minutes)
+# Keyframes added in a second attempt are all mapped, but only registered where more than this
+# number are mapped already (chosen: it takes minutes)
 MAP_MORE_TO = 300
 # Median displacement of the matches, over the width: half of that between consecutive keyframes
 REPEATED_FLOW = 0.06
