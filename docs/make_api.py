@@ -15,6 +15,7 @@ from typing import Any
 
 PAGE = Path(__file__).parent / "api.md"
 DEFAULT = 24  # characters of a default value that is shown
+FIELDS = 14  # an options class with more has its fields in its docstring only
 INTERNAL = set(
     "cached cameras_text cells clip_segments cut fault flush frozen keep_embeddings selects "
     "look maps masked run_conv_block span_text to_json trained updated".split()
@@ -107,7 +108,9 @@ def entry(name: str, value: Any) -> str:
         head = f"class {name}({value.__bases__[0].__name__})"
         summary = first_line(value)
     else:
-        head = f"class {signature(name, value)}"
+        many = len(inspect.signature(value).parameters) >= FIELDS
+        options = name.endswith(("Options", "Layout", "Config"))
+        head = f"class {name}(...)" if many and options else f"class {signature(name, value)}"
         summary = first_line(value)
     members = list(methods(value)) if inspect.isclass(value) else []
     lines = [f"**`{head}`**\n", summary, *([""] if members else []), *members]
