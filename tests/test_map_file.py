@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 from map_worlds import a_map, a_session, observed, random_map, some_points, true_shape
+from reobj.maps.corrections import forget, merge, rename
 
 from reobj.files import load_npz, save_npz
-from reobj.maps.corrections import forget, merge, rename
 from reobj.maps.fusion import object_state
 from reobj.maps.room_map import MapObject, Observation, RoomMap
 from reobj.types import ReobjError

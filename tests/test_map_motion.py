@@ -9,13 +9,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from map_worlds import CAMERA, a_map, observed, true_shape
+from reobj.maps.motion import point_motions
 from scipy.spatial.transform import Rotation
 
 import quadrics
 from reobj.cameras import Poses
 from reobj.maps.compare import FoundObject, PointMotion
 from reobj.maps.fusion import ObjectState, object_state
-from reobj.maps.motion import point_motions
 from reobj.maps.object_points import ObjectView
 from reobj.maps.room_map import MapPoints
 from reobj.types import Array

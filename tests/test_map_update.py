@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from reobj.maps.corrections import delete, forget, with_edits
+from reobj.maps.listing import earlier_sessions
 from simulated import (
     CUP,
     chair_solids,
@@ -19,9 +21,7 @@ from simulated import (
 
 import quadrics
 import reobj_track as rt
-from reobj.maps.corrections import delete, forget, with_edits
 from reobj.maps.fusion import object_state
-from reobj.maps.listing import earlier_sessions
 from reobj.maps.room_map import MapPoints, RoomMap
 from reobj.maps.update import Recording, add_recording
 from reobj.maps.visibility import visibility_of

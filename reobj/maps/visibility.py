@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 import quadrics
 from reobj.cameras import VisiblePoints, invert_rigid, undistort_boxes
-from reobj.maps.compare import Visibility
 from reobj.maps.fusion import ObjectState, alignment_jacobian, shapes_of
 from reobj.objects.observations import entry_depths
 from reobj.results.result import Object, Result
@@ -33,6 +33,31 @@ LEAST_POINTS = 3
 # Largest standard deviation of the centre, over the mean half axis: with more, a detection of the
 # object may lie beside its projection
 MOST_SPREAD = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Visibility:
+    """How the cameras of the recording saw the places of the N objects of the map.
+
+    Views less than 10 degrees apart fail together and count once.
+
+    Attributes:
+        expected: (N,) independent views in which the object would be in the image and unoccluded.
+        seen_through: (N,) of those, views that show what is behind the object (sparse points on
+            rays through its middle), or views besides a first one that show its surroundings.
+        vague: (N,) the position in the map is too uncertain to know what a view shows.
+        detected: (N,) of the expected ones, views in which a detection may show the object; a
+            fraction if some of the views that count as one have one.
+        accident: (N,) log probability that these detections lie there by accident.
+        unlocated: (N,) as `detected`, by detections that belong to no object of the recording.
+    """
+
+    expected: Array
+    seen_through: Array
+    vague: BoolArray
+    detected: Array
+    accident: Array
+    unlocated: Array
 
 
 def visibility_of(
