@@ -528,9 +528,8 @@ class _Verdicts:
 
     def _candidates(self, j: int) -> tuple[int, ...]:
         """Return the numbers that a found object may have, within the margin of the best one."""
-        return tuple(
-            self.of.states[i].id for i in np.flatnonzero(self.loss[:-1, j] < MARGIN).tolist()
-        )
+        states = zip(self.of.states, self.loss[:-1, j], strict=True)
+        return tuple(s.id for s, loss in states if loss < MARGIN)
 
     def _undetected(self, i: int) -> Decision:
         """Decide about a map object that was given no found object."""

@@ -561,7 +561,7 @@ class FolderMap:
         arrays, facts = encoded(others)
         digest = hashlib.sha256(json.dumps([facts, corrections]).encode())
         for values in arrays.values():
-            digest.update(np.ascontiguousarray(values))
+            digest.update(np.asarray(values).tobytes())
         return digest.hexdigest()
 
 

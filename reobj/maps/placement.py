@@ -535,7 +535,7 @@ def spread_over(rows: IntArray, most: int) -> IntArray:
     """Choose rows at equal distances, `most` of them if there are more."""
     if len(rows) <= most:
         return rows
-    return rows[np.linspace(0, len(rows) - 1, most).astype(int)]
+    return np.asarray(rows[np.linspace(0, len(rows) - 1, most).astype(int)], np.int64)
 
 
 def _matched(points: MapPoints) -> MapPoints:
