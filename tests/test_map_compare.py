@@ -168,7 +168,7 @@ def test_gone_needs_views_and_something_seen_behind_the_place(
 def test_an_uncertain_alignment_moves_no_object() -> None:
     """All found objects are 25 cm beside their places; the alignment has a sigma of 20 cm."""
     states = room()
-    detected = [found(s, s.center + [0.2, -0.15, 0]) for s in states]
+    detected = [found(s, s.center + np.array([0.2, -0.15, 0])) for s in states]
     cov = np.diag([0, 0, 0, 0.04, 0.04, 0.04, 0.0])
     assert [d.kind for d in decide(states, detected, cov=cov)] == ["stayed"] * 6
     lone = decide([states[1]], [detected[1]], cov=cov)

@@ -53,7 +53,7 @@ def walk(count=16, radius=0.6):
 def recording(rng, points, cam_from_map, noise_px=0.5, outliers=100, parts=None):
     """Poses in a session's own world, and features of every image with wrong ones among them."""
     to_session = Similarity(
-        SCALE, TURN.T, -SCALE * TURN.T @ SHIFT, np.zeros((7, 7))
+        SCALE, TURN.T, -SCALE * TURN.T @ SHIFT
     )  # of map_from_session
     count = len(cam_from_map)
     session = to_session.poses(cam_from_map)
@@ -108,7 +108,7 @@ def test_errors_agree_with_the_covariance():
         poses, features = recording(rng, points, walk(10), noise_px=1.5)
         (component,) = place(poses, features, points).components
         found = component.similarity
-        truth = Similarity(1 / SCALE, TURN, SHIFT, np.zeros((7, 7)))
+        truth = Similarity(1 / SCALE, TURN, SHIFT)
         turn = truth.rotation @ found.rotation.T  # the correction that leads to the truth
         grow = truth.scale / found.scale
         moved = truth.translation - grow * turn @ found.translation
@@ -158,7 +158,7 @@ def test_components_are_placed_one_by_one_and_become_one():
     truth = walk(21)
     parts = np.repeat([0, 1, 2], 7)
     poses, features = recording(rng, points, truth, parts=parts)
-    other = Similarity(3.0, TURN, SHIFT, np.zeros((7, 7)))
+    other = Similarity(3.0, TURN, SHIFT)
     cam = poses.cam_from_world.copy()
     cam[7:14] = other.poses(cam[7:14])
     poses = dataclasses.replace(poses, cam_from_world=cam)
@@ -169,7 +169,7 @@ def test_components_are_placed_one_by_one_and_become_one():
     assert placement.poses.part.tolist() == [0] * 14 + [1] * 7
     np.testing.assert_allclose(placement.poses.cam_from_world[:14], truth[:14], atol=0.02)
     np.testing.assert_array_equal(placement.poses.cam_from_world[14:], cam[14:])
-    reason = placement.components[2].reason
+    reason = placement.components[2].refused
     assert reason == "0 of 7 images match points of the map, 4 are needed"
 
 

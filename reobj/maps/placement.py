@@ -472,7 +472,7 @@ def refine_similarity(
     bread = np.linalg.pinv(np.einsum("nij,nik->jk", J, J))
     independent = float((gradient**2).sum() / max((J**2).sum(), 1e-300))  # px^2
     common = float(np.trace(bread @ of_image.T @ of_image)) / 7  # px^2
-    cov = bread * max(independent, common * len(images) / max(len(images) - 1, 1))
+    cov = bread * max(independent, len(images) / max(len(images) - 1, 1) * common)
     about = np.eye(7)  # from a small similarity about the centre of the points to one about 0
     about[3:6] = alignment_jacobian(-origin[None])[0]
     return dataclasses.replace(corrected(fit.x), cov=about @ cov @ about.T)
