@@ -81,6 +81,12 @@ def a_session(number: int, **fields: Any) -> Session:
     return Session(number, **usual | fields)
 
 
+def descriptors(rng: np.random.Generator, count: int) -> Any:
+    """Random descriptors of the norm of RootSIFT."""
+    values = rng.gamma(0.3, size=(count, 128))
+    return np.minimum(512 * np.sqrt(values / values.sum(1, keepdims=True)), 255).astype(np.uint8)
+
+
 def some_points(count: int, sessions: int, ids: Sequence[int], seed: int = 0) -> MapPoints:
     """Return points with random descriptors; a quarter of them lie on objects."""
     rng = np.random.default_rng(seed)

@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from map_worlds import CAMERA, a_map, observed, true_shape
+from map_worlds import CAMERA, a_map, descriptors, observed, true_shape
 from scipy.spatial.transform import Rotation
 
 import quadrics
@@ -29,12 +29,6 @@ LAMP = np.array([1.2, 3.4, 0.9])
 TURN = Rotation.from_euler("z", 35, degrees=True).as_matrix()
 X = np.array([1.0, 0, 0])
 UP = np.array([0.0, 0.0, 1.0])
-
-
-def descriptors(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Random descriptors of the norm of RootSIFT."""
-    values = rng.gamma(0.3, size=(count, 128))
-    return np.minimum(512 * np.sqrt(values / values.sum(1, keepdims=True)), 255).astype(np.uint8)
 
 
 def surface(rng: np.random.Generator, count: int) -> Array:
@@ -202,11 +196,6 @@ def test_a_few_points_do_not_turn_an_object_over() -> None:
         assert set(world.motions()[0]) == known
 
 
-def test_one_image_is_too_few() -> None:
-    assert moved_world().motions([3]) == [{}, {}]
-    assert set(moved_world().motions([2, 5])[0]) == {1}
-
-
 def test_table_points_at_the_foot_are_no_evidence_for_what_replaced_the_object() -> None:
     """Points of the table lie inside the enlarged ellipsoid of the object and are tagged too."""
     world = World()
@@ -244,16 +233,6 @@ def test_identical_instances_do_not_compete_and_objects_of_other_classes_do(
     world.put(points, code, ELSEWHERE)
     world.find("radio", ELSEWHERE)
     assert set(world.motions()[0]) == known
-
-
-def test_an_object_that_had_moved_before_is_matched_by_the_points_at_its_last_place() -> None:
-    world = World()
-    points, code = world.add("radio", PLACE)
-    world.tag(1, points + PLACE + [-1.6, 0.5, 0], code)  # before
-    world.put(points, code, ELSEWHERE)
-    world.find("radio", ELSEWHERE)
-    motion = world.motions()[0][1]
-    assert motion.shift == pytest.approx(ELSEWHERE - PLACE, abs=0.01)
 
 
 # ---- Points of the objects of a recording ----

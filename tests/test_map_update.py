@@ -21,12 +21,11 @@ from simulated import (
 import reobj_track as rt
 from reobj.maps import update
 from reobj.maps.compare import PointMotion
-from reobj.maps.contents import delete, earlier_sessions, forget, with_edits
+from reobj.maps.contents import delete, earlier_sessions, forget
 from reobj.maps.fusion import object_state
 from reobj.maps.room_map import MapPoints, RoomMap, Session
 from reobj.maps.update import Recording, add_recording
 from reobj.maps.visibility import visibility_of
-from reobj.results.edits import BoxRef, Edit, Edits
 
 
 def recording(name: str, **changes: Any) -> Recording:
@@ -99,15 +98,6 @@ def monday() -> RoomMap:
     assert [o.id for o in result.objects] == [1, 2, 3]
     assert [c.id for c in result.changes.new] == [1, 2, 3]
     return room
-
-
-def test_the_first_recording_gives_its_numbers_to_the_map(monday):
-    assert [o.id for o in monday.objects] == [1, 2, 3] and monday.next_id == 4
-    assert monday.metric and monday.sessions[0].name == "monday"
-    for found, center in zip(monday.objects, chair_solids().center_in_world, strict=True):
-        state = object_state(found, monday)
-        np.testing.assert_allclose(state.center, center, atol=0.04)
-        assert state.class_name == "chair" and state.present
 
 
 def test_objects_that_stayed_get_their_numbers_in_tracks_objects_and_fits(monday):
@@ -184,17 +174,6 @@ def test_weak_detections_on_its_place_show_that_an_object_is_there(monday, every
     assert object_state(room.objects[1], room).present is not gone
 
 
-def test_detections_of_an_object_beside_its_place_do_not_count(monday):
-    """They lie on it in every second view, as from some directions."""
-    tuesday = moved_by(seen([0, 1, 2], wall=True), 2, [0, 1.5, 0])
-    tracks = tuesday.tracks
-    beside = (tracks.track_id == 2) & (tracks.frame % 2 == 1)
-    xyxy = tracks.xyxy + np.outer(beside, [200, 0, 200, 0])
-    tuesday = dataclasses.replace(tuesday, tracks=dataclasses.replace(tracks, xyxy=xyxy))
-    _, result = add_recording(monday, tuesday, recording("tuesday"))
-    assert [c.id for c in result.changes.gone] == [2]
-
-
 def test_new_objects_and_forgotten_ones_get_numbers_that_nobody_had(monday):
     room, _ = add_recording(RoomMap(), seen([0, 1]), recording("monday"))
     room, result = add_recording(room, seen([0, 1, 2]), recording("tuesday"))
@@ -221,20 +200,6 @@ def test_a_deleted_object_stays_out_of_later_results(monday):
     assert [o.id for o in result.objects] == [1, 3]
     assert set(result.tracks.track_id) == {1, 3} and len(result.fits) == 2
     assert room.object(2).deleted and result.changes.of_objects().keys() == {1, 3}
-
-
-def test_corrections_of_the_viewer_reach_the_map_once(monday):
-    edits = (
-        Edit("rename", BoxRef(0, (0.0, 0, 1, 1), 1), class_name="armchair"),
-        Edit("delete", BoxRef(0, (0.0, 0, 1, 1), 3)),
-        Edit("rename", BoxRef(0, (0.0, 0, 1, 1), 77), class_name="table"),  # not in the map
-    )
-    ours = Edits(edits, Path("edits.json"), map_id=monday.map_id)
-    room = with_edits(with_edits(monday, ours), ours)
-    assert room.object(1).name == "armchair" and room.object(3).deleted
-    assert with_edits(monday, dataclasses.replace(ours, map_id="another")) is monday
-    _, result = add_recording(room, seen([0, 1, 2]), recording("tuesday"))
-    assert [(o.id, o.class_name) for o in result.objects] == [(1, "armchair"), (2, "chair")]
 
 
 def test_pictures_of_a_recording_are_replaced_with_it(monday):
@@ -339,14 +304,3 @@ def test_what_is_occluded_or_of_unknown_place_is_not_expected(monday):
     assert (visible(monday, before).expected < 5).all()
     unknown = visible(monday, behind, vague=1.0)
     assert not unknown.expected.any() and unknown.vague.all()
-
-
-def test_the_class_of_an_object_is_that_of_all_sessions(monday):
-    """Also after a refit of a recording in which the detector saw another class."""
-    again = seen([0, 1, 2])
-    cups = [dataclasses.replace(o, class_name="cup", classes={"cup": 1.0}) for o in again.objects]
-    tuesday = dataclasses.replace(again, objects=cups)
-    room, _ = add_recording(monday, seen([0, 1, 2]), recording("sunday"))
-    for _ in range(2):
-        room, result = add_recording(room, tuesday, recording("tuesday"))
-        assert [(o.id, o.class_name) for o in result.objects] == [(k, "chair") for k in (1, 2, 3)]

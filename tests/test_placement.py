@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from map_worlds import descriptors
 from scipy.spatial.transform import Rotation
 
 from reobj.cameras import Camera, Poses
@@ -16,12 +17,6 @@ CAMERA = Camera("PINHOLE", 640, 480, (520.0, 520.0, 320.0, 240.0))
 SCALE = 0.4  # session units of a map unit
 TURN = Rotation.from_euler("zyx", [2.0, 0.3, -0.4]).as_matrix()
 SHIFT = np.array([3.0, -2.0, 0.7])
-
-
-def descriptors(rng, count):
-    """Random descriptors of the norm of RootSIFT, uint8."""
-    values = rng.gamma(0.3, size=(count, 128))
-    return np.minimum(512 * np.sqrt(values / values.sum(1, keepdims=True)), 255).astype(np.uint8)
 
 
 def room(rng, count=900):
@@ -52,9 +47,7 @@ def walk(count=16, radius=0.6):
 
 def recording(rng, points, cam_from_map, noise_px=0.5, outliers=100, parts=None):
     """Poses in a session's own world, and features of every image with wrong ones among them."""
-    to_session = Similarity(
-        SCALE, TURN.T, -SCALE * TURN.T @ SHIFT
-    )  # of map_from_session
+    to_session = Similarity(SCALE, TURN.T, -SCALE * TURN.T @ SHIFT)  # of map_from_session
     count = len(cam_from_map)
     session = to_session.poses(cam_from_map)
     features = []
@@ -136,19 +129,6 @@ def test_two_equal_rooms_are_refused():
     copy = dataclasses.replace(copy, descriptor=copy.descriptor[:, ::-1].copy())
     placement = place(poses, features, MapPoints.joined([points, copy]))
     assert placement.refused == "two positions in the map are alike (8 and 8 images)"
-
-
-def test_a_point_that_the_map_has_twice_is_no_rival_of_itself():
-    """After two sessions every point is there twice, a centimetre apart."""
-    rng = np.random.default_rng(4)
-    points = room(rng)
-    again = dataclasses.replace(
-        points, xyz=points.xyz + rng.normal(0, 0.005, points.xyz.shape),
-        session=np.full(len(points), 2),
-    )  # fmt: skip
-    poses, features = recording(rng, points, walk())
-    placement = place(poses, features, MapPoints.joined([points, again]))
-    assert placement.refused == "" and len(placement.components[0].images) == 16
 
 
 def test_components_are_placed_one_by_one_and_become_one():
