@@ -22,8 +22,8 @@ from reobj.types import Array, BoolArray, IntArray, unit_rows
 from reobj.words import canonical, merged
 
 # ---- Constants ----------------------------------------------------------------------------------
-# Probabilities of a change hold for the usual time between two recordings, days to weeks. They were
-# chosen, not measured; an error by a factor of 2 shifts a decision by 0.7 nats.
+# Probabilities of a change hold for the usual time between two recordings, days to weeks. They are
+# estimates, not measurements; an error by a factor of 2 shifts a decision by 0.7 nats.
 
 # Probabilities that an object of a class stayed, moved within the room, was taken away
 FATES = {
@@ -46,7 +46,9 @@ ABSENT_FATE = (0.10, 0.20, 0.70)
 NEW_OBJECTS = 1.0  # expected ones, besides those that replace what was taken away
 DETECTED = 0.9  # probability that an object in a part of the room that was seen is found
 MISSED_FLOOR = 1e-3  # least probability that an object is missed, whatever the number of views
-POSITION_FLOOR_M = 0.02  # standard deviation of a centre besides its covariance (design)
+POSITION_FLOOR_M = (
+    0.02  # standard deviation of a centre besides its covariance: errors of the detector's boxes
+)
 # The same, as a fraction of the largest half axis: the centre of an object that is seen from one
 # side shifts with its depth
 EXTENT_SHARE = 0.05
@@ -78,7 +80,7 @@ FEW_INLIERS = 0.25
 MANY_INLIERS = 0.75
 ENOUGH_INLIERS = 6
 INLIERS_LIMIT = 15.0
-MARGIN = 3.0  # nats, below which two explanations are equally probable (design)
+MARGIN = 3.0  # nats (odds of 20), below which two explanations are equally probable
 # Of two explanations that only the displacement distinguishes, the shorter one gives a number if
 # the other one is longer by this factor
 DISPLACEMENT_RATIO = 2.0
