@@ -158,23 +158,12 @@ def test_flipped_and_missing_bytes_are_found(room: RoomMap, saved: Path, tmp_pat
         refusal(path)
 
 
-@pytest.mark.parametrize(
-    ("key", "value", "text"),
-    [
-        ("metres_per_unit", 0.0, "metres_per_unit"),
-        ("name", 3, "Expected `str`, got `int` - at `$.sessions[0].name"),
-        ("number", 10**3000, "number"),
-    ],
-)
-def test_content_of_another_program_is_refused(
-    key: str, value: Any, text: str, saved: Path, tmp_path: Path
-) -> None:
+def test_content_of_another_program_is_refused(saved: Path, tmp_path: Path) -> None:
     """With a right digest."""
     arrays, facts = load_npz(saved)
-    facts["sessions"][0][key] = value
-    arrays[f"session{facts['sessions'][0]['number']}_alignment_cov"] = np.eye(7)
+    facts["sessions"][0]["name"] = 3
     save_npz(tmp_path / "a.map", arrays, **facts)
-    assert text in refusal(tmp_path / "a.map")
+    assert "Expected `str`, got `int` - at `$.sessions[0].name" in refusal(tmp_path / "a.map")
 
 
 def test_map_that_could_not_be_read_is_not_written(room: RoomMap, saved: Path) -> None:

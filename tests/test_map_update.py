@@ -174,16 +174,6 @@ def test_weak_detections_on_its_place_show_that_an_object_is_there(monday, every
     assert object_state(room.objects[1], room).present is not gone
 
 
-def test_new_objects_and_forgotten_ones_get_numbers_that_nobody_had(monday):
-    room, _ = add_recording(RoomMap(), seen([0, 1]), recording("monday"))
-    room, result = add_recording(room, seen([0, 1, 2]), recording("tuesday"))
-    assert [c.id for c in result.changes.new] == [3]
-    room = forget(room, "tuesday")
-    assert [o.id for o in room.objects] == [1, 2]
-    _, result = add_recording(room, seen([0, 1, 2]), recording("friday"))
-    assert [c.id for c in result.changes.new] == [4]
-
-
 def test_the_same_recording_again_replaces_its_session(monday):
     """Its objects keep their numbers, also with another detector; nothing counts twice."""
     again, result = add_recording(monday, seen([2, 0, 1], numbers=[1, 2, 3]), recording("monday"))

@@ -62,11 +62,6 @@ LOWER = np.tril_indices(9)  # entries of a covariance in the file
 Number = Annotated[int, msgspec.Meta(ge=1, lt=2**31)]  # of an object or a session
 
 
-def _default(values: npt.NDArray[Any]) -> Any:
-    """Return a field whose default is a copy of an array."""
-    return field(default_factory=values.copy)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation:
     """What a session says about an object, in the world of the map.
@@ -89,13 +84,13 @@ class Observation:
     session: Number
     status: Annotated[str, msgspec.Meta(pattern="^(new|stayed|moved|gone|not_seen)$")]
     support: str = ""
-    center: Array = _default(np.full(3, np.nan))
-    half_axes: Array = _default(np.full(3, np.nan))
-    quat_wxyz: Array = _default(np.full(4, np.nan))
-    cov: Array = _default(np.full((9, 9), np.nan))
+    center: Array = field(default_factory=np.full(3, np.nan).copy)
+    half_axes: Array = field(default_factory=np.full(3, np.nan).copy)
+    quat_wxyz: Array = field(default_factory=np.full(4, np.nan).copy)
+    cov: Array = field(default_factory=np.full((9, 9), np.nan).copy)
     classes: dict[str, NonNegativeFloat] = field(default_factory=dict)
-    foreground: Floats = _default(np.empty(0, np.float32))
-    background: Floats = _default(np.empty(0, np.float32))
+    foreground: Floats = field(default_factory=np.empty(0, np.float32).copy)
+    background: Floats = field(default_factory=np.empty(0, np.float32).copy)
     embedded: Int32 = 0
     views: Int32 = 0
     expected: Int32 = 0
@@ -148,7 +143,7 @@ class Session:
     metres_per_unit: PositiveFloat = 1.0
     scale_rel_sigma: NonNegativeFloat = 0.0
     scale_source: Annotated[str, msgspec.Meta(pattern="^(poses|priors|known_size|none)$")] = "none"
-    alignment_cov: Array = _default(np.zeros((7, 7)))
+    alignment_cov: Array = field(default_factory=np.zeros((7, 7)).copy)
     localised_frames: Int32 = 0
     tried_frames: Int32 = 0
 

@@ -316,6 +316,9 @@ def test_unusable_maps_end_the_run_before_any_work(
     assert "no such map" in refused(None, "--map-frozen")
     text = refusal(capsys, *tuesday(desk, "--map-frozen", "--map", ""))
     assert "--map-frozen without --map" in text
+    text = refusal(capsys, "objects", desk / "monday", "--set", f"map.path={desk}/flat.map")
+    assert "is missing" in text and "--set map.path=" in text
+    assert not (desk / "flat.map").exists()
 
 
 def test_corrections_of_the_page_reach_the_map(desk: Path) -> None:
@@ -356,12 +359,3 @@ def test_corrections_of_the_page_reach_the_map(desk: Path) -> None:
 def statuses(room: RoomMap) -> dict[tuple[int, int], str]:
     """What happened, by object and session."""
     return {(o.id, x.session): x.status for o in room.objects for x in o.observations}
-
-
-def test_a_missing_map_of_an_output_folder(desk: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (desk / "flat.map").unlink()
-    before = (desk / "tuesday" / "objects.json").read_bytes()
-    text = refusal(capsys, "objects", desk / "tuesday", "--set", f"map.path={desk}/flat.map")
-    assert "is missing" in text and "--set map.path=" in text
-    assert (desk / "tuesday" / "objects.json").read_bytes() == before
-    assert not (desk / "flat.map").exists()
