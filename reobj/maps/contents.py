@@ -59,12 +59,11 @@ def find_session(room: RoomMap, session: int | str) -> Session:
     text = str(session).strip()
     found = [s for s in room.sessions if str(s.number) == text]
     found = found or [s for s in room.sessions if s.name == text]
-    if len(found) == 1:
-        return found[0]
-    known = ", ".join(f"{s.number} ({s.name})" for s in found or room.sessions) or "none"
-    if found:
-        raise ReobjError(f"{len(found)} sessions are called {text!r}; give a number: {known}")
-    raise ReobjError(f"no session {text!r} in the map; it has {known}")
+    if len(found) != 1:
+        known = ", ".join(f"{s.number} ({s.name})" for s in found or room.sessions) or "none"
+        text = f"{len(found) or 'no'} session{'s' if found else ''} {text!r} in the map"
+        raise ReobjError(f"{text}; it has {known}" + ("; give a number" if found else ""))
+    return found[0]
 
 
 def forget(room: RoomMap, session: int | str) -> RoomMap:

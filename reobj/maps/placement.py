@@ -553,14 +553,12 @@ def joined(poses: Poses, components: Sequence[ComponentPlacement], placed: Seque
     part = np.zeros_like(poses.part)
     for number, k in enumerate(sorted({*range(poses.part_count)} - {*placed}), 1):
         part[poses.part == k] = number
-    component_of_point = np.zeros(len(points), np.int64)  # unobserved: of the only component
-    if poses.part_count > 1:
-        component_of_point[:] = -1
-        component_of_point[poses.visibility[:, 1]] = poses.part[poses.visibility[:, 0]]
+    observer, point = poses.visibility.T
     for k in placed:
         similarity = components[k].similarity
         rows = poses.part == k
         cam_from_world[rows] = similarity.poses(cam_from_world[rows])
-        of_component = component_of_point == k
-        points[of_component] = similarity.apply(points[of_component])
+        # unobserved points belong to the only component
+        seen = point[rows[observer]] if poses.part_count > 1 else np.arange(len(points))
+        points[seen] = similarity.apply(points[seen])
     return dataclasses.replace(poses, cam_from_world=cam_from_world, points=points, part=part)
