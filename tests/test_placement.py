@@ -45,6 +45,13 @@ def walk(count=16, radius=0.6):
     return np.array(poses)
 
 
+def project(points, cam_from_map):
+    """Positions (N, 2) of points, and which of them lie in the image."""
+    in_cam = points.xyz @ cam_from_map[:, :3].T + cam_from_map[:, 3]
+    xy = in_cam[:, :2] / in_cam[:, 2:] @ CAMERA.K[:2, :2].T + CAMERA.K[:2, 2]
+    return xy, (in_cam[:, 2] > 0.1) & ((xy > 0) & (xy < (640, 480))).all(1)
+
+
 def recording(rng, points, cam_from_map, noise_px=0.5, outliers=100, parts=None):
     """Poses in a session's own world, and features of every image with wrong ones among them."""
     to_session = Similarity(SCALE, TURN.T, -SCALE * TURN.T @ SHIFT)  # of map_from_session
@@ -53,9 +60,8 @@ def recording(rng, points, cam_from_map, noise_px=0.5, outliers=100, parts=None)
     features = []
     visibility = []
     for row, pose in enumerate(cam_from_map):
-        in_cam = points.xyz @ pose[:, :3].T + pose[:, 3]
-        xy = in_cam[:, :2] / in_cam[:, 2:] @ CAMERA.K[:2, :2].T + CAMERA.K[:2, 2]
-        seen = np.flatnonzero((in_cam[:, 2] > 0.1) & ((xy > 0) & (xy < (640, 480))).all(1))
+        xy, inside = project(points, pose)
+        seen = np.flatnonzero(inside)
         again = seen[rng.random(len(seen)) < 0.6]
         found = points.descriptor[again].astype(float) + rng.normal(0, 6, (len(again), 128))
         wrong = rng.uniform(0, (640, 480), (outliers, 2))
@@ -153,13 +159,6 @@ def test_components_are_placed_one_by_one_and_become_one():
     assert reason == "0 of 7 images match points of the map, 4 are needed"
 
 
-def seen_from(points, cam_from_map):
-    """Mark points that project into an image."""
-    in_cam = points.xyz @ cam_from_map[:, :3].T + cam_from_map[:, 3]
-    xy = in_cam[:, :2] / in_cam[:, 2:] @ CAMERA.K[:2, :2].T + CAMERA.K[:2, 2]
-    return (in_cam[:, 2] > 0.1) & ((xy > 0) & (xy < (640, 480))).all(1)
-
-
 def with_few_matches(rng, features, matching):
     """Features of which only those of the first images, 14 each, are in the map."""
     few = [dataclasses.replace(im, xy=im.xy[:14], descriptor=im.descriptor[:14]) for im in features]
@@ -174,7 +173,7 @@ def test_a_short_view_of_the_mapped_part_places_a_recording():
     points = room(rng)
     truth = walk(60)
     poses, features = recording(rng, points, truth, outliers=0)
-    part = points[np.flatnonzero(seen_from(points, truth[4]))]
+    part = points[np.flatnonzero(project(points, truth[4])[1])]
     few = with_few_matches(rng, features, 8)
     placement = place(poses, few, part, most=60)
     assert placement.refused == ""
