@@ -20,8 +20,7 @@ from reobj.config import Config, add_flags, config_from_args, list_options
 from reobj.evaluation.tracks import evaluate, score_report
 from reobj.export.registry import EXPORTS, export
 from reobj.files import atomic, did_you_mean, wrapped
-from reobj.maps.corrections import FolderMap, corrected
-from reobj.maps.listing import MAP_EXPORTS, export_map, listing
+from reobj.maps.contents import MAP_EXPORTS, FolderMap, corrected, listing
 from reobj.maps.room_map import RoomMap, map_lock
 from reobj.maps.stage import session_key
 from reobj.objects.description import components_message
@@ -397,7 +396,8 @@ def _cmd_map(args: Arguments) -> int:
             room.save(path)
         print("\n".join(lines))
     if output is not None:
-        print(export_map(room, args.export, output))
+        MAP_EXPORTS[args.export](room, output)
+        print(output)
     elif not any(corrections):
         print(listing(room, path))
     return 0

@@ -74,12 +74,17 @@ def a_session(number: int, **fields: Any) -> Session:
     """Return a session of a recording with metric scale from size priors of 5 %."""
     usual: dict[str, Any] = {
         "name": f"day{number}.mp4", "date": f"2026-03-{number:02d}T10:00:00Z",
-        "fingerprint": f"{number:064x}", "embedder": "net", "camera": CAMERA,
-        "cam_from_map": np.tile(np.eye(3, 4), (4, 1, 1)), "metres_per_unit": 1.0,
+        "fingerprint": f"{number:064x}", "embedder": "net", "metres_per_unit": 1.0,
         "scale_rel_sigma": 0.05, "scale_source": "priors", "localised_frames": 9,
         "tried_frames": 10,
     }  # fmt: skip
     return Session(number, **usual | fields)
+
+
+def descriptors(rng: np.random.Generator, count: int) -> Any:
+    """Random descriptors of the norm of RootSIFT."""
+    values = rng.gamma(0.3, size=(count, 128))
+    return np.minimum(512 * np.sqrt(values / values.sum(1, keepdims=True)), 255).astype(np.uint8)
 
 
 def some_points(count: int, sessions: int, ids: Sequence[int], seed: int = 0) -> MapPoints:

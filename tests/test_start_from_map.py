@@ -124,23 +124,11 @@ def test_known_numbers_from_the_first_frame_on():
     assert {i for i in given if i < 100} <= set(number.tolist())
 
 
-def test_numbers_survive_a_saved_tracker(tmp_path):
+def test_poses_of_another_world_give_no_numbers():
     scene = world()
     poses = walk(20, 60.0)
-    tracker = rt.Tracker(CONFIG)
-    tracker.start_from(scene.room(COUNT - 2), NAMES)
-    tracker.save(tmp_path / "before.npz")
-    again = rt.Tracker.load(tmp_path / "before.npz")
-    expected = numbers_of_frames(tracker, scene, poses, poses.cam_from_world)
-    assert numbers_of_frames(again, scene, poses, poses.cam_from_world) == expected
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_poses_of_another_world_give_no_numbers(seed):
-    scene = world(seed)
-    poses = walk(20, 60.0)
     turned = poses.cam_from_world.copy()
-    a = 0.5 + 0.3 * seed  # the session's world: turned and shifted against that of the map
+    a = 0.5  # the session's world: turned and shifted against that of the map
     other = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1.0]])
     turned[:, :, :3] = poses.cam_from_world[:, :, :3] @ other
     turned[:, :, 3] += poses.cam_from_world[:, :, :3] @ np.array([0.6, -0.4, 0.1])

@@ -12,16 +12,18 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.optimize import linear_sum_assignment
 
 from reobj.appearance.reid import SimilarityCalibration
-from reobj.maps.fusion import ObjectState, alignment_jacobian
-from reobj.types import Array, BoolArray, Floats, IntArray, unit_rows
+from reobj.maps.fusion import Described, ObjectState, alignment_jacobian
+from reobj.maps.visibility import Visibility
+from reobj.types import Array, BoolArray, IntArray, unit_rows
 from reobj.words import canonical, merged
 
 # ---- Constants ----------------------------------------------------------------------------------
-# Probabilities of a change hold for the usual time between two recordings, days to weeks. They were
-# chosen, not measured; an error by a factor of 2 shifts a decision by 0.7 nats.
+# Probabilities of a change hold for the usual time between two recordings, days to weeks. They are
+# estimates, not measurements; an error by a factor of 2 shifts a decision by 0.7 nats.
 
 # Probabilities that an object of a class stayed, moved within the room, was taken away
 FATES = {
@@ -44,7 +46,9 @@ ABSENT_FATE = (0.10, 0.20, 0.70)
 NEW_OBJECTS = 1.0  # expected ones, besides those that replace what was taken away
 DETECTED = 0.9  # probability that an object in a part of the room that was seen is found
 MISSED_FLOOR = 1e-3  # least probability that an object is missed, whatever the number of views
-POSITION_FLOOR_M = 0.02  # standard deviation of a centre besides its covariance (design)
+POSITION_FLOOR_M = (
+    0.02  # standard deviation of a centre besides its covariance: errors of the detector's boxes
+)
 # The same, as a fraction of the largest half axis: the centre of an object that is seen from one
 # side shifts with its depth
 EXTENT_SHARE = 0.05
@@ -76,83 +80,47 @@ FEW_INLIERS = 0.25
 MANY_INLIERS = 0.75
 ENOUGH_INLIERS = 6
 INLIERS_LIMIT = 15.0
-MARGIN = 3.0  # nats, below which two explanations are equally probable (design)
+MARGIN = 3.0  # nats (odds of 20), below which two explanations are equally probable
 # Of two explanations that only the displacement distinguishes, the shorter one gives a number if
 # the other one is longer by this factor
 DISPLACEMENT_RATIO = 2.0
 GONE_LOG_ODDS = -3.0  # below which an object that was not detected is gone
-IMPOSSIBLE = -1e9  # nats; finite, for the solver
 GIVEN = 1e6  # nats, of pairs that are given: more than all evidence
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointMotion:
-    """Rigid motion of a map object, by its points recognised on an object of the recording.
+    """Displacement of a map object, by its points recognised on an object of the recording.
 
     Attributes:
-        inliers: different points of the map object that follow it. images: that agree on it; 0:
-            the last run found it, and the images are not read again.
-        new_from_old: (3, 4), in the world of the map; the identity: the points are where they were.
-        shift: (3,) of the centre of the map object. cov: (3, 3) of the shift, without the
-            uncertainty of the alignment of the recording.
+        inliers: different points of the map object that follow it. images: that agree on it.
+        shift: (3,) of the centre of the map object; zeros: the points are where they were.
+        cov: (3, 3) of the shift, without the uncertainty of the alignment of the recording.
     """
 
     inliers: int
     images: int
-    new_from_old: Array
     shift: Array
     cov: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FoundObject:
+class FoundObject(Described):
     """An object of the recording, in the world of the map.
 
     Attributes:
-        id: identity in the recording. classes: weight of each class (sum of detection scores).
-        support, center, half_axes, quat_wxyz, cov: shape as in `reobj.maps.room_map.Observation`.
-        foreground, background: mean unit embeddings; empty: none.
         views: detections. confidence: probability that it exists.
         motion_of: motions of map objects whose points were recognised on this object, by number.
     """
 
-    id: int
-    classes: dict[str, float]
-    support: str
-    center: Array
-    half_axes: Array
-    quat_wxyz: Array
-    cov: Array
-    foreground: Floats
-    background: Floats
     views: int
     confidence: float
     motion_of: dict[int, PointMotion]
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Visibility:
-    """How the cameras of the recording saw the places of the N objects of the map.
-
-    Views less than 10 degrees apart fail together and count once.
-
-    Attributes:
-        expected: (N,) independent views in which the object would be in the image and unoccluded.
-        seen_through: (N,) of those, views that show what is behind the object (sparse points on
-            rays through its middle), or views besides a first one that show its surroundings.
-        vague: (N,) the position in the map is too uncertain to know what a view shows.
-        detected: (N,) of the expected ones, views in which a detection may show the object; a
-            fraction if some of the views that count as one have one.
-        accident: (N,) log probability that these detections lie there by accident.
-        unlocated: (N,) as `detected`, by detections that belong to no object of the recording.
-    """
-
-    expected: Array
-    seen_through: Array
-    vague: BoolArray
-    detected: Array
-    accident: Array
-    unlocated: Array
+    def proven_motion(self, number: int) -> PointMotion | None:
+        """Return the motion of a map object if enough points follow it to measure it."""
+        motion = self.motion_of.get(number)
+        return motion if motion is not None and motion.inliers >= ENOUGH_INLIERS else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,15 +130,13 @@ class Decision:
     Attributes:
         kind: "stayed", "moved", "gone", "not_seen" (objects of the map) or "new".
         map_id: number in the map; 0: new. found_id: identity in the recording; 0: not detected.
-        log_odds: of this decision over the best other one, in nats.
-        candidates: numbers of the map that are as probable within the margin.
+        candidates: other numbers of the map that are as probable within the margin.
         evidence: one sentence.
     """
 
     kind: str
     map_id: int
     found_id: int
-    log_odds: float
     candidates: tuple[int, ...]
     evidence: str
 
@@ -200,35 +166,37 @@ def compare(
     Returns:
         One decision per map object, in their order, then one per new object.
     """
-    pairs = _Pairs(states, found, visibility, known)
-    pairs.place(alignment_cov, metres_per_unit)
-    pairs.compare_appearance(same_embedder)
-    return _Verdicts(pairs).decisions()
+    if not states and not found:
+        return []
+    likelihoods = _Likelihoods(states, found, visibility, known)
+    likelihoods.place(alignment_cov, metres_per_unit)
+    likelihoods.compare_appearance(same_embedder)
+    return _Verdicts(likelihoods).decisions()
 
 
 # ---- Likelihoods of pairs ------------------------------------------------------------------------
 
 
-class _Pairs:
+class _Likelihoods:
     """Log likelihoods of the pairs of map objects and found objects.
 
     Attributes:
-        states, found, visibility: as in `compare`.
+        states, found, visibility: as in `compare`. known: (N, M) True for pairs that are given.
         overlap: (N, M) agreement of the class distributions, 0 to 1.
-        class_score, size_score, points: (N, M) log likelihood terms of one identity.
+        class_score, size_score, points: (N, M) log likelihood terms of one identity;
+            class_ratio: log likelihood ratio of the classes.
         appearance, appearance_there: (N, M) log likelihood ratios of the embeddings, without and
             with those of the background.
-        inliers: (N, M) of the motion of the map object's own points on the found object.
-        own_recognised: (N, M) they are enough to overrule class, size and looks.
+        own_recognised: (N, M) points of the map object itself overrule class, size and looks.
         size_square: (N, M) squared Mahalanobis distance of the sizes.
-        distance, sigmas: (N, M) displacement in metres and in standard deviations, of the points if
-            enough were recognised, otherwise of the centres.
+        by_center: (N, M) too few points were recognised to measure the displacement.
+        distance, sigmas: (N, M) displacement in metres and in standard deviations, of the points or
+            of the centres.
         position: (N, M) log density of the found centre if the object stayed.
         fate: (N, 3) probabilities: stayed, moved, taken away. missed: (N,) probability that an
             object in its place is not among the found ones. seen_there: (N,) log likelihood ratio
             of all detections, of an object in its place over its absence. reach: share of the room
-            that was seen.
-        room: volume of the room in cubic metres. known: (N, M) True for pairs that are given.
+            that was seen. room: its volume in cubic metres.
     """
 
     def __init__(
@@ -240,58 +208,60 @@ class _Pairs:
     ) -> None:
         self.states = states
         self.found = found
-        numbers = np.array([s.id if s.id in known else -1 for s in states], np.int64)
-        self.known = numbers[:, None] == np.array([f.id for f in found], np.int64)
         self.visibility = visibility
-        both: list[ObjectState | FoundObject] = [*states, *found]
-        names = sorted({canonical(name) for o in both for name in o.classes} | {""})
+        shape = (len(states), len(found))
+        given = [[s.id == f.id and s.id in known for f in found] for s in states]
+        self.known = np.array(given, bool).reshape(shape)
+        names = sorted({canonical(name) for o in (*states, *found) for name in o.classes} | {""})
         self.of_map = _class_shares(states, names)  # (N, C)
-        self.of_found = _class_shares(found, names)  # (M, C)
+        of_found = _class_shares(found, names)  # (M, C)
         self.fate = self.of_map @ np.array([FATE_OF.get(name, USUAL_FATE) for name in names])
         self.fate[[not s.present for s in states]] = ABSENT_FATE
-        self.reach = DETECTED * ((visibility.expected > 0).sum() + 1) / (len(states) + 2)
-        rate = np.array([s.detection_rate for s in states]).clip(0.05, 0.95)
         expected = visibility.expected
+        self.reach = DETECTED * ((expected > 0).sum() + 1) / (len(states) + 2)
+        rate = np.array([s.detection_rate for s in states]).clip(0.05, 0.95)
         without = np.maximum(expected - visibility.unlocated, 0.5)  # views near the image border
         self.missed = ((1 - rate) ** without).clip(min=MISSED_FLOOR)
         self.seen_there = visibility.detected * np.log(rate) - visibility.accident
         self.seen_there += (expected - visibility.detected) * np.log(1 - rate)
-        counts = self.of_map.sum(0) + self.of_found.sum(0) + 0.5
-        self.frequency = counts / counts.sum()  # (C,)
+        counts = self.of_map.sum(0) + of_found.sum(0) + 0.5
+        frequency = counts / counts.sum()  # (C,)
         replaced = (self.of_map * self.fate[:, 2:]).sum(0)
-        self.arrivals = replaced + NEW_OBJECTS * self.frequency  # (C,) expected
-        self.overlap = self.of_map @ self.of_found.T
-        confused = self.of_found @ self.frequency
-        self.class_score = np.log(CLASS_KEPT * self.overlap + (1 - CLASS_KEPT) * confused)
+        self.arriving = of_found @ (replaced + NEW_OBJECTS * frequency)  # (M,) expected of a class
+        self.overlap = self.of_map @ of_found.T
+        by_chance = of_found @ frequency
+        self.class_score = np.log(CLASS_KEPT * self.overlap + (1 - CLASS_KEPT) * by_chance)
+        self.class_ratio = self.class_score - np.log(by_chance)
         self.size_score, self.size_square = _size_agreement(states, found)
-        self.inliers = np.zeros(self.overlap.shape, np.int64)
-        for i, j in np.ndindex(self.inliers.shape):
-            motion = found[j].motion_of.get(states[i].id)
-            self.inliers[i, j] = 0 if motion is None else motion.inliers
-        per_inlier = np.where(self.inliers >= ENOUGH_INLIERS, MANY_INLIERS, FEW_INLIERS)
-        self.points = np.minimum(per_inlier * self.inliers, INLIERS_LIMIT)
+        motions = [[f.motion_of.get(s.id) for f in found] for s in states]
+        inliers = np.array([[m.inliers if m else 0 for m in row] for row in motions], np.int64)
+        inliers = inliers.reshape(shape)
+        self.by_center = inliers < ENOUGH_INLIERS
+        per_inlier = np.where(self.by_center, FEW_INLIERS, MANY_INLIERS)
+        self.points = np.minimum(per_inlier * inliers, INLIERS_LIMIT)
         self.own_recognised = self.points >= MARGIN
-        self.appearance = np.zeros(self.overlap.shape)
-        self.appearance_there = np.zeros(self.overlap.shape)
+        self.appearance = np.zeros(shape)
+        self.appearance_there = np.zeros(shape)
 
     def place(self, alignment_cov: Array, metres_per_unit: float) -> None:
         """Compute displacements and position likelihoods, the alignment refined by what stayed."""
         unit = metres_per_unit
         to_metres = np.array([1.0, 1, 1, unit, unit, unit, 1])
-        prior = alignment_cov * np.outer(to_metres, to_metres)
-        center, center_cov, floor = _centers(self.states, unit)
-        other, other_cov, other_floor = _centers(self.found, unit)
-        variance = np.maximum(floor[:, None], other_floor) ** 2 + POSITION_FLOOR_M**2
-        own = center_cov[:, None] + other_cov[None] + variance[..., None, None] * np.eye(3)
-        between = other[None] - center[:, None]  # (N, M, 3)
-        by_center = self.inliers < ENOUGH_INLIERS
-        for i, j in np.argwhere(~by_center).tolist():
+        cov = prior = alignment_cov * np.outer(to_metres, to_metres)
+        everything = (*self.states, *self.found)
+        center = np.array([o.center for o in everything]) * unit
+        center_cov = np.array([o.cov[:3, :3] for o in everything]) * unit**2
+        floor = EXTENT_SHARE * np.array([np.max(o.half_axes) * unit for o in everything])
+        self.room = float(np.prod(np.ptp(center, axis=0) + 1.0))
+        n = len(self.states)
+        variance = np.maximum(floor[:n, None], floor[n:]) ** 2 + POSITION_FLOOR_M**2
+        own = center_cov[:n, None] + center_cov[None, n:] + variance[..., None, None] * np.eye(3)
+        other = center[n:]
+        between = other[None] - center[:n, None]  # (N, M, 3)
+        for i, j in np.argwhere(~self.by_center).tolist():
             motion = self.found[j].motion_of[self.states[i].id]
             between[i, j] = motion.shift * unit
             own[i, j] = motion.cov * unit**2 + POSITION_FLOOR_M**2 * np.eye(3)
-        everything = np.concatenate([center, other])
-        self.room = float(np.prod(np.ptp(everything, axis=0) + 1.0)) if len(everything) else 1.0
-        cov = prior
         update = np.zeros(7)
         for _ in range(3):
             jacobian = alignment_jacobian(other)  # (M, 3, 7)
@@ -300,15 +270,23 @@ class _Pairs:
             self.position, square = _log_normal(difference, total)
             self.distance = np.linalg.norm(difference, axis=2)
             rows, columns = self.known_stayed()
-            ratio = _variance_ratio(square[rows, columns][by_center[rows, columns]])
-            total = np.where(by_center[..., None, None], ratio, 1.0) * total
-            self.position, square = _log_normal(difference, total)
+            # Shapes that one detector measures twice from similar places have errors in common, so
+            # that they differ less than their covariances say. The median, as some may have moved;
+            # 2.366: that of chi-squared with 3 degrees of freedom.
+            stayed = square[rows, columns][self.by_center[rows, columns]]
+            median = float(np.median(stayed)) / 2.366 if len(stayed) else 1.0
+            measured = (len(stayed) * median + USUAL_STAYED) / (len(stayed) + USUAL_STAYED)
+            ratio = np.where(self.by_center, min(VARIANCE_MARGIN * measured, 1.0), 1.0)
+            self.position, square = _log_normal(difference, ratio[..., None, None] * total)
             self.sigmas = np.sqrt(square)
             if not len(rows):
                 break
-            update, cov = _refined_alignment(
-                jacobian[columns], between[rows, columns], own[rows, columns], prior
-            )
+            # Kalman update of the alignment error by the displacements of K objects that stayed
+            by_row = jacobian[columns].reshape(-1, 7)  # (3 K, 7)
+            spread = by_row @ prior @ by_row.T + block_diag(*own[rows, columns])
+            gain = np.linalg.solve(spread, by_row @ prior).T  # (7, 3 K)
+            update = -gain @ between[rows, columns].ravel()
+            cov = prior - gain @ by_row @ prior
 
     def known_stayed(self) -> tuple[IntArray, IntArray]:
         """Find pairs that stayed by geometry, size and class, without a rival on either side."""
@@ -323,6 +301,11 @@ class _Pairs:
 
         The pairs that stayed by geometry are one object each; a member of one and a member of
         another of the same class are different objects.
+
+        Map objects that look alike then get the recognised points of each other: the points of
+        identical instances have the same descriptors, and show which model an object is, not which
+        instance. The score of another object's points is reduced by the log probability that both
+        are of one model; without embeddings, class and size decide.
         """
         calibration = SimilarityCalibration(weight=3.0)  # as much as three pairs of the recording
         if same_embedder:
@@ -330,29 +313,18 @@ class _Pairs:
             background = _cosines(self.states, self.found, "background")
             rows, columns = self.known_stayed()
             calibration.add(foreground[rows, columns], background[rows, columns], same=True)
-            other = self.overlap[np.ix_(rows, columns)] > LEAST_CLASS_OVERLAP
-            other &= ~np.eye(len(rows), dtype=bool)
             cross = np.ix_(rows, columns)
+            other = (self.overlap[cross] > LEAST_CLASS_OVERLAP) & ~np.eye(len(rows), dtype=bool)
             calibration.add(foreground[cross][other], background[cross][other], same=False)
             self.appearance = _bounded(calibration.logit(foreground))
             self.appearance_there = _bounded(calibration.logit(foreground, background))
-        self._share_points(calibration)
-
-    def _share_points(self, calibration: SimilarityCalibration) -> None:
-        """Give map objects that look alike the recognised points of each other.
-
-        The points of identical instances have the same descriptors: they show which model an object
-        is, not which instance. The score of another object's points is reduced by the log
-        probability that both are of one model; without embeddings, class and size decide.
-        """
         logit = calibration.logit(_cosines(self.states, self.states, "foreground"))
         alike = np.where(np.isfinite(logit), -np.logaddexp(0, -logit), 0.0)  # (N, N)
         similar = self.of_map @ self.of_map.T >= LEAST_CLASS_OVERLAP
         similar &= _size_agreement(self.states, self.states)[1] <= WORST_SIZE
         alike[~similar] = -np.inf
         np.fill_diagonal(alike, 0.0)
-        if len(alike):
-            self.points = (alike[..., None] + self.points[None]).max(1)
+        self.points = (alike[..., None] + self.points[None]).max(1, initial=-np.inf)
 
     @property
     def identity(self) -> Array:
@@ -372,22 +344,22 @@ class _Pairs:
         """
         density = np.full(self.distance.shape, 1 / self.room)
         if near:
-            sigma = NEAR_MOVE_M
-            normal = np.exp(-0.5 * (self.distance / sigma) ** 2) / (2 * np.pi * sigma**2) ** 1.5
-            density = (density + normal) / 2
+            normal = np.exp(-0.5 * (self.distance / NEAR_MOVE_M) ** 2)
+            density = (density + normal / (2 * np.pi * NEAR_MOVE_M**2) ** 1.5) / 2
         confidence = np.array([f.confidence for f in self.found]).clip(0.05, 1.0)
         prior = np.log(self.fate[:, 1] * self.reach)
         score = np.log(density) + self.identity + self.appearance + prior[:, None]
         agrees = self.overlap >= LEAST_CLASS_OVERLAP
         agrees &= self.size_square <= WORST_SIZE
         agrees &= self.appearance >= LEAST_APPEARANCE
-        return np.where(agrees | self.own_recognised, score + np.log(confidence), -np.inf)
+        agrees |= self.own_recognised | self.known
+        return np.where(agrees, score + np.log(confidence), -np.inf)
 
     def gain(self, score: Array) -> Array:
         """Return (N, M) scores above the explanation that both objects are unmatched."""
         stay, move, away = self.fate.T
         undetected = np.log(stay * self.missed + move * (1 - self.reach) + away)  # (N,)
-        new = np.log(self.of_found @ self.arrivals / self.room)  # (M,) density of new objects
+        new = np.log(self.arriving / self.room)  # (M,) density of new objects
         return np.asarray(score - (undetected[:, None] + new) + GIVEN * self.known)
 
     def there_log_odds(self) -> Array:
@@ -399,7 +371,7 @@ class _Pairs:
         return np.asarray(np.log(real * stay / away) + missed)
 
 
-def _class_shares(objects: Sequence[ObjectState | FoundObject], names: list[str]) -> Array:
+def _class_shares(objects: Sequence[Described], names: list[str]) -> Array:
     """Return the class distributions (K, C); an object without classes has the class "".
 
     Args:
@@ -408,11 +380,11 @@ def _class_shares(objects: Sequence[ObjectState | FoundObject], names: list[str]
     of_objects = [merged(o.classes) for o in objects]
     weights = np.array([[classes.get(n, 0.0) for n in names] for classes in of_objects])
     weights = weights.reshape(len(objects), len(names))
-    weights[weights.sum(1) <= 0, 0] = 1.0  # the first name is ""
+    weights[weights.sum(1) <= 0, 0] = 1.0
     return np.asarray(weights / weights.sum(1, keepdims=True))
 
 
-def _sorted_sizes(objects: Sequence[ObjectState | FoundObject]) -> tuple[Array, Array]:
+def _sorted_sizes(objects: Sequence[Described]) -> tuple[Array, Array]:
     """Return log half axes (K, 3), ascending, and their covariances (K, 3, 3)."""
     log_half = np.log([o.half_axes for o in objects]).reshape(-1, 3)
     cov = np.array([o.cov[3:6, 3:6] for o in objects]).reshape(-1, 3, 3)
@@ -422,7 +394,7 @@ def _sorted_sizes(objects: Sequence[ObjectState | FoundObject]) -> tuple[Array, 
 
 
 def _size_agreement(
-    states: Sequence[ObjectState], found: Sequence[ObjectState | FoundObject]
+    states: Sequence[ObjectState], found: Sequence[Described]
 ) -> tuple[Array, Array]:
     """Compare sorted half axes.
 
@@ -440,55 +412,11 @@ def _size_agreement(
     return np.log((1 - SIZE_OUTLIERS) * np.exp(ratio) + SIZE_OUTLIERS), square
 
 
-def _centers(
-    objects: Sequence[ObjectState | FoundObject], unit: float
-) -> tuple[Array, Array, Array]:
-    """Return centres (K, 3), covariances (K, 3, 3), and EXTENT_SHARE (K,) of each, in metres."""
-    center = np.array([o.center for o in objects]).reshape(-1, 3) * unit
-    cov = np.array([o.cov[:3, :3] for o in objects]).reshape(-1, 3, 3) * unit**2
-    return center, cov, EXTENT_SHARE * np.array([np.max(o.half_axes) * unit for o in objects])
-
-
 def _log_normal(difference: Array, cov: Array) -> tuple[Array, Array]:
     """Return log densities and squared Mahalanobis distances (...) of differences (..., 3)."""
     solved = np.linalg.solve(cov, difference[..., None])[..., 0]
     square = (difference * solved).sum(-1)
     return -0.5 * (square + np.linalg.slogdet(cov)[1] + 3 * np.log(2 * np.pi)), square
-
-
-def _variance_ratio(square: Array) -> float:
-    """Return the variance of displacements of objects that stayed over the expected one.
-
-    Shapes that one detector measures twice from similar places have errors in common, so that
-    they differ less than their covariances say. The median, as some of them may have moved; at
-    most 1.
-
-    Args:
-        square: (K,) squared Mahalanobis distances of objects that stayed, 3 coordinates each,
-            by their centres.
-    """
-    median = float(np.median(square)) / 2.366 if len(square) else 1.0  # of chi-squared with 3
-    measured = (len(square) * median + USUAL_STAYED) / (len(square) + USUAL_STAYED)
-    return min(VARIANCE_MARGIN * measured, 1.0)
-
-
-def _refined_alignment(
-    jacobian: Array, difference: Array, noise: Array, prior: Array
-) -> tuple[Array, Array]:
-    """Fit the alignment error (7,) to K displacements of objects that stayed (Kalman update).
-
-    Args:
-        jacobian: (K, 3, 7). difference: (K, 3) found minus map. noise: (K, 3, 3). prior: (7, 7).
-
-    Returns:
-        Correction of the found centres, and its covariance (7, 7).
-    """
-    rows = jacobian.reshape(-1, 7)
-    total = rows @ prior @ rows.T
-    for k, block in enumerate(noise):
-        total[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += block
-    weight = np.linalg.solve(total, rows @ prior).T  # (7, 3 K)
-    return -weight @ difference.ravel(), prior - weight @ rows @ prior
 
 
 def _bounded(logit: Array) -> Array:
@@ -497,18 +425,14 @@ def _bounded(logit: Array) -> Array:
     return np.where(np.isfinite(logit), limited, 0.0)
 
 
-def _cosines(
-    states: Sequence[ObjectState], found: Sequence[ObjectState | FoundObject], name: str
-) -> Array:
+def _cosines(states: Sequence[ObjectState], found: Sequence[Described], name: str) -> Array:
     """Return cosines (N, M) of unit embeddings; NaN where one is missing or of another width.
 
     Args:
         name: of the embeddings.
     """
     sides = [[getattr(o, name) for o in side] for side in (states, found)]
-    width = max((len(x) for side in sides for x in side), default=0)
-    if not width:
-        return np.full((len(states), len(found)), np.nan)
+    width = max((len(x) for side in sides for x in side), default=0) or 1
     missing = np.full(width, np.nan, np.float32)
     rows = [np.array([x if len(x) == width else missing for x in side]) for side in sides]
     a, b = (unit_rows(side.reshape(-1, width)) for side in rows)
@@ -525,33 +449,22 @@ def _assigned(gain: Array) -> BoolArray:
     return np.asarray(mask & (gain > 0))
 
 
-def _losses(gain: Array, pairs: BoolArray) -> Array:
-    """Return (N + 1, M + 1) what the best assignment with each pair is worse by than `pairs`.
+def _regret(gain: Array) -> Array:
+    """Return (N + 1, M + 1) the regret of forcing each pair, relative to the best assignment.
 
-    The last row and column stand for "unmatched". A forced pair displaces others along a cycle of
-    the residual graph: the shortest paths of all pairs give the cheapest cycle of each.
+    The last row and column are "unmatched". Of pairs with a loss above the margin it is infinite.
     """
-    n, m = gain.shape
-    score = np.zeros((n + m, n + m))
-    score[:n, :m] = np.maximum(gain, IMPOSSIBLE)
-    column = np.full(n + m, -1)
-    column[:n] = m + np.arange(n)
-    rows, columns = np.nonzero(pairs)
-    column[rows] = columns
-    free = np.flatnonzero(~pairs.any(0))
-    column[n + free] = free
-    column[column < 0] = np.setdiff1d(np.arange(n + m), column)
-    edge = score[np.arange(n + m), column][:, None] - score[:, column]
-    path = edge.copy()
-    for k in range(n + m):
-        path = np.minimum(path, path[:, k, None] + path[k])
-    loss = np.empty_like(edge)
-    loss[:, column] = edge + path.T
-    result = np.zeros((n + 1, m + 1))
-    result[:n, :m] = loss[:n, :m]
-    result[:n, m] = loss[:n, m:].min(1, initial=np.inf)
-    result[n, :m] = loss[n:, :m].min(0, initial=np.inf)
-    return result
+
+    def total(left: Array) -> float:
+        return float(left[_assigned(left)].sum())
+
+    best = total(gain)
+    loss = np.full(np.add(gain.shape, 1), np.inf)
+    for i, j in np.argwhere(gain > -MARGIN).tolist():
+        loss[i, j] = best - gain[i, j] - total(np.delete(np.delete(gain, i, 0), j, 1))
+    for axis, edge in enumerate((loss[:-1, -1], loss[-1, :-1])):
+        edge[:] = [best - total(np.delete(gain, k, axis)) for k in range(len(edge))]
+    return loss
 
 
 def _best_other(score: Array) -> Array:
@@ -564,51 +477,45 @@ class _Verdicts:
     """The best assignment, its rivals, and a decision for each object.
 
     Attributes:
-        stayed, moved: (N, M) gains. near: (N, M) the larger one. far: the same if all moves were
-            equally probable: only the identity counts.
-        loss: (N + 1, M + 1) see `_losses`. matched: (N, M) bool: pairs of the best assignment.
+        of: likelihoods. stayed, moved: (N, M) gains.
+        far: (N, M) the larger one if all moves were equally probable: only the identity counts.
+        loss: (N + 1, M + 1) see `_regret`. matched: (N, M) bool: pairs of the best assignment.
     """
 
-    def __init__(self, pairs: _Pairs) -> None:
-        self.pairs = pairs
-        self.stayed = pairs.gain(pairs.stayed())
-        self.moved = pairs.gain(pairs.moved(near=True))
-        self.near = np.maximum(self.stayed, self.moved)
-        self.far = np.maximum(self.stayed, pairs.gain(pairs.moved(near=False)))
-        self.matched = _assigned(self.near)
-        self.loss = _losses(self.near, self.matched)
+    def __init__(self, likelihoods: _Likelihoods) -> None:
+        self.of = likelihoods
+        self.stayed = likelihoods.gain(likelihoods.stayed())
+        self.moved = likelihoods.gain(likelihoods.moved(near=True))
+        self.far = np.maximum(self.stayed, likelihoods.gain(likelihoods.moved(near=False)))
+        best = np.maximum(self.stayed, self.moved)
+        self.matched = _assigned(best)
+        self.loss = _regret(best)
 
     def decisions(self) -> list[Decision]:
         """Return one decision per map object, then one per new object."""
         accepted = [self._matched(i, j) for i, j in np.argwhere(self.matched).tolist()]
-        by_state = {d.map_id: d for d in accepted if d is not None}
-        known = {d.found_id for d in by_state.values()}
-        of_map = [
-            by_state.get(s.id) or self._undetected(i) for i, s in enumerate(self.pairs.states)
+        by_number = {d.map_id: d for d in accepted if d is not None}
+        known = {d.found_id for d in by_number.values()}
+        return [
+            *(by_number.get(s.id) or self._undetected(i) for i, s in enumerate(self.of.states)),
+            *(self._new(j) for j, f in enumerate(self.of.found) if f.id not in known),
         ]
-        new = [self._new(j) for j, f in enumerate(self.pairs.found) if f.id not in known]
-        return [*of_map, *new]
 
     def _matched(self, i: int, j: int) -> Decision | None:
         """Decide about a pair of the best assignment; None: the evidence is too weak."""
-        state = self.pairs.states[i]
-        found = self.pairs.found[j]
-        lead = float(np.delete(self.loss[i], j).min() - self.loss[i, j])  # of all found objects
-        there = bool(
-            self.stayed[i, j] >= self.moved[i, j] or self.pairs.distance[i, j] < LEAST_MOVE_M
-        )
-        if there:
-            # rivals among map objects only: the displacement decided
+        of = self.of
+        there = bool(self.stayed[i, j] >= self.moved[i, j] or of.distance[i, j] < LEAST_MOVE_M)
+        if there:  # rivals among map objects only: the displacement decided
             accepted = self.loss[-1, j] - self.loss[i, j] >= MARGIN
         else:  # looks and size alone gave three wrong numbers in eleven rendered pairs
-            proven = bool(self.pairs.points[i, j] >= MARGIN)
-            accepted = proven and lead >= MARGIN and self._distinguished(i, j)
-        if not (accepted or self.pairs.known[i, j]):
+            lead = np.delete(self.loss[i], j).min() - self.loss[i, j]  # over all found objects
+            accepted = of.points[i, j] >= MARGIN and lead >= MARGIN and self._distinguished(i, j)
+        if not (accepted or of.known[i, j]):
             return None
-        odds = min(lead, abs(float(self.stayed[i, j] - self.moved[i, j])))
+        number = of.states[i].id
+        rivals = tuple(other for other in self._candidates(j) if other != number)
         kind = "stayed" if there else "moved"
-        rivals = tuple(number for number in self._candidates(j) if number != state.id)
-        return Decision(kind, state.id, found.id, odds, rivals, self._evidence(i, j, there))
+        return Decision(kind, number, of.found[j].id, rivals, self._evidence(i, j, there))
 
     def _distinguished(self, i: int, j: int) -> bool:
         """Return whether identity, or a much shorter displacement, excludes the best rival."""
@@ -617,77 +524,63 @@ class _Verdicts:
         rival = _assigned(without)
         if self.far[self.matched].sum() - self.far[rival].sum() >= MARGIN:
             return True
-        both = self.matched.any(0) & rival.any(0)
-        changed = both & (self.matched != rival).any(0)
-        length = [(self.pairs.distance * mask)[:, changed].sum() for mask in (self.matched, rival)]
+        changed = self.matched.any(0) & rival.any(0) & (self.matched != rival).any(0)
+        length = [(self.of.distance * mask)[:, changed].sum() for mask in (self.matched, rival)]
         return bool(length[1] >= DISPLACEMENT_RATIO * length[0])
 
     def _candidates(self, j: int) -> tuple[int, ...]:
         """Return the numbers that a found object may have, within the margin of the best one."""
-        rows = np.flatnonzero(self.loss[:-1, j] < MARGIN).tolist()
-        return tuple(self.pairs.states[i].id for i in rows)
+        states = zip(self.of.states, self.loss[:-1, j], strict=True)
+        return tuple(s.id for s, loss in states if loss < MARGIN)
 
     def _undetected(self, i: int) -> Decision:
         """Decide about a map object that was given no found object."""
-        state = self.pairs.states[i]
-        view = self.pairs.visibility
-        expected, through = (int(v[i]) for v in (view.expected, view.seen_through))
+        view = self.of.visibility
+        expected = int(view.expected[i])
+        through = int(view.seen_through[i])
         detected = round(view.detected[i])
-        missed = expected - detected
-        there = float(self.pairs.there_log_odds()[i])
         similar = np.flatnonzero((self.loss[i, :-1] < MARGIN) & (self.stayed[i] >= self.moved[i]))
-        gone = there < GONE_LOG_ODDS and through > 0 and not len(similar)
+        improbable = self.of.there_log_odds()[i] < GONE_LOG_ODDS
+        gone = improbable and through > 0 and not len(similar)
+        missed = f"not detected in {expected - detected} views"
         if view.vague[i]:
             evidence = "its position in the map is too uncertain"
         elif expected == 0:
             evidence = "no view passed its place"
         elif len(similar):
-            found = self.pairs.found[int(similar[0])]
-            evidence = f"object {found.id} near its place may be this one"
+            evidence = f"object {self.of.found[similar[0]].id} near its place may be this one"
         elif detected and not gone:
             evidence = (
                 f"detected on its place in {detected} of {expected} views, "
                 "but none of the objects found is clearly this one"
             )
         elif through == 0:
-            evidence = f"not detected in {missed} views, but none shows what is behind it"
+            evidence = f"{missed}, but none shows what is behind it"
         else:
             result = "" if gone else ", which is too few to call it gone"
-            evidence = (
-                f"not detected in {missed} views, {through} of them through its place{result}"
-            )
+            evidence = f"{missed}, {through} of them through its place{result}"
         kind = "gone" if gone else "not_seen"
-        return Decision(kind, state.id, 0, -there if gone else there, (), evidence)
+        return Decision(kind, self.of.states[i].id, 0, (), evidence)
 
     def _new(self, j: int) -> Decision:
         """Decide about a found object that was given no number."""
-        candidates = self._candidates(j)
-        found = self.pairs.found[j]
-        if candidates:
+        evidence = "no object of the map explains it"
+        if candidates := self._candidates(j):
             names = ", ".join(map(str, candidates))
             evidence = f"may be object {names} of the map; the evidence is too weak for a number"
-        else:
-            evidence = "no object of the map explains it"
-        lead = float(np.min(self.loss[:-1, j], initial=99.0))
-        return Decision("new", 0, found.id, lead, candidates, evidence)
+        return Decision("new", 0, self.of.found[j].id, candidates, evidence)
 
     def _evidence(self, i: int, j: int, there: bool) -> str:
         """Describe why a pair is one object."""
-        pairs = self.pairs
-        appearance = (pairs.appearance_there if there else pairs.appearance)[i, j]
+        of = self.of
         terms = {
-            "class": pairs.class_score[i, j] - np.log(pairs.of_found[j] @ pairs.frequency),
-            "size": pairs.size_score[i, j],
-            "appearance": appearance,
+            "class": of.class_ratio,
+            "size": of.size_score,
+            "appearance": of.appearance_there if there else of.appearance,
         }
-        text = ", ".join(f"{name} {value:+.1f}" for name, value in terms.items())
-        motion = pairs.found[j].motion_of.get(pairs.states[i].id)
-        own = ""
-        if motion is not None:
-            own = f", {motion.inliers} of its points recognised in {motion.images} images"
-            if not motion.images:
-                own = ", its points were recognised in the last run"
-            if motion.inliers >= ENOUGH_INLIERS:
-                own += ", which give the displacement"
-        place = f"{pairs.distance[i, j]:.2f} m from its place ({pairs.sigmas[i, j]:.1f} sigma)"
-        return f"{place}; log likelihood ratios: {text}{own}"
+        text = ", ".join(f"{name} {value[i, j]:+.1f}" for name, value in terms.items())
+        if motion := of.found[j].motion_of.get(of.states[i].id):
+            text += f", {motion.inliers} of its points recognised in {motion.images} images"
+            text += "" if of.by_center[i, j] else ", which give the displacement"
+        place = f"{of.distance[i, j]:.2f} m from its place ({of.sigmas[i, j]:.1f} sigma)"
+        return f"{place}; log likelihood ratios: {text}"

@@ -11,37 +11,30 @@ from scipy.spatial.transform import Rotation
 
 import quadrics
 from reobj.cameras import quat_wxyz_from_matrix
-from reobj.maps.room_map import MapObject, Observation, RoomMap, Session
+from reobj.maps.room_map import MapObject, Observation, RoomMap
 from reobj.results.result import Object
 from reobj.tracking.ellipsoid_map import EllipsoidMap
 from reobj.types import Array, BoolArray, Embeddings, Floats, IntArray, ReobjError, unit_rows
 from reobj.words import meant
 
 PLACE_SIGMA_M = 0.01  # of a place between sessions: cleaning and leaning shift an object by 1 cm
+DETECTED = (8.0, 2.0)  # Beta prior of detections and misses: 80 %, worth ten views
+MOST_DETECTED = 0.98  # no detector is certain, and views of one session fail together
 CHI2_3 = 14.16  # 3 sigma of a normal variable (99.73 %), for the squared distance in 3 dimensions
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ObjectState:
-    """What the map knows of an object after its last session.
+class Described:
+    """Classes, shape and looks of an object of a map or of a recording.
 
     Attributes:
-        id: number. class_name: given by the user, or the one with the largest weight.
-        classes: weight of each class, over all sessions.
-        present: False if it was gone in the last session that saw its place.
-        deleted: by the user.
-        support, center, half_axes, quat_wxyz, cov: shape as in `Observation`, with the uncertainty
-            of the alignment of the sessions; the place where it was last seen.
-        foreground, background: mean unit embeddings of one model (`embedder`); empty: none.
-        detection_rate: probability of a detection in a view in which it is expected.
-        log_odds: that it is a real object.
+        id: number in the map, or identity in the recording. classes: weight of each class.
+        support, center, half_axes, quat_wxyz, cov: shape as in `Observation`.
+        foreground, background: mean unit embeddings of one model; empty: none.
     """
 
     id: int
-    class_name: str
     classes: dict[str, float]
-    present: bool
-    deleted: bool
     support: str
     center: Array
     half_axes: Array
@@ -49,7 +42,26 @@ class ObjectState:
     cov: Array
     foreground: Floats
     background: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ObjectState(Described):
+    """What the map knows of an object after its last session: where it was last seen.
+
+    The covariance includes the uncertainty of the alignment of the sessions.
+
+    Attributes:
+        embedder: model of the embeddings. class_name: given by the user, or that of most weight.
+        present: False if it was gone in the last session that saw its place.
+        deleted: by the user.
+        detection_rate: probability of a detection in a view in which it is expected.
+        log_odds: that it is a real object.
+    """
+
     embedder: str
+    class_name: str
+    present: bool
+    deleted: bool
     detection_rate: float
     log_odds: float
 
@@ -67,33 +79,35 @@ def object_state(found: MapObject, room: RoomMap) -> ObjectState:
     detected = [o for o in observations if o.detected]
     if not detected:
         raise ReobjError(f"object {found.id} was not detected in any session of the map")
-    weight: dict[str, float] = {}
-    for o in detected:
-        for name, more in o.classes.items():
-            weight[name] = weight.get(name, 0.0) + more
+    weight = class_weights(detected)
     classes = dict(sorted(weight.items(), key=lambda entry: (-entry[1], entry[0])))
-    looked = [o.status for o in observations if o.status != "not_seen"]
     expected = sum(o.expected for o in detected)
-    missed = sum(o.missed for o in detected)
+    hits = DETECTED[0] + expected - sum(o.missed for o in detected)
     support, shape = _fused(detected, room)
-    embedder, foreground, background = _embeddings(detected, room)
+    foreground, background, embedder = _embeddings(detected, room)
     return ObjectState(
-        id=found.id,
+        found.id,
+        classes,
+        support,
+        shape.center[0],
+        np.exp(shape.log_half[0]),
+        quat_wxyz_from_matrix(shape.rot)[0],
+        shape.cov[0],
+        foreground,
+        background,
+        embedder,
         class_name=found.name or next(iter(classes), "object"),
-        classes=classes,
-        present=looked[-1] != "gone",
+        present=[o.status for o in observations if o.status != "not_seen"][-1] != "gone",
         deleted=found.deleted,
-        support=support,
-        center=shape.center[0],
-        half_axes=np.exp(shape.log_half[0]),
-        quat_wxyz=quat_wxyz_from_matrix(shape.rot)[0],
-        cov=shape.cov[0],
-        foreground=foreground,
-        background=background,
-        embedder=embedder,
-        detection_rate=_detection_rate(expected, missed),
+        detection_rate=min(hits / (sum(DETECTED) + expected), MOST_DETECTED),
         log_odds=float(np.clip(sum(o.log_odds for o in observations), -10.0, 10.0)),
     )
+
+
+def class_weights(detected: Sequence[Observation]) -> dict[str, float]:
+    """Add the weights of each class, by name."""
+    names = sorted({name for o in detected for name in o.classes})
+    return {name: sum(o.classes.get(name, 0.0) for o in detected) for name in names}
 
 
 def state_before(found: MapObject, session: int, room: RoomMap) -> ObjectState | None:
@@ -104,61 +118,42 @@ def state_before(found: MapObject, session: int, room: RoomMap) -> ObjectState |
     return object_state(dataclasses.replace(found, observations=rows), room)
 
 
-def _detection_rate(
-    expected: int, missed: int, prior: tuple[float, float] = (8.0, 2.0), most: float = 0.98
-) -> float:
-    """Return the posterior mean of a detection rate.
-
-    Args:
-        prior: Beta distribution of detections and misses: 80 %, worth ten views. most: upper bound:
-            no detector is certain, and views of one session fail together.
-    """
-    hits = prior[0] + expected - missed
-    return min(hits / (sum(prior) + expected), most)
-
-
-def _embeddings(detected: Sequence[Observation], room: RoomMap) -> tuple[str, Floats, Floats]:
-    """Return the last embedder of an object, and its mean unit embeddings by this model."""
+def _embeddings(detected: Sequence[Observation], room: RoomMap) -> tuple[Floats, Floats, str]:
+    """Return the mean unit embeddings of an object by its last embedder, and this model."""
     embedder_of = {s.number: s.embedder for s in room.sessions}
     rows = [o for o in detected if o.embedded > 0 and o.foreground.size]
-    none = np.empty(0, np.float32)
+    means = [np.empty(0, np.float32)] * 2
     if not rows:
-        return "", none, none
+        return means[0], means[1], ""
     embedder = embedder_of[rows[-1].session]
-    width = rows[-1].foreground.shape
-    rows = [o for o in rows if embedder_of[o.session] == embedder and o.foreground.shape == width]
-
-    def mean(name: str) -> Floats:
-        known = [o for o in rows if getattr(o, name).shape == width]
-        if not known:
-            return none
-        weight = np.array([o.embedded for o in known], np.float64)
-        total = weight @ np.array([getattr(o, name) for o in known], np.float64)  # (E,)
-        return np.asarray(unit_rows(total[None])[0], np.float32)
-
-    return embedder, mean("foreground"), mean("background")
+    width = rows[-1].foreground.size
+    rows = [o for o in rows if embedder_of[o.session] == embedder and o.foreground.size == width]
+    for k, name in enumerate(("foreground", "background")):
+        if known := [o for o in rows if getattr(o, name).size == width]:
+            weight = np.array([o.embedded for o in known], np.float64)
+            total = weight @ np.array([getattr(o, name) for o in known], np.float64)  # (E,)
+            means[k] = unit_rows(total[None])[0].astype(np.float32)
+    return means[0], means[1], embedder
 
 
-def shapes_of(objects: Sequence[ObjectState] | Sequence[Object]) -> quadrics.Ellipsoids:
+def shapes_of(objects: Sequence[Described] | Sequence[Object]) -> quadrics.Ellipsoids:
     """Return the ellipsoids of objects, in the world of the map, inscribed in their shapes."""
-    wxyz = np.array([o.quat_wxyz for o in objects]).reshape(-1, 4)
-    axes = Rotation.from_quat(wxyz[:, [1, 2, 3, 0]]).as_matrix() if len(objects) else wxyz
     return quadrics.Ellipsoids(
         np.array([o.center for o in objects]).reshape(-1, 3),
         np.array([o.half_axes for o in objects]).reshape(-1, 3),
-        axes.reshape(-1, 3, 3),
+        _axes(np.array([o.quat_wxyz for o in objects]).reshape(-1, 4)),
     )
 
 
-def scaled_radius(xyz: Array, shapes: quadrics.Ellipsoids, k: int | IntArray) -> Array:
-    """Return squared distances (N,) of points (N, 3) from the centre of a shape, in half axes.
+def _axes(quat_wxyz: Array) -> Array:
+    """Return world_from_obj (K, 3, 3) of quaternions (K, 4)."""
+    xyzw = quat_wxyz[:, [1, 2, 3, 0]]  # before scipy 1.16 not of no rows
+    return Rotation.from_quat(xyzw).as_matrix() if len(xyzw) else np.empty((0, 3, 3))
 
-    Args:
-        k: row of the shape, or (N,) that of each point.
-    """
-    turn = np.broadcast_to(shapes.world_from_obj[k], (len(xyz), 3, 3))
-    offset = xyz - shapes.center_in_world[k]
-    scaled = np.einsum("ni,nij->nj", offset, turn) / shapes.half_axes[k]
+
+def scaled_radius(xyz: Array, shapes: quadrics.Ellipsoids, k: int) -> Array:
+    """Return squared distances (N,) of points (N, 3) from the centre of shape k, in half axes."""
+    scaled = (xyz - shapes.center_in_world[k]) @ shapes.world_from_obj[k] / shapes.half_axes[k]
     return np.asarray((scaled**2).sum(1))
 
 
@@ -192,8 +187,7 @@ def observed_shapes(detected: Sequence[Observation], room: RoomMap) -> Shapes:
     """
     center = np.array([o.center for o in detected])
     log_half = np.log(np.array([o.half_axes for o in detected]))
-    quat = np.array([o.quat_wxyz for o in detected])
-    rot = Rotation.from_quat(quat[:, [1, 2, 3, 0]]).as_matrix()
+    rot = _axes(np.array([o.quat_wxyz for o in detected]))
     alignment = {s.number: s.alignment_cov for s in room.sessions}
     sigma = np.array([alignment[o.session] for o in detected])  # (K, 7, 7)
     jacobian = np.zeros((len(center), 9, 7))
@@ -228,17 +222,6 @@ def _valid(cov: Array) -> Array:
     return np.asarray(np.einsum("kij,kj,klj->kil", vector, value, vector) * outer)
 
 
-def _axis_rotations() -> Array:
-    """Return the rotations (24, 3, 3) that map the axes onto themselves."""
-    signs = np.array(np.meshgrid([1, -1], [1, -1], [1, -1])).reshape(3, 8).T
-    both = np.array([np.eye(3)[:, order] * s for order in quadrics.AXIS_ORDERS for s in signs])
-    return np.asarray(both[np.linalg.det(both) > 0])
-
-
-TURNS = _axis_rotations()
-KEEPS_THIRD: BoolArray = np.abs(TURNS[:, 2, 2]) > 0.5  # (24,)
-
-
 def _fused(detected: Sequence[Observation], room: RoomMap) -> tuple[str, Shapes]:
     """Fuse the shapes of an object's observations, by session, by their information.
 
@@ -249,113 +232,94 @@ def _fused(detected: Sequence[Observation], room: RoomMap) -> tuple[str, Shapes]
     Returns:
         the kind, and one shape.
     """
-    starts = [k for k, o in enumerate(detected) if o.status in ("new", "moved")]
-    here = np.arange(len(detected)) >= (starts[-1] if starts else 0)
-    last = [o for o, at_place in zip(detected, here, strict=True) if at_place]
-    support = max(last, key=lambda o: o.views).support
+    starts = [k for k, o in enumerate(detected) if o.status in ("new", "moved")] or [0]
+    here = np.arange(len(detected)) >= starts[-1]
+    support = max(detected[starts[-1] :], key=lambda o: o.views).support
     same = np.array([o.support == support for o in detected])
+    is_round = support == "cylinder"
+    upright = room.up is not None or is_round  # the third axis stays the third one
     shapes = observed_shapes(detected, room)
     turning = np.einsum("kii->k", shapes.cov[:, 6:, 6:])
     ref = int(np.where(here & same, turning, np.inf).argmin())
-    upright = room.up is not None or support == "cylinder"
-    nearest, agree = _nearest_orientation(shapes, ref, upright, support == "cylinder")
-    by_size, alike = _nearest_sizes(shapes, ref, upright, support == "cylinder")
+    delta, cov, agree = _nearest_orientation(shapes, ref, upright, is_round)
+    by_size, cov_by_size, alike = _nearest_sizes(shapes, ref, upright, is_round)
     oriented = here & same & agree
-    delta = np.where(oriented[:, None], nearest.delta, by_size.delta)
-    cov = np.where(oriented[:, None, None], nearest.cov, by_size.cov)
+    delta = np.where(oriented[:, None], delta, by_size)
+    cov = np.where(oriented[:, None, None], cov, cov_by_size)
     used = np.repeat(np.stack([here, same & (oriented | alike), oriented], 1), 3, axis=1)  # (K, 9)
     both = used[:, :, None] & used[:, None]
     info = np.where(both, np.linalg.inv(np.where(both, cov, np.eye(9))), 0.0)
     fused_cov = np.linalg.inv(info.sum(0))
     step = fused_cov @ np.einsum("kij,kj->i", info, delta)
-    turn = Rotation.from_rotvec(step[6:]).as_matrix()
     return support, Shapes(
-        shapes.center[ref : ref + 1] + step[:3],
-        shapes.log_half[ref : ref + 1] + step[3:6],
-        shapes.rot[ref : ref + 1] @ turn,
+        shapes.center[[ref]] + step[:3],
+        shapes.log_half[[ref]] + step[3:6],
+        shapes.rot[[ref]] @ Rotation.from_rotvec(step[6:]).as_matrix(),
         (fused_cov + fused_cov.T)[None] / 2,
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Turned:
-    """Increments (K, 9) from the reference to shapes in axes of their symmetry; cov (K, 9, 9)."""
-
-    delta: Array
-    cov: Array
-
-
-def _turned(shapes: Shapes, ref: int, turn: Array, rotvec: Array, rotation: Array) -> _Turned:
-    """Express shapes in other axes.
-
-    Args:
-        turn: (K, 3, 3) of TURNS. rotvec: (K, 3) from the reference to the turned shapes.
-        rotation: (K, 3, 3) the turn, and the yaw of a cylinder: shape.rot @ rotation are the axes.
-    """
-    order = np.abs(turn).swapaxes(1, 2)
-    log_half = (order @ shapes.log_half[..., None])[..., 0]
-    change = np.zeros((len(turn), 9, 9))
-    change[:, :3, :3] = np.eye(3)
-    change[:, 3:6, 3:6] = order
-    change[:, 6:, 6:] = rotation.swapaxes(1, 2)
-    shift = [shapes.center - shapes.center[ref], log_half - shapes.log_half[ref], rotvec]
-    return _Turned(np.concatenate(shift, 1), change @ shapes.cov @ change.swapaxes(1, 2))
-
-
 def _nearest_orientation(
-    shapes: Shapes, ref: int, upright: bool, round_about_third: bool
-) -> tuple[_Turned, BoolArray]:
-    """Choose for every shape the equivalent axes whose directions are nearest to the reference.
+    shapes: Shapes, ref: int, upright: bool, is_round: bool
+) -> tuple[Array, Array, BoolArray]:
+    """Express every shape in the equivalent axes whose directions are nearest to the reference.
 
     Args:
-        upright: the third axis stays the third one. round_about_third: the yaw is arbitrary.
+        is_round: the yaw about the third axis is arbitrary.
     Returns:
-        the turned shapes, and whether their orientation agrees with the reference (K,).
+        increments (K, 9) from the reference, their covariances (K, 9, 9), and whether the
+        orientations agree (K,).
     """
+    target = np.broadcast_to(shapes.rot[ref], shapes.rot.shape)
+    turn = quadrics.nearest_axes(shapes.rot, target, upright)
     relative = shapes.rot[ref].T @ shapes.rot  # (K, 3, 3)
-    trace = np.einsum("kij,gji->kg", relative, TURNS)
-    if upright:
-        trace = np.where(KEEPS_THIRD, trace, -np.inf)
-    turn = TURNS[trace.argmax(1)]
     rotation = turn
-    if round_about_third:
+    if is_round:
         rotvec = quadrics.rotation_vectors(relative @ turn)
         # the yaw that leaves the smallest rotation: the twist of the relative quaternion
         half = np.linalg.norm(rotvec, axis=1) / 2
         twist = 2 * np.arctan2(rotvec[:, 2] * np.sinc(half / np.pi) / 2, np.cos(half))
-        yaw = np.zeros((len(turn), 3))
-        yaw[:, 2] = -twist
-        rotation = turn @ quadrics.rotations(yaw)
+        rotation = turn @ quadrics.rotations(-twist[:, None] * [0, 0, 1])
     rotvec = quadrics.rotation_vectors(relative @ rotation)
-    turned = _turned(shapes, ref, turn, rotvec, rotation)
-    cov = turned.cov[:, 6:, 6:] + turned.cov[ref, 6:, 6:]
-    distance = np.einsum("ki,kij,kj->k", rotvec, np.linalg.inv(cov), rotvec)
-    agree = (distance < CHI2_3) & (np.linalg.norm(rotvec, axis=1) < np.deg2rad(30))
-    agree[ref] = True  # its covariance is twice its own: the distance is 0
-    return turned, agree
+    order = np.abs(turn).swapaxes(1, 2)
+    log_half = (order @ shapes.log_half[..., None])[..., 0]
+    change = np.tile(np.eye(9), (len(turn), 1, 1))
+    change[:, 3:6, 3:6] = order
+    change[:, 6:, 6:] = rotation.swapaxes(1, 2)
+    cov = change @ shapes.cov @ change.swapaxes(1, 2)
+    both = np.linalg.inv(cov[:, 6:, 6:] + cov[ref, 6:, 6:])
+    agree = np.einsum("ki,kij,kj->k", rotvec, both, rotvec) < CHI2_3
+    agree &= np.linalg.norm(rotvec, axis=1) < np.deg2rad(30)
+    shift = [shapes.center - shapes.center[ref], log_half - shapes.log_half[ref], rotvec]
+    return np.concatenate(shift, 1), cov, agree
 
 
 def _nearest_sizes(
     shapes: Shapes, ref: int, upright: bool, third_is_axis: bool
-) -> tuple[_Turned, BoolArray]:
-    """Choose for every shape the order of its axes whose sizes are nearest to the reference.
+) -> tuple[Array, Array, BoolArray]:
+    """Order the axes of every shape so that its sizes are nearest to the reference.
 
     For shapes at another place or in another orientation. An upright object may have been laid on
     its side: its third axis changes if the sizes agree by 3 sigma better so.
 
     Returns:
-        the turned shapes, and whether their sizes agree with the reference (K,).
+        increments (K, 9) from the reference without rotation, their covariances (K, 9, 9), and
+        whether the sizes agree (K,).
     """
-    log_half = np.einsum("gji,kj->kgi", np.abs(TURNS), shapes.log_half)  # (K, 24, 3)
-    cov = np.einsum("gji,kjl,glm->kgim", np.abs(TURNS), shapes.cov[:, 3:6, 3:6], np.abs(TURNS))
-    error = log_half - shapes.log_half[ref]
-    inverse = np.linalg.inv(cov + shapes.cov[ref, 3:6, 3:6])
+    orders = quadrics.AXIS_ORDERS  # (6, 3)
+    size_cov = shapes.cov[:, 3:6, 3:6][:, orders[:, :, None], orders[:, None]]  # (K, 6, 3, 3)
+    error = shapes.log_half[:, orders] - shapes.log_half[ref]  # (K, 6, 3)
+    inverse = np.linalg.inv(size_cov + shapes.cov[ref, 3:6, 3:6])
     distance = np.einsum("kgi,kgij,kgj->kg", error, inverse, error)
-    penalty = np.where(KEEPS_THIRD | (not upright), 0.0, np.inf if third_is_axis else CHI2_3)
+    keeps_third = (orders[:, 2] == 2) | (not upright)
+    penalty = np.where(keeps_third, 0.0, np.inf if third_is_axis else CHI2_3)
     best = (distance + penalty).argmin(1)
-    turn = TURNS[best]
-    turned = _turned(shapes, ref, turn, np.zeros((len(turn), 3)), turn)
-    return turned, distance[np.arange(len(best)), best] < CHI2_3
+    rows = np.arange(len(best))
+    index = np.tile(np.arange(9), (len(best), 1))
+    index[:, 3:6] = 3 + orders[best]
+    cov = shapes.cov[rows[:, None, None], index[:, :, None], index[:, None]]
+    shift = [shapes.center - shapes.center[ref], error[rows, best], np.zeros((len(best), 3))]
+    return np.concatenate(shift, 1), cov, distance[rows, best] < CHI2_3
 
 
 # ---- Scale -------------------------------------------------------------------------------------
@@ -379,19 +343,12 @@ def scale_of(room: RoomMap) -> quadrics.Scale:
     if not sessions:
         return quadrics.Scale(1.0, 0.0, "none")
     value = np.log([s.metres_per_unit for s in sessions])
-    variance = np.array([_scale_variance(s) for s in sessions])
-    mean = float(np.exp(np.average(value, weights=1 / variance)))
-    least = variance.min()
-    pooled = 1 / (1 / variance).sum() if metric else least
-    return quadrics.Scale(mean, float(np.sqrt(pooled)), sessions[variance.argmin()].scale_source)
-
-
-def _scale_variance(session: Session) -> float:
-    """Return the variance of the log scale of the map as a session measured it.
-
-    At least (1e-6)^2: exact poses have sigma 0.
-    """
-    return max(session.scale_rel_sigma**2 + float(session.alignment_cov[6, 6]), 1e-12)
+    # exact poses have sigma 0: at least 1e-6
+    variance = [max(s.scale_rel_sigma**2 + s.alignment_cov[6, 6], 1e-12) for s in sessions]
+    weight = 1 / np.array(variance)
+    mean = float(np.exp(np.average(value, weights=weight)))
+    pooled = 1 / weight.sum() if metric else min(variance)
+    return quadrics.Scale(mean, float(np.sqrt(pooled)), sessions[weight.argmax()].scale_source)
 
 
 # ---- For a tracker that starts from a map -------------------------------------------------------
@@ -425,12 +382,10 @@ def embeddings_of(states: Sequence[ObjectState], embedder: str) -> tuple[IntArra
         rows (n,) of the objects, and their embeddings; zeros for a background that is missing.
     """
     rows = [k for k, s in enumerate(states) if embedder and s.embedder == embedder]
-    rows = [k for k in rows if states[k].foreground.size]
-    fore = [states[k].foreground for k in rows]
     if not rows:
         return np.empty(0, np.int64), Embeddings.empty()
-    width = max(states[k].background.size for k in rows)
-    back = np.zeros((len(rows), width), np.float32)
+    fore = [states[k].foreground for k in rows]
+    back = np.zeros((len(rows), max(states[k].background.size for k in rows)), np.float32)
     for row, k in enumerate(rows):
         back[row, : states[k].background.size] = states[k].background
     return np.array(rows, np.int64), Embeddings(np.array(fore, np.float32), back)

@@ -12,7 +12,7 @@ import dataclasses
 import itertools
 from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TypeVar
 
@@ -25,6 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from reobj.cameras import Camera, Poses, import_pycolmap, invert_rigid
 from reobj.files import Progress
+from reobj.maps.fusion import alignment_jacobian
 from reobj.maps.room_map import MapPoints
 from reobj.poses.features import root_sift
 from reobj.sources.video import Video, shrunk
@@ -33,6 +34,8 @@ from reobj.types import Array, BoolArray, Floats, Frame, IntArray
 T = TypeVar("T")
 
 COMPARED = 40  # images of a component that are matched to the map; more take longer
+MORE = 200  # images that are compared where fewer do not place a recording; more take longer
+DESCRIBED_POINTS = 20_000  # of a recording, those in most images
 MATCHED_POINTS = 15_000  # of the map, first those on no object; more take longer
 RATIO = 0.8  # of angles to the best point and to the best one elsewhere (Lowe, IJCV 2004)
 ELSEWHERE = 0.03  # distance of such a point, over that of the best one from the camera
@@ -70,18 +73,15 @@ class ImageFeatures:
     descriptor: npt.NDArray[np.uint8]
 
 
-def keyframe_rows(poses: Poses, most: int = 200) -> IntArray:
-    """Choose every second keyframe, all of few; return their rows in the poses.
+def keyframe_rows(poses: Poses) -> IntArray:
+    """Choose every second keyframe, all of few, at most MORE; return their rows in the poses.
 
     Every second one shows .95 to .98 of the sparse points (measured on four recordings). Without
     observed points: images spread over all frames.
-
-    Args:
-        most: images; more cover long recordings more densely and take longer.
     """
     rows = np.unique(poses.visibility[:, 0])
     rows = rows[poses.measured[rows]] if len(rows) else np.arange(len(poses.frame))
-    step = max(2 if len(rows) > COMPARED else 1, -(-len(rows) // most))
+    step = max(2 if len(rows) > COMPARED else 1, -(-len(rows) // MORE))
     return np.asarray(rows[::step], np.int64)
 
 
@@ -118,16 +118,12 @@ def image_features(
     return list(of_frames(video, row_of, describe, line))
 
 
-def points_with_descriptors(
-    poses: Poses, features: Sequence[ImageFeatures], most: int = 20_000
-) -> MapPoints:
+def points_with_descriptors(poses: Poses, features: Sequence[ImageFeatures]) -> MapPoints:
     """Describe the sparse points of a recording by the mean descriptor of their keypoints.
 
     A keypoint belongs to the observed point that projects within 1.5 px (of images of 640 px) of
     it.
 
-    Args:
-        most: points; those in most images are kept.
     Returns:
         points of session 0, on no object.
     """
@@ -136,35 +132,35 @@ def points_with_descriptors(
     ray = np.zeros((count, 3))
     number = np.zeros(count, np.int64)
     distance = np.zeros(count)
-    order = np.argsort(poses.visibility[:, 0], kind="stable")
-    frame_row, point = poses.visibility[order].T
     centre = invert_rigid(poses.cam_from_world)[:, :, 3]
     near_px = 1.5 * max(poses.camera.width, poses.camera.height) / 640
     for image in features:
-        first, last = np.searchsorted(frame_row, (image.row, image.row + 1))
-        seen = point[first:last]
-        pose = poses.cam_from_world[image.row]
-        xy = poses.camera.project(poses.points[seen] @ pose[:, :3].T + pose[:, 3])
+        seen = poses.visibility[poses.visibility[:, 0] == image.row, 1]
+        xy = poses.camera.project(transformed(poses.cam_from_world[image.row], poses.points[seen]))
         shown = np.isfinite(xy).all(1)
-        seen = seen[shown]
-        if not len(seen) or not len(image.xy):
+        if not shown.any() or not len(image.xy):
             continue
         gap, keypoint = cKDTree(image.xy).query(xy[shown])
-        seen = seen[gap < near_px]
+        seen = seen[shown][gap < near_px]
         sums[seen] += unit_descriptors(image.descriptor[keypoint[gap < near_px]])
         away = poses.points[seen] - centre[image.row]
         length = np.linalg.norm(away, axis=1)
         ray[seen] += away / length[:, None]
         distance[seen] += length
         number[seen] += 1
-    kept = np.argsort(-number, kind="stable")[:most]
+    kept = np.argsort(-number, kind="stable")[:DESCRIBED_POINTS]
     kept = np.sort(kept[number[kept] > 0])
     mean = distance[kept] / number[kept]
-    return described_points(poses.points[kept], sums[kept], ray[kept], mean, 0)
+    return described_points(poses.points[kept], sums[kept], ray[kept], mean)
+
+
+def transformed(b_from_a: Array, xyz: Array) -> Array:
+    """Transform points (N, 3) by a rigid transform (3, 4)."""
+    return np.asarray(xyz @ b_from_a[:, :3].T + b_from_a[:, 3])
 
 
 def described_points(
-    xyz: Array, descriptor: Floats, ray: Array, distance: Array, object_id: int
+    xyz: Array, descriptor: Floats, ray: Array, distance: Array, object_id: int = 0
 ) -> MapPoints:
     """Return points (n) of session 0 from sums of unit descriptors (n, 128) and rays (n, 3)."""
     return MapPoints(
@@ -177,22 +173,19 @@ def described_points(
     )
 
 
-def _largest(values: Floats, count: int, width: int = 64) -> IntArray:
+def _largest(values: Floats, count: int) -> IntArray:
     """Return the columns (n, count) of the largest of (n, N) values in each row, unordered.
 
-    They lie in the `count` blocks with the largest maxima: the rows are partitioned by block.
-
-    Args:
-        width: columns of a block; has no effect on the result.
+    They lie in the `count` blocks of columns with the largest maxima. (Partitioning whole rows of
+    15,000 takes eight times as long.)
     """
+    width = 64 if values.shape[1] > 64 * count else 1
     missing = -values.shape[1] % width
     blocks = np.pad(values, ((0, 0), (0, missing)), constant_values=-np.inf)
     blocks = blocks.reshape(len(values), -1, width)
-    if blocks.shape[1] <= count:
-        return np.argpartition(-values, count, axis=1)[:, :count]
-    chosen = np.argpartition(-blocks.max(2), count, axis=1)[:, :count]  # (n, count)
+    chosen = np.argpartition(-blocks.max(2), count - 1, axis=1)[:, :count]
     inside = np.take_along_axis(blocks, chosen[:, :, None], 1).reshape(len(values), -1)
-    best = np.argpartition(-inside, count, axis=1)[:, :count]
+    best = np.argpartition(-inside, count - 1, axis=1)[:, :count]
     return np.take_along_axis(chosen, best // width, 1) * width + best % width
 
 
@@ -282,7 +275,7 @@ class PointMatcher:
         )  # fmt: skip
         if estimate is None:
             return None
-        pose = np.asarray(estimate["cam_from_world"].matrix(), np.float64)
+        pose = np.array(estimate["cam_from_world"].matrix(), np.float64)
         inlier = np.asarray(estimate["inlier_mask"], bool)
         depth = xyz @ pose[2, :3] + pose[2, 3]
         away = xyz - invert_rigid(pose)[:, 3]  # a surface is seen from one side only
@@ -298,16 +291,15 @@ class PointMatcher:
         Similar: less than 30 degrees and a factor 1.5 apart, where SIFT is repeatable
         (Mikolajczyk et al., IJCV 2005).
         """
-        points = self.points
         camera = self.camera
-        in_cam = points.xyz @ cam_from_map[:, :3].T + cam_from_map[:, 3]
+        in_cam = transformed(cam_from_map, self.points.xyz)
         length = np.linalg.norm(in_cam, axis=1)
         z = np.where(in_cam[:, 2] > 1e-9, in_cam[:, 2], np.nan)
         xy = in_cam[:, :2] / z[:, None] @ camera.K[:2, :2].T + camera.K[:2, 2]
         inside = ((xy > 0) & (xy < (camera.width, camera.height))).all(1)
         ray = in_cam @ cam_from_map[:, :3] / length[:, None].clip(1e-9)  # in map axes
-        turned = (ray * points.viewing_ray).sum(1) > np.cos(np.radians(30))
-        near = np.abs(np.log(length.clip(1e-9) / points.distance.clip(1e-9))) < np.log(1.5)
+        turned = (ray * self.points.viewing_ray).sum(1) > np.cos(np.radians(30))
+        near = np.abs(np.log(length.clip(1e-9) / self.points.distance.clip(1e-9))) < np.log(1.5)
         return np.asarray(inside & turned & near, bool)
 
 
@@ -326,7 +318,7 @@ class Similarity:
     scale: float
     rotation: Array
     translation: Array
-    cov: Array
+    cov: Array = field(default_factory=lambda: np.zeros((7, 7)))
 
     def apply(self, xyz: Array) -> Array:
         """Transform points (..., 3)."""
@@ -339,18 +331,22 @@ class Similarity:
         return np.concatenate([rotation, moved[:, :, None]], 2)
 
 
+NOT_MOVED = Similarity(1.0, np.eye(3), np.zeros(3))
+
+
 @dataclass(frozen=True, slots=True)
 class ComponentPlacement:
     """How a component of the trajectory was placed in the map, or why it was not.
 
     Attributes:
-        similarity: None: refused. images: that agree. tried: images compared. reason: of a refusal.
+        tried: images compared. refused: the reason; "": placed. images: that agree.
+        similarity: to the world of the map.
     """
 
-    similarity: Similarity | None
-    images: tuple[LocatedImage, ...]
     tried: int
-    reason: str = ""
+    refused: str = ""
+    images: Sequence[LocatedImage] = ()
+    similarity: Similarity = NOT_MOVED
 
 
 def place_component(
@@ -364,30 +360,27 @@ def place_component(
     with ThreadPoolExecutor(2) as pool:
         located = [image for image in pool.map(matcher.locate, tried) if image is not None]
     needed = max(2, min(AGREEING, -(-len(tried) // 2)))
-    refused = partial(ComponentPlacement, None, (), len(tried))
+    refused = partial(ComponentPlacement, len(tried))
     if len(located) < needed:
-        return refused(
-            f"{len(located)} of {len(tried)} images match points of the map, {needed} are needed"
-        )
+        text = f"{len(located)} of {len(tried)} images match points of the map"
+        return refused(f"{text}, {needed} are needed")
     guess, agrees, rival = _agreement(poses, located)
-    agreeing = tuple(image for image, good in zip(located, agrees, strict=True) if good)
+    agreeing = [located[k] for k in np.flatnonzero(agrees)]
     count = f"{len(agreeing)} of {len(tried)} images agree on a position in the map"
-    if guess is not None and len(agreeing) >= needed:
+    if len(agreeing) >= needed:
         cam_from_map = guess.poses(poses.cam_from_world[[image.row for image in tried]])
         shows = sum(matcher.in_view(pose).sum() >= SHOWN for pose in cam_from_map)
         count += f", where {shows} should show points of it"
         needed = max(needed, int(np.ceil(CONFIRMED * shows)))
-    if guess is None or len(agreeing) < needed:
+    if len(agreeing) < needed:
         return refused(f"{count}, {needed} are needed")
     if rival >= max(2, RIVAL * len(agreeing)):
         return refused(f"two positions in the map are alike ({len(agreeing)} and {rival} images)")
     similarity = refine_similarity(guess, poses, agreeing, matcher.points.xyz)
-    return ComponentPlacement(similarity, agreeing, len(tried))
+    return ComponentPlacement(len(tried), "", agreeing, similarity)
 
 
-def _agreement(
-    poses: Poses, images: Sequence[LocatedImage]
-) -> tuple[Similarity | None, BoolArray, int]:
+def _agreement(poses: Poses, images: Sequence[LocatedImage]) -> tuple[Similarity, BoolArray, int]:
     """Find the similarity on which most images agree.
 
     Each pair of images with a baseline is a hypothesis: rotation of one, scale and translation of
@@ -408,15 +401,11 @@ def _agreement(
     length_a = np.linalg.norm(a[i] - a[j], axis=1)
     length_b = np.linalg.norm(b[i] - b[j], axis=1)
     usable = (length_b > 0.02 * depth[i]) & (length_a > 0)  # a shorter baseline gives no scale
-    chosen = np.flatnonzero(usable)
+    chosen = spread_over(np.flatnonzero(usable), 3000)  # hypotheses; more take longer
     if not len(chosen):
-        return None, np.zeros(len(images), bool), 0
-    if len(chosen) > 3000:  # hypotheses; more take longer
-        chosen = chosen[np.linspace(0, len(chosen) - 1, 3000).astype(int)]
+        return NOT_MOVED, np.zeros(len(images), bool), 0
     i = i[chosen]
-    length_a = length_a[chosen]
-    length_b = length_b[chosen]
-    scale = length_b / length_a  # (H,)
+    scale = length_b[chosen] / length_a[chosen]  # (H,)
     rotation = turn[i]
     shift = b[i] - scale[:, None] * np.einsum("hij,hj->hi", rotation, a[i])
     predicted = scale[:, None, None] * np.einsum("hij,lj->hli", rotation, a) + shift[:, None]
@@ -428,7 +417,7 @@ def _agreement(
     apart = np.linalg.norm(predicted - middle, axis=2).min(1) / np.median(depth) > 0.2
     other_turn = (np.einsum("hij,ij->h", rotation, rotation[best]) - 1) / 2 < np.cos(0.3)
     rival = int(good[apart | other_turn].sum(1).max(initial=0))
-    guess = Similarity(float(scale[best]), rotation[best], shift[best], np.zeros((7, 7)))
+    guess = Similarity(float(scale[best]), rotation[best], shift[best])
     return guess, good[best], rival
 
 
@@ -452,17 +441,16 @@ def refine_similarity(
     points = points[known]
     xy = xy[known]
 
-    def moved(x: Array) -> tuple[float, Array, Array]:
-        """Return the similarity with a correction about the origin applied."""
+    def corrected(x: Array) -> Similarity:
+        """Apply a correction (7,) about the origin: rotation vector, translation, log scale."""
         turn = Rotation.from_rotvec(x[:3]).as_matrix()
         grow = float(np.exp(x[6]))
-        rotation = turn @ guess.rotation
         translation = grow * turn @ (guess.translation - origin) + origin + x[3:6]
-        return guess.scale * grow, rotation, translation
+        return Similarity(guess.scale * grow, turn @ guess.rotation, translation)
 
     def residual(x: Array) -> Array:
-        scale, rotation, translation = moved(x)
-        in_session = (points - translation) @ rotation / scale
+        now = corrected(x)
+        in_session = (points - now.translation) @ now.rotation / now.scale
         in_cam = np.einsum("nij,nj->ni", pose[image][:, :, :3], in_session) + pose[image][:, :, 3]
         depth = np.where(in_cam[:, 2] > 1e-9, in_cam[:, 2], 1e-9)
         found = in_cam[:, :2] / depth[:, None] @ K[:2, :2].T + K[:2, 2]
@@ -484,23 +472,10 @@ def refine_similarity(
     bread = np.linalg.pinv(np.einsum("nij,nik->jk", J, J))
     independent = float((gradient**2).sum() / max((J**2).sum(), 1e-300))  # px^2
     common = float(np.trace(bread @ of_image.T @ of_image)) / 7  # px^2
-    few = len(images) / max(len(images) - 1, 1)
-    cov = bread * max(independent, few * common)
-    scale, rotation, translation = moved(fit.x)
-    return Similarity(scale, rotation, translation, about_origin(cov, origin))
-
-
-def about_origin(cov: Array, point: Array) -> Array:
-    """Convert the covariance of a small similarity about a point to that of one about the origin.
-
-    Args:
-        cov: (7, 7) of rotation vector, translation and log scale.
-    """
-    x, y, z = point
-    about = np.eye(7)
-    about[3:6, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
-    about[3:6, 6] = -point
-    return np.asarray(about @ cov @ about.T)
+    cov = bread * max(independent, len(images) / max(len(images) - 1, 1) * common)
+    about = np.eye(7)  # from a small similarity about the centre of the points to one about 0
+    about[3:6] = alignment_jacobian(-origin[None])[0]
+    return dataclasses.replace(corrected(fit.x), cov=about @ cov @ about.T)
 
 
 # ---- The recording -----------------------------------------------------------------------------
@@ -545,24 +520,29 @@ def place(
     error_px = ERROR_PX * max(max(camera.width, camera.height) / size_px, 1.0)
     matcher = PointMatcher(_matched(points), camera, error_px)
     components = list[ComponentPlacement]()
-    for part in range(poses.part_count):
-        of_part = [im for im in features if poses.part[im.row] == part and poses.known[im.row]]
-        tried = of_part[:: max(1, -(-len(of_part) // most))]
+    for k in range(poses.part_count):
+        usable = [im for im in features if poses.part[im.row] == k and poses.known[im.row]]
+        tried = usable[:: max(1, -(-len(usable) // most))]
         components.append(place_component(poses, tried, matcher))
         report(len(tried))
-    placed = [k for k, found in enumerate(components) if found.similarity is not None]
+    placed = [k for k, found in enumerate(components) if not found.refused]
     if not placed:
-        return Placement(poses, tuple(components), components[0].reason)
+        return Placement(poses, tuple(components), components[0].refused)
     return Placement(joined(poses, components, placed), tuple(components))
+
+
+def spread_over(rows: IntArray, most: int) -> IntArray:
+    """Choose rows at equal distances, `most` of them if there are more."""
+    if len(rows) <= most:
+        return rows
+    return np.asarray(rows[np.linspace(0, len(rows) - 1, most).astype(int)], np.int64)
 
 
 def _matched(points: MapPoints) -> MapPoints:
     """Choose MATCHED_POINTS spread over the map: those on no object, then the others."""
-    on_object = points.object_id > 0
-    chosen = list[IntArray]()
-    for rows in (np.flatnonzero(~on_object), np.flatnonzero(on_object)):
-        left = MATCHED_POINTS - sum(map(len, chosen))
-        chosen.append(rows[np.linspace(0, len(rows) - 1, min(left, len(rows))).astype(int)])
+    others = spread_over(np.flatnonzero(points.object_id <= 0), MATCHED_POINTS)
+    on_objects = np.flatnonzero(points.object_id > 0)
+    chosen = [others, spread_over(on_objects, MATCHED_POINTS - len(others))]
     return points[np.sort(np.concatenate(chosen))]
 
 
@@ -571,16 +551,14 @@ def joined(poses: Poses, components: Sequence[ComponentPlacement], placed: Seque
     cam_from_world = poses.cam_from_world.copy()
     points = poses.points.copy()
     part = np.zeros_like(poses.part)
-    others = [k for k in range(poses.part_count) if k not in placed]
-    for number, k in enumerate(others, 1):
+    for number, k in enumerate(sorted({*range(poses.part_count)} - {*placed}), 1):
         part[poses.part == k] = number
-    part_of_point = np.full(len(points), -1)
-    part_of_point[poses.visibility[:, 1]] = poses.part[poses.visibility[:, 0]]
+    observer, point = poses.visibility.T
     for k in placed:
         similarity = components[k].similarity
-        assert similarity is not None
         rows = poses.part == k
         cam_from_world[rows] = similarity.poses(cam_from_world[rows])
-        of_part = part_of_point == k if poses.part_count > 1 else np.ones(len(points), bool)
-        points[of_part] = similarity.apply(points[of_part])
+        # unobserved points belong to the only component
+        seen = point[rows[observer]] if poses.part_count > 1 else np.arange(len(points))
+        points[seen] = similarity.apply(points[seen])
     return dataclasses.replace(poses, cam_from_world=cam_from_world, points=points, part=part)

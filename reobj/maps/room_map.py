@@ -22,7 +22,6 @@ import numpy.typing as npt
 
 import quadrics
 from reobj import __version__
-from reobj.cameras import Camera
 from reobj.files import LockedError, columns_of, load_npz, locked, save_npz
 from reobj.types import (
     Array,
@@ -37,27 +36,27 @@ from reobj.types import (
     one_line,
 )
 
-HEADER = {"format": "reobj-map", "version": 1}
+FORMAT = "reobj-map"
+VERSION = 2  # 1 (of 0.2.0) has cameras of the sessions too
 # Dtypes in the file (and shapes of a row). float16 of a direction: 3e-4 rad; of a covariance it
 # would lose sigmas below 2e-4 and, by rounded correlations, the small variances.
-POINTS: dict[str, np.dtype[Any]] = {
-    "xyz": np.dtype(np.float32),
-    "descriptor": np.dtype(np.uint8),
-    "session": np.dtype(np.int32),
-    "object_id": np.dtype(np.int32),
-    "viewing_ray": np.dtype(np.float16),
-    "distance": np.dtype(np.float32),
+POINTS: dict[str, type[Any]] = {
+    "xyz": np.float32,
+    "descriptor": np.uint8,
+    "session": np.int32,
+    "object_id": np.int32,
+    "viewing_ray": np.float16,
+    "distance": np.float32,
 }
 IN_MEMORY = {"f": np.float64, "i": np.int64, "u": np.uint8}
-OBSERVATIONS: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {
-    "center": (np.dtype(np.float64), (3,)),
-    "half_axes": (np.dtype(np.float32), (3,)),
-    "quat_wxyz": (np.dtype(np.float32), (4,)),
-    "cov": (np.dtype(np.float32), (9, 9)),
+OBSERVATIONS: dict[str, tuple[type[Any], tuple[int, ...]]] = {
+    "center": (np.float64, (3,)),
+    "half_axes": (np.float32, (3,)),
+    "quat_wxyz": (np.float32, (4,)),
+    "cov": (np.float32, (9, 9)),
 }
-CONCATENATED: dict[str, np.dtype[Any]] = {
-    "foreground": np.dtype(np.float16), "background": np.dtype(np.float16),
-    "picture": np.dtype(np.uint8),
+CONCATENATED: dict[str, type[Any]] = {
+    "foreground": np.float16, "background": np.float16, "picture": np.uint8,
 }  # fmt: skip
 LOWER = np.tril_indices(9)  # entries of a covariance in the file
 Number = Annotated[int, msgspec.Meta(ge=1, lt=2**31)]  # of an object or a session
@@ -85,13 +84,13 @@ class Observation:
     session: Number
     status: Annotated[str, msgspec.Meta(pattern="^(new|stayed|moved|gone|not_seen)$")]
     support: str = ""
-    center: Array = field(default_factory=lambda: np.full(3, np.nan))
-    half_axes: Array = field(default_factory=lambda: np.full(3, np.nan))
-    quat_wxyz: Array = field(default_factory=lambda: np.full(4, np.nan))
-    cov: Array = field(default_factory=lambda: np.full((9, 9), np.nan))
+    center: Array = field(default_factory=np.full(3, np.nan).copy)
+    half_axes: Array = field(default_factory=np.full(3, np.nan).copy)
+    quat_wxyz: Array = field(default_factory=np.full(4, np.nan).copy)
+    cov: Array = field(default_factory=np.full((9, 9), np.nan).copy)
     classes: dict[str, NonNegativeFloat] = field(default_factory=dict)
-    foreground: Floats = field(default_factory=lambda: np.empty(0, np.float32))
-    background: Floats = field(default_factory=lambda: np.empty(0, np.float32))
+    foreground: Floats = field(default_factory=np.empty(0, np.float32).copy)
+    background: Floats = field(default_factory=np.empty(0, np.float32).copy)
     embedded: Int32 = 0
     views: Int32 = 0
     expected: Int32 = 0
@@ -128,7 +127,6 @@ class Session:
     Attributes:
         number: from 1, never used again. name: of the recording. date: ISO 8601, UTC.
         fingerprint: of the video's content. embedder: key of the embedding model.
-        camera: intrinsics. cam_from_map: (K, 3, 4) of frames that see the room, spread over it.
         metres_per_unit, scale_rel_sigma, scale_source: the scale of the map's world as this
             session measured it; source "none": it did not.
         alignment_cov: (7, 7) of the alignment of the session with the map: of the rotation vector
@@ -142,16 +140,12 @@ class Session:
     date: str
     fingerprint: str
     embedder: str
-    camera: Camera
-    cam_from_map: Array
     metres_per_unit: PositiveFloat = 1.0
     scale_rel_sigma: NonNegativeFloat = 0.0
     scale_source: Annotated[str, msgspec.Meta(pattern="^(poses|priors|known_size|none)$")] = "none"
-    alignment_cov: Array = field(default_factory=lambda: np.zeros((7, 7)))
+    alignment_cov: Array = field(default_factory=np.zeros((7, 7)).copy)
     localised_frames: Int32 = 0
     tried_frames: Int32 = 0
-
-    ARRAYS = ("cam_from_map", "alignment_cov")
 
     @property
     def scale(self) -> quadrics.Scale:
@@ -243,7 +237,7 @@ class RoomMap:
 
     def save(self, path: str | Path) -> None:
         """Write the file, atomically; the same map gives the same bytes."""
-        arrays, facts = _encoded(self)
+        arrays, facts = encoded(self)
         _decoded(arrays, facts)  # what could not be read again is not written
         save_npz(Path(path), arrays, **facts)
 
@@ -260,12 +254,16 @@ class RoomMap:
         if not path.is_file():
             raise ReobjError(f"{path}: no such map; `run VIDEO -o OUT --map {path}` makes it")
         _check_kind(path)
-        try:
-            arrays, facts = load_npz(path, sealed=True)
-        except ReobjError:
-            _check_header(path, load_npz(path)[1])
-            raise
-        _check_header(path, facts)
+        facts = load_npz(path)[1]
+        if facts.get("format") != FORMAT:
+            raise ReobjError(f"{path}: {ANOTHER_FILE}")
+        if facts.get("version") not in (1, VERSION):
+            raise ReobjError(
+                f"{path}: a map of format {facts.get('version')}, this version reads up to "
+                f"{VERSION}; it was written by reobj_track {facts.get('reobj_track')}: "
+                "update the tool"
+            )
+        arrays, facts = load_npz(path, sealed=True)
         try:
             return _decoded(arrays, facts)
         except (LookupError, TypeError, ValueError, msgspec.ValidationError) as error:
@@ -286,22 +284,14 @@ def _check_kind(path: Path) -> None:
             raise ReobjError(f"{path}: {ANOTHER_FILE}")
 
 
-def _check_header(path: Path, facts: dict[str, Any]) -> None:
-    """Refuse other files and other versions."""
-    if facts.get("format") != HEADER["format"]:
-        raise ReobjError(f"{path}: {ANOTHER_FILE}")
-    if facts.get("version") != HEADER["version"]:
-        raise ReobjError(
-            f"{path}: a map of format {facts.get('version')}, this version reads "
-            f"{HEADER['version']}; it was written by reobj_track {facts.get('reobj_track')}: "
-            "update the tool"
-        )
-
-
-def _encoded(room: RoomMap) -> tuple[dict[str, Any], dict[str, Any]]:
+def encoded(room: RoomMap) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the arrays of a map's file, and its JSON."""
-    origin = _origin(room.points.xyz)
-    columns = columns_of(room.points) | {"xyz": room.points.xyz - origin}
+    # In float32 coordinates of a map projection have a resolution of .5 m: points are relative to a
+    # multiple of 1024, which is 0 for a room near the origin of its world
+    xyz = room.points.xyz
+    origin = 1024 * np.round((np.median(xyz, 0) if len(xyz) else np.zeros(3)) / 1024)
+    origin += 0.0  # no -0
+    columns = columns_of(room.points) | {"xyz": xyz - origin}
     arrays: dict[str, Any] = {"points_origin": origin}
     arrays |= {f"points_{name}": columns[name].astype(kind) for name, kind in POINTS.items()}
     objects = sorted(room.objects, key=lambda found: found.id)
@@ -315,12 +305,15 @@ def _encoded(room: RoomMap) -> tuple[dict[str, Any], dict[str, Any]]:
         if name != "picture" or any(map(len, parts)):
             arrays[f"observation_{name}"] = np.concatenate([np.empty(0, kind), *parts])
             arrays[f"observation_{name}_length"] = np.array([*map(len, parts)], np.int32)
-    sessions = sorted(room.sessions, key=lambda session: session.number)
-    for s in sessions:
-        for name in Session.ARRAYS:
-            arrays[f"session{s.number}_{name}"] = np.asarray(getattr(s, name), np.float64)
-    facts = {
-        **HEADER,
+    sessions = []
+    for s in sorted(room.sessions, key=lambda session: session.number):
+        fields = columns_of(s)
+        arrays[f"session{s.number}_alignment_cov"] = fields.pop("alignment_cov")
+        sessions.append(fields)
+    omitted = {*OBSERVATIONS, *CONCATENATED}
+    return arrays, {
+        "format": FORMAT,
+        "version": VERSION,
         "reobj_track": __version__,
         "map_id": room.map_id,
         "metric": room.metric,
@@ -328,38 +321,21 @@ def _encoded(room: RoomMap) -> tuple[dict[str, Any], dict[str, Any]]:
         "next_id": room.next_id,
         "next_session": room.next_session,
         "merged": {str(old): room.merged[old] for old in sorted(room.merged)},
-        "sessions": [
-            _without(s, *Session.ARRAYS) | {"camera": dataclasses.asdict(s.camera)}
-            for s in sessions
-        ],
+        "sessions": sessions,
         "objects": [columns_of(o) | {"observations": len(o.observations)} for o in objects],
         "observations": [
-            _without(o, *OBSERVATIONS, *CONCATENATED) | {"classes": dict(sorted(o.classes.items()))}
+            {name: value for name, value in columns_of(o).items() if name not in omitted}
+            | {"classes": dict(sorted(o.classes.items()))}
             for o in rows
         ],
     }
-    return arrays, facts
-
-
-def _origin(xyz: Array) -> Array:
-    """Return the point (3,) to which the stored points are relative: a multiple of 1024.
-
-    In float32 coordinates of a map projection have a resolution of .5 m. The origin of a room near
-    that of its world is 0.
-    """
-    middle = np.median(xyz, 0) if len(xyz) else np.zeros(3)
-    return np.asarray(np.round(middle / 1024) * 1024 + 0.0)  # + 0: no -0
-
-
-def _without(record: Any, *names: str) -> dict[str, Any]:
-    """Return the fields of a dataclass other than some."""
-    return {name: value for name, value in columns_of(record).items() if name not in names}
 
 
 def _decoded(arrays: dict[str, Any], facts: dict[str, Any]) -> RoomMap:
     """Build a map from the content of its file."""
     points = {
-        name: arrays[f"points_{name}"].astype(IN_MEMORY[k.kind]) for name, k in POINTS.items()
+        name: (column := arrays[f"points_{name}"]).astype(IN_MEMORY[column.dtype.kind])
+        for name in POINTS
     }
     points["xyz"] += arrays["points_origin"]
     columns: dict[str, Any] = {
@@ -380,7 +356,7 @@ def _decoded(arrays: dict[str, Any], facts: dict[str, Any]) -> RoomMap:
     content = facts | {
         "points": points,
         "sessions": [
-            s | {name: arrays[f"session{s['number']}_{name}"] for name in Session.ARRAYS}
+            s | {"alignment_cov": arrays[f"session{s['number']}_alignment_cov"]}
             for s in facts["sessions"]
         ],
         "objects": [

@@ -15,11 +15,12 @@ import numpy as np
 import quadrics
 from reobj.cameras import Poses, import_pycolmap
 from reobj.files import Progress
-from reobj.maps.corrections import with_edits
+from reobj.maps.contents import earlier_sessions, with_edits
 from reobj.maps.fusion import scale_of
-from reobj.maps.listing import earlier_sessions
 from reobj.maps.object_points import object_views, triangulated
 from reobj.maps.placement import (
+    COMPARED,
+    MORE,
     ImageFeatures,
     Placement,
     image_features,
@@ -27,7 +28,7 @@ from reobj.maps.placement import (
     place,
     points_with_descriptors,
 )
-from reobj.maps.room_map import MapPoints, RoomMap, map_lock
+from reobj.maps.room_map import RoomMap, Session, map_lock
 from reobj.maps.update import Recording, add_recording
 from reobj.results.changes import Changes
 from reobj.results.entries import recording_name
@@ -102,9 +103,6 @@ def opened_map(config: MapConfig, must_exist: bool = False) -> Iterator[OpenMap 
         yield OpenMap(path, room, False, config.pictures)
 
 
-MORE_IMAGES = 200  # compared where fewer do not place a recording; more take longer
-
-
 @dataclass(frozen=True, slots=True)
 class Placed:
     """Cameras of a recording in the world of its map.
@@ -137,50 +135,38 @@ def place_recording(
     room = opened.room
     if not video.has_images:
         return Placed(poses, (), None)
-    rows = keyframe_rows(poses)
-    with progress("map features", 0) as line:
-        features = image_features(poses, video, rows, size_px, line)
-    if not room.sessions:
-        return Placed(dataclasses.replace(poses, map_id=room.map_id), tuple(features), None)
-    with progress("map", 0) as line:
-        placement = place(poses, features, room.points, size_px, report=line.step)
-    if placement.refused:  # the mapped part of the room may be in view for a short time
-        rows = np.flatnonzero(poses.known)
-        rows = np.union1d(rows[:: -(-len(rows) // MORE_IMAGES)], keyframe_rows(poses))
-        rows = np.setdiff1d(rows, [image.row for image in features])
+    keyframes = keyframe_rows(poses)
+    known = np.flatnonzero(poses.known)
+    # the mapped part of the room may be in view for a short time
+    dense = np.union1d(known[:: -(-len(known) // MORE)], keyframes)
+    features = list[ImageFeatures]()
+    for rows, most in ((keyframes, COMPARED), (dense, len(dense))):
+        missing = np.setdiff1d(rows, [image.row for image in features])
         with progress("map features", 0) as line:
-            features += image_features(poses, video, rows, size_px, line)
+            features += image_features(poses, video, missing, size_px, line)
         features.sort(key=lambda image: image.row)
+        if not room.sessions:
+            return Placed(dataclasses.replace(poses, map_id=room.map_id), tuple(features), None)
         with progress("map", 0) as line:
-            placement = place(poses, features, room.points, size_px, len(features), line.step)
+            placement = place(poses, features, room.points, size_px, most, line.step)
+        if not placement.refused:
+            break
     if placement.refused:
         return Placed(poses, tuple(features), placement)
-    return _placed(room, poses, tuple(features), placement)
-
-
-def _placed(
-    room: RoomMap, poses: Poses, features: tuple[ImageFeatures, ...], placement: Placement
-) -> Placed:
-    """Give the cameras of a recording that was placed the units and gravity of the map.
-
-    Args:
-        poses: before.
-    """
-    known = scale_of(room)
+    scale_of_map = scale_of(room)
     scale = None
     if poses.metric and not room.metric:
         best = placement.best
-        assert best.similarity is not None
         sigma = float(np.sqrt(best.similarity.cov[6, 6]))
-        known = scale = quadrics.Scale(1 / best.similarity.scale, sigma, "poses")
+        scale_of_map = scale = quadrics.Scale(1 / best.similarity.scale, sigma, "poses")
     moved = dataclasses.replace(
         placement.poses,
         metric=room.metric and placement.poses.part_count == 1,
-        scale=None if known.source == "none" else (known.value, known.rel_sigma),
+        scale=None if scale_of_map.source == "none" else scale_of_map[:2],
         up_in_world=room.up,
         map_id=room.map_id,
     )
-    return Placed(moved, features, placement, scale)
+    return Placed(moved, tuple(features), placement, scale)
 
 
 def move_models(
@@ -199,22 +185,17 @@ def move_models(
     placement = placed.placement
     if placement is None or placement.refused or not models:
         return list(models)
-    pc = import_pycolmap()
-    others = list[Path]()
-    placed_models = list[tuple[int, int]]()  # frames, component
-    for k, model in enumerate(models):
-        if placement.components[k].similarity is None:
-            others.append(model)
-        elif model.is_dir():
-            placed_models.append((int((poses.part == k).sum()), -k))
-    if not placed_models:
+    refused = [c.refused for c in placement.components]
+    others = [model for model, reason in zip(models, refused, strict=True) if reason]
+    mine = [k for k, model in enumerate(models) if not refused[k] and model.is_dir()]
+    if not mine:
         return others
-    largest = -max(placed_models)[1]
+    largest = max(mine, key=lambda k: int((poses.part == k).sum()))
     similarity = placement.components[largest].similarity
-    assert similarity is not None
     target = folder(largest)
     shutil.rmtree(target, ignore_errors=True)
     target.mkdir(parents=True)
+    pc = import_pycolmap()
     reconstruction = pc.Reconstruction(str(models[largest]))
     rotation = pc.Rotation3d(similarity.rotation)
     reconstruction.transform(pc.Sim3d(similarity.scale, rotation, similarity.translation))
@@ -239,14 +220,30 @@ def finish_map(
         placed: None: the cameras are those of the last run, with the points that the map has.
         before: of the last run if `placed` is None; a frozen map does not have its alignment.
     """
-    if refused := _refusal(opened, result.poses, video, placed):
-        return _refused(opened, result, video, placed, refused)
     room = opened.room
+    placement = None if placed is None else placed.placement
+    if refused := _refusal(opened, result, video, placed):
+        kept = "the map is unchanged, the objects lack its numbers"
+        text = f"{refused}; {kept}" if room.sessions else f"not made: {refused}"
+        tried = 0 if placement is None else sum(c.tried for c in placement.components)
+        return dataclasses.replace(
+            result,
+            changes=Changes(str(opened.path), session_name(video), refused, 0, tried),
+            warnings=[*result.warnings, f"map {opened.path}: {text}"],
+        )
+    assert result.poses is not None
     if result.edits is not None:
         room = with_edits(room, result.edits)
     recording = _recording(opened, result, video, embedder, placed, before)
-    if placed is not None and video.has_images:
-        recording = _with_object_points(recording, result, video, progress, opened.frozen)
+    old = room.session_of(recording.session.fingerprint)
+    if placed is not None:
+        objects = [o for o in result.located if o.part == 0]
+        with progress("object features", 0) as line:
+            views = object_views(objects, result.poses, result.tracks, video, line)
+        recording = dataclasses.replace(recording, views=views)
+        if not opened.frozen:
+            points = triangulated(objects, views, result.poses)
+            recording = dataclasses.replace(recording, object_points=points)
     if opened.pictures and not opened.frozen:
         pictures = None
         if video.has_images and not video.is_live:
@@ -254,7 +251,6 @@ def finish_map(
         recording = dataclasses.replace(recording, pictures=pictures)
     new_room, numbered = add_recording(room, result, recording)
     warnings = list(numbered.warnings)
-    old = room.session_of(recording.fingerprint)
     if old is not None and placed is not None:  # perhaps a copy under another name
         replaced = "" if opened.frozen else ", which is replaced"
         text = f"it has this recording as session {old.number} ({old.name}){replaced}"
@@ -265,57 +261,24 @@ def finish_map(
         except ReobjError as error:
             text = f"map {error}; the results are complete, but the map lacks this recording"
             warnings.append(text)
-    earlier = earlier_sessions(new_room, opened.path, recording.fingerprint)
+    earlier = earlier_sessions(new_room, opened.path, recording.session.fingerprint)
     return dataclasses.replace(numbered, earlier=earlier, warnings=warnings)
 
 
-def _with_object_points(
-    recording: Recording,
-    result: Result,
-    video: Video,
-    progress: Callable[[str, int], Progress],
-    frozen: bool,
-) -> Recording:
-    """Add features in the boxes of objects, and the points that they give to a map that learns."""
-    assert result.poses is not None
-    objects = [o for o in result.located if o.part == 0]
-    with progress("object features", 0) as line:
-        views = object_views(objects, result.poses, result.tracks, video, line)
-    points = MapPoints.empty() if frozen else triangulated(objects, views, result.poses)
-    return dataclasses.replace(recording, views=tuple(views), object_points=points)
-
-
-def _refusal(opened: OpenMap, poses: Poses | None, video: Video, placed: Placed | None) -> str:
+def _refusal(opened: OpenMap, result: Result, video: Video, placed: Placed | None) -> str:
     """Say why a recording is not in the world of the map; "" if it is."""
     if placed is not None and placed.placement is not None and placed.placement.refused:
         return (
             f"this is not the room of {opened.path.name}, or nothing in view matches it: "
             f"{placed.placement.refused}"
         )
-    if poses is None or not poses.known.any():
+    if result.poses is None or not result.poses.known.any():
         return "the recording has no camera poses"
     if not video.has_images and placed is not None:
         return "a recording without images cannot be placed in a map"
-    if poses.map_id != opened.room.map_id:
+    if result.poses.map_id != opened.room.map_id:
         return "its cameras were not placed in this map; run the video again with --map"
     return ""
-
-
-def _refused(
-    opened: OpenMap, result: Result, video: Video, placed: Placed | None, refused: str
-) -> Result:
-    """Return the result of a recording that is not in the world of the map."""
-    text = f"map {opened.path}: {refused}; the map is unchanged, the objects lack its numbers"
-    if not opened.room.sessions:
-        text = f"map {opened.path}: not made: {refused}"
-    tried = 0
-    if placed is not None and placed.placement is not None:
-        tried = sum(c.tried for c in placed.placement.components)
-    return dataclasses.replace(
-        result,
-        changes=Changes(str(opened.path), session_name(video), refused, 0, tried),
-        warnings=[*result.warnings, text],
-    )
 
 
 def session_name(video: Video) -> str:
@@ -348,44 +311,41 @@ def _recording(
     room = opened.room
     key = session_key(video)
     old = room.session_of(key)
-    first = min((s.number for s in room.sessions), default=0)
-    recording = Recording(
-        opened.path, session_name(video), key, embedder, np.zeros((7, 7)), 0, 0,
-        quadrics.Scale(1.0, np.inf, "none"), None,
-        placed_by="" if not first or (old is not None and old.number == first) else "points",
-    )  # fmt: skip
-    changed = partial(dataclasses.replace, recording)
+    session = Session(1, session_name(video), "", key, embedder)
+    changed = partial(dataclasses.replace, session)
+    placed_by = "" if not room.sessions or old is room.sessions[0] else "points"
     if placed is None:
         if old is not None:
-            return changed(
-                alignment_cov=old.alignment_cov, localised_frames=old.localised_frames,
-                tried_frames=old.tried_frames, scale=old.scale,
+            session = dataclasses.replace(old, name=session.name, embedder=embedder)
+        elif before is not None:
+            sigma = (before.sigma_m or 0.0) / scale_of(room).value  # of a vector
+            session = changed(
+                alignment_cov=np.diag([0, 0, 0, 1, 1, 1, 0]) * sigma**2 / 3,
+                localised_frames=before.localised_frames, tried_frames=before.tried_frames,
             )  # fmt: skip
-        if before is None:
-            return recording
-        sigma = (before.sigma_m or 0.0) / scale_of(room).value  # of a vector
-        return changed(
-            alignment_cov=np.diag([0, 0, 0, 1, 1, 1, 0]) * sigma**2 / 3,
-            localised_frames=before.localised_frames, tried_frames=before.tried_frames,
-            placed_by=before.placed_by, moved=before.moved,
+            placed_by = before.placed_by
+        return Recording(opened.path, session, placed_by)
+    if placed.placement is None:
+        count = len(placed.features)
+        session = changed(localised_frames=count, tried_frames=count)
+        scale = quadrics.Scale(1.0, 0.0, "poses") if placed.poses.metric else result.world.scale
+    else:
+        best = placed.placement.best
+        session = changed(
+            alignment_cov=best.similarity.cov, localised_frames=len(best.images),
+            tried_frames=best.tried,
         )  # fmt: skip
-    poses = placed.poses
-    row_of = {int(row): k for k, row in enumerate(np.flatnonzero(poses.part == 0))}
+        scale = placed.scale or (None if old is None else old.scale)
+    if scale is not None:
+        sigma = float(scale.rel_sigma) if np.isfinite(scale.rel_sigma) else 0.0
+        session = dataclasses.replace(
+            session, metres_per_unit=float(scale.value), scale_rel_sigma=sigma,
+            scale_source=scale.source,
+        )  # fmt: skip
+    poses = placed.poses.of_part(0)
+    row_of = {int(row): k for k, row in enumerate(np.flatnonzero(placed.poses.part == 0))}
     features = [
         dataclasses.replace(f, row=row_of[f.row]) for f in placed.features if f.row in row_of
     ]
-    points = points_with_descriptors(poses.of_part(0), features)
-    count = len(placed.features)
-    if placed.placement is None:
-        scale = quadrics.Scale(1.0, 0.0, "poses") if poses.metric else result.world.scale
-        return changed(
-            localised_frames=count, tried_frames=count, points=points,
-            scale=scale or recording.scale,
-        )  # fmt: skip
-    best = placed.placement.best
-    assert best.similarity is not None
-    return changed(
-        alignment_cov=best.similarity.cov, localised_frames=len(best.images),
-        tried_frames=best.tried, points=points,
-        scale=placed.scale or (recording.scale if old is None else old.scale),
-    )  # fmt: skip
+    points = points_with_descriptors(poses, features)
+    return Recording(opened.path, session, placed_by, points)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 import quadrics
 from reobj.cameras import VisiblePoints, invert_rigid, undistort_boxes
-from reobj.maps.compare import Visibility
 from reobj.maps.fusion import ObjectState, alignment_jacobian, shapes_of
 from reobj.objects.observations import entry_depths
 from reobj.results.result import Object, Result
@@ -33,6 +33,31 @@ LEAST_POINTS = 3
 # Largest standard deviation of the centre, over the mean half axis: with more, a detection of the
 # object may lie beside its projection
 MOST_SPREAD = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Visibility:
+    """How the cameras of the recording saw the places of the N objects of the map.
+
+    Views less than 10 degrees apart fail together and count once.
+
+    Attributes:
+        expected: (N,) independent views in which the object would be in the image and unoccluded.
+        seen_through: (N,) of those, views that show what is behind the object (sparse points on
+            rays through its middle), or views besides a first one that show its surroundings.
+        vague: (N,) the position in the map is too uncertain to know what a view shows.
+        detected: (N,) of the expected ones, views in which a detection may show the object; a
+            fraction if some of the views that count as one have one.
+        accident: (N,) log probability that these detections lie there by accident.
+        unlocated: (N,) as `detected`, by detections that belong to no object of the recording.
+    """
+
+    expected: Array
+    seen_through: Array
+    vague: BoolArray
+    detected: Array
+    accident: Array
+    unlocated: Array
 
 
 def visibility_of(
@@ -71,23 +96,21 @@ def visibility_of(
     large = np.sqrt(area) * 640 / max(size) >= LEAST_PX
     large &= area >= IN_VIEW * np.maximum(_area(whole), 1e-9)
     visible = VisiblePoints(poses)
-    expected = np.zeros((len(rows), len(states)), bool)
-    through = np.zeros((len(rows), len(states)), bool)
-    around = np.zeros((len(rows), len(states)), bool)
-    behind: list[set[int]] = [set() for _ in states]
+    expected, through, around = np.zeros((3, len(rows), len(states)), bool)
+    behind = np.zeros((len(states), len(poses.points)), bool)  # points behind, in any view
     for v, row in enumerate(rows.tolist()):
         shown = np.flatnonzero(large[v])
         shown = shown[~_behind_objects(shapes[shown], boxes[v, shown], nearer, cameras[v])]
         points = visible.in_frame(row)
-        occluded, beside, seen = _points_around(
+        occluded, beside, beyond = _points_around(
             shapes[shown], boxes[v, shown], poses.points[points], cameras[v], centre[v]
         )
-        expected[v, shown[~occluded]] = True
-        around[v, shown[~occluded & beside]] = True
-        for k, inside in zip(shown.tolist(), seen, strict=True):
-            through[v, k] = bool(len(inside)) and expected[v, k]
-            behind[k].update(points[inside].tolist() if expected[v, k] else ())
-    through[:, [len(ids) < LEAST_POINTS for ids in behind]] = False
+        clear = shown[~occluded]
+        expected[v, clear] = True
+        around[v, clear] = beside[~occluded]
+        through[v, clear] = beyond[~occluded].any(1)
+        behind[np.ix_(clear, points)] |= beyond[~occluded]
+    through[:, behind.sum(1) < LEAST_POINTS] = False
     jacobian = alignment_jacobian(shapes.center_in_world)
     cov = np.array([s.cov[:3, :3] for s in states]).reshape(-1, 3, 3)
     cov = cov + jacobian @ alignment_cov @ jacobian.swapaxes(1, 2)
@@ -193,8 +216,8 @@ def _behind_objects(
 
 def _points_around(
     shapes: quadrics.Ellipsoids, box: Array, points: Array, camera: Array, centre: Array
-) -> tuple[BoolArray, BoolArray, list[IntArray]]:
-    """Mark shapes that points occlude or surround, and find points behind shapes.
+) -> tuple[BoolArray, BoolArray, BoolArray]:
+    """Mark shapes that points occlude or surround, and points behind shapes.
 
     Args:
         box: (n, 4) projected. points: (P, 3) that the image shows. centre: (3,) of the camera.
@@ -202,43 +225,30 @@ def _points_around(
         occluded: (n,) at least five points lie on rays through the middle of the object, most of
         them before it. beside: (n,) at least three points lie in the box enlarged by its size on
         each side, not nearer than the object, and no more lie before it: nothing large stands
-        there. behind: for each object the points (k,) behind it on rays through its
-        middle; none if as many lie on it or before it.
+        there. behind: (n, P) points behind it on rays through its middle; none if as many lie on it
+        or before it.
     """
-    occluded = np.zeros(len(shapes), bool)
-    beside = np.zeros(len(shapes), bool)
-    through = [np.empty(0, np.int64) for _ in range(len(shapes))]
-    projected = points @ camera[:, :3].T + camera[:, 3]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        xy = projected[:, :2] / projected[:, 2:]
-    for k in range(len(shapes)):
-        middle = (box[k, :2] + box[k, 2:]) / 2
-        side = box[k, 2:] - box[k, :2]
-        depth = projected[:, 2]
-        near = np.flatnonzero((np.abs(xy - middle) < 1.5 * side).all(1) & (depth > 0))
-        front = shapes.center_in_world[k] @ camera[2, :3] + camera[2, 3]
-        front -= float(shapes.half_axes[k].max())
-        beyond = int((depth[near] > front).sum())
-        beside[k] = beyond >= 3 and len(near) - beyond <= beyond
-        half = 0.7 * side / 2  # beside it the ray may miss the object
-        inside = np.flatnonzero((np.abs(xy - middle) < half).all(1) & (depth > 0))
-        if not len(inside):
-            continue
-        scaled = shapes.world_from_obj[k] / shapes.half_axes[k]
-        start = (centre - shapes.center_in_world[k]) @ scaled
-        along = (points[inside] - centre) @ scaled  # the point is at 1
-        a = (along**2).sum(1)
-        b = along @ start
-        square = float(start @ start)
-        hit = b**2 - a * (square - 1)
-        root = np.sqrt(hit.clip(0))
-        enter = (-b - root) / a
-        leave = (-b + root) / a
-        crosses = (square - b**2 / a < 0.6**2) & (leave > 0)  # through its middle
-        behind = crosses & (leave < 1 - 0.05)  # errors of depth
-        before = crosses & (enter > 1 + 0.05)
-        others = crosses & ~behind
-        occluded[k] = before.sum() >= 5 and before.sum() > 0.5 * crosses.sum()
-        if behind.sum() > others.sum():
-            through[k] = inside[behind]
-    return occluded, beside, through
+    in_cam = points @ camera[:, :3].T + camera[:, 3]  # (P, 3)
+    depth = np.where(in_cam[:, 2] > 0, in_cam[:, 2], np.nan)
+    xy = in_cam[:, :2] / depth[:, None]
+    middle = (box[:, :2] + box[:, 2:]) / 2
+    off = np.abs(xy - middle[:, None]) / (box[:, 2:] - box[:, :2])[:, None]  # (n, P, 2) of its size
+    near = (off < 1.5).all(2)
+    front = shapes.center_in_world @ camera[2, :3] + camera[2, 3] - shapes.half_axes.max(1)
+    beyond = (near & (depth > front[:, None])).sum(1)
+    beside = (beyond >= 3) & (near.sum(1) <= 2 * beyond)
+    scaled = shapes.world_from_obj / shapes.half_axes[:, None]  # (n, 3, 3): to unit spheres
+    start = np.einsum("ni,nij->nj", centre - shapes.center_in_world, scaled)
+    along = np.einsum("pi,nij->npj", points - centre, scaled)  # the point is at 1
+    a = (along**2).sum(2)  # (n, P)
+    b = np.einsum("npj,nj->np", along, start)
+    square = (start**2).sum(1)[:, None]
+    root = np.sqrt((b**2 - a * (square - 1)).clip(0))
+    leave = (root - b) / a
+    crosses = (square - b**2 / a < 0.6**2) & (leave > 0)  # through its middle
+    crosses &= (off < 0.35).all(2)  # beside the box's middle the ray may miss the object
+    behind = crosses & (leave < 1 - 0.05)  # errors of depth
+    before = (crosses & (-(b + root) / a > 1 + 0.05)).sum(1)
+    total = crosses.sum(1)
+    behind[2 * behind.sum(1) <= total] = False
+    return (before >= 5) & (2 * before > total), beside, behind

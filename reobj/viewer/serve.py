@@ -179,7 +179,7 @@ class Corrections:
 
     Args:
         command: program and first arguments that run the tool. find_map: returns the map of the
-            folder, a `reobj.maps.corrections.FolderMap`; None: it has none.
+            folder, a `reobj.maps.contents.FolderMap`; None: it has none.
     """
 
     def __init__(self, out: Path, command: Sequence[str], find_map: Callable[[], Any]) -> None:
