@@ -16,7 +16,7 @@ from typing import Any
 PAGE = Path(__file__).parent / "api.md"
 DEFAULT = 24  # characters of a default value that is shown
 INTERNAL = set(
-    "cached cameras_text cells clip_segments cut fault flush frozen keep_embeddings selects "
+    "cached cameras_text cells cut fault flush frozen keep_embeddings selects "
     "look maps masked run_conv_block span_text to_json trained updated".split()
 )  # methods for the tool itself
 

@@ -297,12 +297,11 @@ def draw_wireframes(
     """
     ends, edge, front = frames.segments(cam_from_world)
     straight = scale * (ends @ camera.K.T)[..., :2] / ends[..., 2:]  # (n, 2, 2) undistorted
-    clipped = camera.clip_segments(ends)
-    within = np.asarray(np.isfinite(clipped).all((1, 2)), bool)  # (n,)
     pieces = 1 if camera.model == "PINHOLE" else 8  # segments of an edge: 8 look smooth
     fraction = np.linspace(0, 1, pieces + 1)[:, None]  # (B + 1, 1)
-    line = clipped[:, :1] + fraction * (clipped[:, 1:] - clipped[:, :1])  # (n, B + 1, 3)
+    line = ends[:, :1] + fraction * (ends[:, 1:] - ends[:, :1])  # (n, B + 1, 3)
     pixels = scale * camera.project(line) - 0.5  # OpenCV draws with the pixel's centre at 0
+    within = np.asarray(np.isfinite(pixels).all((1, 2)), bool)  # (n,)
     solid = frames.solid[edge]  # (n,)
     wanted = [k for k in np.unique(solid).tolist() if drawn[k]]
     for k in sorted(wanted, key=lambda k: -ends[solid == k, :, 2].mean()):  # nearest last

@@ -9,6 +9,7 @@ without one the frames of the files of poses and detections.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from reobj.cameras import WORLD_MAX, Camera, Poses, camera_parameters, invert_rigid
+from reobj.cameras import Camera, Poses, invert_rigid
 from reobj.files import spans
 from reobj.formats import AUTO, Format, Probe, Registry, frames_by_name
 from reobj.poses.estimate import PosesConfig
@@ -30,11 +31,9 @@ from reobj.poses.intrinsics import (
 from reobj.poses.supplied import pose_formats as formats
 from reobj.poses.supplied.check import Supplied
 from reobj.poses.supplied.frame_assignment import (
-    FrameAssignment,
     SourceFrames,
     assign,
     by_numbers,
-    by_order,
     interpolated,
     numbers_of_names,
     numbers_of_times,
@@ -81,78 +80,52 @@ def read_supplied(video: Any, config: PosesConfig) -> Supplied:
     """Read poses as `read_poses` does, with what `check` needs to name a mistake."""
     path = Path(config.mode)
     size = (int(video.size[0]), int(video.size[1]))
-    pose_file = read_pose_file(path, config.fmt, size)
+    file = read_pose_file(path, config.fmt, size)
     stated = parse_camera(config.camera, size, config.camera_format)
-    if stated is None and not any(pose_file.cameras):
+    if stated is None and not any(file.cameras):
         raise ReobjError(f"{path}: no intrinsics; add --camera {CAMERA_FORMS}")
     source = source_of(video)
-    stamps_s = None
-    if pose_file.stamps is not None:
-        stamps_s = seconds_of(pose_file.stamps, pose_file.unit)
-    assignment = assign(pose_file, stamps_s, source, str(path), config.frames_by)
+    stamps_s = None if file.stamps is None else seconds_of(file.stamps, file.unit)
+    assignment = assign(file, stamps_s, source, str(path), config.frames_by)
     row = assignment.row
-    turns = turns_of(source, size, pose_file.cameras, row) if pose_file.stored_pixels else {}
-    cameras = pose_file.cameras
-    if len(cameras) == len(pose_file.cam_from_world) > 1:  # those of the frames
-        used = [(f, r) for f, r in enumerate(row.tolist()) if r >= 0]
-        cameras = tuple(turned(cameras[r], turns.get(f)) for f, r in used)
+    used = np.flatnonzero(row >= 0)  # (n,)
+    cam_from_world = np.where((row >= 0)[:, None, None], file.cam_from_world[row], np.nan)
+    if assignment.key == "time" and stamps_s is not None:
+        between, use = interpolated(file.cam_from_world, stamps_s, source.time_s)
+        cam_from_world[use & (row >= 0)] = between[row[use] >= 0]
+    if file.stored_pixels:
+        _refuse_turned(source, size, file, row)
+    cameras = file.cameras
+    if len(cameras) == len(file.cam_from_world) > 1:  # those of the frames
+        cameras = tuple(cameras[r] for r in row[used])
     camera = stated or one_camera(cameras, path, size)
-    cam_from_world = _of_frames(pose_file.cam_from_world, assignment, source, stamps_s)
-    if (np.abs(cam_from_world) >= WORLD_MAX).any():
-        raise ReobjError(f"{path}: a camera is more than {WORLD_MAX:g} units away from the origin")
-    for f, turn in turns.items():
-        cam_from_world[f, :2] = turn @ cam_from_world[f, :2]
     known = np.asarray(np.isfinite(cam_from_world).all((1, 2)), bool)
-    metric = config.metric or pose_file.metric is not False
-    is_assumed = pose_file.metric is None and not config.metric
+    metric = config.metric or file.metric is not False
     if metric:
         _check_units(cam_from_world, path)
-    frame_of = np.full(len(pose_file.cam_from_world), -1)
-    frame_of[row[row >= 0]] = np.flatnonzero(row >= 0)
-    seen = np.column_stack([frame_of[pose_file.visibility[:, 0]], pose_file.visibility[:, 1]])
-    poses = Poses(
-        camera, source.frame, source.time_s, cam_from_world,
-        np.where(known, "supplied", "none"), "user", metric=metric,
-        up_in_world=pose_file.up_in_world, points=pose_file.points, colors=pose_file.colors,
-        visibility=seen[seen[:, 0] >= 0],
-        messages=tuple(_messages(pose_file, path, source, known, len(turns))),
-        reading=f"{pose_file.kind}{METRES_ASSUMED * is_assumed}, frames by {assignment.rule}",
-    )  # fmt: skip
-    by_text = assignment.key == "order"
-    others = (
-        by_order(len(pose_file.cam_from_world), source, by_text)
-        if by_text or assignment.key == "text"
-        else []
-    )
-    orders = {
-        f"the {one.rule} (--set poses.frames_by={one.key})": _of_frames(
-            pose_file.cam_from_world, one, source
-        )
-        for one in others
-        if one.key != assignment.key
-    }
-    return Supplied(poses, pose_file.axes, orders)
-
-
-def _messages(
-    pose_file: PoseFile, path: Path, source: SourceFrames, known: BoolArray, turned: int
-) -> list[str]:
-    """List photos that were turned, frames (F,) without a pose, and poses of lost frames."""
-    messages = list(pose_file.messages)
-    if turned:
-        messages.append(f"{turned} photos have an EXIF orientation, which COLMAP ignores: its "
-                        "cameras are turned with them")  # fmt: skip
+    frame_of = np.full(len(file.cam_from_world), -1)
+    frame_of[row[used]] = used
+    seen = np.column_stack([frame_of[file.visibility[:, 0]], file.visibility[:, 1]])
+    assumed = METRES_ASSUMED * (file.metric is None and not config.metric)
     facts = []
     if not known.all():
         step = int(np.median(np.diff(source.frame))) if len(known) > 1 else 1
         without = spans(source.frame[~known].tolist(), step)
         facts.append(f"poses for {known.sum()} of {len(known)} frames, none for {without}")
-    if lost := int((~np.isfinite(pose_file.cam_from_world).all((1, 2))).sum()):
+    if lost := int((~np.isfinite(file.cam_from_world).all((1, 2))).sum()):
         facts.append(f"{lost} poses of lost frames (the identity, zeros, not finite)")
-    return messages + [f"{path}: {'; '.join(facts)}"] * bool(facts)
+    poses = Poses(
+        camera, source.frame, source.time_s, cam_from_world,
+        np.where(known, "supplied", "none"), "user", metric=metric,
+        up_in_world=file.up_in_world, points=file.points, colors=file.colors,
+        visibility=seen[seen[:, 0] >= 0],
+        messages=(*file.messages, *[f"{path}: {'; '.join(facts)}"] * bool(facts)),
+        reading=f"{file.kind}{assumed}, frames by {assignment.rule}",
+    )  # fmt: skip
+    return Supplied(poses, file.axes)
 
 
-LARGE_M, FAST_M = 100.0, 0.5  # radius of an indoor path, and of a step in it (chosen)
+LARGE_M, FAST_M = 100.0, 0.5  # radius of a path, and a step in it, that none has indoors
 
 
 def _check_units(cam_from_world: Array, path: Path) -> None:
@@ -168,7 +141,7 @@ def _check_units(cam_from_world: Array, path: Path) -> None:
         )
 
 
-MAX_SPREAD = 0.02  # focal lengths, over the images of one camera: autofocus (chosen)
+MAX_SPREAD = 0.02  # of focal lengths over the images of one camera, by autofocus
 
 
 def one_camera(cameras: Sequence[Camera | None], path: Path, size: tuple[int, int]) -> Camera:
@@ -180,95 +153,42 @@ def one_camera(cameras: Sequence[Camera | None], path: Path, size: tuple[int, in
         ReobjError: none, or they differ by more than MAX_SPREAD in focal length or principal point,
             or in model or size.
     """
-    found = sorted((c for c in cameras if c is not None), key=lambda c: c.params[0])
-    if not found:
-        raise ReobjError(f"{path}: no intrinsics; add --camera {CAMERA_FORMS}")
+    found = sorted(filter(None, cameras), key=lambda camera: camera.params[0])
     for camera in found:
         refuse_unusable(camera, str(path))
     kinds = sorted({f"{c.model} {c.width}x{c.height}" for c in found})
     K = np.array([camera.K for camera in found])  # (n, 3, 3)
     if len(kinds) > 1 or np.ptp(K, axis=0).max() > MAX_SPREAD * K[0, 0, 0]:
-        least, most = K[0, 0], K[-1, 0]
-        text = f"focal lengths {least[0]:.4g}-{most[0]:.4g}, centres {least[2]:.4g}-{most[2]:.4g}"
-        text = ", ".join(kinds[:3]) if len(kinds) > 1 else text
+        spread = f"focal lengths {K[0, 0, 0]:.4g}-{K[-1, 0, 0]:.4g}"
         raise ReobjError(
-            f"{path}: several different cameras took the frames ({text}); expected one: "
-            "give its intrinsics with --camera, or reconstruct with a single camera"
+            f"{path}: several different cameras took the frames ({', '.join(kinds[:3])}, {spread});"
+            " expected one: give its intrinsics with --camera, or reconstruct with a single camera"
         )
     return fitted_camera(found[len(found) // 2], size, str(path))
 
 
-def _of_frames(
-    cam_from_world: Array,
-    assignment: FrameAssignment,
-    source: SourceFrames,
-    stamps_s: Array | None = None,
-) -> Array:
-    """Return the poses (F, 3, 4) of the frames by one assignment, NaN where there is none."""
-    row = assignment.row
-    poses = np.where((row >= 0)[:, None, None], cam_from_world[row], np.nan)
-    if assignment.key == "time" and stamps_s is not None:
-        exact, use = interpolated(cam_from_world, stamps_s, source.time_s)
-        poses[use & (row >= 0)] = exact[row[use] >= 0]
-    return poses
+def _refuse_turned(
+    source: SourceFrames, size: tuple[int, int], file: PoseFile, row: IntArray
+) -> None:
+    """Refuse COLMAP's cameras of stored pixels: it ignores the EXIF orientation of photos.
 
-
-# ---- EXIF orientations: COLMAP's cameras are those of the stored pixels --------------------------
-
-# upright_from_stored (2, 2): of offsets from the middle of the image
-TURNS = {3: -np.eye(2), 6: np.array([[0.0, -1], [1, 0]]), 8: np.array([[0.0, 1], [-1, 0]])}
-
-
-def turns_of(
-    source: SourceFrames, size: tuple[int, int], cameras: Sequence[Camera | None], row: IntArray
-) -> dict[int, Array]:
-    """Return the turns (2, 2) of the photos with an EXIF orientation, by frame row.
-
-    A camera of the shape of the upright photos, where a turn by 90 deg changes it, is not turned.
+    A camera of the shape of the upright photos, where a turn by 90 deg changes it, is right.
 
     Args:
-        size: (w, h) of the upright photos.
-        cameras: of the stored pixels, of each pose. row: (F,) pose of each frame, -1: none.
+        size: (w, h) of the upright photos. row: (F,) pose of each frame, -1: none.
     """
-    turns: dict[int, Array] = {}
     for f in np.flatnonzero(row >= 0).tolist() if source.images else ():
         path = Path(source.images[int(source.frame[f])])
-        orientation = exif_orientation(path)
-        camera = cameras[row[f]]
-        if orientation == 1 or camera is None:
-            continue
-        if orientation not in TURNS:
+        camera = file.cameras[row[f]]
+        is_portrait = camera is not None and camera.width < camera.height
+        is_upright = exif_orientation(path) > 4 and size[0] != size[1]
+        is_upright &= is_portrait == (size[0] < size[1])
+        if exif_orientation(path) != 1 and not is_upright:
             raise ReobjError(
-                f"{path}: a mirrored EXIF orientation ({orientation}), which COLMAP ignores; store "
-                "the photos upright, without EXIF orientation, and reconstruct them again"
+                f"{path}: has an EXIF orientation, which COLMAP ignores: its cameras are those of "
+                "the stored pixels; store the photos upright, without EXIF orientation (`mogrify "
+                "-auto-orient`), and reconstruct them again"
             )
-        is_upright = size[0] != size[1] and (camera.width > camera.height) == (size[0] > size[1])
-        if orientation == 3 or not is_upright:
-            turns[f] = TURNS[orientation]
-    return turns
-
-
-def turned(camera: Camera | None, turn: Array | None) -> Camera | None:
-    """Return the camera of the turned images; turn: (2, 2) of TURNS, or None."""
-    if camera is None or turn is None:
-        return camera
-    names = camera_parameters(camera.model)
-    if unknown := [n for n in names if not re.fullmatch(r"[fc][xy]?|k\d?|p[12]|omega", n)]:
-        raise ReobjError(
-            f"a {camera.model} camera is not turned with the EXIF orientation of its photos "
-            f"({', '.join(unknown)}); store them upright and reconstruct them again"
-        )
-    values = dict(zip(names, camera.params, strict=True))
-    stored = np.array([camera.width, camera.height])
-    size = np.abs(turn @ stored).astype(int)
-    if "p2" in values:  # (p2, p1) r^2 + 2 ((p2, p1) x) x: a vector of the image
-        values["p2"], values["p1"] = turn @ [values["p2"], values["p1"]]
-    if "fx" in values:
-        values["fx"], values["fy"] = np.abs(turn @ [values["fx"], values["fy"]])
-    centre = turn @ (np.array([values["cx"], values["cy"]]) - stored / 2) + size / 2
-    values["cx"], values["cy"] = centre
-    width, height = size.tolist()
-    return Camera(camera.model, width, height, tuple(float(values[name]) for name in names))
 
 
 # ---- Formats -------------------------------------------------------------------------------------
@@ -280,20 +200,21 @@ def read_pose_file(path: Path, fmt: str, size: tuple[int, int]) -> PoseFile:
     Args:
         size: (w, h) of the images, for formats that do not state it.
     """
-    read = POSES.reader(path, fmt)
-    entry = next(one for one in POSES.formats if one.read is read)
+    entry = POSES.find(path, fmt)
     try:
-        found = read(path, size)
+        found = entry.read(path, size)
     except ReobjError as error:
         text = str(error)  # of a file beside it, or without a name
         raise ReobjError(text if str(path) in text else f"{path}: {text}") from None
     except Exception as error:  # files of other tools lack any key, or hold any type
         text = f"damaged, or no file of format {entry.name} ({error!r:.100})"
         raise ReobjError(f"{path}: {text}") from None
-    return _settled(found, entry, path)
+    metric = {METRES: True, UNKNOWN: False}.get(entry.units, found.metric)
+    kind = f"{entry.name} {found.kind}".strip()
+    return _without_lost(dataclasses.replace(found, metric=metric, kind=kind), path)
 
 
-def _settled(found: PoseFile, entry: Format[ReadPoses], path: Path) -> PoseFile:
+def _without_lost(found: PoseFile, path: Path) -> PoseFile:
     """Sort poses by their time stamps, without repeated ones, and remove those of lost frames.
 
     These are the identity in the axes of the file. It is a pose where it begins the path, where it
@@ -310,24 +231,19 @@ def _settled(found: PoseFile, entry: Format[ReadPoses], path: Path) -> PoseFile:
             messages += (f"{path}: {repeated} rows repeat a time stamp and are left out",)
         poses = poses[kept]
     identity = np.column_stack([found.axes, np.zeros(3)])
-    same: BoolArray = np.all(np.abs(poses - identity) < 1e-9, axis=(1, 2))  # (N,)
-    begins = same[:1].any() and not same[1:2].any()
-    if begins or (found.names and same.sum() == 1):
-        same[same.argmax()] = False
-    same &= not same.all()
-    poses = np.where(same[:, None, None], np.nan, poses)
+    lost: BoolArray = np.all(np.abs(poses - identity) < 1e-9, axis=(1, 2))  # (N,)
+    begins = lost[:1].any() and not lost[1:2].any()
+    if begins or (found.names and lost.sum() == 1):
+        lost[lost.argmax()] = False
+    poses = np.where((lost & ~lost.all())[:, None, None], np.nan, poses)
     if not np.isfinite(poses).all((1, 2)).any():
         raise ReobjError(f"{path}: no poses in it, or only those of lost frames")
-    return dataclasses.replace(
-        found, cam_from_world=poses, stamps=stamps, messages=messages,
-        metric={METRES: True, UNKNOWN: False}.get(entry.units, found.metric),
-        kind=f"{entry.name} {found.kind}".strip(),
-    )  # fmt: skip
+    return dataclasses.replace(found, cam_from_world=poses, stamps=stamps, messages=messages)
 
 
 def _head(probe: Probe) -> tuple[str, list[str], str]:
     """Return the header, and words and text of the first row, of a table; else "", [], ""."""
-    probe = Probe(formats.table_file(probe.path)) if probe.is_dir else probe
+    probe = Probe(formats._file(probe.path, *formats.TABLES)) if probe.is_dir else probe
     for k, line in enumerate(probe.lines):
         words = line.replace(",", " ").split()
         if words and all(map(formats.is_number, words)):
@@ -426,17 +342,7 @@ POSES: Registry[ReadPoses] = Registry("poses", "--pose-format", [
     Format("splatting", "3D Gaussian splatting: `cameras.json`",
            _has("cameras.json", "img_name", "position"), formats.read_splatting, NAME,
            UNKNOWN),
-    *(Format("", title, _has(name, *keys), None,
-             advice=f"write a COLMAP model with {tool}") for title, name, keys, tool in (
-        ("OpenSfM's reconstruction.json", "reconstruction.json", ["shots"],
-         "`opensfm export_colmap`"),
-        ("Meshroom's cameras.sfm", "cameras.sfm", ["views", "version"], "the node ExportColmap"),
-        ("openMVG's sfm_data.json", "sfm_data.json", ["sfm_data_version"],
-         "openMVG_main_openMVG2Colmap"),
-    )),
-    Format("", "Metashape's cameras.xml", lambda p: p.root is not None and p.root.tag == "document",
-           None, advice="export the cameras as COLMAP: File, Export, Export Cameras"),
-])  # fmt: skip
+], "; of other tools, export a COLMAP model")  # fmt: skip
 
 
 # ---- Without a video -----------------------------------------------------------------------------
@@ -459,35 +365,35 @@ def open_video(
         ReobjError: no video, and no file of detections, poses or size of the images either;
             options that need a video or camera poses.
     """
-    if poses.mode == "none" and (poses.depth or poses.metric):
-        raise ReobjError("--depth and --metric need camera poses, but --poses is none")
-    if isinstance(source, Video):
-        return source
+    is_file = isinstance(boxes, str | Path) and bool(boxes)
+    has_video = source is not None
+    for fault, text in (
+        (poses.mode == "none" and (poses.depth or poses.metric),
+         "--depth and --metric need camera poses, but --poses is none"),
+        (not has_video and poses.depth,
+         f"--depth {poses.depth}: depth maps are matched to images; name the video"),
+        (not has_video and (not is_file or poses.mode in ("auto", "none")),
+         "no video: name one, or use `run` without images: --detections FILE (or --tracks FILE), "
+         "--poses FILE and --camera MODEL WIDTH HEIGHT PARAMS, or a file"),
+        (not has_video and is_file and not Path(boxes).exists(), f"{boxes} does not exist"),
+    ):  # fmt: skip
+        if fault:
+            raise ReobjError(text)
     if source is not None:
-        return Video(source, config)
-    if poses.depth:
-        raise ReobjError(f"--depth {poses.depth}: depth maps are matched to images; name the video")
-    if not isinstance(boxes, str | Path) or not boxes or poses.mode in ("auto", "none"):
-        raise ReobjError(
-            "no video: name one, or use `run` without images: --detections FILE (or --tracks "
-            "FILE), --poses FILE and --camera MODEL WIDTH HEIGHT PARAMS, or a file"
-        )
+        return source if isinstance(source, Video) else Video(source, config)
     path = Path(boxes)
-    unknown = (1, 1)
-    if not path.exists():
-        raise ReobjError(f"{path} does not exist")
     detect = detect or DetectConfig()
     size = described_images(path, detect)[0]
-    stated = stated_camera(poses.camera, size, poses.camera_format)
-    size = size or (unknown if stated is None else (stated.width, stated.height))
-    pose_file = read_pose_file(Path(poses.mode), poses.fmt, size)
-    if size == unknown and (camera := next(filter(None, pose_file.cameras), None)) is not None:
+    if camera := stated_camera(poses.camera, size, poses.camera_format):
+        size = size or (camera.width, camera.height)
+    file = read_pose_file(Path(poses.mode), poses.fmt, size or (1, 1))
+    if size is None and (camera := next(filter(None, file.cameras), None)):
         size = (camera.width, camera.height)
-    if size == unknown:
+    if size in (None, (1, 1)):
         raise ReobjError(
             f"{poses.mode}: no image size in it; give --camera MODEL WIDTH HEIGHT PARAMS"
         )
-    video = _frames_of(pose_file, path, size, poses.mode, config, detect)
+    video = _frames_of(file, path, size, poses.mode, config, detect)
     video.messages.append(
         f"{NOTE_START}no images: {video.frame_count} frames of {size[0]}x{size[1]} from "
         f"{poses.mode} and {path}; tracked by motion and cameras alone, without appearance and "
@@ -497,7 +403,7 @@ def open_video(
 
 
 def _frames_of(
-    pose_file: PoseFile,
+    file: PoseFile,
     boxes: Path,
     size: tuple[int, int],
     source: str,
@@ -511,39 +417,37 @@ def _frames_of(
     frames, by these numbers. Poses without names: evenly spaced times from 0 on are numbers;
     otherwise each row is one frame.
     """
+    video = functools.partial(ImagelessVideo, source, size, config)
     _, given, times_s = described_images(boxes, detect)
     if times_s is not None:
-        return ImagelessVideo(source, size, config, times_s=times_s)
+        return video(times_s=times_s)
     named = {Path(name.replace("\\", "/")).name for name in given}
-    posed = {Path(name).name for name in pose_file.names}
+    posed = {Path(name).name for name in file.names}
     if named and posed and (frames_by_name(sorted(named), sorted(posed))[0] >= 0).all():
         named = posed  # all of the detections' images and more, with suffixes
     names = sorted_names(named or posed)
-    first = ImagelessVideo(source, size, config, names=names if named else ())
     unfiltered = dataclasses.replace(detect, min_score=0.0, classes="", max_detections=0)
+    first = video(names=names if named else ())
     count = int(read_detections(boxes, first, unfiltered).frame.max(initial=-1)) + 1
     if names and count > len(names):
         number = numbers_of_names(names, source)
         frames = SourceFrames(np.arange(count), np.arange(count) / 1.0, count)
         inside = [a for a in by_numbers(number, frames, "numbers") if not a.outside]
         if len(inside) != 1:
-            last = int(number.max()) + 1
-            return ImagelessVideo(source, size, config, count=count if inside else max(count, last))
+            return video(count=count if inside else max(count, int(number.max()) + 1))
         names = [names[row] if row >= 0 else "" for row in inside[0].row]
     if names:
-        return ImagelessVideo(source, size, config, names=names)
-    rows = len(pose_file.cam_from_world)
-    stamps = pose_file.stamps
-    if stamps is not None:
-        stamps_s = seconds_of(stamps, pose_file.unit)
+        return video(names=names)
+    rows = len(file.cam_from_world)
+    if file.stamps is not None:
+        stamps_s = seconds_of(file.stamps, file.unit)
         number = numbers_of_times(stamps_s)
-        times_s = np.interp(np.arange(number[-1] + 1), number, stamps_s)
-        rows = len(times_s)
+        rows = int(number[-1]) + 1
         if count <= rows:
-            return ImagelessVideo(source, size, config, times_s=times_s)
+            return video(times_s=np.interp(np.arange(rows), number, stamps_s))
     if count > rows:
         raise ReobjError(
             f"{boxes}: frame {count - 1}, but {source} has {rows} poses without names; expected a "
             "pose for each frame, or a CSV with a `timestamp`"
         )
-    return ImagelessVideo(source, size, config, count=rows)
+    return video(count=rows)
