@@ -197,35 +197,27 @@ def checked_pose(
         ReobjError: the pose is not rigid, or its camera, the points or `part` are invalid.
     """
 
-    def refuse(is_wrong: Any, text: str) -> None:
-        if is_wrong:
-            raise ReobjError(text)
-
-    refuse(
-        points is not None and (np.shape(points)[1:] != (3,) or not np.isfinite(points).all()),
-        f"points of shape {np.shape(points)}, expected (N, 3), finite, in world",
-    )
-    refuse(
-        not isinstance(part, int | np.integer) or not 0 <= part <= 1000,  # an hour has a few
-        f"part {part!r}, expected the number of a component, from 0",
-    )
+    if points is not None and (np.shape(points)[1:] != (3,) or not np.isfinite(points).all()):
+        raise ReobjError(f"points of shape {np.shape(points)}, expected (N, 3), finite, in world")
+    if not isinstance(part, int | np.integer) or not 0 <= part <= 1000:  # an hour's walk has a few
+        raise ReobjError(f"part {part!r}, expected the number of a component, from 0")
     if cam_from_world is None:
         return None
     pose = as_numbers(cam_from_world, "cam_from_world").astype(np.float64)
-    refuse(pose.shape != (3, 4), f"cam_from_world of shape {pose.shape}, expected (3, 4): [R | t]")
+    if pose.shape != (3, 4):
+        raise ReobjError(f"cam_from_world of shape {pose.shape}, expected (3, 4): [R | t]")
     if np.isnan(pose).any():
         return None
     rotation = pose[:, :3].clip(-2, 2)  # the squares of 1e300 are too large
     determinant = np.linalg.det(rotation)
     is_rotation = determinant > 0 and np.abs(rotation @ rotation.T - np.eye(3)).max() <= 1e-3
-    refuse(
-        not is_rotation or (np.abs(pose[:, 3]) > WORLD_MAX).any(),
-        f"cam_from_world: its 3x3 block is not a rotation (determinant {determinant:.2g}), or it "
-        f"is more than {WORLD_MAX:g} units away; expected [R | t], x right, y down, z forward",
-    )
-    if not isinstance(camera, Camera):
-        raise ReobjError("cam_from_world without a camera: give camera=rt.Camera(...) as well")
-    refuse(not usable(camera), f"{camera}: expected a size, and focal lengths above 0, in pixels")
+    if not is_rotation or (np.abs(pose[:, 3]) > WORLD_MAX).any():
+        raise ReobjError("cam_from_world: its 3x3 block is not a rotation (determinant "
+                         f"{determinant:.2g}), or it is more than {WORLD_MAX:g} units away; "
+                         "expected [R | t], x right, y down, z forward")  # fmt: skip
+    if not isinstance(camera, Camera) or not usable(camera):
+        raise ReobjError(f"cam_from_world with camera={camera}: expected rt.Camera(...) with a "
+                         "size, and focal lengths above 0, in pixels")  # fmt: skip
     return pose
 
 
@@ -565,29 +557,25 @@ def read_sparse_model(folder: Path) -> SparseModel:
     """Read a COLMAP model, binary or text, with pycolmap."""
     model = import_pycolmap().Reconstruction(str(folder))
     images = [model.image(i) for i in sorted(model.reg_image_ids())]
-    points = sorted(model.points3D.items())
-    row = {point_id: r for r, (point_id, _) in enumerate(points)}
+    ids, points = zip(*sorted(model.points3D.items()), strict=True) if model.points3D else ((), ())
+    row = {point_id: r for r, point_id in enumerate(ids)}
     seen = [
         (r, row[p.point3D_id], *p.xy)
         for r, image in enumerate(images)
         for p in image.get_observation_points2D()
     ]
     table = np.array(seen).reshape(-1, 4)
-    cameras = {
-        i: Camera(c.model.name, c.width, c.height, tuple(c.params.tolist()))
-        for i, c in model.cameras.items()
-    }
+    of_image = [model.cameras[image.camera_id] for image in images]
     poses = [image.cam_from_world().matrix() for image in images]
     return SparseModel(
-        names=tuple(image.name for image in images),
-        cameras=[cameras[image.camera_id] for image in images],
-        cam_from_world=np.array(poses).reshape(-1, 3, 4),
-        points=checked_points([point.xyz for _, point in points], list(row), folder),
-        colors=np.array([point.color for _, point in points], np.uint8).reshape(-1, 3),
-        track_length=np.array([point.track.length() for _, point in points], np.int64),
-        obs_image=table[:, 0].astype(np.int64),
-        obs_point=table[:, 1].astype(np.int64),
-        obs_xy=table[:, 2:],
+        tuple(image.name for image in images),
+        [Camera(c.model.name, c.width, c.height, tuple(c.params.tolist())) for c in of_image],
+        np.array(poses).reshape(-1, 3, 4),
+        checked_points([point.xyz for point in points], ids, folder),
+        np.array([point.color for point in points], np.uint8).reshape(-1, 3),
+        np.array([point.track.length() for point in points], np.int64),
+        *table[:, :2].T.astype(np.int64),
+        table[:, 2:],
     )
 
 
@@ -628,13 +616,10 @@ class VisiblePoints:
 
     def in_frame(self, row: int) -> IntArray:
         """Return the rows of the points in the image of a frame, ascending; none without a pose."""
-        if not self.poses.known[row]:
-            return np.empty(0, np.int64)
         points = self.nearby(row)
-        if len(self.observed(row)):
-            return points
-        size = (self.poses.camera.width, self.poses.camera.height)
-        image = np.array([[0.0, 0.0, *size]])
+        if not self.poses.known[row] or len(self.observed(row)):
+            return points[: None if self.poses.known[row] else 0]
+        image = np.array([[0.0, 0.0, self.poses.camera.width, self.poses.camera.height]])
         _, inside, _ = points_in_boxes(self.poses.points[points], self._img_from_world[row], image)
         return points[inside]
 

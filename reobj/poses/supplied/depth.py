@@ -22,7 +22,7 @@ from reobj.cameras import Camera, Poses, VisiblePoints, invert_rigid
 from reobj.files import load_json
 from reobj.poses.intrinsics import camera_of_keys
 from reobj.poses.supplied.frame_assignment import rows_by_time
-from reobj.poses.supplied.pose_formats import scannet_camera
+from reobj.poses.supplied.pose_formats import Size, scannet_camera
 from reobj.sources.image_files import read_image
 from reobj.types import Array, BoolArray, Floats, IntArray, ReobjError, log
 
@@ -130,7 +130,7 @@ def _last_number(text: str) -> str:
     return "".join(str(int(digits)) for digits in re.findall(r"\d+", text)[-1:])
 
 
-def _depth_camera(folder: Path, size: tuple[int, int], color: Camera) -> tuple[Camera, Array]:
+def _depth_camera(folder: Path, size: Size, color: Camera) -> tuple[Camera, Array]:
     """Find the intrinsics of the maps: in a file beside them, else those of the colour images.
 
     Returns:

@@ -94,8 +94,8 @@ def assign(
         first = file.names[:1] or ([] if stamps_s is None else stamps_s[[0, -1]].tolist())
         times = f"times {source.time_s[0]:.3f}-{source.time_s[-1]:.3f} s" * source.timed
         raise ReobjError(f"{where}: none of its {count} poses belongs to a frame ({first}; frames: "
-                         f"{source.images[:1] or times}); expected the frames' names or numbers, "
-                         "seconds of the same clock, or one row for each frame")  # fmt: skip
+                         f"{source.images[:1] or times}); expected seconds of the same clock, "
+                         "names or numbers of frames, or one row for each frame")  # fmt: skip
     if frames_by and frames_by not in kept:
         raise ReobjError(f"--set poses.frames_by={frames_by}: {where} can be read by "
                          f"{', '.join(kept)}")  # fmt: skip
@@ -268,17 +268,17 @@ def interpolated(
     """
     known = np.isfinite(cam_from_world).all((1, 2))
     stamps_s = stamps_s[known]
-    world_from_cam = invert_rigid(cam_from_world[known])
     if len(stamps_s) < 2:
         return np.empty((0, 3, 4)), np.zeros(len(time_s), bool)
+    turn, centre = np.split(invert_rigid(cam_from_world[known]), [3], 2)
     after = np.searchsorted(stamps_s, time_s, side="right").clip(1, len(stamps_s) - 1)  # (F,)
     start, end = stamps_s[after - 1], stamps_s[after]
     same_s = 5e-4  # times in files and containers are rounded to a ms
     use = (time_s - start > same_s) & (end - time_s > same_s) & (end - start <= max_step_s)
     at = time_s[use]
-    turn = Slerp(stamps_s, Rotation.from_matrix(world_from_cam[:, :, :3]))(at).as_matrix()
-    centre = [np.interp(at, stamps_s, axis) for axis in world_from_cam[:, :, 3].T]
-    return invert_rigid(np.concatenate([turn, np.transpose([centre], (2, 1, 0))], 2)), use
+    turns = Slerp(stamps_s, Rotation.from_matrix(turn))(at).as_matrix()
+    centres = np.transpose([np.interp(at, stamps_s, axis) for axis in centre[..., 0].T])
+    return invert_rigid(np.dstack([turns, centres])), use
 
 
 # ---- Order ---------------------------------------------------------------------------------------

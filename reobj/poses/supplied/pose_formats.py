@@ -39,6 +39,8 @@ from reobj.poses.intrinsics import (
 )
 from reobj.types import Array, IntArray, ReobjError
 
+Size = tuple[int, int]  # width, height of images, px
+
 # ---- Result of a reader, and checks of all readers -----------------------------------------------
 
 
@@ -213,7 +215,7 @@ def stated_metric(header: str) -> bool | None:
     return unit[1] == "metres" if unit else None
 
 
-def read_tum(path: Path, size: tuple[int, int]) -> PoseFile:
+def read_tum(path: Path, size: Size) -> PoseFile:
     """Read TUM rows: time, world_from_cam, w last. Column names in the header override this."""
     path = _file(path, *TABLES)
     rows, where, header = read_table(path, (8,))
@@ -224,13 +226,13 @@ def read_tum(path: Path, size: tuple[int, int]) -> PoseFile:
     )  # fmt: skip
 
 
-def read_ours(path: Path, size: tuple[int, int]) -> PoseFile:
+def read_ours(path: Path, size: Size) -> PoseFile:
     """Read an output folder of this tool: poses.txt, with the camera of sparse/."""
     cameras = read_sparse_model(path / "sparse").cameras[:1]
     return dataclasses.replace(read_tum(path, size), cameras=tuple(cameras))
 
 
-def read_euroc(path: Path, size: tuple[int, int]) -> PoseFile:
+def read_euroc(path: Path, size: Size) -> PoseFile:
     """Read EuRoC's CSV of 8 or 17 columns: ns, world_from_body, quaternion w first; metres.
 
     `T_BS` in the camera's sensor.yaml, beside it or in cam0 beside its folder, is body_from_cam;
@@ -240,20 +242,19 @@ def read_euroc(path: Path, size: tuple[int, int]) -> PoseFile:
     rows, where, header = read_table(path, (8, 17))
     columns = named_columns(header, rows.shape[1]) or [1, 2, 3, 5, 6, 7, 4]
     poses = invert_rigid(from_quaternions(rows[:, columns], where))
-    near = (path.parent, path.parent.parent / "cam0", path.parent / "cam0")
-    sensors = [read_yaml(s) for s in (f / "sensor.yaml" for f in near) if s.is_file()]
-    cameras = list[Camera | None]()
-    for sensor in [s for s in sensors if s.get("sensor_type", "camera") == "camera"][:1]:
-        matrix = np.array(sensor["T_BS"]["data"], np.float64).reshape(1, 4, 4)
-        poses = invert_rigid(checked_rigid(matrix, ["T_BS of sensor.yaml"])) @ homogeneous(poses)
-        cameras.append(camera_of_keys(sensor, size))
     text = (f"{path}: poses of the body, and no sensor.yaml with the camera's T_BS beside it: body "
             "taken for camera")  # fmt: skip
-    return PoseFile(poses, tuple(cameras), stamps=rows[:, 0], unit="ns",
-                    messages=(text,) * (not cameras))  # fmt: skip
+    for folder in (path.parent, path.parent.parent / "cam0", path.parent / "cam0"):
+        file = folder / "sensor.yaml"
+        sensor = read_yaml(file) if file.is_file() else {}
+        if sensor.get("sensor_type", "camera") == "camera" and "T_BS" in sensor:
+            matrix = np.array(sensor["T_BS"]["data"], np.float64).reshape(1, 4, 4)
+            poses = invert_rigid(checked_rigid(matrix, [str(file)])) @ homogeneous(poses)
+            return PoseFile(poses, (camera_of_keys(sensor, size),), stamps=rows[:, 0], unit="ns")
+    return PoseFile(poses, stamps=rows[:, 0], unit="ns", messages=(text,))
 
 
-def read_stray(path: Path, size: tuple[int, int]) -> PoseFile:
+def read_stray(path: Path, size: Size) -> PoseFile:
     """Read Stray Scanner's folder: odometry.csv, camera_matrix.csv; world_from_cam, y up, metres.
 
     OpenCV axes, quaternion x first, a row for each frame of rgb.mp4, numbered from 0.
@@ -268,7 +269,7 @@ def read_stray(path: Path, size: tuple[int, int]) -> PoseFile:
     return PoseFile(invert_rigid(poses), cameras, numbers, up_in_world=Y_UP)
 
 
-def _phone_camera(K: Array, size: tuple[int, int]) -> Camera:
+def _phone_camera(K: Array, size: Size) -> Camera:
     """Return the camera of a matrix K at the size of the frames, or the native one of ARKit.
 
     The principal point is near the middle of the right one.
@@ -278,14 +279,14 @@ def _phone_camera(K: Array, size: tuple[int, int]) -> Camera:
     return brown_camera(right, *K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist())
 
 
-def read_matrices(path: Path, size: tuple[int, int]) -> PoseFile:
+def read_matrices(path: Path, size: Size) -> PoseFile:
     """Read rows of 12 (KITTI) or 16 numbers (Replica, NICE-SLAM): world_from_cam, OpenCV axes."""
     rows, where, header = read_table(_file(path, *TABLES), (12, 16))
     poses = checked_rigid(rows.reshape(len(rows), -1, 4), where)
     return PoseFile(invert_rigid(poses), metric=stated_metric(header))
 
 
-def read_traj(path: Path, size: tuple[int, int]) -> PoseFile:
+def read_traj(path: Path, size: Size) -> PoseFile:
     """Read ARKitScenes' .traj: s, axis-angle, translation of cam_from_world; .pincam beside it."""
     path = next(iter(sorted(path.glob("*.traj"))), path) if path.is_dir() else path
     rows, where, _ = read_table(path, (7,))
@@ -307,26 +308,23 @@ def _listed(
     entries: dict[str, Any], read: Callable[[Any], Entry], axes: Array | None = None, **more: Any
 ) -> PoseFile:
     """Read entries, by their location, whose camera axes are these, by default OpenCV's."""
-    matrices = np.tile(np.eye(4).ravel(), (len(entries), 1))  # (N, 16)
     found = list[Entry]()
-    for row, (where, entry) in enumerate(entries.items()):
+    for where, entry in entries.items():
         try:
-            found.append(read(entry))
-            numbers = np.array(found[-1][0], np.float64).ravel()
-            matrices[row, : 12 if numbers.size == 12 else 16] = numbers
-        except ReobjError as error:
-            text = str(error)
+            numbers, camera, name = read(entry)
+            matrix = np.array(numbers, np.float64).reshape(-1, 4)
+            found.append((np.append(matrix, np.eye(4)[len(matrix) :], 0), camera, name))
+        except Exception as error:
+            text = f"no pose and camera as the format has them ({error!r:.100})"
+            text = str(error) if isinstance(error, ReobjError) else text
             raise ReobjError(text if text.startswith(where) else f"{where}: {text}") from None
-        except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
-            raise ReobjError(f"{where}: no pose and camera as the format has them "
-                             f"({error!r:.100})") from None  # fmt: skip
+    matrices, cameras, names = zip(*found, strict=True)
     axes = np.eye(3) if axes is None else axes
-    poses = axes @ invert_rigid(checked_rigid(matrices.reshape(-1, 4, 4), list(entries)))
-    names = tuple(filter(None, (name for _, _, name in found)))
-    return PoseFile(poses, tuple(camera for _, camera, _ in found), names, axes=axes, **more)
+    poses = axes @ invert_rigid(checked_rigid(np.array(matrices), list(entries)))
+    return PoseFile(poses, cameras, tuple(filter(None, names)), axes=axes, **more)
 
 
-def read_record3d(path: Path, size: tuple[int, int]) -> PoseFile:
+def read_record3d(path: Path, size: Size) -> PoseFile:
     """Read Record3D's metadata: `poses` qx qy qz qw tx ty tz, world_from_cam, OpenGL axes, y up.
 
     The file `metadata`, its folder, or an .r3d, which is a zip of the folder.
@@ -353,7 +351,7 @@ def scannet_files(path: Path) -> list[Path]:
     return sorted(f for f in folder.glob("*.txt") if re.fullmatch(form, f.name))
 
 
-def read_scannet(path: Path, size: tuple[int, int]) -> PoseFile:
+def read_scannet(path: Path, size: Size) -> PoseFile:
     """Read ScanNet's `pose/<frame>.txt` (z up) or 7-Scenes' `*.pose.txt`: 4x4 world_from_cam.
 
     Metres; inf: no pose. ScanNet's intrinsics have the centre of the first pixel at (0, 0).
@@ -370,7 +368,7 @@ def read_scannet(path: Path, size: tuple[int, int]) -> PoseFile:
     return _listed({str(file): file for file in files}, read, up_in_world=up)
 
 
-def scannet_camera(path: Path, size: tuple[int, int]) -> Camera:
+def scannet_camera(path: Path, size: Size) -> Camera:
     """Read a matrix of ScanNet, whose first pixel has its centre at (0, 0)."""
     fx, fy, cx, cy = read_camera(path, size, "matrix").params
     return Camera("PINHOLE", *size, (fx, fy, cx + 0.5, cy + 0.5))
@@ -382,7 +380,7 @@ def arkit_files(path: Path) -> list[Path]:
     return next(filter(None, (sorted(path.glob(form)) for form in forms)), [])
 
 
-def read_arkit(path: Path, size: tuple[int, int]) -> PoseFile:
+def read_arkit(path: Path, size: Size) -> PoseFile:
     """Read a raw export of Polycam or of 3D Scanner App: a JSON file for each image.
 
     world_from_cam row by row, `t_00` to `t_23` or `cameraPoseARFrame`; ARKit's axes (those of
@@ -398,7 +396,7 @@ def read_arkit(path: Path, size: tuple[int, int]) -> PoseFile:
     return _listed(files, read, CV_FROM_GL, up_in_world=Y_UP)
 
 
-def read_transforms(path: Path, size: tuple[int, int]) -> PoseFile:
+def read_transforms(path: Path, size: Size) -> PoseFile:
     """Read nerfstudio's or instant-ngp's transforms.json: world_from_cam, OpenGL axes; no scale.
 
     nerfstudio transformed the world by `applied_transform` A; this is undone:
@@ -421,7 +419,7 @@ def read_transforms(path: Path, size: tuple[int, int]) -> PoseFile:
     return dataclasses.replace(found, cam_from_world=found.cam_from_world @ turn)
 
 
-def read_scannetpp(path: Path, size: tuple[int, int]) -> PoseFile:
+def read_scannetpp(path: Path, size: Size) -> PoseFile:
     """Read ScanNet++'s pose_intrinsic_imu.json of an iPhone: per frame world_from_cam, z up.
 
     `aligned_pose` (of the laser scan) or else `pose`, and `intrinsic`; OpenCV axes, metres.
@@ -439,7 +437,7 @@ def read_scannetpp(path: Path, size: tuple[int, int]) -> PoseFile:
     return _listed(named, read, up_in_world=Z_UP if is_aligned else None)
 
 
-def read_llff(path: Path, size: tuple[int, int]) -> PoseFile:
+def read_llff(path: Path, size: Size) -> PoseFile:
     """Read LLFF's poses_bounds.npy: (N, 17), 3x5 [R | t | h, w, f] and two depths; no scale.
 
     world_from_cam with the axes down, right, backwards. One row per image, in the order of the
@@ -462,7 +460,7 @@ def read_llff(path: Path, size: tuple[int, int]) -> PoseFile:
     return _listed(dict(zip(where, tables, strict=True)), read, CV_FROM_LLFF, by_text=True)
 
 
-def read_splatting(path: Path, size: tuple[int, int]) -> PoseFile:
+def read_splatting(path: Path, size: Size) -> PoseFile:
     """Read cameras.json of 3D Gaussian splatting: position and rotation of world_from_cam.
 
     OpenCV axes, no scale; the principal point is the middle of the image.
@@ -498,7 +496,7 @@ def find_models(path: Path) -> list[Path]:
     return []
 
 
-def read_colmap(path: Path, size: tuple[int, int]) -> PoseFile:
+def read_colmap(path: Path, size: Size) -> PoseFile:
     """Read a COLMAP model, binary (preferred) or text, with or without rigs; scale unknown.
 
     Raises:
@@ -539,29 +537,28 @@ def _read_text_model(folder: Path) -> PoseFile:
     These are points3D.txt, and the line of observations after each image. Names may have spaces.
     Observations are those of the points.
     """
-    cameras = {w[0]: colmap_camera(w[1:]) for w, _ in _records(folder / "cameras.txt")}
-    images = [image for image in _records(folder / "images.txt") if not _observes(image[0])]
-    raise_where([not images], [f"{folder / 'images.txt'}"], "no registered image")
-    where = [place for _, place in images]
-    faults = [len(w) < 10 or not all(map(is_number, w[:8])) for w, _ in images]
+    cameras = {w[0]: colmap_camera(w[1:]) for w in _records(folder / "cameras.txt").values()}
+    path = folder / "images.txt"
+    images = {at: words for at, words in _records(path).items() if not _observes(words)}
+    where = sorted(images, key=lambda at: images[at][0].zfill(20))
+    rows = [images[at] for at in where]
+    raise_where([not rows], [str(path)], "no registered image")
+    faults = [len(words) < 10 or not all(map(is_number, words[:8])) for words in rows]
     raise_where(faults, where, "expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME")
-    images.sort(key=lambda image: int(image[0][0]))
-    where = [place for _, place in images]
-    numbers = np.array([words[1:8] for words, _ in images], np.float64)
+    numbers = np.array([words[1:8] for words in rows], np.float64)
     length = np.linalg.norm(numbers[:, :4], axis=1)
     fault = "the quaternion is not of length 1"
     raise_where(~(np.abs(length - 1) <= POSE_TOLERANCE), where, fault)  # also NaN
     turn_of = import_pycolmap().Rotation3d  # with its rounding
     turns = [turn_of(xyzw).matrix() for xyzw in numbers[:, [1, 2, 3, 0]]]
-    row_of = {words[0]: row for row, (words, _) in enumerate(images)}
+    row_of = {words[0]: row for row, words in enumerate(rows)}
     path = folder / "points3D.txt"
-    points = [words for words, _ in _records(path)] if path.is_file() else []
-    points.sort(key=lambda words: int(words[0]))
+    points = sorted(_records(path).values() if path.is_file() else [], key=lambda w: int(w[0]))
     seen = [(row_of[i], p) for p, words in enumerate(points) for i in words[8::2] if i in row_of]
     return PoseFile(
         checked_rigid(np.dstack([turns, numbers[:, 4:]]), where),
-        tuple(cameras[words[8]] for words, _ in images),
-        tuple(" ".join(words[9:]) for words, _ in images),
+        tuple(cameras[words[8]] for words in rows),
+        tuple(" ".join(words[9:]) for words in rows),
         points=checked_points([w[1:4] for w in points], [w[0] for w in points], path),
         colors=np.array([w[4:7] for w in points], np.uint8).reshape(-1, 3),
         visibility=np.array(sorted(seen), np.int64).reshape(-1, 2),
@@ -573,10 +570,10 @@ def _observes(words: list[str]) -> bool:
     return len(words) % 3 == 0 and all(word.lstrip("-").isdigit() for word in words[2::3])
 
 
-def _records(path: Path) -> list[tuple[list[str], str]]:
-    """Return words, and the location, of the lines of a text file that are no comments."""
-    lines = [(line.split(), f"{path}, line {n}") for n, line in enumerate(read_lines(path), 1)]
-    return [(words, where) for words, where in lines if words and not words[0].startswith("#")]
+def _records(path: Path) -> dict[str, list[str]]:
+    """Return the words, by location, of the lines of a text file that are no comments."""
+    lines = {f"{path}, line {n}": line.split() for n, line in enumerate(read_lines(path), 1)}
+    return {where: words for where, words in lines.items() if words and words[0][0] != "#"}
 
 
 # Records of COLMAP's binary files: bytes before a name, or before the number of entries; the format

@@ -40,7 +40,7 @@ from reobj.poses.supplied.frame_assignment import (
     seconds_of,
     source_of,
 )
-from reobj.poses.supplied.pose_formats import PoseFile
+from reobj.poses.supplied.pose_formats import PoseFile, Size
 from reobj.sources.detection_files import DetectConfig, described_images, read_detections
 from reobj.sources.image_files import exif_orientation, sorted_names
 from reobj.sources.video import ImagelessVideo, InputConfig, Video
@@ -132,19 +132,19 @@ def _check_units(cam_from_world: Array, path: Path) -> None:
     """Refuse a path (F, 3, 4) in metres that no camera takes indoors."""
     centre = invert_rigid(cam_from_world)[:, :, 3]
     centre = centre[np.isfinite(centre).all(1)]  # (n, 3)
-    step = np.median(np.linalg.norm(np.diff(centre, axis=0), axis=1)) if len(centre) > 1 else 0.0
+    steps = np.linalg.norm(np.diff(centre, axis=0), axis=1)
     radius = np.linalg.norm(centre - np.median(centre, axis=0), axis=1).max(initial=0.0)
-    if radius > LARGE_M and step > FAST_M:
+    if radius > LARGE_M and np.median(steps) > FAST_M:
         raise ReobjError(
-            f"{path}: the cameras move by {step:.3g} between frames, within a radius of "
-            f"{radius:.3g}; expected metres (mm, cm? divide the translations by 1000, 100)"
+            f"{path}: the cameras move by {np.median(steps):.3g} between frames, within a radius "
+            f"of {radius:.3g}; expected metres (mm, cm? divide the translations by 1000, 100)"
         )
 
 
 MAX_SPREAD = 0.02  # of focal lengths over the images of one camera, by autofocus
 
 
-def one_camera(cameras: Sequence[Camera | None], path: Path, size: tuple[int, int]) -> Camera:
+def one_camera(cameras: Sequence[Camera | None], path: Path, size: Size) -> Camera:
     """Return the single camera of images: the median of slightly different focal lengths.
 
     Args:
@@ -167,9 +167,7 @@ def one_camera(cameras: Sequence[Camera | None], path: Path, size: tuple[int, in
     return fitted_camera(found[len(found) // 2], size, str(path))
 
 
-def _refuse_turned(
-    source: SourceFrames, size: tuple[int, int], file: PoseFile, row: IntArray
-) -> None:
+def _refuse_turned(source: SourceFrames, size: Size, file: PoseFile, row: IntArray) -> None:
     """Refuse COLMAP's cameras of stored pixels: it ignores the EXIF orientation of photos.
 
     A camera of the shape of the upright photos, where a turn by 90 deg changes it, is right.
@@ -194,7 +192,7 @@ def _refuse_turned(
 # ---- Formats -------------------------------------------------------------------------------------
 
 
-def read_pose_file(path: Path, fmt: str, size: tuple[int, int]) -> PoseFile:
+def read_pose_file(path: Path, fmt: str, size: Size) -> PoseFile:
     """Read a file or folder of poses in a format of POSES, or recognise it.
 
     Args:
@@ -297,7 +295,7 @@ def _has(name: str, *keys: str) -> Callable[[Probe], bool]:
     return test
 
 
-ReadPoses = Callable[[Path, tuple[int, int]], PoseFile]
+ReadPoses = Callable[[Path, Size], PoseFile]
 NAME, TIME, ORDER = "name, number", "time", "order"
 METRES, UNKNOWN = "metres", "unknown"
 UNSTATED = "not stated: metres, or as `# units: arbitrary` in the file says"
@@ -365,31 +363,26 @@ def open_video(
         ReobjError: no video, and no file of detections, poses or size of the images either;
             options that need a video or camera poses.
     """
-    is_file = isinstance(boxes, str | Path) and bool(boxes)
-    has_video = source is not None
-    for fault, text in (
-        (poses.mode == "none" and (poses.depth or poses.metric),
-         "--depth and --metric need camera poses, but --poses is none"),
-        (not has_video and poses.depth,
-         f"--depth {poses.depth}: depth maps are matched to images; name the video"),
-        (not has_video and (not is_file or poses.mode in ("auto", "none")),
-         "no video: name one, or use `run` without images: --detections FILE (or --tracks FILE), "
-         "--poses FILE and --camera MODEL WIDTH HEIGHT PARAMS, or a file"),
-        (not has_video and is_file and not Path(boxes).exists(), f"{boxes} does not exist"),
-    ):  # fmt: skip
-        if fault:
-            raise ReobjError(text)
+    if poses.mode == "none" and (poses.depth or poses.metric):
+        raise ReobjError("--depth and --metric need camera poses, but --poses is none")
     if source is not None:
         return source if isinstance(source, Video) else Video(source, config)
+    if poses.depth:
+        raise ReobjError(f"--depth {poses.depth}: depth maps are matched to images; name the video")
+    if not isinstance(boxes, str | Path) or not boxes or poses.mode in ("auto", "none"):
+        raise ReobjError(
+            "no video: name one, or use `run` without images: --detections FILE (or --tracks "
+            "FILE), --poses FILE and --camera MODEL WIDTH HEIGHT PARAMS, or a file"
+        )
     path = Path(boxes)
     detect = detect or DetectConfig()
     size = described_images(path, detect)[0]
-    if camera := stated_camera(poses.camera, size, poses.camera_format):
-        size = size or (camera.width, camera.height)
+    camera = stated_camera(poses.camera, size, poses.camera_format)
+    size = size or (camera and (camera.width, camera.height))
     file = read_pose_file(Path(poses.mode), poses.fmt, size or (1, 1))
-    if size is None and (camera := next(filter(None, file.cameras), None)):
-        size = (camera.width, camera.height)
-    if size in (None, (1, 1)):
+    camera = camera or next(filter(None, file.cameras), None)
+    size = size or (camera and (camera.width, camera.height))
+    if size is None or size == (1, 1):
         raise ReobjError(
             f"{poses.mode}: no image size in it; give --camera MODEL WIDTH HEIGHT PARAMS"
         )
@@ -405,7 +398,7 @@ def open_video(
 def _frames_of(
     file: PoseFile,
     boxes: Path,
-    size: tuple[int, int],
+    size: Size,
     source: str,
     config: InputConfig,
     detect: DetectConfig,
