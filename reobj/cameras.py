@@ -366,11 +366,14 @@ def save_poses(path: Path, poses: Poses, **more: Any) -> None:
 def load_poses(path: Path) -> Poses:
     """Read a file of `save_poses`."""
     arrays, facts = load_npz(path, sealed=True)
-    given: dict[str, Any] = {k: facts[k] for k in _FACTS if k in facts}
-    given |= {k: tuple(v) for k, v in given.items() if isinstance(v, list)}
-    camera = Camera(**facts["camera"] | {"params": tuple(facts["camera"]["params"])})
-    up = None if facts["up"] is None else np.array(facts["up"])
-    return Poses(camera, up_in_world=up, **given, **arrays)
+    given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in facts.items()}
+    camera = given["camera"]
+    return Poses(
+        Camera(**{**camera, "params": tuple(camera["params"])}),
+        up_in_world=None if given["up"] is None else np.array(given["up"]),
+        **{name: given[name] for name in _FACTS},
+        **arrays,
+    )
 
 
 def invert_rigid(b_from_a: Array) -> Array:
@@ -574,7 +577,8 @@ def read_sparse_model(folder: Path) -> SparseModel:
         checked_points([point.xyz for point in points], ids, folder),
         np.array([point.color for point in points], np.uint8).reshape(-1, 3),
         np.array([point.track.length() for point in points], np.int64),
-        *table[:, :2].T.astype(np.int64),
+        table[:, 0].astype(np.int64),
+        table[:, 1].astype(np.int64),
         table[:, 2:],
     )
 

@@ -78,8 +78,8 @@ def conventions(given: Supplied) -> Iterator[tuple[str, Array]]:
     filled = np.maximum.accumulate(np.where(known, at, known.argmax()))  # (F,)
     rows = {"the order reversed": at[::-1]}
     for first in (0, 1):
-        order = np.argsort(np.argsort([str(n + first) for n in at]))
-        rows[f"the order of numbers from {first} as text (1, 10, 2)"] = order
+        text = f"the order of numbers from {first} as text (1, 10, 2)"
+        rows[text] = np.argsort(np.argsort([str(n + first) for n in at]))
     for k in range(1, 11):
         for step, word in ((k, "earlier"), (-k, "later")):
             rows[f"the order shifted (each pose is that of {k} frames {word})"] = at + step
@@ -204,7 +204,9 @@ def check_boxes(given: Supplied, tracks: Tracks, refuse: bool = True) -> bool:
     residuals = {name: _residual_deg(poses, views) for name, poses in conventions(given)}
     best = min(residuals.values())
     if best <= min(MAX_RATIO * as_given, 2 * GOOD_DEG):
-        likely = sorted((n for n in residuals if residuals[n] <= 1.5 * best), key=residuals.get)
+        likely = sorted(
+            (n for n in residuals if residuals[n] <= 1.5 * best), key=residuals.__getitem__
+        )
         _refuse(given, likely, f"{measured}, then {best:.1f} deg")
     if as_given > WRONG_DEG:
         _refuse(given, [], measured)

@@ -58,7 +58,8 @@ class DepthMaps:
         sides = (np.arange(0.5, side, step) for side in size)
         # pixels of an ideal pinhole camera lie elsewhere in the distorted image; NaN: outside
         at = np.nan_to_num(self.camera.distort(np.stack(np.meshgrid(*sides), -1)) - 0.5, nan=-9)
-        depth = cv2.remap(image, at.astype(np.float32), None, cv2.INTER_NEAREST).astype(np.float32)
+        x, y = np.moveaxis(at.astype(np.float32), -1, 0)
+        depth = cv2.remap(image, x, y, cv2.INTER_NEAREST).astype(np.float32)  # outside: 0
         depth[depth == 65535] = 0  # 7-Scenes: none
         # a pixel x of the subsampled map has its centre at step x + .5 of the whole one
         small_from_full = np.diag([1 / step, 1 / step, 1])

@@ -378,10 +378,10 @@ def open_video(
     detect = detect or DetectConfig()
     size = described_images(path, detect)[0]
     camera = stated_camera(poses.camera, size, poses.camera_format)
-    size = size or (camera and (camera.width, camera.height))
-    file = read_pose_file(Path(poses.mode), poses.fmt, size or (1, 1))
-    camera = camera or next(filter(None, file.cameras), None)
-    size = size or (camera and (camera.width, camera.height))
+    of_camera = [(camera.width, camera.height)] if camera else []
+    file = read_pose_file(Path(poses.mode), poses.fmt, size or (*of_camera, (1, 1))[0])
+    of_camera += [(one.width, one.height) for one in file.cameras if one]
+    size = size or next(iter(of_camera), None)
     if size is None or size == (1, 1):
         raise ReobjError(
             f"{poses.mode}: no image size in it; give --camera MODEL WIDTH HEIGHT PARAMS"
