@@ -70,29 +70,6 @@ def test_undistorted_pixels_are_those_of_a_pinhole_with_the_same_k(model):
     assert camera.resized(SIZE) == camera
 
 
-def test_pixels_without_a_pinhole_equivalent_are_nan():
-    """For a fisheye of 180 degrees and more, and outside the invertible range of a polynomial."""
-    fisheye = rt.Camera("SIMPLE_FISHEYE", *SIZE, (200.0, 320.0, 240.0))
-    found = fisheye.undistort(np.array([[320.0, 240], [0, 240], [0, 0], [320, 0]]))
-    assert np.isfinite(found).all(1).tolist() == [True, False, False, True]  # 92, 115, 69 deg
-    assert found[3, 1] == pytest.approx(240 - 200 * np.tan(1.2))
-    barrel = rt.Camera("SIMPLE_RADIAL", *SIZE, (400.0, 320.0, 240.0, -0.5))
-    assert np.isnan(barrel.undistort(np.array([[0.0, 0]]))).all()
-
-
-@pytest.mark.parametrize(
-    "model, params, message",
-    [
-        ("MAGIC", (500.0, 320.0, 240.0), "no camera model MAGIC; pycolmap has SIMPLE_PINHOLE"),
-        ("OPENCV", (500.0, 500.0, 320.0), "3 parameters of a OPENCV camera; expected fx, fy, cx"),
-        ("EQUIRECTANGULAR", (640.0, 320.0), "EQUIRECTANGULAR camera has no focal length"),
-    ],
-)
-def test_invalid_cameras_are_refused_with_their_name(model, params, message):
-    with pytest.raises(rt.ReobjError, match=message):
-        _ = rt.Camera(model, *SIZE, params).K
-
-
 def test_boxes_are_undistorted_by_the_middles_of_their_edges():
     camera = rt.Camera("OPENCV", *SIZE, DISTORTED["OPENCV"])
     boxes = np.array([[100, 80, 200, 300.0], [0, 50, 640, 480]])

@@ -150,14 +150,12 @@ def test_subsampled_maps_have_no_pixel_offset(tmp_path, walk):
     """Every 3rd pixel of 960: half a pixel off would show."""
     camera = CAMERA.resized((960, 720))
     folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS, camera=camera)
-    maps = find_depth_maps(str(folder), walk, NamedVideo([]))
-    depth, K = maps.read(5)
+    depth, K = find_depth_maps(str(folder), walk, NamedVideo([])).read(5)
     assert depth.shape == (240, 320)
     y, x = np.mgrid[30:200:10, 40:300:10].reshape(2, -1)
     in_cam = np.column_stack([x + 0.5, y + 0.5, np.ones(len(x))]) @ np.linalg.inv(K).T
-    world_from_cam = invert_rigid(walk.cam_from_world[5])
-    points = (in_cam * depth[y, x][:, None]) @ world_from_cam[:, :3].T + world_from_cam[:, 3]
-    assert on_walls(points).max() < 0.002
+    turn, centre = np.split(invert_rigid(walk.cam_from_world[5]), [3], 1)
+    assert on_walls((in_cam * depth[y, x][:, None]) @ turn.T + centre[:, 0]).max() < 0.002
 
 
 # ---- Scale ---------------------------------------------------------------------------------------

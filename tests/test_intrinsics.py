@@ -56,6 +56,7 @@ def test_numbers_are_parsed(text, camera):
         assert stated_camera(camera_line(camera), None) == camera
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize(
     "text, message",
     [
@@ -73,6 +74,8 @@ def test_numbers_are_parsed(text, camera):
         ("PINHOLE 640 480 500 500 320 nan", "not finite"),
         ("PINHOLE 9" + "0" * 30 + " 480 500 500 320 240", "size not of 1 to"),
         ("EQUIRECTANGULAR 640 480 640 480", "has no focal length"),
+        ("OPENCV 640 480 500 500 320 240 0 0 2 0", "distortion is invertible for only"),
+        ("OPENCV 640 480 500 500 320 240 1e20 0 0 0", "distortion is invertible for only"),
         ("PINHOLE 480 640 500 500 240 320", "480x640 images, but the frames are 640x480"),
     ],
 )

@@ -204,9 +204,8 @@ def check_boxes(given: Supplied, tracks: Tracks, refuse: bool = True) -> bool:
     residuals = {name: _residual_deg(poses, views) for name, poses in conventions(given)}
     best = min(residuals.values())
     if best <= min(MAX_RATIO * as_given, 2 * GOOD_DEG):
-        likely = sorted(
-            (n for n in residuals if residuals[n] <= 1.5 * best), key=residuals.__getitem__
-        )
+        likely = [n for n in residuals if residuals[n] <= 1.5 * best]
+        likely.sort(key=residuals.__getitem__)
         _refuse(given, likely, f"{measured}, then {best:.1f} deg")
     if as_given > WRONG_DEG:
         _refuse(given, [], measured)
