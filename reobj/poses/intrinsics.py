@@ -73,14 +73,11 @@ def read_camera(path: Path, size: Size, fmt: str = AUTO) -> Camera:
     if path.stat().st_size > CAMERA_MAX:
         raise ReobjError(f"{path}: more than {CAMERA_MAX} bytes, not a camera file")
     try:
-        camera = CAMERAS.find(path, fmt).read(path, size)
+        return CAMERAS.find(path, fmt).read(path, size)
     except ReobjError as error:
         raise ReobjError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
     except Exception:  # files of other programs hold any type
         raise ReobjError(f"{path}: not a camera file; expected {CAMERA_FORMS}") from None
-    if camera is None:
-        raise ReobjError(f"{path}: no focal length; expected {CAMERA_FORMS}")
-    return camera
 
 
 def fitted_camera(camera: Camera, size: tuple[int, int], where: str) -> Camera:
