@@ -268,7 +268,7 @@ def without_frozen(poses: Poses, tracks: Tracks) -> Poses:
 
 def _boxes_move(tracks: Tracks, first: int, last: int) -> bool:
     """Test whether the boxes of tracks move by more than 3 px between two frames."""
-    start, end = tracks[tracks.frame == first], tracks[tracks.frame == last]
+    start, end = (tracks[tracks.frame == frame] for frame in (first, last))
     _, i, j = np.intersect1d(start.tracklet_id, end.tracklet_id, True, True)
     moves = (start.xyxy[i] - end.xyxy[j]).reshape(-1, 2, 2).mean(1)  # of the centres
     return not len(moves) or bool(np.median(np.linalg.norm(moves, axis=1)) > 3)

@@ -88,9 +88,11 @@ def find_depth_maps(text: str, poses: Poses, video: Any) -> DepthMaps:
     """
     names = [video.name(int(frame)) for frame in poses.frame] if video.names else []
     match = re.fullmatch(r"(.*?)(?::([\d.eE+-]+))?", text)
-    folder, units = Path(text), 1000.0
+    folder = Path(text)
+    units = 1000.0
     if not folder.is_dir() and match and match[2]:
-        folder, units = Path(match[1]), float(match[2])
+        folder = Path(match[1])
+        units = float(match[2])
     if not folder.is_dir() or not 0 < units < np.inf:
         expected = "FOLDER, or FOLDER:UNITS with units per metre (1000: mm; TUM: 5000)"
         raise ReobjError(f"--depth {text}: no such folder; expected {expected}")
