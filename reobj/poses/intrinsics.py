@@ -414,7 +414,7 @@ ReadCamera = Callable[[Path, Size], Camera]
 
 
 def _rows_of(form: str) -> Callable[[Probe], bool]:
-    """Test for a text file, no YAML, JSON or XML, that holds rows of one of these forms."""
+    """Test for a text file, no YAML, JSON or XML, that holds rows of a form."""
 
     def test(probe: Probe) -> bool:
         marked = probe.suffix in (".pincam", ".yaml", ".yml") or probe.kind != "text"

@@ -290,7 +290,7 @@ def _by_order(count: int, source: SourceFrames, by_text: bool = False) -> list[F
     Args:
         by_text: in the order of the images' names as text (1, 10, 2), not of their numbers.
     """
-    rule = "order, one row for each frame"
+    rule = "order, one row for each frame of the source"
     if count == source.count:
         frame = np.arange(count)
         if by_text and source.images:
@@ -298,7 +298,8 @@ def _by_order(count: int, source: SourceFrames, by_text: bool = False) -> list[F
             frame = np.array(sorted(range(count), key=names.__getitem__), np.int64)
             rule = "order of the image names as text (1, 10, 2)"
         return [_assignment("order", rule, frame, source)]
-    known = [FrameAssignment("order", f"{rule} that is read", np.arange(count), 0)]
+    rule = "order, one row for each frame that is read"
+    known = [FrameAssignment("order", rule, np.arange(count), 0)]
     return known if count == len(source.frame) else []
 
 
