@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -154,32 +155,74 @@ def test_poses_of_lost_frames_are_no_poses(tmp_path: Path, kind: str) -> None:
 
 # ---- EXIF orientations ---------------------------------------------------------------------------
 
+# EXIF orientation: from the upright image to the stored one; rotation stored_from_upright
+STORED = {
+    1: (lambda image: image, np.eye(3)),
+    3: (lambda image: image[::-1, ::-1], np.diag([-1.0, -1, 1])),
+    6: (lambda image: np.rot90(image, 1), np.array([[0, 1.0, 0], [-1, 0, 0], [0, 0, 1]])),
+    8: (lambda image: np.rot90(image, -1), np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]])),
+}
 
-@pytest.mark.parametrize(("orientation", "is_upright"), [(2, False), (3, False), (6, False),
-                                                         (6, True)])  # fmt: skip
-def test_cameras_of_stored_pixels_are_refused(
-    tmp_path: Path, orientation: int, is_upright: bool
-) -> None:
-    """Photos with an EXIF orientation; cameras of their upright pixels, and our own, are right."""
-    (tmp_path / "img").mkdir()
+
+def turned_photos(folder: Path, orientations: list[int]) -> tuple[Path, Path]:
+    """Write photos and COLMAP's model of the stored pixels, with an off-centre lens."""
+    (folder / "img").mkdir()
+    poses = path_of().copy()
+    for i, (image, orientation) in enumerate(zip(images(), orientations, strict=True)):
+        exif = Image.Exif()
+        exif[0x0112] = orientation
+        turn, stored_from_upright = STORED[orientation]
+        stored = np.ascontiguousarray(turn(image))
+        Image.fromarray(stored).save(folder / "img" / f"{i:04d}.jpg", quality=95, exif=exif)
+        poses[i] = stored_from_upright @ poses[i]
+    path = folder / "model"
+    write_colmap(path, as_poses(poses), [f"{i:04d}.jpg" for i in ALL])
+    return folder / "img", path
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_cameras_of_stored_pixels_turn_with_the_photos(tmp_path: Path, orientation: int) -> None:
+    source, path = turned_photos(tmp_path, [orientation] * FRAMES)
+    _, turn = STORED[orientation]
+    size = (240, 320) if orientation > 4 else (320, 240)
+    fx, fy = (291, 290) if orientation > 4 else (290, 291)
+    offset = turn[:2, :2] @ [3.0, -2.0]
+    p2, p1 = turn[:2, :2] @ [-0.002, 0.003]
+    params = (fx, fy, size[0] / 2 + offset[0], size[1] / 2 + offset[1], 0.02, 0.01, p1, p2)
+    line = " ".join(map(str, ("1 OPENCV", *size, *params)))
+    (path / "cameras.txt").write_text(f"{line}\n")
+    poses = rt.read_poses(path, rt.Video(source))
+    assert_right(poses, ALL)
+    upright = (290, 291, 163.0, 118.0, 0.02, 0.01, 0.003, -0.002)
+    np.testing.assert_allclose(poses.camera.params, upright, atol=1e-12)
+    assert any("EXIF orientation" in text for text in poses.messages) == (orientation > 1)
+
+
+def test_photos_of_several_orientations_and_mirrored_ones(tmp_path: Path) -> None:
+    source, path = turned_photos(tmp_path, [(1, 3)[i % 2] for i in ALL])
+    assert_right(rt.read_poses(path, rt.Video(source)), ALL)
     exif = Image.Exif()
-    exif[0x0112] = orientation
-    for i, image in enumerate(images()):
-        stored = np.ascontiguousarray(np.rot90(image)) if orientation == 6 else image
-        Image.fromarray(stored).save(tmp_path / "img" / f"{i:04d}.jpg", exif=exif)
-    write_colmap(tmp_path / "model", as_poses(path_of()), [f"{i:04d}.jpg" for i in ALL])
-    if orientation == 6 and not is_upright:
-        line = "1 PINHOLE 240 320 290 290 120 160\n"
-        (tmp_path / "model" / "cameras.txt").write_text(line)
-    source = rt.Video(tmp_path / "img")
-    if is_upright:
-        assert_right(rt.read_poses(tmp_path / "model", source), ALL)
-        return
-    with pytest.raises(rt.ReobjError, match=r"0000.jpg: has an EXIF orientation.*auto-orient"):
-        rt.read_poses(tmp_path / "model", source)
-    write_colmap(tmp_path / "model", as_poses(path_of()), [f"{i:04d}.jpg" for i in ALL])
-    (tmp_path / "model" / "upright.txt").touch()  # in models that we wrote
-    assert_right(rt.read_poses(tmp_path / "model", source), ALL)
+    exif[0x0112] = 2
+    Image.fromarray(images()[0]).save(source / "0000.jpg", exif=exif)
+    with pytest.raises(rt.ReobjError, match="mirrored EXIF orientation"):
+        rt.read_poses(path, rt.Video(source))
+
+
+@pytest.mark.parametrize("orientation", [3, 6])
+def test_our_own_output_is_read_back(tmp_path: Path, orientation: int) -> None:
+    """Photos turned by EXIF: our model has upright cameras, which are not turned again."""
+    source, path = turned_photos(tmp_path, [orientation] * FRAMES)
+    size = (240, 320) if orientation > 4 else (320, 240)
+    line = f"1 PINHOLE {size[0]} {size[1]} 290 290 {size[0] / 2} {size[1] / 2}"
+    (path / "cameras.txt").write_text(f"{line}\n")
+    words = ["poses", str(source), "-o", str(tmp_path / "out"), "--poses", str(path)]
+    assert rt.main([*words, "--set", "poses.size_px=160"]) == 0
+    shutil.copytree(tmp_path / "out" / "sparse", tmp_path / "copy")
+    for given in ("out", "copy"):
+        poses = rt.read_poses(tmp_path / given, rt.Video(source))
+        assert_right(poses, ALL)
+        assert (poses.camera.width, poses.camera.params) == (320, (290, 290, 160, 120))
+        assert not poses.metric
 
 
 # ---- Other tools ---------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from reobj.cameras import Camera, Poses, invert_rigid
+from reobj.cameras import Camera, Poses, camera_parameters, invert_rigid
 from reobj.files import spans
 from reobj.formats import AUTO, Format, Probe, Registry, frames_by_name
 from reobj.poses.estimate import PosesConfig
@@ -93,11 +93,12 @@ def read_supplied(video: Any, config: PosesConfig) -> Supplied:
     if assignment.key == "time" and stamps_s is not None:
         between, use = interpolated(file.cam_from_world, stamps_s, source.time_s)
         cam_from_world[use & (row >= 0)] = between[row[use] >= 0]
-    if file.stored_pixels:
-        _refuse_turned(source, size, file, row)
+    turns = turns_of(source, size, file.cameras, row) if file.stored_pixels else {}
     cameras = file.cameras
     if len(cameras) == len(file.cam_from_world) > 1:  # those of the frames
-        cameras = tuple(cameras[r] for r in row[used])
+        cameras = tuple(turned(cameras[row[f]], turns.get(f)) for f in used.tolist())
+    for f, turn in turns.items():
+        cam_from_world[f, :2] = turn @ cam_from_world[f, :2]
     camera = stated or one_camera(cameras, path, size)
     known = np.asarray(np.isfinite(cam_from_world).all((1, 2)), bool)
     metric = config.metric or file.metric is not False
@@ -107,19 +108,24 @@ def read_supplied(video: Any, config: PosesConfig) -> Supplied:
     frame_of[row[used]] = used
     seen = np.column_stack([frame_of[file.visibility[:, 0]], file.visibility[:, 1]])
     assumed = METRES_ASSUMED * (file.metric is None and not config.metric)
-    facts = []
+    messages: list[str] = []
+    facts: list[str] = []
+    if turns:
+        messages = [f"{len(turns)} photos have an EXIF orientation, which COLMAP ignores: its "
+                    "cameras are turned with them"]  # fmt: skip
     if not known.all():
         step = int(np.median(np.diff(source.frame))) if len(known) > 1 else 1
         without = spans(source.frame[~known].tolist(), step)
         facts.append(f"poses for {known.sum()} of {len(known)} frames, none for {without}")
     if lost := int((~np.isfinite(file.cam_from_world).all((1, 2))).sum()):
         facts.append(f"{lost} poses of lost frames (the identity, zeros, not finite)")
+    messages += [f"{path}: {'; '.join(facts)}"] * bool(facts)
     poses = Poses(
         camera, source.frame, source.time_s, cam_from_world,
         np.where(known, "supplied", "none"), "user", metric=metric,
         up_in_world=file.up_in_world, points=file.points, colors=file.colors,
         visibility=seen[seen[:, 0] >= 0],
-        messages=(*file.messages, *[f"{path}: {'; '.join(facts)}"] * bool(facts)),
+        messages=(*file.messages, *messages),
         reading=f"{file.kind}{assumed}, frames by {assignment.rule}",
     )  # fmt: skip
     return Supplied(poses, file.axes)
@@ -167,26 +173,62 @@ def one_camera(cameras: Sequence[Camera | None], path: Path, size: Size) -> Came
     return fitted_camera(found[len(found) // 2], size, str(path))
 
 
-def _refuse_turned(source: SourceFrames, size: Size, file: PoseFile, row: IntArray) -> None:
-    """Refuse COLMAP's cameras of stored pixels: it ignores the EXIF orientation of photos.
+# ---- EXIF orientations: COLMAP's cameras are those of the stored pixels --------------------------
 
-    A camera of the shape of the upright photos, where a turn by 90 deg changes it, is right.
+# upright_from_stored (2, 2): of offsets from the middle of the image
+TURNS = {3: -np.eye(2), 6: np.array([[0.0, -1], [1, 0]]), 8: np.array([[0.0, 1], [-1, 0]])}
+
+
+def turns_of(
+    source: SourceFrames, size: Size, cameras: Sequence[Camera | None], row: IntArray
+) -> dict[int, Array]:
+    """Return the turns (2, 2) of the photos with an EXIF orientation, by frame row.
+
+    A camera of the shape of the upright photos, where a turn by 90 deg changes it, is not turned.
 
     Args:
-        size: (w, h) of the upright photos. row: (F,) pose of each frame, -1: none.
+        size: (w, h) of the upright photos.
+        cameras: of the stored pixels, of each pose. row: (F,) pose of each frame, -1: none.
     """
+    turns: dict[int, Array] = {}
     for f in np.flatnonzero(row >= 0).tolist() if source.images else ():
         path = Path(source.images[int(source.frame[f])])
-        camera = file.cameras[row[f]]
-        is_portrait = camera is not None and camera.width < camera.height
-        is_upright = exif_orientation(path) > 4 and size[0] != size[1]
-        is_upright &= is_portrait == (size[0] < size[1])
-        if exif_orientation(path) != 1 and not is_upright:
+        orientation = exif_orientation(path)
+        camera = cameras[row[f]]
+        if orientation == 1 or camera is None:
+            continue
+        if orientation not in TURNS:
             raise ReobjError(
-                f"{path}: has an EXIF orientation, which COLMAP ignores: its cameras are those of "
-                "the stored pixels; store the photos upright, without EXIF orientation (`mogrify "
-                "-auto-orient`), and reconstruct them again"
+                f"{path}: a mirrored EXIF orientation ({orientation}), which COLMAP ignores; store "
+                "the photos upright, without EXIF orientation, and reconstruct them again"
             )
+        is_upright = size[0] != size[1] and (camera.width > camera.height) == (size[0] > size[1])
+        if orientation == 3 or not is_upright:
+            turns[f] = TURNS[orientation]
+    return turns
+
+
+def turned(camera: Camera | None, turn: Array | None) -> Camera | None:
+    """Return the camera of the turned images; turn: (2, 2) of TURNS, or None."""
+    if camera is None or turn is None:
+        return camera
+    names = camera_parameters(camera.model)
+    if unknown := [n for n in names if not re.fullmatch(r"[fc][xy]?|k\d?|p[12]|omega", n)]:
+        raise ReobjError(
+            f"a {camera.model} camera is not turned with the EXIF orientation of its photos "
+            f"({', '.join(unknown)}); store them upright and reconstruct them again"
+        )
+    values = dict(zip(names, camera.params, strict=True))
+    stored = np.array([camera.width, camera.height])
+    size = np.abs(turn @ stored).astype(int)
+    if "p2" in values:  # (p2, p1) r^2 + 2 ((p2, p1) x) x: a vector of the image
+        values["p2"], values["p1"] = turn @ [values["p2"], values["p1"]]
+    if "fx" in values:
+        values["fx"], values["fy"] = np.abs(turn @ [values["fx"], values["fy"]])
+    centre = turn @ (np.array([values["cx"], values["cy"]]) - stored / 2) + size / 2
+    values["cx"], values["cy"] = centre
+    width, height = size.tolist()
+    return Camera(camera.model, width, height, tuple(float(values[name]) for name in names))
 
 
 # ---- Formats -------------------------------------------------------------------------------------
