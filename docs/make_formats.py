@@ -30,12 +30,10 @@ def table(rows: Iterable[tuple[str, ...]]) -> str:
 
 
 def formats_table(formats: Sequence[Format[Any]]) -> str:
-    """Format the formats that are read, and name the others."""
+    """Format the formats that are read."""
     rows = [("format", "written by", "frames", "units", "not read")]
-    rows += [(f"`{f.name}`", f.title, f.frames, f.units, f.unread) for f in formats if f.read]
-    others = [f.title for f in formats if not f.read]
-    text = f"\nRefused, with what to do instead: {'; '.join(others)}.\n" if others else ""
-    return table(rows) + text
+    rows += [(f"`{f.name}`", f.title, f.frames, f.units, f.unread) for f in formats]
+    return table(rows)
 
 
 def layouts_table() -> str:
@@ -49,7 +47,7 @@ def layouts_table() -> str:
 
 TABLES = {
     "detections": formats_table(DETECTIONS.formats),
-    "ground truth": formats_table(TRUTH.readable),
+    "ground truth": formats_table(TRUTH.formats),
     "poses": formats_table(POSES.formats),
     "cameras": formats_table(CAMERAS.formats),
     "layouts": layouts_table(),

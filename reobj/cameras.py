@@ -81,6 +81,10 @@ class Camera:
             return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
         return np.asarray(self.to_pycolmap().calibration_matrix(), np.float64)
 
+    def _to_pixels(self, in_cam: Array) -> Array:
+        """Project points (N, 3) in front of the camera to pixels (N, 2) without distortion."""
+        return in_cam[:, :2] / in_cam[:, 2:] @ self.K[:2, :2].T + self.K[:2, 2]
+
     @property
     def fold_radius(self) -> float:
         """Radius |xy| / z of a ray up to which the distortion keeps moving points outwards.
@@ -97,13 +101,13 @@ class Camera:
         """
         flat = np.asarray(in_cam, np.float64).reshape(-1, 3)
         pixels = np.full((len(flat), 2), np.nan)
-        front = np.flatnonzero(flat[:, 2] > 0)
-        ahead = flat[front]
+        radius = np.hypot(flat[:, 0], flat[:, 1]) / (1 + 1e-9)  # rounding at the fold
+        with np.errstate(invalid="ignore"):  # inf * 0
+            shown = (flat[:, 2] > 0) & ~(radius > self.fold_radius * flat[:, 2])
         if self.model == "PINHOLE":
-            pixels[front] = ahead[:, :2] / ahead[:, 2:] @ self.K[:2, :2].T + self.K[:2, 2]
-        elif len(front):
-            found = np.asarray(self.to_pycolmap().img_from_cam(ahead), np.float64)
-            pixels[front] = np.where(self._within_fold(ahead)[:, None], found, np.nan)
+            pixels[shown] = self._to_pixels(flat[shown])
+        elif shown.any():
+            pixels[shown] = self.to_pycolmap().img_from_cam(flat[shown])
         return pixels.reshape(*np.shape(in_cam)[:-1], 2)
 
     def distort(self, xy: Array) -> Array:
@@ -120,38 +124,15 @@ class Camera:
         NaN for NaN, for rays 90 deg or more off the axis, and for pixels to which the distortion
         maps no point within `fold_radius`.
         """
-        camera = self.to_pycolmap()
         flat = np.asarray(xy, np.float64).reshape(-1, 2)
         ideal = np.full_like(flat, np.nan)
         rows = np.flatnonzero(np.isfinite(flat).all(1))
         if len(rows):
-            ray = np.asarray(camera.cam_ray_from_img(flat[rows]), np.float64)  # (n, 3)
+            ray = np.asarray(self.to_pycolmap().cam_ray_from_img(flat[rows]), np.float64)  # (n, 3)
             error = np.abs(self.project(ray) - flat[rows]).max(1)  # NaN, inf: no inverse
             inverted = error < 0.01  # px, negligible
-            ray = ray[inverted]
-            ideal[rows[inverted]] = ray[:, :2] / ray[:, 2:] @ self.K[:2, :2].T + self.K[:2, 2]
+            ideal[rows[inverted]] = self._to_pixels(ray[inverted])
         return ideal.reshape(np.shape(xy))
-
-    def _within_fold(self, in_cam: Array) -> BoolArray:
-        """Test whether points (..., 3) in front of the camera lie within `fold_radius`."""
-        radius = np.hypot(in_cam[..., 0], in_cam[..., 1]) / (1 + 1e-9)  # rounding at the fold
-        return np.asarray(radius <= self.fold_radius * in_cam[..., 2], bool)
-
-    def clip_segments(self, ends: Array) -> Array:
-        """Clip segments (n, 2, 3) in front of the camera to `fold_radius`; NaN: all is beyond.
-
-        To 1/512 of their length. The rays within the fold are a convex cone, so that one part of a
-        segment is left, and all of it if both ends are within.
-        """
-        cut = np.flatnonzero(~self._within_fold(ends).all(1))
-        share = np.linspace(0, 1, 513)[:, None]
-        line = ends[cut, :1] + share * (ends[cut, 1:] - ends[cut, :1])  # (c, 513, 3)
-        shown = self._within_fold(line)
-        kept = np.stack([shown.argmax(1), 512 - shown[:, ::-1].argmax(1)], 1)  # (c, 2)
-        clipped = ends.copy()
-        clipped[cut] = np.take_along_axis(line, kept[..., None], 1)
-        clipped[cut[~shown.any(1)]] = np.nan
-        return clipped
 
     def to_pycolmap(self) -> Any:
         """Convert to a `pycolmap.Camera` with id 1.
@@ -189,31 +170,14 @@ def _fold_radius(model: str, params: tuple[float, ...], step_deg: float = 0.1) -
     radius = np.tan(np.radians(np.arange(0, 90, step_deg)))  # (r,)
     turn = 2 * np.pi * np.arange(16) / 16
     xy = radius[:, None, None] * np.stack([np.cos(turn), np.sin(turn)], 1)  # (r, 16, 2)
-    rays = np.concatenate([xy, np.ones((*xy.shape[:2], 1))], 2).reshape(-1, 3)
-    pixels = np.asarray(camera.to_pycolmap().img_from_cam(rays), np.float64).reshape(xy.shape)
+    pixels = camera.to_pycolmap().img_from_cam(np.insert(xy, 2, 1, 2).reshape(-1, 3))
     with np.errstate(all="ignore"):  # the terms of the distortion may diverge
-        offset = (pixels - camera.K[:2, 2]) / np.diag(camera.K)[:2]
+        offset = (pixels.reshape(xy.shape) - camera.K[:2, 2]) / np.diag(camera.K)[:2]
         outwards = (np.diff(np.linalg.norm(offset, axis=2), axis=0) > 0).all(1)  # (r - 1,)
-    return float("inf") if outwards.all() else float(radius[outwards.argmin()])
+    return float(np.append(radius[:-1], np.inf)[np.append(outwards, False).argmin()])
 
 
-def checked_camera(camera: Camera, where: str) -> Camera:
-    """Return the camera; refuse intrinsics of images of another size."""
-    size = np.array([camera.width, camera.height])
-    centre = camera.K[:2, 2]
-    focal = camera.K[0, 0]
-    # Principal points within .2 sides of the middle, focal lengths of .1 to 10 longer sides: wide
-    # limits, from fisheye to telephoto lenses
-    off_centre = (np.abs(centre - size / 2) > 0.2 * size).any()
-    if off_centre or not 0.1 < focal / size.max() < 10:
-        raise ReobjError(
-            f"{where}: focal length {focal:.0f} px and centre ({centre[0]:.0f}, {centre[1]:.0f}) "
-            f"do not fit frames of {size[0]}x{size[1]} as they are read (rotated? resized?)"
-        )
-    return camera
-
-
-WORLD_MAX = 1e9  # world units, of a camera's position; chosen: the Earth in cm fits
+WORLD_MAX = 1e9  # world units, of a camera's position: the Earth in cm fits
 
 
 def usable(camera: Camera) -> bool:
@@ -232,6 +196,7 @@ def checked_pose(
     Raises:
         ReobjError: the pose is not rigid, or its camera, the points or `part` are invalid.
     """
+
     if points is not None and (np.shape(points)[1:] != (3,) or not np.isfinite(points).all()):
         raise ReobjError(f"points of shape {np.shape(points)}, expected (N, 3), finite, in world")
     if not isinstance(part, int | np.integer) or not 0 <= part <= 1000:  # an hour's walk has a few
@@ -245,23 +210,22 @@ def checked_pose(
         return None
     rotation = pose[:, :3].clip(-2, 2)  # the squares of 1e300 are too large
     determinant = np.linalg.det(rotation)
-    is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=1e-3)
-    if not is_rotation or determinant < 0 or (np.abs(pose[:, 3]) > WORLD_MAX).any():
+    is_rotation = determinant > 0 and np.abs(rotation @ rotation.T - np.eye(3)).max() <= 1e-3
+    if not is_rotation or (np.abs(pose[:, 3]) > WORLD_MAX).any():
         raise ReobjError("cam_from_world: its 3x3 block is not a rotation (determinant "
                          f"{determinant:.2g}), or it is more than {WORLD_MAX:g} units away; "
                          "expected [R | t], x right, y down, z forward")  # fmt: skip
-    if not isinstance(camera, Camera):
-        raise ReobjError("cam_from_world without a camera: give camera=rt.Camera(...) as well")
-    if not usable(camera):
-        raise ReobjError(f"{camera}: expected a size, and focal lengths above 0, in pixels")
+    if not isinstance(camera, Camera) or not usable(camera):
+        raise ReobjError(f"cam_from_world with camera={camera}: expected rt.Camera(...) with a "
+                         "size, and focal lengths above 0, in pixels")  # fmt: skip
     return pose
 
 
 def scaled_camera(camera: Camera, scale: float) -> Camera:
     """Return the pinhole camera, without distortion, of images resized by `scale`."""
-    K = camera.K
-    params = (K[0, 0] * scale, K[1, 1] * scale, K[0, 2] * scale, K[1, 2] * scale)
-    return Camera("PINHOLE", round(camera.width * scale), round(camera.height * scale), params)
+    params = camera.K[[0, 1, 0, 1], [0, 1, 2, 2]] * scale
+    size = (round(camera.width * scale), round(camera.height * scale))
+    return Camera("PINHOLE", *size, tuple(params.tolist()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -374,13 +338,11 @@ def without_copies(poses: Poses, copies: Mapping[int, int]) -> Poses:
         copies: numbers of frames, and of the frame that each is a copy of. Images to which the user
             gave different poses are no copies.
     """
-    row_of = {number: row for row, number in enumerate(poses.frame.tolist())}
     lost = np.zeros(len(poses.frame), bool)
-    for copy, first in copies.items():
-        if copy in row_of and first in row_of:
-            pair = poses.cam_from_world[[row_of[copy], row_of[first]]]
-            is_same = poses.source != "user" or np.allclose(*pair)
-            lost[row_of[copy]] = np.isfinite(pair).all() and is_same
+    for pair in copies.items():
+        row, known = place_of(poses, np.array(pair))
+        same = poses.source != "user" or np.allclose(*poses.cam_from_world[row])
+        lost[row[0]] |= known.all() and same
     return dataclasses.replace(
         poses,
         cam_from_world=np.where(lost[:, None, None], np.nan, poses.cam_from_world),
@@ -404,11 +366,14 @@ def save_poses(path: Path, poses: Poses, **more: Any) -> None:
 def load_poses(path: Path) -> Poses:
     """Read a file of `save_poses`."""
     arrays, facts = load_npz(path, sealed=True)
-    given: dict[str, Any] = {k: facts[k] for k in _FACTS if k in facts}
-    given |= {k: tuple(v) for k, v in given.items() if isinstance(v, list)}
-    camera = Camera(**facts["camera"] | {"params": tuple(facts["camera"]["params"])})
-    up = None if facts["up"] is None else np.array(facts["up"])
-    return Poses(camera, up_in_world=up, **given, **arrays)
+    given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in facts.items()}
+    camera = given["camera"]
+    return Poses(
+        Camera(**{**camera, "params": tuple(camera["params"])}),
+        up_in_world=None if given["up"] is None else np.array(given["up"]),
+        **{name: given[name] for name in _FACTS},
+        **arrays,
+    )
 
 
 def invert_rigid(b_from_a: Array) -> Array:
@@ -444,13 +409,11 @@ def undistort_boxes(xyxy: Array, camera: Camera) -> Array:
     """
     if not len(xyxy) or camera.model in ("PINHOLE", "SIMPLE_PINHOLE"):
         return xyxy
-    edges = np.tile(((xyxy[:, :2] + xyxy[:, 2:]) / 2)[:, None], (1, 4, 1))  # (N, 4, 2) midpoints
     side = np.arange(4)
-    axis = np.array([0, 1, 0, 1])
-    edges[:, side, axis] = xyxy
-    undistorted = camera.undistort(edges)[:, side, axis]  # (N, 4)
-    limit = np.array([camera.width, camera.height] * 2)
-    at_border = (xyxy <= 1) | (xyxy >= limit - 1)
+    edges = np.tile(((xyxy[:, :2] + xyxy[:, 2:]) / 2)[:, None], (1, 4, 1))  # (N, 4, 2) midpoints
+    edges[:, side, side % 2] = xyxy
+    undistorted = camera.undistort(edges)[:, side, side % 2]  # (N, 4)
+    at_border = (xyxy <= 1) | (xyxy >= np.array([camera.width, camera.height] * 2) - 1)
     boxes = np.where(at_border, xyxy, undistorted)
     return np.where(np.isfinite(boxes).all(1, keepdims=True), boxes, np.nan)
 
@@ -459,40 +422,25 @@ def distort_boxes(xyxy: Array, camera: Camera) -> Array:
     """Return the bounds (..., 4), pixels of the image, of boxes (..., 4) of a pinhole camera.
 
     Only the part within `Camera.fold_radius` has an image; NaN for boxes without such a part.
+    Bounds of a grid of points in equal steps of the viewing angle, as a box may extend to nearly 90
+    deg, with the row and the column nearest to the optical axis, where the fold is farthest out.
     """
     if camera.model in ("PINHOLE", "SIMPLE_PINHOLE"):
         return xyxy
-    boxes = xyxy.reshape(-1, 4)
-    bounds = np.full_like(boxes, np.nan)
-    rows = np.flatnonzero(np.isfinite(boxes).all(1))
-    for count in (5, 33):  # points along a side: more where the fold cuts the box
-        grid = _distorted_grid(boxes[rows], camera, count)
-        bounds[rows, :2] = np.nan_to_num(grid, nan=np.inf).min(1)
-        bounds[rows, 2:] = np.nan_to_num(grid, nan=-np.inf).max(1)
-        rows = rows[np.isnan(grid).any((1, 2))]
-    bounds[~(bounds[:, :2] < bounds[:, 2:]).all(1)] = np.nan
-    return bounds.reshape(xyxy.shape)
-
-
-def _distorted_grid(xyxy: Array, camera: Camera, count: int) -> Array:
-    """Distort a grid of points (N, g, 2) over the parts of boxes (N, 4) that may have an image.
-
-    Equal steps of the viewing angle, as a box may extend to nearly 90 deg, and the row and the
-    column nearest to the optical axis, where the fold is farthest out.
-
-    Args:
-        count: of the steps' ends along each side.
-    """
     focal = np.diag(camera.K)[:2]
     centre = camera.K[:2, 2]
     limit = min(np.arctan(camera.fold_radius), np.radians(89.9))
     ends = np.arctan((xyxy.reshape(-1, 2, 2) - centre) / focal).clip(-limit, limit)
     low, high = np.moveaxis(ends, 1, 0)  # (N, 2) rad
-    share = np.linspace(0, 1, count)[:, None, None]
+    share = np.linspace(0, 1, 5)[:, None, None]
     angle = np.append(low + share * (high - low), np.clip(0, low, high)[None], 0)
-    x, y = np.moveaxis(np.tan(angle) * focal + centre, 2, 0)  # (count + 1, N) each
-    xy = np.stack(np.broadcast_arrays(x[:, None], y), -1)  # (count + 1, count + 1, N, 2)
-    return np.moveaxis(camera.distort(xy).reshape((count + 1) ** 2, -1, 2), 1, 0)
+    x, y = np.moveaxis(np.tan(angle) * focal + centre, 2, 0)  # (6, N) each
+    grid = camera.distort(np.stack(np.broadcast_arrays(x[:, None], y), -1)).reshape(36, -1, 2)
+    bounds = np.hstack([
+        np.nan_to_num(grid, nan=np.inf).min(0), np.nan_to_num(grid, nan=-np.inf).max(0)
+    ])  # fmt: skip
+    bounds[~(bounds[:, :2] < bounds[:, 2:]).all(1)] = np.nan
+    return bounds.reshape(xyxy.shape)
 
 
 def viewing_rays(xyxy: Array, img_from_world: Array) -> Array:
@@ -561,19 +509,20 @@ def write_colmap(path: Path, poses: Poses, image_names: Sequence[str]) -> None:
     for old in path.glob("*.bin"):
         old.unlink()
     camera = poses.camera
-    numbers = " ".join(repr(float(p)) for p in camera.params)
-    facts = f"1 {camera.model} {camera.width} {camera.height} {numbers}\n"
-    (path / "cameras.txt").write_text(facts, encoding="utf-8")
-    known = poses.cam_from_world[poses.known]
+    rows = np.flatnonzero(poses.known).tolist()
+    known = poses.cam_from_world[rows]
     values = np.column_stack([quat_wxyz_from_matrix(known[:, :, :3]), known[:, :, 3]])  # (N, 7)
-    lines = [
-        f"{i + 1} {' '.join(map(repr, row))} 1 {image_names[i]}\n\n"
-        for i, row in zip(np.flatnonzero(poses.known).tolist(), values.tolist(), strict=True)
-    ]
-    (path / "images.txt").write_text("".join(lines), "utf-8", "surrogateescape")
+    params = map(float, camera.params)
     points = zip(poses.points.tolist(), poses.colors.tolist(), strict=True)
-    rows = [" ".join(map(repr, (i, *xyz, *rgb, 0))) for i, (xyz, rgb) in enumerate(points, 1)]
-    (path / "points3D.txt").write_text("".join(f"{row}\n" for row in rows), encoding="utf-8")
+    tables: dict[str, list[Sequence[Any]]] = {
+        "cameras": [(1, camera.model, camera.width, camera.height, *params)],
+        "images": [(row + 1, *value, 1, f"{image_names[row]}\n")
+                   for row, value in zip(rows, values.tolist(), strict=True)],
+        "points3D": [(i, *xyz, *rgb, 0) for i, (xyz, rgb) in enumerate(points, 1)],
+    }  # fmt: skip
+    for name, table in tables.items():
+        text = "".join(f"{' '.join(map(str, row))}\n" for row in table)
+        (path / f"{name}.txt").write_text(text, "utf-8", "surrogateescape")
 
 
 @dataclass(frozen=True, slots=True)
@@ -611,29 +560,26 @@ def read_sparse_model(folder: Path) -> SparseModel:
     """Read a COLMAP model, binary or text, with pycolmap."""
     model = import_pycolmap().Reconstruction(str(folder))
     images = [model.image(i) for i in sorted(model.reg_image_ids())]
-    points = sorted(model.points3D.items())
-    row = {point_id: r for r, (point_id, _) in enumerate(points)}
+    ids, points = zip(*sorted(model.points3D.items()), strict=True) if model.points3D else ((), ())
+    row = {point_id: r for r, point_id in enumerate(ids)}
     seen = [
         (r, row[p.point3D_id], *p.xy)
         for r, image in enumerate(images)
         for p in image.get_observation_points2D()
     ]
     table = np.array(seen).reshape(-1, 4)
-    cameras = {
-        i: Camera(c.model.name, c.width, c.height, tuple(c.params.tolist()))
-        for i, c in model.cameras.items()
-    }
+    of_image = [model.cameras[image.camera_id] for image in images]
     poses = [image.cam_from_world().matrix() for image in images]
     return SparseModel(
-        names=tuple(image.name for image in images),
-        cameras=[cameras[image.camera_id] for image in images],
-        cam_from_world=np.array(poses).reshape(-1, 3, 4),
-        points=checked_points([point.xyz for _, point in points], list(row), folder),
-        colors=np.array([point.color for _, point in points], np.uint8).reshape(-1, 3),
-        track_length=np.array([point.track.length() for _, point in points], np.int64),
-        obs_image=table[:, 0].astype(np.int64),
-        obs_point=table[:, 1].astype(np.int64),
-        obs_xy=table[:, 2:],
+        tuple(image.name for image in images),
+        [Camera(c.model.name, c.width, c.height, tuple(c.params.tolist())) for c in of_image],
+        np.array(poses).reshape(-1, 3, 4),
+        checked_points([point.xyz for point in points], ids, folder),
+        np.array([point.color for point in points], np.uint8).reshape(-1, 3),
+        np.array([point.track.length() for point in points], np.int64),
+        table[:, 0].astype(np.int64),
+        table[:, 1].astype(np.int64),
+        table[:, 2:],
     )
 
 
@@ -674,31 +620,12 @@ class VisiblePoints:
 
     def in_frame(self, row: int) -> IntArray:
         """Return the rows of the points in the image of a frame, ascending; none without a pose."""
-        if not self.poses.known[row]:
-            return np.empty(0, np.int64)
         points = self.nearby(row)
-        if len(self.observed(row)):
-            return points
-        size = (self.poses.camera.width, self.poses.camera.height)
-        image = np.array([[0.0, 0.0, *size]])
+        if not self.poses.known[row] or len(self.observed(row)):
+            return points[: None if self.poses.known[row] else 0]
+        image = np.array([[0.0, 0.0, self.poses.camera.width, self.poses.camera.height]])
         _, inside, _ = points_in_boxes(self.poses.points[points], self._img_from_world[row], image)
         return points[inside]
-
-    def in_boxes(self, row: int, xyxy: Array) -> tuple[IntArray, IntArray, Array]:
-        """Find the points that a frame sees inside boxes.
-
-        Args:
-            row: of the frame in the poses. xyxy: (D, 4) boxes in native pixels.
-        Returns:
-            one entry for each of K pairs of a box and a point in it, by box: rows of the boxes
-            (K,) and of the points (K,), depth (K,) of the point in the frame's camera.
-        """
-        points = self.in_frame(row)
-        boxes = undistort_boxes(xyxy, self.poses.camera)
-        box, inside, depth = points_in_boxes(
-            self.poses.points[points], self._img_from_world[row], boxes
-        )
-        return box, points[inside], depth
 
 
 def points_in_boxes(

@@ -8,6 +8,8 @@ guessed: a file that fits no entry, or several, is refused with their names and 
 
 from __future__ import annotations
 
+import codecs
+import contextlib
 import functools
 import xml.etree.ElementTree as ElementTree
 import zipfile
@@ -40,10 +42,10 @@ class Probe:
         """Names in the folder, or in the zip archive; empty of another file."""
         if self.is_dir:
             return frozenset(entry.name for entry in self.path.iterdir())
-        if zipfile.is_zipfile(self.path):
-            with zipfile.ZipFile(self.path) as archive:
-                return frozenset(archive.namelist())
-        return frozenset()
+        if not zipfile.is_zipfile(self.path):
+            return frozenset()
+        with zipfile.ZipFile(self.path) as archive:
+            return frozenset(archive.namelist())
 
     @functools.cached_property
     def lines(self) -> list[str]:
@@ -52,11 +54,11 @@ class Probe:
             return []
         with self.path.open("rb") as file:
             head = file.read(HEAD_BYTES)
-        if b"\0" in head and not head.startswith((b"\xff\xfe", b"\xfe\xff")):
+        is_utf16 = head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        if b"\0" in head and not is_utf16:
             return []
-        coding = "utf-16" if head.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig"
-        lines = head.decode(coding, "replace").splitlines()
-        return [line.strip() for line in lines if line.strip()]
+        text = head.decode("utf-16" if is_utf16 else "utf-8-sig", "replace")
+        return list(filter(None, map(str.strip, text.splitlines())))
 
     @property
     def json_lines(self) -> bool:
@@ -67,9 +69,9 @@ class Probe:
     @functools.cached_property
     def kind(self) -> str:
         """Kind of file: "folder", "XML", "JSON" or "text"; "" of a binary one."""
-        begin = self.lines[0][0] if self.lines else ""
-        text = {"<": "XML", "[": "JSON", "{": "JSON", "": ""}.get(begin, "text")
-        return "folder" if self.is_dir else text
+        if self.is_dir or not self.lines:
+            return "folder" * self.is_dir
+        return {"<": "XML", "[": "JSON", "{": "JSON"}.get(self.lines[0][0], "text")
 
     @functools.cached_property
     def json(self) -> Any:
@@ -78,25 +80,21 @@ class Probe:
         Raises:
             ReobjError: the name ends with .json, and the content is damaged.
         """
-        if (self.suffix != ".json" and self.kind != "JSON") or self.json_lines:
-            return None
-        return load_json(self.path)
+        is_json = self.suffix == ".json" or self.kind == "JSON"
+        return load_json(self.path) if is_json and not self.json_lines else None
 
     @functools.cached_property
     def root(self) -> ElementTree.Element | None:
         """Root element of an XML file, without its children; None of another file."""
-        if self.kind != "XML":
-            return None
-        try:
-            element: ElementTree.Element = next(ElementTree.iterparse(self.path, ("start",)))[1]
-        except (ElementTree.ParseError, StopIteration):
-            return None
-        return element
+        if self.kind == "XML":
+            with contextlib.suppress(ElementTree.ParseError, StopIteration):
+                element: ElementTree.Element = next(ElementTree.iterparse(self.path, ("start",)))[1]
+                return element
+        return None
 
     def keys(self) -> frozenset[str]:
         """Keys of a JSON object, or of the first object of a JSON list; else empty."""
-        data = self.json
-        data = data[0] if isinstance(data, list) and data else data
+        data = self.json[0] if isinstance(self.json, list) and self.json else self.json
         return frozenset(data) if isinstance(data, dict) else frozenset()
 
     @functools.cached_property
@@ -116,7 +114,6 @@ class Format(Generic[R]):
     Attributes:
         name: value of the flag. title: the tools and datasets that write it.
         recognise: tests structure alone (names, suffix, header, keys).
-        read: the reader; None: a format that is only named, with `advice` on the export to use.
         frames, units, unread: numbering of frames, units, and what is not read (for the table).
         kind: of file, as of a Probe; "": any.
     """
@@ -124,63 +121,55 @@ class Format(Generic[R]):
     name: str
     title: str
     recognise: Callable[[Any], bool]
-    read: R | None
+    read: R
     frames: str = ""
     units: str = ""
     unread: str = ""
-    advice: str = ""
     kind: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Registry(Generic[R]):
-    """All formats of one kind of content. `flag` names an entry; `what`: in messages."""
+    """All formats of one kind of content.
+
+    Attributes:
+        what: the content, in messages. flag: names an entry. advice: for files of other formats.
+    """
 
     what: str
     flag: str
     formats: Sequence[Format[R]]
-
-    @property
-    def readable(self) -> list[Format[R]]:
-        """The formats with a reader."""
-        return [entry for entry in self.formats if entry.read is not None]
-
-    def reader(self, path: Path, name: str = AUTO) -> R:
-        """Return the reader of a file: of the format that the user names, or that it fits.
-
-        Raises:
-            ReobjError: no such file or format; a file that fits none, several, or one that is
-                only named.
-        """
-        entry = self.find(path, name)
-        if entry.read is None:
-            raise ReobjError(f"{path}: {entry.title}, not read; {entry.advice}")
-        return entry.read
+    advice: str = ""
 
     def find(self, path: Path, name: str = AUTO) -> Format[R]:
-        """Return the format of a file, as `reader` does."""
+        """Return the format of a file: the one that the user names, or that it fits.
+
+        Raises:
+            ReobjError: no such file or format; a file that fits none or several.
+        """
         if not path.exists():
             raise ReobjError(f"{path} does not exist")
         return self.choose(Probe(path), name)
 
-    def choose(self, probe: Probe, name: str = AUTO) -> Format[R]:
-        """Return the format that the user names, or that a probe fits, as `reader` does."""
-        known = {entry.name: entry for entry in self.readable}
+    def choose(self, probe: Any, name: str = AUTO) -> Format[R]:
+        """Return the format that the user names, or that a probe fits, as `find` does."""
+        known = {entry.name: entry for entry in self.formats}
         if name not in ("", AUTO):
             if name not in known:
                 close = did_you_mean(name, known) or f"; expected {AUTO}, {', '.join(known)}"
                 raise ReobjError(f"{self.flag} {name}: no such format{close}")
             return known[name]
         fits = [entry for entry in self.formats if entry.recognise(probe)]
-        if len(fits) == 1:
-            return fits[0]
-        names = [entry.name for entry in fits if entry.read is not None]
-        if fits:
-            raise ReobjError(f"{probe.path}: fits {len(fits)} formats of {self.what}: "
-                             f"{', '.join(names)}; name one with {self.flag}")  # fmt: skip
-        near = [name for name, entry in known.items() if entry.kind == probe.kind] or known
-        raise ReobjError(f"{probe.path}: no known format of {self.what}{probe.found}; expected one "
-                         f"of {', '.join(near)} ({self.flag}; docs/input_formats.md)")  # fmt: skip
+        if len(fits) > 1:
+            names = ", ".join(entry.name for entry in fits)
+            raise ReobjError(f"{probe.path}: fits {len(fits)} formats of {self.what}: {names}; "
+                             f"name one with {self.flag}")  # fmt: skip
+        if not fits:
+            near = [name for name, entry in known.items() if entry.kind == probe.kind] or known
+            raise ReobjError(f"{probe.path}: no known format of {self.what}{probe.found}; expected "
+                             f"one of {', '.join(near)} ({self.flag}; docs/input_formats.md)"
+                             f"{self.advice}")  # fmt: skip
+        return fits[0]
 
 
 # ---- Names of images -----------------------------------------------------------------------------
@@ -211,22 +200,22 @@ def frames_by_name(
             names.
     """
     for suffix in (True, False):
-        given_paths = [_components(name, suffix) for name in given]
-        image_paths = [_components(image, suffix) for image in images]
+        given_paths, image_paths = (
+            [_components(name, suffix) for name in names] for names in (given, images)
+        )
         clash: list[tuple[str, ...]] = []
         for depth in range(1, max(map(len, given_paths + image_paths), default=0) + 1):
-            of_given = Counter(path[-depth:] for path in given_paths)
-            of_images = Counter(path[-depth:] for path in image_paths)
-            matched = [key for key in of_given if key in of_images]
+            keys, of_images = ([p[-depth:] for p in paths] for paths in (given_paths, image_paths))
+            counts = Counter(keys), Counter(of_images)
+            matched = counts[0].keys() & counts[1].keys()
             if not matched:
                 break  # longer keys match no better
-            clash = [key for key in matched if of_given[key] > 1 or of_images[key] > 1]
+            clash = sorted(key for key in matched if counts[0][key] > 1 or counts[1][key] > 1)
             if not clash:
-                frame_of = {path[-depth:]: frame for frame, path in enumerate(image_paths)}
-                rule = "file names" if depth == 1 else f"file names with {depth - 1} folders"
-                rule += "" if suffix else ", without suffixes"
-                frames = [frame_of.get(path[-depth:], -1) for path in given_paths]
-                return np.array(frames, np.int64), rule
+                frame_of = {key: frame for frame, key in enumerate(of_images)}
+                rule = "file names" + f" with {depth - 1} folders" * (depth > 1)
+                frames = [frame_of.get(key, -1) for key in keys]
+                return np.array(frames, np.int64), rule + ", without suffixes" * (not suffix)
         if clash:
             raise ReobjError(
                 f"{where}: {'/'.join(clash[0])} is the name of several images in different "

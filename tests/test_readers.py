@@ -10,11 +10,11 @@ import zipfile
 import cv2
 import numpy as np
 import pytest
-from pose_worlds import FOCAL, FRAMES, PINHOLE, SIZE, blank, some_cameras, supplied
+from pose_worlds import FOCAL, FRAMES, PINHOLE, blank, some_cameras, supplied
 from scipy.spatial.transform import Rotation
 
 import reobj_track as rt
-from reobj.cameras import import_pycolmap, invert_rigid, write_colmap, write_tum
+from reobj.cameras import import_pycolmap, invert_rigid, write_colmap
 
 CAMERA = f"{FOCAL},{FOCAL},320,240"
 K = [[FOCAL, 0, 320], [0, FOCAL, 240], [0, 0, 1]]
@@ -38,8 +38,13 @@ def text(path, rows, head="", sep=" "):
     return path
 
 
+def world(cams):
+    """world_from_cam (F, 4, 4)."""
+    return full(invert_rigid(cams))
+
+
 def gl(cams):
-    return full(invert_rigid(cams)) @ GL
+    return world(cams) @ GL
 
 
 def rows_of(world_from_cam, first, order=(0, 1, 2, 3)):
@@ -74,7 +79,7 @@ def as_euroc(folder, cams):
          f"  data: {BODY_FROM_CAM.ravel().tolist()}\nresolution: [640, 480]\n"
          "distortion_model: radial-tangential\ndistortion_coefficients: [0, 0, 0, 0]\n"
          "intrinsics: [500.0, 500.0, 320, 240] #fu, fv, cu, cv\n")  # fmt: skip
-    body = full(invert_rigid(cams)) @ np.linalg.inv(BODY_FROM_CAM)
+    body = world(cams) @ np.linalg.inv(BODY_FROM_CAM)
     rows = rows_of(body, [i * 33333333 for i in range(len(cams))], (3, 0, 1, 2))
     names = [f"p_RS_R_{a} [m]" for a in "xyz"] + [f"q_RS_{a} []" for a in "wxyz"]
     head = ", ".join(["#timestamp", *names, *"abcdefghi"])
@@ -86,7 +91,7 @@ def as_kitti(folder, cams):
 
 
 def as_replica(folder, cams):
-    return text(folder / "traj.txt", full(invert_rigid(cams))).parent
+    return text(folder / "traj.txt", world(cams)).parent
 
 
 def as_stray(folder, cams):
@@ -107,13 +112,13 @@ def as_arkitscenes(folder, cams):
 
 def as_scannet(folder, cams):
     text(folder / "intrinsic" / "intrinsic_color.txt", K - np.array([[0, 0, 0.5]] * 2 + [[0] * 3]))
-    for i, w in enumerate(full(invert_rigid(cams))):
+    for i, w in enumerate(world(cams)):
         text(folder / "pose" / f"{i}.txt", w)
     return folder
 
 
 def as_seven_scenes(folder, cams):
-    for i, w in enumerate(full(invert_rigid(cams))):
+    for i, w in enumerate(world(cams)):
         text(folder / f"frame-{i:06d}.pose.txt", w)
     return folder
 
@@ -165,7 +170,7 @@ def as_nerfstudio(folder, cams):
 def as_scannetpp(folder, cams):
     entries = {
         f"frame_{i:06d}": {"aligned_pose": w.tolist(), "pose": np.eye(4).tolist(), "intrinsic": K}
-        for i, w in enumerate(full(invert_rigid(cams)))
+        for i, w in enumerate(world(cams))
     }
     return text(folder / "pose_intrinsic_imu.json", entries)
 
@@ -302,46 +307,19 @@ def test_a_unit_that_the_format_does_not_state_is_declared_or_assumed_once(tmp_p
         assert poses.metric == (unit == "metres") and "assumed" not in poses.reading
 
 
-@pytest.mark.parametrize("write", [model, as_nerfstudio])
-def test_distorted_cameras_of_files_are_read(tmp_path, write):
-    """FULL_OPENCV of a COLMAP model, text and binary; k3 of a transforms.json."""
-    terms = (-0.1, 0.02, 0.001, 0.002, 0.3, 0.0, 0.0, 0.0)
-    camera = rt.Camera("FULL_OPENCV", *SIZE, (FOCAL, FOCAL, 320.0, 240.0, *terms))
-    if write is as_nerfstudio:
-        path = write(tmp_path, some_cameras())
-        named = dict(zip(("k1", "k2", "p1", "p2", "k3"), terms[:5], strict=True))
-        edit_json(tmp_path / NGP, lambda data: data.update(named))
-    else:
-        path = model(tmp_path, some_cameras(), camera)
-        assert read(binary(path)).camera == camera
-    assert read(path).camera == camera
-
-
-@pytest.mark.parametrize("fmt", ["tum", "transforms", "record3d"])
-def test_the_format_option_is_used(tmp_path, fmt):
-    write = {"tum": as_tum, "transforms": as_instant_ngp, "record3d": as_record3d}[fmt]
-    path = write(tmp_path, some_cameras()).rename(tmp_path / "cameras.dat")
-    np.testing.assert_allclose(read(path, fmt=fmt, camera=CAMERA).cam_from_world, some_cameras())
-    with pytest.raises(rt.ReobjError):
-        read(path, fmt="record3d" if fmt == "transforms" else "transforms", camera=CAMERA)
-
-
 @pytest.mark.parametrize("form", ["text", "binary"])
 def test_colmap_observations_become_rows_of_frames_and_points(tmp_path, form):
     """Ids count from 1 here; images 1 and 6 of the model are no frames of the video."""
     folder = model(tmp_path, some_cameras())
-    observed = {1: [1, 2], 2: [2], 3: [1], 4: [], 5: [1, 2], 6: [1]}  # points of each image
-    rows = [
-        f"{row}\n" + " ".join(f"{9 * k + 1}.5 2.5 {point}" for k, point in enumerate(points))
-        for row, points in zip(image_rows(folder), observed.values(), strict=True)
-    ]
-    (folder / "images.txt").write_text("\n".join(rows) + "\n")
+    observed = ([1, 2], [2], [1], [], [1, 2], [1])  # points of each image
+    rows = [f"{row}\n{' '.join(f'9.5 {k}.5 {point}' for k, point in enumerate(points))}\n"
+            for row, points in zip(image_rows(folder), observed, strict=True)]  # fmt: skip
+    (folder / "images.txt").write_text("".join(rows))
     lines = (folder / "points3D.txt").read_text().splitlines()
-    tracks = [
-        " ".join(f"{image} {points.index(p)}" for image, points in observed.items() if p in points)
-        for p in (1, 2)
-    ]
-    text(folder / "points3D.txt", [f"{lines[k]} {tracks[k]}".split() for k in (1, 0)])
+    for p, line in enumerate(lines, 1):
+        track = [f"{i} {points.index(p)}" for i, points in enumerate(observed, 1) if p in points]
+        lines[p - 1] = " ".join([line, *track])
+    (folder / "points3D.txt").write_text("\n".join(lines[::-1]))
     poses = read(folder if form == "text" else binary(folder), blank(4, NAMES[1:5]))
     assert poses.reading.startswith(f"colmap ({form})")
     assert sorted(map(tuple, poses.visibility.tolist())) == [(0, 1), (1, 0), (3, 0), (3, 1)]
@@ -355,16 +333,6 @@ def test_rows_of_images_are_no_observations(tmp_path):
     names = ["in a folder/0000.jpg", "0001.jpg", "in a folder/0002.jpg", "0003.jpg"]
     path.write_text("".join(f"{i} 1 0 0 0 {i} 0 0 1 {name}\n" for i, name in enumerate(names)))
     assert np.flatnonzero(read(path).known).tolist() == [0, 1, 2, 3]
-
-
-def test_own_files_are_read_back(tmp_path):
-    cams = some_cameras()
-    cams[2] = np.nan
-    write_tum(tmp_path / "poses.txt", dataclasses.replace(supplied(cams), source="pycolmap"))
-    back = read(tmp_path / "poses.txt", camera=CAMERA)
-    np.testing.assert_allclose(back.cam_from_world, cams, atol=1e-8)
-    assert not back.metric  # the header states that the scale is unknown
-    assert "5 of 6" in back.messages[0]
 
 
 # ---- Damaged files: location, found and expected content, remedy ---------------------------------
@@ -418,28 +386,21 @@ DAMAGED = [
     (as_tum, "poses.txt", lambda p: edit(p, 3, word(7, "0.1")), "line 4: the quaternion"),
     (as_tum, "poses.txt", lambda p: edit(p, 3, word(2, "1e300")), r"line 4: more than 1e\+09 unit"),
     (as_tum, "poses.txt", lambda p: edit(p, 3, word(0, "inf")), "a time stamp is not finite"),
-    (as_tum, "poses.txt", lambda p: p.write_bytes(b"\xff\xfe\x00\x81"), "no known format"),
     (as_scannet, "pose/1.txt", lambda p: edit(p, 1, word(0, "3.0")), "1.txt: .*not a rotation"),
-    (as_scannet, "pose/1.txt", lambda p: text(p, np.loadtxt(p).T), "1.txt: .*row-major"),
     (as_scannet, "pose/2.txt", lambda p: edit(p, 1, drop_last), "2.txt, line 2: 3 words .*4 numb"),
     (as_scannet, "pose/2.txt", mirror, "2.txt: .*mirrored"),
     (as_scannet, COLOR, lambda p: p.unlink(), "--camera"),
-    (as_scannet, COLOR, lambda p: edit(p, 0, word(2, "648")), "do not fit"),
     (as_instant_ngp, NGP, lambda p: p.write_text(p.read_text()[:50]), "not valid JSON"),
-    (as_instant_ngp, NGP, lambda p: edit_json(p, lambda d: d.pop("frames")), "no known format"),
     (as_instant_ngp, NGP, lambda p: edit_frame(p, transform_matrix=[1, 2]), r"frames\[1\]: no pos"),
     (as_instant_ngp, NGP, lambda p: edit_json(p, lambda d: d.update(applied_transform="no")),
      f"{DAMAGE} transforms"),
     (as_instant_ngp, NGP, lambda p: edit_frame(p, fl_x=900.0), "several different cameras"),
-    (as_instant_ngp, NGP, lambda p: edit_json(p, lambda d: d.update(w=480, h=640)), "rotated"),
     (as_instant_ngp, NGP, lambda p: edit_json(p, lambda d: [f.update(file_path="a.png")
                                                             for f in d["frames"]]), "none of its"),
     (ONLY, IMAGES, lambda p: edit(p, 1, drop_last), "images.txt, line 2: expected IMAGE_ID"),
     (ONLY, IMAGES, lambda p: edit(p, 1, word(1, "2.0")), "images.txt, line 2: the quaternion"),
     (ONLY, IMAGES, lambda p: p.write_bytes(bytes(range(256))), "cannot be read as text"),
     (ONLY, CAMERAS, lambda p: edit(p, 0, drop_last), "3 parameters of a PINHOLE camera"),
-    (ONLY, CAMERAS, lambda p: edit(p, 0, word(1, "MAGIC")), "no camera model MAGIC"),
-    (ONLY, CAMERAS, lambda p: edit(p, 0, word(4, "0")), "focal length"),
     (ONLY, CAMERAS, lambda p: p.unlink(), "no cameras.txt beside it"),
     (as_colmap_with_observations, "points3D.txt", lambda p: edit(p, 0, word(2, "x")), DAMAGE),
     (as_colmap_binary, "binary/images.bin", shorten, DAMAGE),
@@ -459,31 +420,26 @@ def test_damaged_files_are_refused_in_one_clear_line(tmp_path, write, file, dama
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.parametrize("name, at", [("images.bin", 81), ("points3D.bin", 51), ("frames.bin", 72)])
+@pytest.mark.parametrize("name, at", [("images.bin", 0), ("points3D.bin", 51), ("frames.bin", 72)])
 def test_a_binary_model_that_claims_more_than_it_holds(tmp_path, name, at):
-    """A claim of 2^40 points would take 40 TB before the first is read."""
+    """A claim of 2^31 points would take 85 GB before the first is read."""
     pc = import_pycolmap()
     pc.synthesize_dataset(pc.SyntheticDatasetOptions()).write_binary(str(tmp_path))
-    whole = (tmp_path / name).read_bytes()
-    at = whole.index(b"\0", 72) + 1 if name == "images.bin" else at
-    for where, claim in ((0, struct.pack("<Q", 2**40)), (at, struct.pack("<I", 2**31))):
-        data = bytearray(whole)
-        data[where : where + len(claim)] = claim
-        (tmp_path / name).write_bytes(data)
-        with pytest.raises(rt.ReobjError, match=f"{name} claims [0-9]+ (records|entries) in"):
-            rt.read_poses(tmp_path, blank(9))
+    data = bytearray((tmp_path / name).read_bytes())
+    data[at : at + 4] = struct.pack("<I", 2**31)
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(rt.ReobjError, match=f"{name} claims [0-9]+ (records|entries) in"):
+        rt.read_poses(tmp_path, blank(9))
 
 
 def test_missing_files_unknown_formats_and_missing_intrinsics(tmp_path):
     path = as_tum(tmp_path, some_cameras())
-    for name in ("empty", "other"):
-        (tmp_path / name).mkdir()
-    import_pycolmap().Reconstruction().write_binary(str(tmp_path / "empty"))
+    (tmp_path / "other").mkdir()
     for file, options, message in (
         ("no.txt", {}, r"no\.txt does not exist$"), (path, {}, "--camera"),
         ("other", {}, "no known format of poses; expected one of colmap"),
-        ("empty", {}, "no registered image"),
         (path, {"fmt": "xyz"}, "no such format; expected auto, colmap"),
+        (path, {"fmt": "transforms"}, "not valid JSON"),
         (path, {"video": blank(0), "camera": CAMERA}, "no readable frame"),
     ):  # fmt: skip
         with pytest.raises(rt.ReobjError, match=message):
@@ -504,58 +460,26 @@ def test_lost_scannet_frames_have_no_pose(tmp_path):
     assert read(tmp_path, blank(FRAMES)).known.all()
 
 
-@pytest.mark.parametrize(
-    "stamps, known",
-    [
-        (np.arange(6) / 30, [0, 1, 2, 3, 4, 5]),
-        (np.arange(6).round(3) / 30 + 3e-4, [0, 1, 2, 3, 4, 5]),  # the same times, rounded
-        ([0.010, 0.045, 0.2], [0, 1]),  # within half a frame; the last is beyond the video's end
-        ([0.0, 0.0167, 0.0333, 0.05, 0.0667], [0, 1, 2]),  # twice the rate
-        (100 + np.arange(6) / 30, [0, 1, 2, 3, 4, 5]),  # another clock, one a frame: in order
-        (1000.0 + np.arange(4), None),  # another clock, and another number
-    ],
-)
-def test_time_stamps_are_matched_within_half_a_frame(tmp_path, stamps, known):
-    path = as_tum(tmp_path, some_cameras(len(stamps)))
-    for i, stamp in enumerate(stamps):
-        edit(path, i + 1, word(0, repr(float(stamp))))
-    if known is None:
-        with pytest.raises(rt.ReobjError, match="none of its 4 poses belongs to a frame"):
-            read(path, blank(FRAMES), camera=CAMERA)
-        return
-    poses = read(path, blank(FRAMES), camera=CAMERA)
-    assert np.flatnonzero(poses.known).tolist() == known
-    if len(stamps) == FRAMES:
-        np.testing.assert_allclose(poses.cam_from_world, some_cameras(), atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    "step, stamps, offset, known",
-    [
-        (1 / 30, np.arange(0, 0.3, 0.01), 0.004, [0, 1, 2, 3, 4, 5]),  # motion capture, 100 Hz
-        (1.0, np.arange(0, 6, 1.0), 0.03, []),  # half a frame is far more than TUM's 20 ms
-        (1.0, np.arange(0, 4, 0.01), 0.067, [1, 2, 3, 4]),  # begins 67 ms after the first image
-    ],
-)
-def test_times_in_image_names_match_poses_of_a_higher_rate(tmp_path, step, stamps, offset, known):
+def test_times_in_image_names_match_poses_of_a_higher_rate(tmp_path):
     """TUM: 1305031102.175304.png; the pose is that of its time, between two of the file."""
     start = 1305031102.175304
-    times = start + step * np.arange(FRAMES)
+    times = start + np.arange(FRAMES) / 30
     for time in times:
         cv2.imwrite(str(tmp_path / f"{time:.6f}.png"), np.zeros((48, 64, 3), np.uint8))
+    stamps = np.arange(0, 0.3, 0.01)  # motion capture, 100 Hz
     cams = some_cameras(len(stamps))
     path = as_tum(tmp_path, cams)
     rows = np.loadtxt(path)
-    rows[:, 0] = start + stamps + offset
+    rows[:, 0] = start + stamps + 0.004
     np.savetxt(path, rows, "%.6f " + " %.9f" * 7)
-    if not known:
-        with pytest.raises(rt.ReobjError, match="none of its 6 poses"):
-            read(path, rt.Video(tmp_path), camera="50,50,32,24")
-        return
     poses = read(path, rt.Video(tmp_path), camera="50,50,32,24")
-    assert np.flatnonzero(poses.known).tolist() == known and poses.metric
+    assert poses.known.all() and poses.metric
     np.testing.assert_allclose(poses.time_s, times, atol=1e-6)
     centre = invert_rigid(cams)[:, :, 3]
-    wanted = [np.interp(times[known] - start - offset, stamps, axis) for axis in centre.T]
-    found = invert_rigid(poses.cam_from_world[known])[:, :, 3]
+    wanted = [np.interp(times - start - 0.004, stamps, axis) for axis in centre.T]
+    found = invert_rigid(poses.cam_from_world)[:, :, 3]
     np.testing.assert_allclose(found, np.transpose(wanted), atol=1e-5)  # times have 6 digits
+    rows[:, 0] += 0.025  # later than the first image by more than TUM's 20 ms
+    np.savetxt(path, rows, "%.6f " + " %.9f" * 7)
+    poses = read(path, rt.Video(tmp_path), camera="50,50,32,24")
+    assert poses.known.tolist() == [False] + [True] * 5

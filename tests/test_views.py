@@ -140,21 +140,6 @@ def test_frames_without_a_pose_or_of_another_component_have_no_points() -> None:
     ]  # fmt: skip
 
 
-def test_boxes_of_a_frame_get_their_points_with_depth() -> None:
-    """Boxes are undistorted: with this lens the point at a corner leaves the box otherwise."""
-    camera = rt.Camera("SIMPLE_RADIAL", *SIZE, (520.0, 320.0, 240.0, 0.3))
-    poses = sparse_walk(camera=camera)
-    model = pycolmap.Camera(
-        model="SIMPLE_RADIAL", width=640, height=480, params=list(camera.params)
-    )
-    in_cam = poses.points[:3] @ poses.cam_from_world[4, :, :3].T + poses.cam_from_world[4, :, 3]
-    x, y = np.asarray(model.img_from_cam(in_cam))[2]  # where the lens puts point 2
-    boxes = np.array([[x - 2, y - 2, x + 2, y + 2], [0.0, 0, 1, 1], [0.0, 0, 640, 480]])
-    box, point, depth = VisiblePoints(poses).in_boxes(4, boxes)
-    assert list(zip(box.tolist(), point.tolist(), strict=True)) == [(0, 2), (2, 0), (2, 2)]
-    np.testing.assert_allclose(depth, in_cam[[2, 0, 2], 2])
-
-
 CHAIRS = chair_solids()
 
 

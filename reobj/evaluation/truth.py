@@ -96,7 +96,7 @@ def read_truth(
     Raises:
         ReobjError: the file cannot be read, or an identity has two boxes in a frame.
     """
-    reader = TRUTH.reader(path, fmt)
+    reader = TRUTH.find(path, fmt).read
     if first not in ("", "0", "1"):
         raise ReobjError(f"detect.first_frame {first}: expected 0 or 1 for ground truth")
     notes = [] if notes is None else notes
@@ -108,7 +108,6 @@ def read_truth(
 
 def _read_labelled(entry: Format[Reader], source: Source, _: float) -> LabelledBoxes:
     """Read a format of detections with identities as ground truth."""
-    assert entry.read is not None
     path = source.path
     source.names = ()  # the file has its own
     recorded = read_source(source, entry.read)
@@ -235,16 +234,13 @@ def _mot_classes(
     return named, (flagged | unnamed) * Role.IGNORED, note
 
 
-WITH_TRACKS = "export it as COCO JSON with track_id, or as MOTChallenge rows"
 WITH_IDENTITIES = "visdrone kitti csv records coco cvat".split()
 TRUTH: Registry[TruthReader] = Registry("ground truth", "--gt-format", [
     Format("mot", "MOTChallenge, CVAT's MOT 1.1, DanceTrack: rows of 6 to 10 numbers",
            lambda probe: bool(forms(probe) & {"mot", "boxmot"}), _read_mot, FROM_1, "px",
            "x, y, z in ten columns", kind="text"),
-    *(dataclasses.replace(entry, read=entry.read and partial(_read_labelled, entry),
-                          advice=WITH_TRACKS)
-      for entry in cast(Sequence[Any], DETECTIONS.formats)
-      if entry.name in WITH_IDENTITIES or entry.read is None),
+    *(dataclasses.replace(entry, read=partial(_read_labelled, entry))
+      for entry in cast(Sequence[Any], DETECTIONS.formats) if entry.name in WITH_IDENTITIES),
 ])  # fmt: skip
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from reobj.cameras import Camera, camera_parameters, checked_camera, usable
+from reobj.cameras import Camera, camera_parameters, usable
 from reobj.files import load_json, load_npz, read_text, shortened
 from reobj.formats import AUTO, Format, Probe, Registry
 from reobj.types import COORDINATE_MAX, ReobjError
@@ -46,7 +46,7 @@ def parse_camera(text: str, size: tuple[int, int], fmt: str = AUTO) -> Camera | 
     return None if camera is None else fitted_camera(camera, size, f"--camera {text:.200}")
 
 
-CAMERA_MAX = 1 << 20  # characters of a file; chosen: a thousand times what a camera takes
+CAMERA_MAX = 1 << 20  # characters of a file, a thousand times what a camera takes
 
 
 def stated_camera(text: str, size: Size, fmt: str = AUTO) -> Camera | None:
@@ -73,34 +73,40 @@ def read_camera(path: Path, size: Size, fmt: str = AUTO) -> Camera:
     if path.stat().st_size > CAMERA_MAX:
         raise ReobjError(f"{path}: more than {CAMERA_MAX} bytes, not a camera file")
     try:
-        camera = CAMERAS.reader(path, fmt)(path, size)
+        return CAMERAS.find(path, fmt).read(path, size)
     except ReobjError as error:
         raise ReobjError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
     except Exception:  # files of other programs hold any type
         raise ReobjError(f"{path}: not a camera file; expected {CAMERA_FORMS}") from None
-    if camera is None:
-        raise ReobjError(f"{path}: no focal length; expected {CAMERA_FORMS}")
-    return camera
 
 
 def fitted_camera(camera: Camera, size: tuple[int, int], where: str) -> Camera:
-    """Return the camera resized to (w, h) `size`; refuse one of another aspect ratio."""
+    """Return the camera resized to (w, h) `size`.
+
+    Raises:
+        ReobjError: another aspect ratio; a principal point more than .2 sides off the middle, or a
+            focal length outside .1 to 10 longer sides, as no lens has; a distortion that few pixels
+            are invertible for.
+    """
+    refuse_unusable(camera, where)
     width = camera.width
     height = camera.height
-    try:
-        camera_parameters(camera.model)  # refuses panoramas, which have no K
-    except ReobjError as error:
-        raise ReobjError(f"{where}: {error}") from None
-    refuse_unusable(camera, where)
     if abs(width * size[1] - height * size[0]) > max(width, height, *size):  # more than rounding
         raise ReobjError(
             f"{where}: a camera of {width}x{height} images, but the frames are {size[0]}x{size[1]};"
             " expected the same aspect ratio (rotated or cropped video?)"
         )
-    camera = checked_camera(camera.resized(size), where)
+    camera = camera.resized(size)
+    K = camera.K
+    off_centre = np.abs(K[:2, 2] / size - 0.5).max() > 0.2
+    if off_centre or not 0.1 < K[0, 0] / max(size) < 10:
+        raise ReobjError(
+            f"{where}: focal length {K[0, 0]:.0f} px and centre ({K[0, 2]:.0f}, {K[1, 2]:.0f}) "
+            f"do not fit frames of {size[0]}x{size[1]} as they are read (rotated? resized?)"
+        )
     is_brown = camera.model in ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-    least = 0.4 if is_brown else 0.1  # usual ones have .7 and more, fisheyes of 180 deg .4
-    if (ratio := pinhole_ratio(camera)) < least:
+    ratio = pinhole_ratio(camera)
+    if ratio < (0.4 if is_brown else 0.1):  # usual ones have .7 and more, fisheyes of 180 deg .4
         raise ReobjError(
             f"{where}: {camera_line(camera)}: its distortion is invertible for only "
             f"{100 * ratio:.0f} % of the pixels; check the order of the distortion terms"
@@ -110,29 +116,27 @@ def fitted_camera(camera: Camera, size: tuple[int, int], where: str) -> Camera:
 
 def refuse_unusable(camera: Camera, where: str) -> None:
     """Refuse a camera without a size, finite parameters and positive focal lengths."""
-    if not usable(camera):
-        text = "expected a size, finite numbers and focal lengths above 0"
-        raise ReobjError(f"{where}: {camera_line(camera)}: {text}")
+    try:
+        fault = (
+            "" if usable(camera) else "expected a size, finite numbers and focal lengths above 0"
+        )
+    except ReobjError as error:  # a panorama has no K
+        fault = str(error)
+    if fault:
+        raise ReobjError(f"{where}: {camera_line(camera)}: {fault}")
 
 
-def pinhole_ratio(camera: Camera, count: int = 16) -> float:
-    """Return the fraction of a camera's pixels whose distortion is plausible.
+def pinhole_ratio(camera: Camera) -> float:
+    """Return the fraction of a camera's pixels, on a grid, whose distortion is plausible.
 
     It must be invertible within its fold, and change the radius from the image centre by a factor
     of at most 3, beyond what a pinhole image can show.
-
-    Args:
-        count: of the pixels tried along each side.
     """
-    x, y = ((np.arange(count) + 0.5) / count * side for side in (camera.width, camera.height))
-    pixel = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
-    centre = camera.K[:2, 2]
-    ideal = camera.undistort(pixel) - centre
-    radius = np.linalg.norm(pixel - centre, axis=1)
-    ideal_radius = np.linalg.norm(ideal, axis=1)
-    good = np.isfinite(ideal_radius)
-    good &= (ideal_radius < 3 * radius) & (radius < 3 * ideal_radius)
-    return float(good.mean())
+    sides = ((np.arange(16) + 0.5) / 16 * side for side in (camera.width, camera.height))
+    pixel = np.stack(np.meshgrid(*sides), -1)  # (16, 16, 2)
+    offsets = np.stack([camera.undistort(pixel), pixel]) - camera.K[:2, 2]
+    ideal, radius = np.linalg.norm(offsets, axis=-1)
+    return float(((ideal < 3 * radius) & (radius < 3 * ideal)).mean())
 
 
 def camera_line(camera: Camera) -> str:
@@ -192,20 +196,13 @@ def brown_camera(
         size: (w, h) px. distortion: k1, k2, p1, p2, k3, k4, k5, k6 (Brown's model, with k4 to k6
             OpenCV's rational one); trailing zeros may be left out.
     """
-    terms = [*distortion, *[0.0] * (8 - len(distortion))]
-    model = "PINHOLE"
-    count = 0
-    if any(terms):
-        model = "OPENCV"
-        count = 4
-    if any(terms[4:]):
-        model = "FULL_OPENCV"
-        count = 8
+    terms = [*distortion, *[0.0] * 8][:8]
+    count = 8 if any(terms[4:]) else 4 * any(terms)
+    model = {0: "PINHOLE", 4: "OPENCV", 8: "FULL_OPENCV"}[count]
     params = (fx, fy, cx, cy, *terms[:count])
     if not np.isfinite(params).all() or min(fx, fy) <= 0:
         raise ReobjError("a number is not finite, or a focal length not positive")
-    width, height = _sized(size)
-    return Camera(model, width, height, params)
+    return Camera(model, *_sized(size), params)
 
 
 def _focal_and_centre(matrix: Any) -> tuple[float, ...]:
@@ -215,11 +212,12 @@ def _focal_and_centre(matrix: Any) -> tuple[float, ...]:
         return tuple(flat.tolist())
     if flat.size not in (9, 16):
         raise ReobjError(f"intrinsics of {flat.size} numbers; expected fx, fy, cx, cy or 3x3, 4x4")
-    K = flat.reshape(4, 4)[:3, :3] if flat.size == 16 else flat.reshape(3, 3)
+    side = math.isqrt(flat.size)
+    K = flat.reshape(side, side)[:3, :3]
     K = K.T if K[2, :2].any() else K  # Open3D, Record3D
-    if abs(K[0, 1]) > 0.001 * abs(K[0, 0]):  # chosen: less than half a pixel at the border
+    if abs(K[0, 1]) > 0.001 * abs(K[0, 0]):  # half a pixel at the border of usual images
         raise ReobjError(f"a skew of {K[0, 1]:g} in the matrix, which no camera model here has")
-    return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
+    return tuple(K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist())
 
 
 def image_side(value: Any) -> int:
@@ -244,43 +242,46 @@ BROWN = (
     "PERSPECTIVE", "PLUMB_BOB", "RATIONAL_POLYNOMIAL", "RADTAN", "RADIAL_TANGENTIAL",
     "BROWN_CONRADY", "RECTIFIED",
 )  # fmt: skip
-DISTORTION = r"dist(ortion)?(coef|coeffs?|coefs|coefficients?)?|coeffs?|kc"  # kc: Bouguet's toolbox
-SIDES = ("resolution", "camerares", "imagesize", "imgsize", "imageresolution")
+# Names of the keys that are read, and their other spellings as `_plain` returns them
+NAMES = {
+    "fx": "flx|f|focal", "fy": "fly", "cx": "ppx", "cy": "ppy",
+    "K": "k|cameramatrix|intrinsicmatrix|mtx|intrinsics?",  # k, d: of ROS 2
+    "D": "d|dist(ortion)?(coef|coeffs?|coefs|coefficients?)?|coeffs?|kc",  # kc: Bouguet's toolbox
+    "width": "[wW]|im(a)?ge?width", "height": "[hH]|im(a)?ge?height",
+    "sides": "resolution|camerares|im(a)?ge?size|imageresolution",
+    "model": "cameramodel|modeltype", "lens": "distortionmodel",  # of ROS and Kalibr
+    "fisheye": "isfisheye|fisheyemodel", "angle": "cameraanglex",
+}  # fmt: skip
 # Keys that change the camera; not the matrices of rectified images in ROS's files
 CAMERA_LIKE = (
     r".*((?<!un)distort|focal|intrinsic|cam(era)?ma?t(ri)?x|principal|mirrorparam).*|[kps]\d|"
     r"[fc][xyuv]|[muv][0uv]|xi|skew|fov[xy]?|mtx|im(a)?ge?(shape|dim).*|k|f|d|camera2.*|"
-    rf"(radial|tangential).*|{DISTORTION}|{'|'.join(SIDES)}"
+    rf"(radial|tangential).*|{NAMES['D']}|{NAMES['sides']}"
 )
 
 
 def _plain(key: str) -> str:
     """Return a key without a prefix of ORB-SLAM; if long, in small letters and digits alone."""
-    key = re.sub(r"^Camera1?\.", "", str(key).replace("Camera.type", "model"))
+    key = re.sub(r"^Camera1?\.", "", key.replace("Camera.type", "model"))
     plain = re.sub(r"[^a-z0-9]", "", key.lower())
     return plain if len(plain) > 2 else key
 
 
-def _flat(data: dict[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return values, and keys as they are written, by `_plain`; also those of nested cameras."""
-    values: dict[str, Any] = {}
-    written: dict[str, str] = {}
+def _flat(data: dict[str, Any]) -> dict[str, tuple[str, Any]]:
+    """Return keys as they are written, and values, by the names of NAMES or `_plain`.
+
+    Also those of nested cameras.
+    """
+    found: dict[str, tuple[str, Any]] = {}
     for key, value in data.items():
-        plain = _plain(key)
+        plain = _plain(str(key))
         is_group = isinstance(value, dict) and "data" not in value
         if is_group and re.fullmatch(f"cam(era)?|.*parameters|{CAMERA_LIKE}", plain):
-            inner = _flat(value)
-            values |= inner[0]
-            written |= inner[1]
+            found |= _flat(value)
         else:
-            values[plain] = value
-            written[plain] = str(key)
-    return values, written
-
-
-def _take(keys: dict[str, Any], *names: str) -> Any:
-    """Remove the first of the names that is a key; return its value, or None."""
-    return next((keys.pop(name) for name in names if name in keys), None)
+            names = [name for name, form in NAMES.items() if re.fullmatch(form, plain)]
+            found[(names or [plain])[0]] = (str(key), value)
+    return found
 
 
 def _numbers(value: Any) -> list[float]:
@@ -294,43 +295,28 @@ def _numbers(value: Any) -> list[float]:
 
 def _terms(keys: dict[str, Any], *names: str) -> list[float]:
     """Take the distortion in the order of its names: by name, or from a list; else 0."""
-    found = [key for key in keys if key == "D" or re.fullmatch(DISTORTION, key)]
-    values = _numbers(_take(keys, *found))
+    values = _numbers(keys.pop("D", None))
     if any(values[len(names) :]):
         raise ReobjError(f"{len(values)} distortion coefficients; expected {','.join(names)}")
     listed = [*values, *[0.0] * len(names)]
-    pairs = zip(names, listed, strict=False)
-    return [float(keys.pop(name, value)) for name, value in pairs]
-
-
-def _brown_terms(keys: dict[str, Any]) -> list[float]:
-    """Take the terms of OpenCV's model; refuse a k4 that may be one of a fisheye lens."""
-    if "k" in keys:  # of SIMPLE_RADIAL
-        keys["k1"] = keys.pop("k")
-    if not {"k5", "k6"} & keys.keys() and any(_numbers(keys.get("k4"))):
-        raise ReobjError("k4 without k5 and k6: of a fisheye lens (camera_model OPENCV_FISHEYE), "
-                         "or of OpenCV's rational model (k5 and k6 too, if 0)")  # fmt: skip
-    return _terms(keys, "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    return [float(keys.pop(name, value)) for name, value in zip(names, listed, strict=False)]
 
 
 def _pinhole(keys: dict[str, Any], size: Size) -> tuple[float, ...] | None:
     """Take fx, fy, cx, cy, or a matrix; None without a focal length."""
-    matrix = _take(keys, "cameramatrix", "K", "intrinsicmatrix", "mtx", "intrinsics", "intrinsic")
-    if matrix is not None:
-        return _focal_and_centre(_numbers(matrix))
-    fx = _take(keys, "fx", "flx", "f", "focal")
-    fy = _take(keys, "fy", "fly")
-    centre = [_take(keys, "cx", "ppx"), _take(keys, "cy", "ppy")]
-    angle = _take(keys, "cameraanglex")
-    if fx is None and angle is not None and size:
+    if "K" in keys:
+        return _focal_and_centre(_numbers(keys.pop("K")))
+    angle = keys.pop("angle", None)
+    if "fx" not in keys and angle is not None and size:
         if not 0 < float(angle) < math.pi:
             raise ReobjError(f"camera_angle_x {angle}, expected radians between 0 and pi")
-        fx = 0.5 * size[0] / math.tan(0.5 * float(angle))
-    if fx is None:
+        keys["fx"] = 0.5 * size[0] / math.tan(0.5 * float(angle))
+    if "fx" not in keys:
         return None
-    if centre == [None, None]:
-        centre = [0.5 * side for side in _sized(size)]
-    return tuple(map(float, (fx, fx if fy is None else fy, *centre)))
+    fx = keys.pop("fx")
+    middle = [] if {"cx", "cy"} & keys.keys() else [0.5 * side for side in _sized(size)]
+    centre = middle or [keys.pop(name, None) for name in ("cx", "cy")]
+    return tuple(map(float, (fx, keys.pop("fy", fx), *centre)))
 
 
 def _lens(keys: dict[str, Any]) -> str:
@@ -339,29 +325,14 @@ def _lens(keys: dict[str, Any]) -> str:
     Raises:
         ReobjError: neither a model of pycolmap, nor one of FISHEYE and BROWN.
     """
-    model = str(_take(keys, "cameramodel", "model", "modeltype") or "").upper()
-    lens = str(_take(keys, "distortionmodel") or "").upper()  # of ROS and Kalibr
+    model, lens = (str(keys.pop(name, None) or "").upper() for name in ("model", "lens"))
     model = lens if model in ("", "PINHOLE") and lens else model
     model = re.sub("[ -]", "_", model.removeprefix("DISTORTION."))  # of RealSense
-    if re.fullmatch("(INVERSE|MODIFIED)_BROWN_CONRADY", model):
-        distorted = any(_numbers(keys.get("coeffs")))
-        model = model if distorted else "BROWN_CONRADY"
+    if not any(_numbers(keys.get("D"))):
+        model = re.sub("(INVERSE|MODIFIED)_BROWN", "BROWN", model)
     if model not in (*FISHEYE, *BROWN):
         camera_parameters(model)  # refuses unknown ones
     return model
-
-
-def _refuse_unread(keys: dict[str, Any], written: dict[str, str], camera: Camera) -> None:
-    """Refuse a key that is left, has a number that is not the camera's, and changes cameras."""
-    for plain, value in keys.items():
-        key = written[plain]
-        repeated = () if key[1:].isdecimal() else camera.params  # not those of k1, p1
-        lost = {*_numbers(value)} - {0.0, *repeated}
-        if lost and re.fullmatch(CAMERA_LIKE, plain, re.IGNORECASE):
-            raise ReobjError(
-                f"{key!r} is not read; expected fx, fy, cx, cy or a matrix K, k1, k2, p1, p2, k3 "
-                "or a list dist_coeffs in OpenCV's order, width, height"
-            )
 
 
 def camera_of_keys(data: dict[str, Any], size: Size) -> Camera | None:
@@ -383,35 +354,36 @@ def camera_of_keys(data: dict[str, Any], size: Size) -> Camera | None:
     rigs = [name for name, v in data.items() if isinstance(v, dict) and "intrinsics" in v]
     if len(rigs) > 1:  # Kalibr
         raise ReobjError(f"cameras {', '.join(rigs)}; expected one: leave the others out")
-    keys, written = _flat(data[rigs[0]] if rigs else data)
-    if len(_numbers(keys.get("k"))) == 9:  # ROS 2: as K and D of ROS 1
-        keys |= {name.upper(): keys.pop(name) for name in ("k", "d") if name in keys}
-        written |= {"K": "k", "D": "d"}
-    sides = _numbers(_take(keys, *SIDES)) or [
-        _take(keys, letter, letter.upper(), word, f"image{word}", f"img{word}")
-        for letter, word in (("w", "width"), ("h", "height"))
-    ]
+    found = _flat(data[rigs[0]] if rigs else data)
+    keys = {name: value for name, (_, value) in found.items()}
+    sides = _numbers(keys.pop("sides", None)) or [keys.pop(k, None) for k in ("width", "height")]
     size = size if None in sides else (image_side(sides[0]), image_side(sides[1]))
     model = _lens(keys)
-    params = _take(keys, "params")
+    params = keys.pop("params", None)
+    pinhole = None if model and params is not None else _pinhole(keys, size)
     if model and params is not None:
         camera = colmap_camera([model, *map(str, (*_sized(size), *params))])
-    elif (pinhole := _pinhole(keys, size)) is None:
+    elif pinhole is None:
         return None
-    elif str(_take(keys, "isfisheye", "fisheyemodel")).lower() in ("true", "1") or model in FISHEYE:
+    elif str(keys.pop("fisheye", "")).lower() in ("true", "1") or model in FISHEYE:
         terms = _terms(keys, "k1", "k2", "k3", "k4")
         camera = Camera("OPENCV_FISHEYE", *_sized(size), (*pinhole, *terms))
     elif model in BROWN:
-        camera = brown_camera(size, *pinhole, *_brown_terms(keys))
+        if not {"k5", "k6"} & keys.keys() and any(_numbers(keys.get("k4"))):
+            raise ReobjError("k4 without k5 and k6: of a fisheye lens (camera_model OPENCV_FISHEYE)"
+                             ", or of OpenCV's rational model (k5 and k6 too, if 0)")  # fmt: skip
+        camera = brown_camera(size, *pinhole, *_terms(keys, *"k1 k2 p1 p2 k3 k4 k5 k6".split()))
     else:
-        known = dict(zip(("fx", "fy", "cx", "cy", "f"), (*pinhole, pinhole[0]), strict=True))
-        names = camera_parameters(model)
-        values = [known[name] if name in known else _take(keys, name) for name in names]
-        if None in values:
-            missing = names[values.index(None)]
-            raise ReobjError(f"no {missing} of a {model} camera")
-        camera = Camera(model, *_sized(size), tuple(map(float, values)))
-    _refuse_unread(keys, written, camera)
+        raise ReobjError(f"a {model} camera without `params`, the numbers of COLMAP's model")
+    for name, value in keys.items():  # that is left, and has a number that is not the camera's
+        key = found[name][0] if name in found else name
+        repeated = () if key[1:].isdecimal() else camera.params  # not those of k1, p1
+        lost = {*_numbers(value)} - {0.0, *repeated}
+        if lost and re.fullmatch(CAMERA_LIKE, name, re.IGNORECASE):
+            raise ReobjError(
+                f"{key!r} is not read; expected fx, fy, cx, cy or a matrix K, k1, k2, p1, p2, k3 "
+                "or a list dist_coeffs in OpenCV's order, width, height"
+            )
     return camera
 
 
@@ -441,15 +413,20 @@ def _of_xml(element: ElementTree.Element) -> Any:
 ReadCamera = Callable[[Path, Size], Camera]
 
 
-def _text_rows(probe: Probe) -> list[list[str]]:
-    """Return the words of the lines of a text file that is no YAML, JSON or XML."""
-    marked = probe.suffix in (".pincam", ".yaml", ".yml") or not probe.lines
-    return [] if marked or probe.lines[0][0] in "[{<%" else _rows("\n".join(probe.lines))
+def _rows_of(form: str) -> Callable[[Probe], bool]:
+    """Test for a text file, no YAML, JSON or XML, that holds rows of a form."""
 
+    def test(probe: Probe) -> bool:
+        marked = probe.suffix in (".pincam", ".yaml", ".yml") or probe.kind != "text"
+        rows = [] if marked or probe.lines[0][0] == "%" else _rows("\n".join(probe.lines))
+        is_square = len(rows) in (3, 4) and {*map(len, rows)} == {len(rows)}
+        forms = {
+            "kitti": any(map(KITTI_LINE.fullmatch, probe.lines)),
+            "colmap": _is_model_line(rows), "matrix": is_square, "numbers": len(rows) == 1,
+        }  # fmt: skip
+        return next((name for name, fits in forms.items() if fits), "") == form
 
-def is_kitti_calibration(probe: Probe) -> bool:
-    """Test for lines `P0: ...` or `P_rect_00: ...` of 12 numbers."""
-    return any(KITTI_LINE.fullmatch(line) for line in probe.lines)
+    return test
 
 
 KITTI_LINE = re.compile(r"P(_rect_0)?\d:(\s+\S+){12}")
@@ -493,16 +470,13 @@ def _arrays(path: Path) -> dict[str, Any]:
 FRAME_PX, OWN_PX, UNREAD = "px of the frames", "px of the size in it", "rectified images"
 CAMERAS: Registry[ReadCamera] = Registry("cameras", "--camera-format", [
     Format("colmap", "COLMAP: `cameras.txt` with one camera, `[ID] MODEL WIDTH HEIGHT PARAMS`, of "
-           "any model with a focal length", lambda p: _is_model_line(_text_rows(p)), _read_rows,
-           units=OWN_PX),
+           "any model with a focal length", _rows_of("colmap"), _read_rows, units=OWN_PX),
     Format("numbers", "one line `fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]]`, OpenCV's order",
-           lambda p: len(rows := _text_rows(p)) == 1 and not _is_model_line(rows)
-           and not is_kitti_calibration(p), _read_rows, units=FRAME_PX),
+           _rows_of("numbers"), _read_rows, units=FRAME_PX),
     Format("kitti", "KITTI: `calib.txt` and `calib_cam_to_cam.txt`, `P0:` or `P_rect_00:`",
-           is_kitti_calibration, _read_kitti, units=FRAME_PX, unread="images before rectification"),
-    Format("matrix", "K.txt, ScanNet: matrix K, 3x3 or 4x4",
-           lambda p: len(rows := _text_rows(p)) in (3, 4) and {*map(len, rows)} == {len(rows)},
-           _read_rows, units=FRAME_PX),
+           _rows_of("kitti"), _read_kitti, units=FRAME_PX, unread="images before rectification"),
+    Format("matrix", "K.txt, ScanNet: matrix K, 3x3 or 4x4", _rows_of("matrix"), _read_rows,
+           units=FRAME_PX),
     Format("pincam", "ARKitScenes: `w h fx fy cx cy`", lambda p: p.suffix == ".pincam",
            _read_pincam, units=OWN_PX),
     Format("json", "COLMAP, nerfstudio, instant-ngp, OpenCV, Open3D, Record3D, RealSense",

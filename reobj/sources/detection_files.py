@@ -251,7 +251,7 @@ def _read(
     if config.first_frame not in ("", "0", "1", "order"):
         raise ReobjError(f"detect.first_frame {config.first_frame}: expected 0, 1 or order")
     source = Source(path, video, class_names(config), config.first_frame, poses)
-    return read_source(source, DETECTIONS.reader(path, config.format))
+    return read_source(source, DETECTIONS.find(path, config.format).read)
 
 
 def class_names(config: DetectConfig) -> Sequence[str]:
@@ -281,7 +281,7 @@ def described_images(
     """
     source = Source(path, NoVideo(path.stem), class_names(config), config.first_frame)
     source.describes = True
-    size = read_source(source, DETECTIONS.reader(path, config.format)).size
+    size = read_source(source, DETECTIONS.find(path, config.format).read).size
     sizes = source.image_sizes if size == (0, 0) else {size}
     stated = sizes.pop() if len(sizes) == 1 else (0, 0)
     times_s = None if source.times_s is None else np.unique(source.times_s)

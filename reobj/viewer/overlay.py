@@ -297,29 +297,29 @@ def draw_wireframes(
     """
     ends, edge, front = frames.segments(cam_from_world)
     straight = scale * (ends @ camera.K.T)[..., :2] / ends[..., 2:]  # (n, 2, 2) undistorted
-    clipped = camera.clip_segments(ends)
-    within = np.asarray(np.isfinite(clipped).all((1, 2)), bool)  # (n,)
     pieces = 1 if camera.model == "PINHOLE" else 8  # segments of an edge: 8 look smooth
     fraction = np.linspace(0, 1, pieces + 1)[:, None]  # (B + 1, 1)
-    line = clipped[:, :1] + fraction * (clipped[:, 1:] - clipped[:, :1])  # (n, B + 1, 3)
+    line = ends[:, :1] + fraction * (ends[:, 1:] - ends[:, :1])  # (n, B + 1, 3)
     pixels = scale * camera.project(line) - 0.5  # OpenCV draws with the pixel's centre at 0
+    within = np.asarray(np.isfinite(pixels).all(2), bool)  # (n, B + 1) up to the fold of the lens
     solid = frames.solid[edge]  # (n,)
     wanted = [k for k in np.unique(solid).tolist() if drawn[k]]
     for k in sorted(wanted, key=lambda k: -ends[solid == k, :, 2].mean()):  # nearest last
-        rows = (solid == k) & within
-        found = pixels[rows]
-        if not (len(found) and _fits(straight[solid == k], image) and _fits(found, image)):
+        rows = (solid == k) & (within.sum(1) > 1)
+        found = [line[shown] for line, shown in zip(pixels[rows], within[rows], strict=True)]
+        if not (found and _fits(straight[solid == k], image) and _fits(np.vstack(found), image)):
             continue
         obj = object_id[k]
-        lines = np.round(found * (1 << SHIFT)).astype(np.int32)
-        shown = front[rows]
+        lines = [np.round(line * (1 << SHIFT)).astype(np.int32) for line in found]
+        front_lines = list(itertools.compress(lines, front[rows]))
         color = object_color(obj)
         dim = tuple(int(0.6 * c) for c in color)
         width = _width_of(image)
         if obj in seen:
-            cv2.polylines(image, list(lines[~shown]), False, dim, width, cv2.LINE_AA, SHIFT)
+            occluded_lines = list(itertools.compress(lines, ~front[rows]))
+            cv2.polylines(image, occluded_lines, False, dim, width, cv2.LINE_AA, SHIFT)
         width *= 2 if obj in seen else 1
-        cv2.polylines(image, list(lines[shown]), False, color, width, cv2.LINE_AA, SHIFT)
+        cv2.polylines(image, front_lines, False, color, width, cv2.LINE_AA, SHIFT)
 
 
 def _fits(pixels: Array, image: Image) -> bool:

@@ -84,16 +84,16 @@ def model(folder: Path, frames: list[int], names: list[str], camera: str = "") -
     return folder
 
 
-def transforms(path: Path, frames: list[int], names: list[str]) -> Path:
-    world_from_gl = np.tile(np.eye(4), (len(frames), 1, 1))
-    world_from_gl[:, :3] = invert_rigid(path_of()[frames])
-    world_from_gl = world_from_gl @ np.diag([1.0, -1, -1, 1])
+def transforms(path: Path, names: list[str]) -> Path:
+    """Poses of the first frames under these names."""
+    whole = np.tile(np.eye(4), (len(names), 1, 1))
+    whole[:, :3] = invert_rigid(path_of()[: len(names)])
     rows = [
         {"file_path": name, "transform_matrix": pose.tolist()}
-        for name, pose in zip(names, world_from_gl, strict=True)
+        for name, pose in zip(names, whole @ np.diag([1.0, -1, -1, 1]), strict=True)
     ]
-    path.write_text(json.dumps({"fl_x": 290, "cx": 160, "cy": 120, "w": 320, "h": 240,
-                                "frames": rows}))  # fmt: skip
+    facts = {"fl_x": 290, "cx": 160, "cy": 120, "w": 320, "h": 240}
+    path.write_text(json.dumps(facts | {"frames": rows}))
     return path
 
 
@@ -147,12 +147,7 @@ def assert_chairs_in_place(out: Path, atol: float = 0.02) -> None:
 
 
 ALL = list(range(FRAMES))
-KEPT = {
-    "all": ALL,
-    "first missing": ALL[1:],
-    "last missing": ALL[:-1],
-    "both missing": ALL[1:-1],
-}
+KEPT = {"all": ALL, "first missing": ALL[1:], "last missing": ALL[:-1]}
 
 
 # ---- Numbers in names ----------------------------------------------------------------------------
@@ -200,7 +195,7 @@ def test_every_kth_frame_renumbered(tmp_path: Path, every: int, first: int) -> N
 def test_photos_from_0_beside_names_from_1(tmp_path: Path) -> None:
     source = rt.Video(folder_of(tmp_path))
     names = [f"images/frame_{i + 1:05d}.png" for i in ALL[:-1]]
-    path = transforms(tmp_path / "t.json", ALL[:-1], names)
+    path = transforms(tmp_path / "t.json", names)
     with pytest.raises(rt.ReobjError, match=r"number .*number1 .*poses.frames_by"):
         rt.read_poses(path, source)
     assert_right(rt.read_poses(path, source, frames_by="number1"), ALL[:-1])
@@ -223,7 +218,7 @@ def test_equal_file_names_in_two_folders_of_a_model(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("first", "step", "said"),
-    [(5, 1, "order"), (0, 1, "whole numbers"), (1700000000, 1, "order"), (0, 0.1, "order")],
+    [(0, 1, "whole numbers"), (1700000000, 1, "order"), (0, 0.1, "order")],
 )
 def test_as_many_rows_as_images_without_times(
     tmp_path: Path, first: int, step: float, said: str
@@ -236,14 +231,9 @@ def test_as_many_rows_as_images_without_times(
 
 
 @pytest.mark.parametrize("first", [0, 1])
-@pytest.mark.parametrize("kept", ["all", "last missing"])
-def test_frame_numbers_in_the_column_of_times(tmp_path: Path, first: int, kept: str) -> None:
-    frames = KEPT[kept]
-    path = tum(tmp_path / "t.txt", [f"{i + first}.0" for i in frames], frames)
-    is_open = first == 1 and kept == "last missing"  # from 0, the first missing, is as likely
-    poses = rt.read_poses(path, rt.Video(write_clip(tmp_path)), camera=LINE,
-                          frames_by="number1" if is_open else "")  # fmt: skip
-    assert_right(poses, frames)
+def test_frame_numbers_in_the_column_of_times(tmp_path: Path, first: int) -> None:
+    path = tum(tmp_path / "t.txt", [f"{i + first}.0" for i in ALL], ALL)
+    assert_right(rt.read_poses(path, rt.Video(write_clip(tmp_path)), camera=LINE), ALL)
 
 
 @pytest.mark.parametrize("per_s", [1e3, 1e6, 1e9])
@@ -297,93 +287,73 @@ def test_csv_with_w_first(
     assert_chairs_in_place(tmp_path / "out")
 
 
-def test_body_poses_are_used_as_camera_poses_with_a_warning(tmp_path: Path) -> None:
-    path = tmp_path / "gt.csv"
-    centre, xyzw = quaternions(ALL)
-    rows = np.column_stack([1.7e18 + 5e7 * np.arange(FRAMES), centre, xyzw[:, [3, 0, 1, 2]]])
-    np.savetxt(path, rows, "%.9f", delimiter=",", header="timestamp [ns], p_RS_R_x [m], ...")
-    poses = rt.read_poses(path, rt.Video(folder_of(tmp_path)), camera=LINE)
-    assert_right(poses, ALL)
-    assert any("body taken for camera" in text for text in poses.messages)
-
-
 # ---- Models and cameras --------------------------------------------------------------------------
 
 
-def test_of_several_models_one_has_to_be_named(tmp_path: Path) -> None:
+NAMES = [f"{i:04d}.jpg" for i in ALL]
+
+
+@pytest.mark.parametrize("suffix", [".txt", ".bin"])
+def test_a_model_is_found_or_has_to_be_named(tmp_path: Path, suffix: str) -> None:
     source = rt.Video(folder_of(tmp_path))
-    names = [f"{i:04d}.jpg" for i in ALL]
-    small = model(tmp_path / "w" / "sparse" / "0", ALL[:6], names[:6])
-    large = model(tmp_path / "w" / "sparse" / "1", ALL[4:], names[4:])
+    small = model(tmp_path / "w" / "sparse" / "0", ALL[:6], NAMES[:6])
+    large = model(tmp_path / "w" / "sparse" / "1", ALL[4:], NAMES[4:])
+    for folder in (small, large) if suffix == ".bin" else ():
+        import_pycolmap().Reconstruction(str(folder)).write_binary(str(folder))
     with pytest.raises(rt.ReobjError, match=r"sparse/0 and .*sparse/1; name one"):
         rt.read_poses(tmp_path / "w", source)
-    assert_right(rt.read_poses(small, source), ALL[:6])
     small.rename(large / "0")
     assert_right(rt.read_poses(large, source), ALL[4:])  # named, though another one is below it
-
-
-@pytest.mark.parametrize("name", ["cameras", "images"])
-@pytest.mark.parametrize("suffix", [".txt", ".bin"])
-def test_a_file_of_a_model_is_its_folder_or_names_it(
-    tmp_path: Path, name: str, suffix: str
-) -> None:
-    source = rt.Video(folder_of(tmp_path))
-    path = model(tmp_path / "m", ALL, [f"{i:04d}.jpg" for i in ALL])
-    if suffix == ".bin":
-        import_pycolmap().Reconstruction(str(path)).write_binary(str(path))
-    assert_right(rt.read_poses(path / f"{name}{suffix}", source), ALL)
-    alone = (tmp_path / f"{name}{suffix}").write_bytes((path / f"{name}{suffix}").read_bytes())
-    assert alone
-    with pytest.raises(rt.ReobjError, match=f"{name}{suffix}: no .*give that folder"):
-        rt.read_poses(tmp_path / f"{name}{suffix}", source)
+    for name in ("cameras", "images"):
+        file = large / f"{name}{suffix}"
+        assert_right(rt.read_poses(file, source), ALL[4:])
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+        with pytest.raises(rt.ReobjError, match=f"{name}{suffix}: no .*give that folder"):
+            rt.read_poses(tmp_path / file.name, source)
+        (tmp_path / file.name).unlink()
 
 
 def test_a_folder_of_two_formats_is_asked(tmp_path: Path) -> None:
     """nerfstudio's own folder is not: its transforms.json was made from the model in colmap/."""
-    names = [f"{i:04d}.jpg" for i in ALL]
     video = rt.Video(folder_of(tmp_path))
-    transforms(tmp_path / "transforms.json", ALL, names)
-    model(tmp_path / "colmap" / "sparse" / "0", ALL, names)
+    transforms(tmp_path / "transforms.json", NAMES)
+    model(tmp_path / "colmap" / "sparse" / "0", ALL, NAMES)
     assert rt.read_poses(tmp_path, video).reading == "transforms, frames by file names"
-    model(tmp_path / "sparse" / "0", ALL, names)
-    (tmp_path / "colmap").rename(tmp_path / "other")
+    (tmp_path / "colmap" / "sparse").rename(tmp_path / "sparse")
+    (tmp_path / "colmap").rmdir()
     with pytest.raises(rt.ReobjError, match=r"2 formats of poses: colmap, transforms"):
         rt.read_poses(tmp_path, video)
     assert_right(rt.read_poses(tmp_path, video, fmt="colmap"), ALL)
 
 
-def with_cameras(folder: Path, cameras: list[str], of_image: list[int]) -> Path:
-    path = model(folder, ALL, [f"{i:04d}.jpg" for i in ALL])
-    lines = [line for line in (path / "images.txt").read_text().splitlines() if line]
-    rows = [line.split() for line in lines]
-    for row, camera in zip(rows, of_image, strict=True):
-        row[8] = str(camera)
-    other = ["999", *rows[0][1:8], "99", "cam1/9999.jpg"]
-    (path / "images.txt").write_text("\n\n".join(" ".join(row) for row in [*rows, other]) + "\n\n")
-    text = "".join(f"{i} {camera}\n" for i, camera in enumerate(cameras, 1))
-    (path / "cameras.txt").write_text(text + "99 OPENCV 1000 700 900 900 500 350 0 0 0 0\n")
-    return path
-
-
-def test_only_cameras_of_images_that_are_frames_count(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["one", "each", "two"])
+def test_only_cameras_of_images_that_are_frames_count(tmp_path: Path, kind: str) -> None:
     source = rt.Video(folder_of(tmp_path))
-    path = with_cameras(tmp_path / "m", [LINE], [1] * FRAMES)
-    assert_right(rt.read_poses(path, source), ALL)
-    each = [f"PINHOLE 320 240 {290 + 0.1 * (i % 5)} {290 + 0.1 * (i % 5)} 160 120" for i in ALL]
-    path = with_cameras(tmp_path / "each", each, [i + 1 for i in ALL])
-    assert rt.read_poses(path, source).camera.params[0] == pytest.approx(290.2)
-    path = with_cameras(tmp_path / "two", [LINE, LINE.replace("290", "400")], [1, 2] * 15)
-    with pytest.raises(rt.ReobjError, match=r"several different cameras .*290-400.*--camera"):
-        rt.read_poses(path, source)
-    assert rt.read_poses(path, source, camera=LINE).camera == CAMERA
+    path = model(tmp_path / "m", [*ALL, 0], [*NAMES, "cam1/9999.jpg"])
+    focal = {"one": [290.0], "each": [290 + 0.1 * (i % 5) for i in ALL], "two": [290, 400]}[kind]
+    cameras = [f"{i} PINHOLE 320 240 {f} {f} 160 120\n" for i, f in enumerate(focal, 1)]
+    other = "99 OPENCV 1000 700 900 900 500 350 0 0 0 0\n"
+    (path / "cameras.txt").write_text("".join(cameras) + other)
+    lines = (path / "images.txt").read_text().splitlines()[::2]
+    rows = [[*line.split()[:8], str(i % len(focal) + 1), line.split()[9]]
+            for i, line in enumerate(lines)]  # fmt: skip
+    rows[-1][8] = "99"
+    (path / "images.txt").write_text("".join(f"{' '.join(row)}\n\n" for row in rows))
+    if kind == "two":
+        with pytest.raises(rt.ReobjError, match=r"several different cameras .*290-400.*--camera"):
+            rt.read_poses(path, source)
+        assert rt.read_poses(path, source, camera=LINE).camera == CAMERA
+    else:
+        poses = rt.read_poses(path, source)
+        assert_right(poses, ALL)
+        assert poses.camera.params[0] == pytest.approx(290 if kind == "one" else 290.2)
 
 
-@pytest.mark.parametrize("number", ["nan", "1e300"])
-@pytest.mark.parametrize("binary", [True, False])
+@pytest.mark.parametrize(("number", "binary"), [("nan", True), ("1e300", False)])
 def test_points_that_are_not_finite_are_refused(
     tmp_path: Path, number: str, binary: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = model(tmp_path / "m", ALL, [f"{i:04d}.jpg" for i in ALL])
+    path = model(tmp_path / "m", ALL, NAMES)
     x = "5" if binary else number
     (path / "points3D.txt").write_text(f"3 0 0 1 9 9 9 0\n7 {x} 0 1 9 9 9 0\n")
     if binary:
@@ -393,18 +363,3 @@ def test_points_that_are_not_finite_are_refused(
     assert run(tmp_path, None, path) == 2
     assert "point 7 is not finite, or more than" in capsys.readouterr().err
     assert not (tmp_path / "out" / "objects.json").exists()
-
-
-@pytest.mark.filterwarnings("error::RuntimeWarning")
-@pytest.mark.parametrize(
-    "lens",
-    ["OPENCV 320 240 290 290 160 120 0 0 2 0", "OPENCV 320 240 290 290 160 120 1e20 0 0 0",
-     "SIMPLE_RADIAL 320 240 290 160 120 -1000"],
-)  # fmt: skip
-@pytest.mark.parametrize("in_model", [True, False])
-def test_a_lens_that_leaves_no_pixel_is_refused(tmp_path: Path, lens: str, in_model: bool) -> None:
-    source = rt.Video(folder_of(tmp_path))
-    names = [f"{i:04d}.jpg" for i in ALL]
-    path = model(tmp_path / "m", ALL, names, f"1 {lens}\n" if in_model else "")
-    with pytest.raises(rt.ReobjError, match="its distortion is invertible for only"):
-        rt.read_poses(path, source, camera="" if in_model else lens)

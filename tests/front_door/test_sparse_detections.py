@@ -14,7 +14,6 @@ from simulated import unlinked, walk
 import reobj_track as rt
 from reobj.objects.fit import link_and_fit
 from reobj.sources.recorded import frames_looked_at
-from reobj.tracking.interpolation import fill_gaps
 
 TABLE, CHAIR = 60, 56
 FRAMES = 60
@@ -128,37 +127,30 @@ def test_both_objects_are_tracked(images: Path, tmp_path: Path, n: int) -> None:
     assert rows[rows[:, 1] == 1, 0].tolist() == list(range(1, last + 1, n))
     assert rows[rows[:, 1] == 2, 0].tolist() == list(range(first, last + 1, n))
     assert (rows[:, 6] > 0).all()
-    gt = mot(tmp_path / "gt.txt", range(FRAMES), truth=True)
-    whole = rt.evaluate(tmp_path / "out", gt)
+    whole = rt.evaluate(tmp_path / "out", mot(tmp_path / "gt.txt", range(FRAMES), truth=True))
     assert whole["tracks"]["all"]["HOTA"] == 1 and whole["tracks"]["all"]["IDF1"] == 1
     assert "the detector was not run" in whole["messages"][-1]
-    assert rt.evaluate(tmp_path / "out/tracks.txt", gt) == whole
-    dense = track(images, mot(tmp_path / "all.txt", range(FRAMES)), tmp_path / "dense")
-    assert dense == []
 
 
 def test_lists_of_images_define_the_processed_frames(images: Path, tmp_path: Path) -> None:
     """COCO's `images` and npz's `done`: also frames without a box, whatever their intervals."""
     seen, clip = [0, 1, 7, 30, 31, 50], rt.Video(images)
-    names = [{"id": f + 7, "file_name": f"{f:04d}.png"} for f in seen]
-    kinds = [{"id": k, "name": rt.COCO_NAMES[k]} for k in (TABLE, CHAIR)]
+    boxes = {f: scene(f) if f in (0, 30, 31) else [] for f in seen}
     entries = [
         {"id": 2 * f + k, "image_id": f + 7, "category_id": int(c), "score": s,
          "bbox": [x1, y1, x2 - x1, y2 - y1]}
-        for f in (0, 30, 31) for k, (x1, y1, x2, y2, s, c) in enumerate(scene(f))
+        for f, found in boxes.items() for k, (x1, y1, x2, y2, s, c) in enumerate(found)
     ]  # fmt: skip
-    data = {"images": names, "categories": kinds, "annotations": entries}
+    data = {"images": [{"id": f + 7, "file_name": f"{f:04d}.png"} for f in seen],
+            "categories": [{"id": k, "name": rt.COCO_NAMES[k]} for k in (TABLE, CHAIR)],
+            "annotations": entries}  # fmt: skip
     (tmp_path / "coco.json").write_text(json.dumps(data))
-    boxes = [(f, rt.Detections.from_array(scene(f) if f in (0, 30, 31) else [])) for f in seen]
-    rt.write_detections_npz(tmp_path / "d.npz", boxes, rt.COCO_NAMES, (640, 480))
+    arrays = [(f, rt.Detections.from_array(found)) for f, found in boxes.items()]
+    rt.write_detections_npz(tmp_path / "d.npz", arrays, rt.COCO_NAMES, (640, 480))
     for name in ("coco.json", "d.npz"):
-        found = rt.read_detections(tmp_path / name, clip)
-        assert found.looked is not None and found.looked.tolist() == seen
-        assert sum("lists 6 frames only (0, 1, 7, 30, 31, ...)" in m for m in found.messages) == 1
         source = rt.open_detections(clip, rt.DetectConfig(), tmp_path / name)
-        answers = [*source.detect(list(clip))]
-        assert [f for f, a in enumerate(answers) if a is not None] == seen
-        assert [len(a) for a in answers if a is not None] == [1, 0, 0, 2, 2, 0]
+        answers = {f: len(a) for f, a in enumerate(source.detect(list(clip))) if a is not None}
+        assert answers == {f: len(found) for f, found in boxes.items()}
 
 
 def test_none_from_a_function_means_not_processed(images: Path, tmp_path: Path) -> None:
@@ -183,45 +175,14 @@ def test_none_from_a_function_means_not_processed(images: Path, tmp_path: Path) 
     assert "in the 0 frames that the detector was run on" in nothing.warnings[-1]
 
 
-def test_the_reason_for_an_empty_result_is_reported(images: Path, tmp_path: Path) -> None:
-    det = mot(tmp_path / "det.txt", range(0, FRAMES, 3))
-    more = ("--set", "tracker.new_score=.9")
-    (_, said) = track(images, det, tmp_path / "a", *more)
-    assert "36 detections" in said and "tracker.new_score=0.9" in said
-    lines = track(images, det, tmp_path / "b", "--set", "detect.min_score=.9")
-    assert any("none of 36 boxes is left: those of score 0.9 or more" in line for line in lines)
-    assert not any("another detector" in line for line in lines)
-
-
-def moving(frames: list[int], step: float = 100.0) -> rt.Tracks:
-    """A box of 40 px that moves by `step` a frame."""
-    n = np.array(frames)
-    xyxy = np.stack([n * step, 0 * n, n * step + 40, 0 * n + 40], 1)
-    one = np.ones(len(n), np.int64)
-    return rt.Tracks(n, one, one, xyxy, 0.9 * one, 0 * one, 0 * one)
-
-
-def test_gaps_are_filled_in_processed_frames() -> None:
-    tracks, size = moving([0, 2, 6, 8, 10], step=5.0), (2000, 480)
-    even = fill_gaps(tracks, size, 5, np.arange(0, 11, 2))  # frame 4 was processed, odd ones not
-    assert even.frame.tolist() == [0, 2, 4, 6, 8, 10]
-    assert abs(even.xyxy[2, 0] - 20) < 1
-    irregular = fill_gaps(tracks, size, 5, np.array([0, 2, 5, 6, 8, 10]))
-    assert irregular.frame.tolist() == [0, 2, 5, 6, 8, 10]
-    assert abs(irregular.xyxy[2, 0] - 25) < 1
-    assert fill_gaps(tracks, size, 5).frame.tolist() == [0, 2, 4, 6, 8, 10]  # every second one read
-
-
 def test_unprocessed_frames_do_not_lower_the_confidence() -> None:
     """The confidence of chairs whose boxes are those of every fourth frame."""
+    given = unlinked(walk())
+    given = dataclasses.replace(given, tracks=given.tracks[given.tracks.frame % 4 == 0])
+    given.tracks.score[:] = 0.35
     confidences = []
     for looked in (np.arange(0, 40, 4), None):
-        given = unlinked(walk())
-        keep = given.tracks.frame % 4 == 0
-        given = dataclasses.replace(given, tracks=given.tracks[keep])
-        given.tracks.score[:] = 0.35
-        given = dataclasses.replace(given, looked=looked)
-        found = link_and_fit(given, rt.ObjectsConfig()).objects
+        found = link_and_fit(dataclasses.replace(given, looked=looked), rt.ObjectsConfig()).objects
         confidences.append([o.confidence or 0.0 for o in found])
     assert len(confidences[0]) == 3
     assert min(confidences[0]) > max(confidences[1] or [0.0]) + 0.1

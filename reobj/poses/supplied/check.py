@@ -1,7 +1,7 @@
 """Check supplied poses against matched features or boxes; name the convention that would fit.
 
 Poses are right if their relative poses explain the images (epipolar geometry of matched features)
-or, without images, the boxes (one point per track). Nothing is chosen: poses that fit less well
+or, without images, the boxes (one point per track). Nothing is converted: poses that fit less well
 than another convention, or not at all, are refused. The accuracy is not judged here.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,16 +21,10 @@ from reobj.types import Array, IntArray, ReobjError, Tracks, rows_by
 
 @dataclass(frozen=True, slots=True)
 class Supplied:
-    """Poses of a file, before they are checked.
-
-    Attributes:
-        axes: (3, 3) OpenCV's camera axes from those of the file, as it was read.
-        orders: the poses (F, 3, 4) in other orders of the images, by name.
-    """
+    """Poses of a file, before they are checked; axes: (3, 3) OpenCV's from those of the file."""
 
     poses: Poses
     axes: Array = field(default_factory=lambda: np.eye(3))
-    orders: Mapping[str, Array] = field(default_factory=dict)
 
 
 # ---- Conventions ---------------------------------------------------------------------------------
@@ -62,46 +56,36 @@ def conventions(given: Supplied) -> Iterator[tuple[str, Array]]:
     """
     poses = given.poses.cam_from_world
     inverse = invert_rigid(poses)
-    for order, sign in itertools.product(
-        itertools.permutations(range(3)), itertools.product((1.0, -1.0), repeat=3)
-    ):
+    signs = itertools.product((1.0, -1.0), repeat=3)
+    for order, sign in itertools.product(itertools.permutations(range(3)), signs):
         cv_from_read = np.diag(sign)[:, order]
         mirror = np.append(np.full(3, np.linalg.det(cv_from_read)), 1.0)  # columns of [R | t]
         if not (cv_from_read == np.eye(3)).all():
             yield _axes_text(cv_from_read @ given.axes), cv_from_read @ poses * mirror
-        text = _axes_text(cv_from_read).replace(" (OpenCV)", "")
-        text = "" if (cv_from_read == given.axes).all() else f" and {text}"
+        text = "" if (cv_from_read == given.axes).all() else f" and {_axes_text(cv_from_read)}"
         name = "the inverse direction (cam_from_world given as world_from_cam, or reversed)"
-        yield name + text, cv_from_read @ inverse * mirror
+        yield name + text.replace(" (OpenCV)", ""), cv_from_read @ inverse * mirror
     for name, roll in (("first given as w last", -1), ("last given as w first", 1)):
         yield f"quaternions with w {name}", _rolled(poses, roll)
     (R, c), (Q, t) = (np.split(some, [3], 2) for some in (inverse, poses))
-    yield "inverse rotations beside camera centres", np.concatenate([R, -R @ c], 2)
-    yield "camera centres beside rotations of cam_from_world", np.concatenate([Q, -Q @ t], 2)
-    yield (
-        "translations of cam_from_world beside rotations of world_from_cam",
-        np.concatenate([R.swapaxes(1, 2), c], 2),
-    )
-    yield from _orders(given)
-
-
-def _orders(given: Supplied) -> Iterator[tuple[str, Array]]:
-    """List the poses (F, 3, 4) in other orders; a frame that has none gets the one before."""
-    poses = given.poses.cam_from_world
+    yield "inverse rotations beside camera centres", np.dstack([R, -R @ c])
+    yield "camera centres beside rotations of cam_from_world", np.dstack([Q, -Q @ t])
+    name = "translations of cam_from_world beside rotations of world_from_cam"
+    yield name, np.dstack([Q, c])
+    # other orders; a frame that has no pose gets the one before
     at = np.arange(len(poses))
     known = np.isfinite(poses).all((1, 2))
     filled = np.maximum.accumulate(np.where(known, at, known.argmax()))  # (F,)
     rows = {"the order reversed": at[::-1]}
-    for first in (0, 1) if not given.orders else ():
-        order = np.argsort(np.argsort([str(n + first) for n in at]))
-        rows[f"the order of numbers from {first} as text (1, 10, 2)"] = order
-    for k in (*range(-10, 0), *range(1, 11)):
-        frames = f"{abs(k)} frames {'earlier' if k > 0 else 'later'}"
-        rows[f"the order shifted (each pose is that of {frames})"] = at + k
+    for first in (0, 1):
+        text = f"the order of numbers from {first} as text (1, 10, 2)"
+        rows[text] = np.argsort(np.argsort([str(n + first) for n in at]))
+    for k in range(1, 11):
+        for step, word in ((k, "earlier"), (-k, "later")):
+            rows[f"the order shifted (each pose is that of {k} frames {word})"] = at + step
     for k in (2, 3, 4, 5):
         rows[f"the order of {k} poses for each frame (frame n has pose {k}n)"] = k * at
         rows[f"the order of one pose for {k} frames (frame n has pose n/{k})"] = at // k
-    yield from given.orders.items()
     for text, row in rows.items():
         yield text, poses[filled[row.clip(0, len(at) - 1)]]
 
@@ -117,18 +101,15 @@ def _rolled(cam_from_world: Array, count: int) -> Array:
 
 def _refuse(given: Supplied, likely: Sequence[str], measured: str) -> None:
     """Refuse the poses; likely: conventions that fit, [] if none does."""
+    text = (f"the poses fit in no convention ({measured}): are they the poses of this video, in "
+            "this order, with this camera (--poses, --camera)?")  # fmt: skip
     if likely:
-        remedy = "convert them, or name their format with --pose-format"
-        if likely[0].startswith("the order"):
-            remedy = "give each frame its pose in --poses"
-        raise ReobjError(
+        text = (
             f"the poses look like ones with {' or '.join(likely[:3])}; they were read with "
-            f"{_axes_text(given.axes)} ({measured}): {remedy}"
+            f"{_axes_text(given.axes)} ({measured}): convert them, or name their format with "
+            "--pose-format"
         )
-    raise ReobjError(
-        f"the poses fit in no convention ({measured}): are they the poses of this video, in this "
-        "order, with this camera (--poses, --camera)?"
-    )
+    raise ReobjError(text)
 
 
 # ---- By images -----------------------------------------------------------------------------------
@@ -151,7 +132,7 @@ def check_matches(
         the explained fraction of the matches; NaN where there are too few.
     """
     use = np.flatnonzero(np.isfinite(rays).all((1, 2)))
-    if len(use) < 100:  # chosen: of several pairs
+    if len(use) < 100:  # the matches of about two pairs of images
         return np.nan
     use = use[:: len(use) // 5000 + 1]
     views = rows[match_rows[use]]  # (m, 2)
@@ -176,17 +157,18 @@ def _explained(cam_from_world: Array, views: IntArray, rays: Array) -> float:
     """
     one, other = cam_from_world[views[:, 0]], cam_from_world[views[:, 1]]  # (m, 3, 4)
     turn = other[:, :, :3] @ np.swapaxes(one[:, :, :3], 1, 2)  # other_from_one
-    shift = other[:, :, 3] - np.einsum("mij,mj->mi", turn, one[:, :, 3])
+    shift = other[:, :, 3] - (turn @ one[:, :, 3:])[..., 0]
     shift = shift / np.maximum(np.linalg.norm(shift, axis=1, keepdims=True), 1e-12)
-    x, y = np.moveaxis(np.concatenate([rays, np.ones((len(rays), 2, 1))], 2), 1, 0)  # (m, 3) each
-    x = np.einsum("mij,mj->mi", turn, x)
+    x, y = np.moveaxis(np.insert(rays, 2, 1, 2), 1, 0)  # (m, 3) each
+    x = (turn @ x[..., None])[..., 0]
     line = np.cross(shift, x)  # E x = [t] R x
     back = np.einsum("mij,mi->mj", turn, np.cross(y, shift))  # E' y
-    slope = np.sqrt((line[:, :2] ** 2).sum(1) + (back[:, :2] ** 2).sum(1))
+    slope = np.linalg.norm(np.hstack([line[:, :2], back[:, :2]]), axis=1)
     distance = np.abs((y * line).sum(1)) / np.maximum(slope, 1e-12)
     # depth_y y = depth_x x + t
-    xx, yy, xy = ((a * b).sum(1) for a, b in ((x, x), (y, y), (x, y)))
-    tx, ty = ((shift * ray).sum(1) for ray in (x, y))
+    xx, yy, xy, tx, ty = (
+        (a * b).sum(1) for a, b in ((x, x), (y, y), (x, y), (shift, x), (shift, y))
+    )
     in_front = (xy * ty > yy * tx) & (xx * ty > xy * tx)
     far = (xx * yy - xy**2 < np.sin(np.radians(1)) ** 2 * xx * yy) & (xy > 0)
     return float(((distance < 0.006) & (in_front | far)).mean())
@@ -194,14 +176,10 @@ def _explained(cam_from_world: Array, views: IntArray, rays: Array) -> float:
 
 # ---- By boxes ------------------------------------------------------------------------------------
 
-GOOD_DEG = 1.0  # residual of poses that are certainly right (chosen: 9 px at 500 px focal length)
-MAX_RATIO = 0.3  # of residuals of a clearly better convention (chosen; higher: refuses right poses)
-ORDER_DEG = 0.2  # least residual of a wrong order (chosen: 2 px at 500 px focal length)
-# Of residuals of a better order: below and above GOOD_DEG. Measured, right poses: recordings .93
-# and more; noise of the boxes up to 8 px .82, of 20 px (residuals above 1.2 deg) .70 and more
-MAX_ORDER_RATIO = (0.75, 0.6)
+GOOD_DEG = 1.0  # residual of poses that are certainly right: 9 px at 500 px focal length
+MAX_RATIO = 0.3  # of residuals of a clearly better convention; higher: refuses right poses
 WRONG_DEG = 6.0  # of poses that are certainly wrong; measured, right ones: up to 2.0
-MIN_TRACKS = 4  # chosen: three triangulate by chance in a trajectory read backwards
+MIN_TRACKS = 4  # three triangulate by chance in a trajectory read backwards
 
 
 def check_boxes(given: Supplied, tracks: Tracks, refuse: bool = True) -> bool:
@@ -214,29 +192,21 @@ def check_boxes(given: Supplied, tracks: Tracks, refuse: bool = True) -> bool:
     Returns:
         True if the boxes agree with the poses; False: they do not, or are too few.
     """
-    runs = [_overlapping(tracks, rows) for rows in rows_by(tracks.tracklet_id)]
-    found = [view for run in runs if (view := _rays(given.poses, tracks[run])) is not None]
+    runs = (_overlapping(tracks, rows) for rows in rows_by(tracks.tracklet_id))
+    found = [view for run in runs if len((view := _rays(given.poses, tracks[run]))[0]) >= 5]
     views = sorted(found, key=lambda view: -len(view[0]))[:60]  # the longest: all take long
     if len(views) < MIN_TRACKS:
         return False
     as_given = _residual_deg(given.poses.cam_from_world, views)
-    if not refuse:
+    if as_given < GOOD_DEG or not refuse:
         return as_given < GOOD_DEG
     measured = f"{len(views)} tracks triangulate within {as_given:.1f} deg"
-    if as_given >= GOOD_DEG:
-        residuals = {name: _residual_deg(poses, views) for name, poses in conventions(given)}
-        best = min(residuals.values())
-        if best <= min(MAX_RATIO * as_given, 2 * GOOD_DEG):
-            likely = [n for n in sorted(residuals, key=residuals.__getitem__)
-                      if residuals[n] <= 1.5 * best]  # fmt: skip
-            _refuse(given, likely, f"{measured}, then {best:.1f} deg")
-    orders = {name: _residual_deg(poses, views) for name, poses in _orders(given)}
-    best = min(orders.values())
-    ratio = MAX_ORDER_RATIO[as_given >= GOOD_DEG]
-    if as_given > ORDER_DEG and best < min(ratio * as_given, GOOD_DEG):
-        _refuse(given, [min(orders, key=orders.__getitem__)], f"{measured}, then {best:.1f} deg")
-    if as_given < GOOD_DEG:
-        return True
+    residuals = {name: _residual_deg(poses, views) for name, poses in conventions(given)}
+    best = min(residuals.values())
+    if best <= min(MAX_RATIO * as_given, 2 * GOOD_DEG):
+        likely = [n for n in residuals if residuals[n] <= 1.5 * best]
+        likely.sort(key=residuals.__getitem__)
+        _refuse(given, likely, f"{measured}, then {best:.1f} deg")
     if as_given > WRONG_DEG:
         _refuse(given, [], measured)
     return False
@@ -250,20 +220,17 @@ def _overlapping(tracks: Tracks, rows: IntArray) -> IntArray:
     return max(np.split(rows, np.flatnonzero(moved.any(1)) + 1), key=len)
 
 
-def _rays(poses: Poses, track: Tracks) -> tuple[IntArray, Array] | None:
+def _rays(poses: Poses, track: Tracks) -> tuple[IntArray, Array]:
     """Return the viewing rays of a track's centres in the frames with a pose, thinned.
 
     Returns:
-        rows (n,) of the poses and unit rays (n, 3) in camera axes, n from 5 to 40; None if the
-        track is too short.
+        rows (n,) of the poses and unit rays (n, 3) in camera axes, n up to 40.
     """
     rows, known = place_of(poses, track.frame)
     xy = poses.camera.undistort((track.xyxy[:, :2] + track.xyxy[:, 2:]) / 2)  # (n, 2)
     use = np.flatnonzero(known & np.isfinite(xy).all(1))
-    if len(use) < 5:
-        return None
-    use = use[np.unique(np.linspace(0, len(use) - 1, 40).round().astype(int))]
-    rays = np.column_stack([xy[use], np.ones(len(use))]) @ np.linalg.inv(poses.camera.K).T  # (n, 3)
+    use = use[np.unique(np.linspace(0, len(use) - 1, 40).round().astype(int))] if len(use) else use
+    rays = np.insert(xy[use], 2, 1, 1) @ np.linalg.inv(poses.camera.K).T  # (n, 3)
     return rows[use], rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
@@ -286,24 +253,22 @@ def without_frozen(poses: Poses, tracks: Tracks) -> Poses:
 
     Runs of three and more frames; without boxes in them, all are removed.
     """
-    same = np.zeros(len(poses.frame), bool)  # (F,) as that of the frame before
-    same[1:] = (np.abs(np.diff(poses.cam_from_world, axis=0)) < 1e-9).all((1, 2))  # NaN: False
-    frozen = np.zeros_like(same)
-    for run in np.split(np.arange(len(same)), np.flatnonzero(~same)[1:]):
+    steps = np.abs(np.diff(poses.cam_from_world, axis=0)).max((1, 2))  # NaN where one has no pose
+    frozen = np.zeros(len(poses.frame), bool)
+    for run in np.split(np.arange(len(frozen)), np.flatnonzero(~(steps < 1e-9)) + 1):
         frozen[run[1:]] = len(run) >= 3 and _boxes_move(tracks, *poses.frame[run[[0, -1]]])
     if not frozen.any():
         return poses
     text = f"{frozen.sum()} poses repeat the one before while the view changes: no poses"
-    lost = np.where(frozen[:, None, None], np.nan, poses.cam_from_world)
-    status = np.where(frozen, "none", poses.status)
-    messages = (*poses.messages, text)
-    return dataclasses.replace(poses, cam_from_world=lost, status=status, messages=messages)
+    return dataclasses.replace(
+        poses, cam_from_world=np.where(frozen[:, None, None], np.nan, poses.cam_from_world),
+        status=np.where(frozen, "none", poses.status), messages=(*poses.messages, text),
+    )  # fmt: skip
 
 
 def _boxes_move(tracks: Tracks, first: int, last: int) -> bool:
     """Test whether the boxes of tracks move by more than 3 px between two frames."""
-    centre = (tracks.xyxy[:, :2] + tracks.xyxy[:, 2:]) / 2
-    start, end = (np.flatnonzero(tracks.frame == frame) for frame in (first, last))
-    _, i, j = np.intersect1d(tracks.tracklet_id[start], tracks.tracklet_id[end], True, True)
-    moves = np.linalg.norm(centre[start[i]] - centre[end[j]], axis=1)
-    return not len(moves) or bool(np.median(moves) > 3)
+    start, end = (tracks[tracks.frame == frame] for frame in (first, last))
+    _, i, j = np.intersect1d(start.tracklet_id, end.tracklet_id, True, True)
+    moves = (start.xyxy[i] - end.xyxy[j]).reshape(-1, 2, 2).mean(1)  # of the centres
+    return not len(moves) or bool(np.median(np.linalg.norm(moves, axis=1)) > 3)

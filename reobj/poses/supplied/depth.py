@@ -22,7 +22,7 @@ from reobj.cameras import Camera, Poses, VisiblePoints, invert_rigid
 from reobj.files import load_json
 from reobj.poses.intrinsics import camera_of_keys
 from reobj.poses.supplied.frame_assignment import rows_by_time
-from reobj.poses.supplied.pose_formats import scannet_camera
+from reobj.poses.supplied.pose_formats import Size, scannet_camera
 from reobj.sources.image_files import read_image
 from reobj.types import Array, BoolArray, Floats, IntArray, ReobjError, log
 
@@ -57,8 +57,8 @@ class DepthMaps:
         step = -(-max(size) // 320)
         sides = (np.arange(0.5, side, step) for side in size)
         # pixels of an ideal pinhole camera lie elsewhere in the distorted image; NaN: outside
-        at = self.camera.distort(np.stack(np.meshgrid(*sides), -1)) - 0.5  # (h, w, 2)
-        x, y = np.moveaxis(np.nan_to_num(at, nan=-9).astype(np.float32), -1, 0)
+        at = np.nan_to_num(self.camera.distort(np.stack(np.meshgrid(*sides), -1)) - 0.5, nan=-9)
+        x, y = np.moveaxis(at.astype(np.float32), -1, 0)
         depth = cv2.remap(image, x, y, cv2.INTER_NEAREST).astype(np.float32)  # outside: 0
         depth[depth == 65535] = 0  # 7-Scenes: none
         # a pixel x of the subsampled map has its centre at step x + .5 of the whole one
@@ -87,7 +87,15 @@ def find_depth_maps(text: str, poses: Poses, video: Any) -> DepthMaps:
         ReobjError: no folder, no maps in it, none of a frame, or intrinsics that do not fit.
     """
     names = [video.name(int(frame)) for frame in poses.frame] if video.names else []
-    folder, units = _folder_and_units(text)
+    match = re.fullmatch(r"(.*?)(?::([\d.eE+-]+))?", text)
+    folder = Path(text)
+    units = 1000.0
+    if not folder.is_dir() and match and match[2]:
+        folder = Path(match[1])
+        units = float(match[2])
+    if not folder.is_dir() or not 0 < units < np.inf:
+        expected = "FOLDER, or FOLDER:UNITS with units per metre (1000: mm; TUM: 5000)"
+        raise ReobjError(f"--depth {text}: no such folder; expected {expected}")
     paths = sorted(folder.glob("*.png"))
     if not paths:
         raise ReobjError(f"{folder}: no .png in it; --depth needs a folder of 16-bit depth maps")
@@ -103,23 +111,14 @@ def find_depth_maps(text: str, poses: Poses, video: Any) -> DepthMaps:
     return DepthMaps(files, units, camera, invert_rigid(color_from_depth))
 
 
-def _folder_and_units(text: str) -> tuple[Path, float]:
-    """Split FOLDER:UNITS; without units mm, as in ScanNet, 7-Scenes and Record3D."""
-    folder = Path(text)
-    units = 1000.0
-    if not folder.is_dir() and (match := re.fullmatch(r"(.*):([\d.eE+-]+)", text)):
-        folder = Path(match[1])
-        units = float(match[2])
-    if not folder.is_dir() or not 0 < units < np.inf:
-        expected = "FOLDER, or FOLDER:UNITS with units per metre (1000: mm; TUM: 5000)"
-        raise ReobjError(f"--depth {text}: no such folder; expected {expected}")
-    return folder, units
-
-
 def _files_of_rows(paths: Sequence[Path], frame: IntArray, names: Sequence[str]) -> dict[int, Path]:
-    """Match depth maps to frames: by name, else by time stamps, else by the last number."""
-    images = [_core(Path(name).stem) for name in names]
-    maps = {_core(path.stem): path for path in paths}
+    """Match depth maps to frames: by name, else by time stamps, else by the last number.
+
+    The word for the kind of image in a name, as in frame-000020.depth, does not count.
+    """
+    kind = re.compile("[._-]?(depth|color|colour|rgb)[._-]?", re.IGNORECASE)
+    images = [kind.sub("", Path(name).stem) for name in names]
+    maps = {kind.sub("", path.stem): path for path in paths}
     if maps.keys().isdisjoint(images):
         if images and all(re.fullmatch(r"\d+\.\d+", name) for name in (*images, *maps)):  # s (TUM)
             near = rows_by_time(np.array([*maps], float), frame, np.array(images, float))
@@ -134,41 +133,34 @@ def _last_number(text: str) -> str:
     return "".join(str(int(digits)) for digits in re.findall(r"\d+", text)[-1:])
 
 
-def _core(stem: str) -> str:
-    """Remove the word for the kind of image from a name such as frame-000020.depth."""
-    return re.sub(r"[._-]?(depth|color|colour|rgb)[._-]?", "", stem, flags=re.IGNORECASE)
-
-
-def _depth_camera(folder: Path, size: tuple[int, int], color: Camera) -> tuple[Camera, Array]:
+def _depth_camera(folder: Path, size: Size, color: Camera) -> tuple[Camera, Array]:
     """Find the intrinsics of the maps: in a file beside them, else those of the colour images.
 
     Returns:
         camera, and color_from_depth (3, 4).
     """
+    identity = np.eye(3, 4)
     for path in (folder, folder.parent, folder.parent / "intrinsic"):
         if (file := path / "intrinsic_depth.txt").exists():
-            return scannet_camera(file, size), np.eye(3, 4)
+            return scannet_camera(file, size), identity
     for path in (folder / "intrinsics.json", folder.parent / "intrinsics.json"):
         content = load_json(path) if path.exists() else {}
-        if not (depth := content.get("depth", content if path.parent == folder else None)):
+        if not (keys := content.get("depth", content if path.parent == folder else None)):
             continue
-        camera = None
-        color_from_depth = np.eye(3, 4)
         with contextlib.suppress(AttributeError, TypeError, ValueError):
-            given = np.array(content.get("T_color_from_depth", [0, 0, 0]), np.float64)
-            color_from_depth[:, 3 if given.ndim == 1 else slice(4)] = given[:3]
-            camera = camera_of_keys(depth, size)
-        if camera is None:
-            expected = "fx, fy, cx, cy of the depth maps, T_color_from_depth: 3 or 3x4 numbers in m"
-            raise ReobjError(f"{path}: expected {expected}")
-        return camera.resized(size), color_from_depth
+            given = np.array(content.get("T_color_from_depth", [0, 0, 0]), np.float64)[:3]
+            if camera := camera_of_keys(keys, size):
+                matrix = np.column_stack([np.eye(3), given]) if given.ndim == 1 else given
+                return camera.resized(size), matrix
+        expected = "fx, fy, cx, cy of the depth maps, T_color_from_depth: 3 or 3x4 numbers in m"
+        raise ReobjError(f"{path}: expected {expected}")
     if abs(color.width * size[1] - color.height * size[0]) > max(color.width, color.height, *size):
         raise ReobjError(
             f"{folder}: depth maps of {size[0]}x{size[1]}, frames of {color.width}x{color.height}: "
             "another aspect ratio; add the depth camera's intrinsics there: intrinsics.json with "
             "fx, fy, cx, cy"
         )
-    return color.resized(size), np.eye(3, 4)
+    return color.resized(size), identity
 
 
 # ---- Scale and points ----------------------------------------------------------------------------
@@ -198,7 +190,7 @@ def add_depth(poses: Poses, text: str, video: Any) -> Poses:
 
 
 # Systematic relative sigma: of the depth camera itself (Khoshelham and Elberink 2012: ~1 %), of its
-# extrinsics and the colour camera's focal length (chosen: redkitchen, 1 to 3 %).
+# extrinsics and the colour camera's focal length (redkitchen: 1 to 3 %).
 SENSOR_SIGMA = 0.02
 
 
@@ -206,8 +198,7 @@ def depth_scale(poses: Poses, maps: DepthMaps, max_spread: float = 0.2) -> tuple
     """Estimate metres per unit of each component: depth of the maps over that of sparse points.
 
     Args:
-        max_spread: relative, between maps; more contradicts the poses (chosen; higher: a wrong
-            scale is taken).
+        max_spread: relative, between maps; more contradicts the poses.
     Returns:
         scale and relative sigma of each component, and the number of maps.
     Raises:
@@ -219,24 +210,21 @@ def depth_scale(poses: Poses, maps: DepthMaps, max_spread: float = 0.2) -> tuple
     for component in range(poses.part_count):
         rows = [r for r in _spread_rows(poses, maps) if poses.part[r] == component]
         ratios = [_log_ratio(poses, maps, visible, row) for row in rows]
-        logs = np.array([log for log in ratios if log is not None])
-        where = "" if poses.part_count == 1 else f" of component {component}"
-        if len(logs) < 3:  # no median and spread
+        logs = np.array([ratio for ratio in ratios if ratio is not None])
+        where = f" of component {component}" * (poses.part_count > 1)
+        middle = float(np.median(logs)) if len(logs) >= 3 else np.nan
+        spread = 1.4826 * float(np.median(np.abs(logs - middle))) if len(logs) >= 3 else np.nan
+        if not spread <= max_spread:
             raise UnusableError(
                 f"the maps do not give the scale{where}, and no points are added from them: "
-                f"{len(logs)} of {len(rows)} maps show enough sparse points; 3 maps are needed"
-            )
-        spread = 1.4826 * float(np.median(np.abs(logs - np.median(logs))))
-        if spread > max_spread:
-            raise UnusableError(
-                f"the ratio of depth to the poses{where} varies by {100 * spread:.0f} % between "
-                "maps: depth or poses are wrong; the maps do not give the scale"
+                f"{len(logs)} of {len(rows)} maps show enough sparse points (3 are needed), and "
+                f"the ratio of depth to the poses varies by {100 * spread:.0f} % between them"
             )
         used += len(logs)
         # errors of neighbouring maps are correlated: 8 runs of them count as one measurement each
         runs = np.array([np.median(run) for run in np.array_split(logs, min(8, len(logs)))])
         sigma = float(runs.std(ddof=1)) / np.sqrt(len(runs))
-        found.append((np.exp(np.median(logs)), np.hypot(sigma, SENSOR_SIGMA)))
+        found.append((np.exp(middle), np.hypot(sigma, SENSOR_SIGMA)))
     scale, sigmas = np.array(found).T  # (C,) each
     return scale, sigmas, used
 
@@ -244,24 +232,23 @@ def depth_scale(poses: Poses, maps: DepthMaps, max_spread: float = 0.2) -> tuple
 def _spread_rows(poses: Poses, maps: DepthMaps) -> list[int]:
     """Choose at most 60 rows with a pose and a map, evenly spread: all would take long."""
     rows = [row for row in sorted(maps.files) if poses.known[row]]
-    chosen = np.linspace(0, len(rows) - 1, min(len(rows), 60)).round().astype(int)
-    return [rows[i] for i in chosen]
+    spread = np.linspace(0, len(rows) - 1, min(len(rows), 60)).round().astype(int)
+    return [rows[i] for i in spread]
 
 
 def _log_ratio(poses: Poses, maps: DepthMaps, visible: VisiblePoints, row: int) -> float | None:
     """Return the median log of metres per unit of the points that a map sees; None: too few."""
+    least = 10  # fewer points have no stable median
     points = poses.points[visible.in_frame(row)]
-    least = 10  # fewer have no stable median
     if len(points) < least:
         return None
     depth, K = maps.read(row)
     in_color = moved(points, poses.cam_from_world[row])
     in_depth = in_color @ maps.depth_from_color[:, :3].T  # without the shift, which needs the scale
     measured = look_up_depth(depth, K, in_depth)
-    good = (measured > 0) & (in_depth[:, 2] > 0)
-    if good.sum() < least:
-        return None
-    return float(np.median(np.log(measured[good] / in_depth[good, 2])))
+    good = measured > 0
+    ratio = measured[good] / in_depth[good, 2]
+    return float(np.median(np.log(ratio))) if len(ratio) >= least else None
 
 
 def moved(points: Array, b_from_a: Array) -> Array:
@@ -282,21 +269,16 @@ def look_up_depth(depth: Floats, K: Array, in_depth: Array) -> Array:
 def _scaled(poses: Poses, scale: Array, sigma: Array) -> Poses:
     """Scale the components of the trajectory to metres; the largest sigma is that of all."""
     cam_from_world = poses.cam_from_world.copy()
-    points = poses.points.copy()
     cam_from_world[:, :, 3] *= scale[poses.part][:, None]
-    component = np.zeros(len(points), np.int64)
+    component = np.zeros(len(poses.points), np.int64)
     component[poses.visibility[:, 1]] = poses.part[poses.visibility[:, 0]]
-    points *= scale[component][:, None]
     return dataclasses.replace(
-        poses,
-        cam_from_world=cam_from_world,
-        points=points,
-        metric=True,
-        scale=(1.0, float(sigma.max())),
-    )
+        poses, cam_from_world=cam_from_world, points=poses.points * scale[component][:, None],
+        metric=True, scale=(1.0, float(sigma.max())),
+    )  # fmt: skip
 
 
-AGREE = 0.04  # relative difference of equal depths (chosen: noise and pose errors) ...
+AGREE = 0.04  # relative difference of equal depths: noise of the maps and errors of poses ...
 AGREE_M = 0.03  # ... and at least
 
 
@@ -326,24 +308,25 @@ def _with_points(poses: Poses, maps: DepthMaps, video: Any) -> Poses:
     if not sum(map(len, grids)):
         raise UnusableError(f"no points from depth: {len(rows)} maps of frames with a pose show no "
                             "surface; are they depth maps?")  # fmt: skip
-    worlds = [moved(g, invert_rigid(cams[r])) for r, g in zip(rows, grids, strict=True)]
-    points = np.concatenate(worlds)
+    points = np.concatenate(
+        [moved(g, invert_rigid(cams[r])) for r, g in zip(rows, grids, strict=True)]
+    )
     origin = np.repeat(rows, list(map(len, grids)))
     kept = _thin(points, np.concatenate(grids)[:, 2], poses.part[origin])
     points, origin = points[kept], origin[kept]
-    agrees = np.zeros((len(rows), len(points)), bool)
-    through = np.zeros_like(agrees)
-    for k, row in enumerate(rows):
+    found = []
+    for row in rows:
         in_depth = moved(points, cams[row])
         measured = look_up_depth(*depths[row], in_depth)
         measured[poses.part[origin] != poses.part[row]] = 0
-        agrees[k], through[k] = compared(measured, in_depth[:, 2])
+        found.append(compared(measured, in_depth[:, 2]))
+    agrees, through = np.moveaxis(np.array(found), 1, 0)  # (rows, N) each
     views = agrees.sum(0)  # (N,)
-    confirmed = (views - 1).clip(0).sum()
     contradicted = through.sum()
-    if contradicted > MAX_CONTRADICTED * (confirmed + contradicted):
+    count = (views - 1).clip(0).sum() + contradicted
+    if contradicted > MAX_CONTRADICTED * count:
         raise UnusableError(
-            f"no points from depth: in {contradicted} of {contradicted + confirmed} views another "
+            f"no points from depth: in {contradicted} of {count} views another "
             "map sees through a point; are units, intrinsics and poses those of these maps?"
         )
     good = views > through.sum(0)  # else it moved, or is a stray pixel
@@ -373,14 +356,14 @@ def smooth_pixels(depth: Floats) -> BoolArray:
 def _grid_points(depth: Floats, K: Array) -> Array:
     """Return points (N, 3) of a coarse grid of a map, 80 across, in its camera; none at edges."""
     step = max(1, max(depth.shape) // 80)
-    chosen = np.zeros(depth.shape, bool)
-    chosen[step // 2 :: step, step // 2 :: step] = True
-    return points_of(depth, K, chosen & smooth_pixels(depth))
+    wanted = np.zeros(depth.shape, bool)
+    wanted[step // 2 :: step, step // 2 :: step] = True
+    return points_of(depth, K, wanted & smooth_pixels(depth))
 
 
-def points_of(depth: Floats, K: Array, chosen: BoolArray) -> Array:
-    """Return the points (N, 3), in its camera, of the chosen pixels (h, w) of a map."""
-    y, x = np.nonzero(chosen)
+def points_of(depth: Floats, K: Array, wanted: BoolArray) -> Array:
+    """Return the points (N, 3), in its camera, of the wanted pixels (h, w) of a map."""
+    y, x = np.nonzero(wanted)
     rays = np.column_stack([x + 0.5, y + 0.5, np.ones(len(x))]) @ np.linalg.inv(K).T  # (N, 3)
     return np.asarray(rays * depth[y, x][:, None], np.float64)
 
@@ -404,12 +387,12 @@ def _colors(points: Array, origin: IntArray, poses: Poses, video: Any) -> npt.ND
     """Return the colours (N, 3) of points in the images of the frames `origin` (N,): rows."""
     colors = np.full((len(points), 3), 128, np.uint8)  # where there is no image
     for frame in video:
-        chosen = np.flatnonzero(poses.frame[origin] == frame.index)
-        if not len(chosen) or frame.image is None:
+        rows = np.flatnonzero(poses.frame[origin] == frame.index)
+        if not len(rows) or frame.image is None:
             continue
         height, width = frame.image.shape[:2]
-        in_cam = moved(points[chosen], poses.cam_from_world[origin[chosen[0]]])
+        in_cam = moved(points[rows], poses.cam_from_world[origin[rows[0]]])
         xy = np.nan_to_num(poses.camera.resized((width, height)).project(in_cam))  # (n, 2)
         x, y = xy.astype(int).clip(0, (width - 1, height - 1)).T
-        colors[chosen] = frame.image[y, x, ::-1]
+        colors[rows] = frame.image[y, x, ::-1]
     return colors

@@ -84,43 +84,27 @@ def assign(
         found = _by_stamps(stamps_s, source, file.is_ours)
     else:
         found = _by_rows(count, source, where, frames_by, file.by_text)
-    fits = any(not one.outside for one in found if one.key != "time")
-    kept: list[FrameAssignment] = []
+    complete = any(not one.outside for one in found if one.key != "time")
+    different: dict[bytes, FrameAssignment] = {}
     for one in found:
-        same = any(np.array_equal(one.row, other.row) for other in kept)
-        is_excluded = one.outside > 0 and fits  # another assigns all poses
-        if not is_excluded and not same and (one.row >= 0).any():
-            kept.append(one)
+        if (one.row >= 0).any() and not (one.outside and complete):
+            different.setdefault(one.row.tobytes(), one)
+    kept = {one.key: one for one in different.values()}
     if not kept:
-        compared = _compared(file.names, stamps_s, source)
-        raise ReobjError(f"{where}: none of its {count} poses belongs to a frame ({compared})")
-    keys = [one.key for one in kept]
-    if frames_by and frames_by not in keys:
-        raise ReobjError(
-            f"--set poses.frames_by={frames_by}: {where} can be read by {', '.join(keys)}"
-        )
+        first = file.names[:1] or ([] if stamps_s is None else stamps_s[[0, -1]].tolist())
+        times = f"times {source.time_s[0]:.3f}-{source.time_s[-1]:.3f} s" * source.timed
+        raise ReobjError(f"{where}: none of its {count} poses belongs to a frame ({first}; frames: "
+                         f"{source.images[:1] or times}); expected seconds of the same clock, "
+                         "names or numbers of frames, or one row for each frame")  # fmt: skip
+    if frames_by and frames_by not in kept:
+        raise ReobjError(f"--set poses.frames_by={frames_by}: {where} can be read by "
+                         f"{', '.join(kept)}")  # fmt: skip
+    first = next(iter(kept))
     if len(kept) > 1 and not frames_by:
-        choices = "; or ".join(f"{one.key} ({one.rule})" for one in kept)
-        raise ReobjError(
-            f"{where}: its poses can be assigned to frames in {len(kept)} ways: {choices}; choose "
-            f"with --set poses.frames_by={keys[0]}"
-        )
-    return kept[keys.index(frames_by) if frames_by else 0]
-
-
-def _compared(names: Sequence[str], stamps_s: Array | None, source: SourceFrames) -> str:
-    """Describe what was compared without a match, for a message."""
-    if names:
-        first = source.images[int(source.frame[0])] if source.images else int(source.frame[0])
-        return f"images {names[0]!r} ..., frames {first!r} ..."
-    if stamps_s is None:
-        return "in order"
-    times = "{:.3f}-{:.3f} s".format
-    frames = f"frames {times(*source.time_s[[0, -1]])}" if source.timed else "images without times"
-    return (
-        f"{times(*stamps_s[[0, -1]])}, {frames}; expected seconds of the same clock, frame "
-        "numbers, or one row for each frame"
-    )
+        choices = "; or ".join(f"{one.key} ({one.rule})" for one in kept.values())
+        raise ReobjError(f"{where}: its poses can be assigned to frames in {len(kept)} ways: "
+                         f"{choices}; choose with --set poses.frames_by={first}")  # fmt: skip
+    return kept[frames_by or first]
 
 
 # ---- Names and numbers ---------------------------------------------------------------------------
@@ -145,26 +129,23 @@ def by_numbers(number: IntArray, source: SourceFrames, noun: str) -> list[FrameA
     if not known.any():
         return []
     images = _numbers_of_images(source.images)  # (F,) or (0,)
+    start = min(images.tolist(), default=0)
     least = int(number[known].min())
-    first_image = int(images.min()) if len(images) else 0
-    rules = (
-        [("number", noun, 0, 1)] if len(images) else [("number0", f"{noun}, counted from 0", 0, 1)]
-    )
-    if first_image == 0 < least:
-        rules.append(("number1", f"{noun}, counted from 1", 1, 1))
-    if least == 0 and first_image == 1:
-        rules.append(("number0", f"{noun}, counted from 0", -1, 1))
+    base = min(least, 1)
+    from_0 = ("number", "", 0, 1) if len(images) else ("number0", ", counted from 0", 0, 1)
+    rules = [from_0]
+    if start in (0, 1) and base != start:
+        rules.append((f"number{base}", f", counted from {base}", base - start, 1))
     for k in [] if len(images) else _steps(number[known], source.count):
-        of = f"{noun} of one frame in {k}, counted from"
-        rules += [(f"every{k}from{first}", f"{of} {first}", first, k) for first in (0, 1)]
+        text = f" of one frame in {k}, counted from"
+        rules += [(f"every{k}from{n}", f"{text} {n}", n, k) for n in (0, 1) if n <= least]
     frame_of = {n: frame for frame, n in enumerate(images.tolist())}
     found = []
-    for key, rule, first, step in rules:
+    for key, text, first, step in rules:
         frame = step * (number - first)
         if frame_of:
             frame = np.array([frame_of.get(n, -1) for n in frame.tolist()], np.int64)
-        if least >= first:
-            found.append(_assignment(key, rule, np.where(known, frame, -1), source))
+        found.append(_assignment(key, noun + text, np.where(known, frame, -1), source))
     if known.all() and len(number) == len(images):
         order = np.argsort(np.argsort(number))
         found.append(_assignment("order", f"order of the {noun}", order, source))
@@ -192,7 +173,7 @@ def numbers_of_names(names: Sequence[str], where: str) -> IntArray:
     """
     digits = [re.findall(r"\d+", PurePosixPath(name.replace("\\", "/")).stem) for name in names]
     counts = {len(found) for found in digits if found}
-    for group in range(1, max(counts, default=1) + 1 if len(counts) < 2 else 2):
+    for group in range(1, max(counts) + 1 if len(counts) == 1 else 2):
         number = [int(found[-group][-18:]) if found else -1 for found in digits]  # int64 holds 18
         repeated = [n for n, count in Counter(number).items() if n >= 0 and count > 1]
         if not repeated:
@@ -243,19 +224,18 @@ def _by_stamps(stamps_s: Array, source: SourceFrames, is_ours: bool) -> list[Fra
     Whole numbers that are no dates are not in seconds: they are frame numbers, or of another unit.
     """
     found = list[FrameAssignment]()
-    time_s = source.time_s
-    count = len(stamps_s)
-    is_number = (stamps_s == stamps_s.round()).all() and not is_date(stamps_s[0])
-    overlap = stamps_s[0] <= time_s[-1] and stamps_s[-1] >= time_s[0]
+    first, last = stamps_s[[0, -1]].tolist()
+    is_number = (stamps_s == stamps_s.round()).all() and not is_date(first)
+    overlap = first <= source.time_s[-1] and last >= source.time_s[0]
     if overlap and (is_ours or (source.timed and not is_number)):
-        row = rows_by_time(stamps_s, source.frame, time_s)
+        row = rows_by_time(stamps_s, source.frame, source.time_s)
         found.append(FrameAssignment("time", "time stamps", row, 0))
-    if found and (is_ours or (found[0].row < 0).all()):  # the same clock, none within the tolerance
-        return found
-    if is_number and 0 <= stamps_s[0] and stamps_s[-1] <= source.count:
+        if is_ours or (row < 0).all():  # the same clock, none within the tolerance
+            return found
+    if is_number and first >= 0 and last <= source.count:
         noun = "whole numbers in place of time stamps"
         found += by_numbers(stamps_s.astype(np.int64), source, noun)
-    return found + by_order(count, source) or _by_frames_read(count, source)
+    return found + _by_order(len(stamps_s), source)
 
 
 def rows_by_time(stamps_s: Array, frame: IntArray, time_s: Array) -> IntArray:
@@ -281,52 +261,53 @@ def interpolated(
     Rotations by slerp, centres linearly.
 
     Args:
-        max_step_s: chosen: poses at 10 Hz, with jitter.
+        max_step_s: of poses at 10 Hz, with jitter.
     Returns:
         cam_from_world (n, 3, 4), and the mask (F,) of the times that are interpolated: between two
         such poses and at the time of neither.
     """
     known = np.isfinite(cam_from_world).all((1, 2))
     stamps_s = stamps_s[known]
-    world_from_cam = invert_rigid(cam_from_world[known])
     if len(stamps_s) < 2:
         return np.empty((0, 3, 4)), np.zeros(len(time_s), bool)
+    turn, centre = np.split(invert_rigid(cam_from_world[known]), [3], 2)
     after = np.searchsorted(stamps_s, time_s, side="right").clip(1, len(stamps_s) - 1)  # (F,)
     start, end = stamps_s[after - 1], stamps_s[after]
     same_s = 5e-4  # times in files and containers are rounded to a ms
     use = (time_s - start > same_s) & (end - time_s > same_s) & (end - start <= max_step_s)
     at = time_s[use]
-    turn = Slerp(stamps_s, Rotation.from_matrix(world_from_cam[:, :, :3]))(at).as_matrix()
-    centre = [np.interp(at, stamps_s, axis) for axis in world_from_cam[:, :, 3].T]
-    return invert_rigid(np.concatenate([turn, np.transpose([centre], (2, 1, 0))], 2)), use
+    turns = Slerp(stamps_s, Rotation.from_matrix(turn))(at).as_matrix()
+    centres = np.transpose([np.interp(at, stamps_s, axis) for axis in centre[..., 0].T])
+    return invert_rigid(np.dstack([turns, centres])), use
 
 
 # ---- Order ---------------------------------------------------------------------------------------
 
 
-def by_order(count: int, source: SourceFrames, by_text: bool = False) -> list[FrameAssignment]:
-    """Assign rows without names or times, one for each frame of the source; [] for other counts.
+def _by_order(count: int, source: SourceFrames, by_text: bool = False) -> list[FrameAssignment]:
+    """Assign a row to each frame of the source, or that is read; [] for other counts.
 
     Args:
         by_text: in the order of the images' names as text (1, 10, 2), not of their numbers.
     """
-    if count != source.count:
-        return []
-    if not by_text or not source.images:
-        rule = "order, one row for each frame of the source"
-        return [_assignment("order", rule, np.arange(count), source)]
-    frame = sorted(range(count), key=lambda n: PurePosixPath(source.images[n]).name)
-    rule = "order of the image names as text (1, 10, 2)"
-    return [_assignment("text", rule, np.array(frame, np.int64), source)]
+    rule = "order, one row for each frame of the source"
+    if count == source.count:
+        frame = np.arange(count)
+        if by_text and source.images:
+            names = [PurePosixPath(image).name for image in source.images]
+            frame = np.array(sorted(range(count), key=names.__getitem__), np.int64)
+            rule = "order of the image names as text (1, 10, 2)"
+        return [_assignment("order", rule, frame, source)]
+    rule = "order, one row for each frame that is read"
+    known = [FrameAssignment("order", rule, np.arange(count), 0)]
+    return known if count == len(source.frame) else []
 
 
 def _by_rows(
     count: int, source: SourceFrames, where: str, frames_by: str, by_text: bool
 ) -> list[FrameAssignment]:
     """Assign rows without names or times by their order, or by the numbers of selected images."""
-    if found := by_order(count, source, by_text):
-        return found + (by_order(count, source, not by_text) if frames_by else [])
-    if found := _by_frames_read(count, source):
+    if found := _by_order(count, source, by_text):
         return found
     last = int(source.frame[-1])
     found = by_numbers(np.arange(count), source, "rows")
@@ -336,17 +317,8 @@ def _by_rows(
         rule = f"order, row n for frame n of {source.count or 'an unknown number of'}"
         return [FrameAssignment("order", rule, source.frame.copy(), 0)]
     keys = " or ".join(f"{one.key} ({one.rule})" for one in found)
-    raise ReobjError(
-        f"{where}: {count} rows, frame numbers up to {last}; expected one row a frame, or --set "
-        f"poses.frames_by={keys}"
-    )
-
-
-def _by_frames_read(count: int, source: SourceFrames) -> list[FrameAssignment]:
-    """Assign rows in order to the frames that are read; [] for other counts."""
-    rule = "order, one row for each frame that is read"
-    known = [FrameAssignment("order", rule, np.arange(count), 0)]
-    return known if count == len(source.frame) else []
+    raise ReobjError(f"{where}: {count} rows, frame numbers up to {last}; expected one row a frame,"
+                     f" or --set poses.frames_by={keys}")  # fmt: skip
 
 
 def source_of(video: Any) -> SourceFrames:

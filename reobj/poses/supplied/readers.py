@@ -9,6 +9,7 @@ without one the frames of the files of poses and detections.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from reobj.cameras import WORLD_MAX, Camera, Poses, camera_parameters, invert_rigid
+from reobj.cameras import Camera, Poses, camera_parameters, invert_rigid
 from reobj.files import spans
 from reobj.formats import AUTO, Format, Probe, Registry, frames_by_name
 from reobj.poses.estimate import PosesConfig
@@ -30,18 +31,16 @@ from reobj.poses.intrinsics import (
 from reobj.poses.supplied import pose_formats as formats
 from reobj.poses.supplied.check import Supplied
 from reobj.poses.supplied.frame_assignment import (
-    FrameAssignment,
     SourceFrames,
     assign,
     by_numbers,
-    by_order,
     interpolated,
     numbers_of_names,
     numbers_of_times,
     seconds_of,
     source_of,
 )
-from reobj.poses.supplied.pose_formats import PoseFile
+from reobj.poses.supplied.pose_formats import PoseFile, Size
 from reobj.sources.detection_files import DetectConfig, described_images, read_detections
 from reobj.sources.image_files import exif_orientation, sorted_names
 from reobj.sources.video import ImagelessVideo, InputConfig, Video
@@ -81,97 +80,77 @@ def read_supplied(video: Any, config: PosesConfig) -> Supplied:
     """Read poses as `read_poses` does, with what `check` needs to name a mistake."""
     path = Path(config.mode)
     size = (int(video.size[0]), int(video.size[1]))
-    pose_file = read_pose_file(path, config.fmt, size)
+    file = read_pose_file(path, config.fmt, size)
     stated = parse_camera(config.camera, size, config.camera_format)
-    if stated is None and not any(pose_file.cameras):
+    if stated is None and not any(file.cameras):
         raise ReobjError(f"{path}: no intrinsics; add --camera {CAMERA_FORMS}")
     source = source_of(video)
-    stamps_s = None
-    if pose_file.stamps is not None:
-        stamps_s = seconds_of(pose_file.stamps, pose_file.unit)
-    assignment = assign(pose_file, stamps_s, source, str(path), config.frames_by)
+    stamps_s = None if file.stamps is None else seconds_of(file.stamps, file.unit)
+    assignment = assign(file, stamps_s, source, str(path), config.frames_by)
     row = assignment.row
-    turns = turns_of(source, size, pose_file.cameras, row) if pose_file.stored_pixels else {}
-    cameras = pose_file.cameras
-    if len(cameras) == len(pose_file.cam_from_world) > 1:  # those of the frames
-        used = [(f, r) for f, r in enumerate(row.tolist()) if r >= 0]
-        cameras = tuple(turned(cameras[r], turns.get(f)) for f, r in used)
-    camera = stated or one_camera(cameras, path, size)
-    cam_from_world = _of_frames(pose_file.cam_from_world, assignment, source, stamps_s)
-    if (np.abs(cam_from_world) >= WORLD_MAX).any():
-        raise ReobjError(f"{path}: a camera is more than {WORLD_MAX:g} units away from the origin")
+    used = np.flatnonzero(row >= 0)  # (n,)
+    cam_from_world = np.where((row >= 0)[:, None, None], file.cam_from_world[row], np.nan)
+    if assignment.key == "time" and stamps_s is not None:
+        between, use = interpolated(file.cam_from_world, stamps_s, source.time_s)
+        cam_from_world[use & (row >= 0)] = between[row[use] >= 0]
+    turns = turns_of(source, size, file.cameras, row) if file.stored_pixels else {}
+    cameras = file.cameras
+    if len(cameras) == len(file.cam_from_world) > 1:  # those of the frames
+        cameras = tuple(turned(cameras[row[f]], turns.get(f)) for f in used.tolist())
     for f, turn in turns.items():
         cam_from_world[f, :2] = turn @ cam_from_world[f, :2]
+    camera = stated or one_camera(cameras, path, size)
     known = np.asarray(np.isfinite(cam_from_world).all((1, 2)), bool)
-    metric = config.metric or pose_file.metric is not False
-    is_assumed = pose_file.metric is None and not config.metric
+    metric = config.metric or file.metric is not False
     if metric:
         _check_units(cam_from_world, path)
-    frame_of = np.full(len(pose_file.cam_from_world), -1)
-    frame_of[row[row >= 0]] = np.flatnonzero(row >= 0)
-    seen = np.column_stack([frame_of[pose_file.visibility[:, 0]], pose_file.visibility[:, 1]])
-    poses = Poses(
-        camera, source.frame, source.time_s, cam_from_world,
-        np.where(known, "supplied", "none"), "user", metric=metric,
-        up_in_world=pose_file.up_in_world, points=pose_file.points, colors=pose_file.colors,
-        visibility=seen[seen[:, 0] >= 0],
-        messages=tuple(_messages(pose_file, path, source, known, len(turns))),
-        reading=f"{pose_file.kind}{METRES_ASSUMED * is_assumed}, frames by {assignment.rule}",
-    )  # fmt: skip
-    by_text = assignment.key == "order"
-    others = (
-        by_order(len(pose_file.cam_from_world), source, by_text)
-        if by_text or assignment.key == "text"
-        else []
-    )
-    orders = {
-        f"the {one.rule} (--set poses.frames_by={one.key})": _of_frames(
-            pose_file.cam_from_world, one, source
-        )
-        for one in others
-        if one.key != assignment.key
-    }
-    return Supplied(poses, pose_file.axes, orders)
-
-
-def _messages(
-    pose_file: PoseFile, path: Path, source: SourceFrames, known: BoolArray, turned: int
-) -> list[str]:
-    """List photos that were turned, frames (F,) without a pose, and poses of lost frames."""
-    messages = list(pose_file.messages)
-    if turned:
-        messages.append(f"{turned} photos have an EXIF orientation, which COLMAP ignores: its "
-                        "cameras are turned with them")  # fmt: skip
-    facts = []
+    frame_of = np.full(len(file.cam_from_world), -1)
+    frame_of[row[used]] = used
+    seen = np.column_stack([frame_of[file.visibility[:, 0]], file.visibility[:, 1]])
+    assumed = METRES_ASSUMED * (file.metric is None and not config.metric)
+    messages: list[str] = []
+    facts: list[str] = []
+    if turns:
+        messages = [f"{len(turns)} photos have an EXIF orientation, which COLMAP ignores: its "
+                    "cameras are turned with them"]  # fmt: skip
     if not known.all():
         step = int(np.median(np.diff(source.frame))) if len(known) > 1 else 1
         without = spans(source.frame[~known].tolist(), step)
         facts.append(f"poses for {known.sum()} of {len(known)} frames, none for {without}")
-    if lost := int((~np.isfinite(pose_file.cam_from_world).all((1, 2))).sum()):
+    if lost := int((~np.isfinite(file.cam_from_world).all((1, 2))).sum()):
         facts.append(f"{lost} poses of lost frames (the identity, zeros, not finite)")
-    return messages + [f"{path}: {'; '.join(facts)}"] * bool(facts)
+    messages += [f"{path}: {'; '.join(facts)}"] * bool(facts)
+    poses = Poses(
+        camera, source.frame, source.time_s, cam_from_world,
+        np.where(known, "supplied", "none"), "user", metric=metric,
+        up_in_world=file.up_in_world, points=file.points, colors=file.colors,
+        visibility=seen[seen[:, 0] >= 0],
+        messages=(*file.messages, *messages),
+        reading=f"{file.kind}{assumed}, frames by {assignment.rule}",
+    )  # fmt: skip
+    return Supplied(poses, file.axes)
 
 
-LARGE_M, FAST_M = 100.0, 0.5  # radius of an indoor path, and of a step in it (chosen)
+LARGE_M, FAST_M = 100.0, 0.5  # radius of a path, and a step in it, that none has indoors
 
 
 def _check_units(cam_from_world: Array, path: Path) -> None:
     """Refuse a path (F, 3, 4) in metres that no camera takes indoors."""
     centre = invert_rigid(cam_from_world)[:, :, 3]
     centre = centre[np.isfinite(centre).all(1)]  # (n, 3)
-    step = np.median(np.linalg.norm(np.diff(centre, axis=0), axis=1)) if len(centre) > 1 else 0.0
+    steps = np.linalg.norm(np.diff(centre, axis=0), axis=1)
     radius = np.linalg.norm(centre - np.median(centre, axis=0), axis=1).max(initial=0.0)
-    if radius > LARGE_M and step > FAST_M:
+    if radius > LARGE_M and np.median(steps) > FAST_M:
         raise ReobjError(
-            f"{path}: the cameras move by {step:.3g} between frames, within a radius of "
-            f"{radius:.3g}; expected metres (mm, cm? divide the translations by 1000, 100)"
+            f"{path}: the cameras move by {np.median(steps):.3g} between frames, within a radius "
+            f"of {radius:.3g}; expected metres (mm, cm? divide the translations by 1000, 100)"
         )
 
 
-MAX_SPREAD = 0.02  # focal lengths, over the images of one camera: autofocus (chosen)
+MAX_SPREAD = 0.02  # of focal lengths over the images of one camera, by autofocus
 
 
-def one_camera(cameras: Sequence[Camera | None], path: Path, size: tuple[int, int]) -> Camera:
+def one_camera(cameras: Sequence[Camera | None], path: Path, size: Size) -> Camera:
     """Return the single camera of images: the median of slightly different focal lengths.
 
     Args:
@@ -180,37 +159,18 @@ def one_camera(cameras: Sequence[Camera | None], path: Path, size: tuple[int, in
         ReobjError: none, or they differ by more than MAX_SPREAD in focal length or principal point,
             or in model or size.
     """
-    found = sorted((c for c in cameras if c is not None), key=lambda c: c.params[0])
-    if not found:
-        raise ReobjError(f"{path}: no intrinsics; add --camera {CAMERA_FORMS}")
+    found = sorted(filter(None, cameras), key=lambda camera: camera.params[0])
     for camera in found:
         refuse_unusable(camera, str(path))
     kinds = sorted({f"{c.model} {c.width}x{c.height}" for c in found})
     K = np.array([camera.K for camera in found])  # (n, 3, 3)
     if len(kinds) > 1 or np.ptp(K, axis=0).max() > MAX_SPREAD * K[0, 0, 0]:
-        least, most = K[0, 0], K[-1, 0]
-        text = f"focal lengths {least[0]:.4g}-{most[0]:.4g}, centres {least[2]:.4g}-{most[2]:.4g}"
-        text = ", ".join(kinds[:3]) if len(kinds) > 1 else text
+        spread = f"focal lengths {K[0, 0, 0]:.4g}-{K[-1, 0, 0]:.4g}"
         raise ReobjError(
-            f"{path}: several different cameras took the frames ({text}); expected one: "
-            "give its intrinsics with --camera, or reconstruct with a single camera"
+            f"{path}: several different cameras took the frames ({', '.join(kinds[:3])}, {spread});"
+            " expected one: give its intrinsics with --camera, or reconstruct with a single camera"
         )
     return fitted_camera(found[len(found) // 2], size, str(path))
-
-
-def _of_frames(
-    cam_from_world: Array,
-    assignment: FrameAssignment,
-    source: SourceFrames,
-    stamps_s: Array | None = None,
-) -> Array:
-    """Return the poses (F, 3, 4) of the frames by one assignment, NaN where there is none."""
-    row = assignment.row
-    poses = np.where((row >= 0)[:, None, None], cam_from_world[row], np.nan)
-    if assignment.key == "time" and stamps_s is not None:
-        exact, use = interpolated(cam_from_world, stamps_s, source.time_s)
-        poses[use & (row >= 0)] = exact[row[use] >= 0]
-    return poses
 
 
 # ---- EXIF orientations: COLMAP's cameras are those of the stored pixels --------------------------
@@ -220,7 +180,7 @@ TURNS = {3: -np.eye(2), 6: np.array([[0.0, -1], [1, 0]]), 8: np.array([[0.0, 1],
 
 
 def turns_of(
-    source: SourceFrames, size: tuple[int, int], cameras: Sequence[Camera | None], row: IntArray
+    source: SourceFrames, size: Size, cameras: Sequence[Camera | None], row: IntArray
 ) -> dict[int, Array]:
     """Return the turns (2, 2) of the photos with an EXIF orientation, by frame row.
 
@@ -274,26 +234,27 @@ def turned(camera: Camera | None, turn: Array | None) -> Camera | None:
 # ---- Formats -------------------------------------------------------------------------------------
 
 
-def read_pose_file(path: Path, fmt: str, size: tuple[int, int]) -> PoseFile:
+def read_pose_file(path: Path, fmt: str, size: Size) -> PoseFile:
     """Read a file or folder of poses in a format of POSES, or recognise it.
 
     Args:
         size: (w, h) of the images, for formats that do not state it.
     """
-    read = POSES.reader(path, fmt)
-    entry = next(one for one in POSES.formats if one.read is read)
+    entry = POSES.find(path, fmt)
     try:
-        found = read(path, size)
+        found = entry.read(path, size)
     except ReobjError as error:
         text = str(error)  # of a file beside it, or without a name
         raise ReobjError(text if str(path) in text else f"{path}: {text}") from None
     except Exception as error:  # files of other tools lack any key, or hold any type
         text = f"damaged, or no file of format {entry.name} ({error!r:.100})"
         raise ReobjError(f"{path}: {text}") from None
-    return _settled(found, entry, path)
+    metric = {METRES: True, UNKNOWN: False}.get(entry.units, found.metric)
+    kind = f"{entry.name} {found.kind}".strip()
+    return _without_lost(dataclasses.replace(found, metric=metric, kind=kind), path)
 
 
-def _settled(found: PoseFile, entry: Format[ReadPoses], path: Path) -> PoseFile:
+def _without_lost(found: PoseFile, path: Path) -> PoseFile:
     """Sort poses by their time stamps, without repeated ones, and remove those of lost frames.
 
     These are the identity in the axes of the file. It is a pose where it begins the path, where it
@@ -310,24 +271,19 @@ def _settled(found: PoseFile, entry: Format[ReadPoses], path: Path) -> PoseFile:
             messages += (f"{path}: {repeated} rows repeat a time stamp and are left out",)
         poses = poses[kept]
     identity = np.column_stack([found.axes, np.zeros(3)])
-    same: BoolArray = np.all(np.abs(poses - identity) < 1e-9, axis=(1, 2))  # (N,)
-    begins = same[:1].any() and not same[1:2].any()
-    if begins or (found.names and same.sum() == 1):
-        same[same.argmax()] = False
-    same &= not same.all()
-    poses = np.where(same[:, None, None], np.nan, poses)
+    lost: BoolArray = np.all(np.abs(poses - identity) < 1e-9, axis=(1, 2))  # (N,)
+    begins = lost[:1].any() and not lost[1:2].any()
+    if begins or (found.names and lost.sum() == 1):
+        lost[lost.argmax()] = False
+    poses = np.where((lost & ~lost.all())[:, None, None], np.nan, poses)
     if not np.isfinite(poses).all((1, 2)).any():
         raise ReobjError(f"{path}: no poses in it, or only those of lost frames")
-    return dataclasses.replace(
-        found, cam_from_world=poses, stamps=stamps, messages=messages,
-        metric={METRES: True, UNKNOWN: False}.get(entry.units, found.metric),
-        kind=f"{entry.name} {found.kind}".strip(),
-    )  # fmt: skip
+    return dataclasses.replace(found, cam_from_world=poses, stamps=stamps, messages=messages)
 
 
 def _head(probe: Probe) -> tuple[str, list[str], str]:
     """Return the header, and words and text of the first row, of a table; else "", [], ""."""
-    probe = Probe(formats.table_file(probe.path)) if probe.is_dir else probe
+    probe = Probe(formats._file(probe.path, *formats.TABLES)) if probe.is_dir else probe
     for k, line in enumerate(probe.lines):
         words = line.replace(",", " ").split()
         if words and all(map(formats.is_number, words)):
@@ -381,7 +337,7 @@ def _has(name: str, *keys: str) -> Callable[[Probe], bool]:
     return test
 
 
-ReadPoses = Callable[[Path, tuple[int, int]], PoseFile]
+ReadPoses = Callable[[Path, Size], PoseFile]
 NAME, TIME, ORDER = "name, number", "time", "order"
 METRES, UNKNOWN = "metres", "unknown"
 UNSTATED = "not stated: metres, or as `# units: arbitrary` in the file says"
@@ -426,17 +382,7 @@ POSES: Registry[ReadPoses] = Registry("poses", "--pose-format", [
     Format("splatting", "3D Gaussian splatting: `cameras.json`",
            _has("cameras.json", "img_name", "position"), formats.read_splatting, NAME,
            UNKNOWN),
-    *(Format("", title, _has(name, *keys), None,
-             advice=f"write a COLMAP model with {tool}") for title, name, keys, tool in (
-        ("OpenSfM's reconstruction.json", "reconstruction.json", ["shots"],
-         "`opensfm export_colmap`"),
-        ("Meshroom's cameras.sfm", "cameras.sfm", ["views", "version"], "the node ExportColmap"),
-        ("openMVG's sfm_data.json", "sfm_data.json", ["sfm_data_version"],
-         "openMVG_main_openMVG2Colmap"),
-    )),
-    Format("", "Metashape's cameras.xml", lambda p: p.root is not None and p.root.tag == "document",
-           None, advice="export the cameras as COLMAP: File, Export, Export Cameras"),
-])  # fmt: skip
+], "; of other tools, export a COLMAP model")  # fmt: skip
 
 
 # ---- Without a video -----------------------------------------------------------------------------
@@ -461,10 +407,8 @@ def open_video(
     """
     if poses.mode == "none" and (poses.depth or poses.metric):
         raise ReobjError("--depth and --metric need camera poses, but --poses is none")
-    if isinstance(source, Video):
-        return source
     if source is not None:
-        return Video(source, config)
+        return source if isinstance(source, Video) else Video(source, config)
     if poses.depth:
         raise ReobjError(f"--depth {poses.depth}: depth maps are matched to images; name the video")
     if not isinstance(boxes, str | Path) or not boxes or poses.mode in ("auto", "none"):
@@ -473,21 +417,18 @@ def open_video(
             "FILE), --poses FILE and --camera MODEL WIDTH HEIGHT PARAMS, or a file"
         )
     path = Path(boxes)
-    unknown = (1, 1)
-    if not path.exists():
-        raise ReobjError(f"{path} does not exist")
     detect = detect or DetectConfig()
     size = described_images(path, detect)[0]
-    stated = stated_camera(poses.camera, size, poses.camera_format)
-    size = size or (unknown if stated is None else (stated.width, stated.height))
-    pose_file = read_pose_file(Path(poses.mode), poses.fmt, size)
-    if size == unknown and (camera := next(filter(None, pose_file.cameras), None)) is not None:
-        size = (camera.width, camera.height)
-    if size == unknown:
+    camera = stated_camera(poses.camera, size, poses.camera_format)
+    of_camera = [(camera.width, camera.height)] if camera else []
+    file = read_pose_file(Path(poses.mode), poses.fmt, size or (*of_camera, (1, 1))[0])
+    of_camera += [(one.width, one.height) for one in file.cameras if one]
+    size = size or next(iter(of_camera), None)
+    if size is None or size == (1, 1):
         raise ReobjError(
             f"{poses.mode}: no image size in it; give --camera MODEL WIDTH HEIGHT PARAMS"
         )
-    video = _frames_of(pose_file, path, size, poses.mode, config, detect)
+    video = _frames_of(file, path, size, poses.mode, config, detect)
     video.messages.append(
         f"{NOTE_START}no images: {video.frame_count} frames of {size[0]}x{size[1]} from "
         f"{poses.mode} and {path}; tracked by motion and cameras alone, without appearance and "
@@ -497,9 +438,9 @@ def open_video(
 
 
 def _frames_of(
-    pose_file: PoseFile,
+    file: PoseFile,
     boxes: Path,
-    size: tuple[int, int],
+    size: Size,
     source: str,
     config: InputConfig,
     detect: DetectConfig,
@@ -511,39 +452,37 @@ def _frames_of(
     frames, by these numbers. Poses without names: evenly spaced times from 0 on are numbers;
     otherwise each row is one frame.
     """
+    video = functools.partial(ImagelessVideo, source, size, config)
     _, given, times_s = described_images(boxes, detect)
     if times_s is not None:
-        return ImagelessVideo(source, size, config, times_s=times_s)
+        return video(times_s=times_s)
     named = {Path(name.replace("\\", "/")).name for name in given}
-    posed = {Path(name).name for name in pose_file.names}
+    posed = {Path(name).name for name in file.names}
     if named and posed and (frames_by_name(sorted(named), sorted(posed))[0] >= 0).all():
         named = posed  # all of the detections' images and more, with suffixes
     names = sorted_names(named or posed)
-    first = ImagelessVideo(source, size, config, names=names if named else ())
     unfiltered = dataclasses.replace(detect, min_score=0.0, classes="", max_detections=0)
+    first = video(names=names if named else ())
     count = int(read_detections(boxes, first, unfiltered).frame.max(initial=-1)) + 1
     if names and count > len(names):
         number = numbers_of_names(names, source)
         frames = SourceFrames(np.arange(count), np.arange(count) / 1.0, count)
         inside = [a for a in by_numbers(number, frames, "numbers") if not a.outside]
         if len(inside) != 1:
-            last = int(number.max()) + 1
-            return ImagelessVideo(source, size, config, count=count if inside else max(count, last))
+            return video(count=count if inside else max(count, int(number.max()) + 1))
         names = [names[row] if row >= 0 else "" for row in inside[0].row]
     if names:
-        return ImagelessVideo(source, size, config, names=names)
-    rows = len(pose_file.cam_from_world)
-    stamps = pose_file.stamps
-    if stamps is not None:
-        stamps_s = seconds_of(stamps, pose_file.unit)
+        return video(names=names)
+    rows = len(file.cam_from_world)
+    if file.stamps is not None:
+        stamps_s = seconds_of(file.stamps, file.unit)
         number = numbers_of_times(stamps_s)
-        times_s = np.interp(np.arange(number[-1] + 1), number, stamps_s)
-        rows = len(times_s)
+        rows = int(number[-1]) + 1
         if count <= rows:
-            return ImagelessVideo(source, size, config, times_s=times_s)
+            return video(times_s=np.interp(np.arange(rows), number, stamps_s))
     if count > rows:
         raise ReobjError(
             f"{boxes}: frame {count - 1}, but {source} has {rows} poses without names; expected a "
             "pose for each frame, or a CSV with a `timestamp`"
         )
-    return ImagelessVideo(source, size, config, count=rows)
+    return video(count=rows)
