@@ -9,7 +9,6 @@ from reobj.appearance.reid import (
     Gallery,
     SimilarityCalibration,
     match_probability,
-    paired_cosine,
     part_cosines,
 )
 
@@ -96,12 +95,6 @@ def test_gallery_parts_come_from_the_most_similar_view() -> None:
     assert (fore, back) == (pytest.approx(0.8), pytest.approx(1))
 
 
-def test_identities_after_the_last_with_a_view_are_unknown() -> None:
-    """They were confirmed in frames without an image; slots are allocated 16 at a time."""
-    fore, _, _ = filled((0, 90)).parts(at_degrees(0), np.array([0, 16, 40]), UNKNOWN)
-    np.testing.assert_allclose(fore, [[1, np.nan, np.nan]], rtol=1e-6)
-
-
 # ---- Cosines ----
 
 
@@ -115,12 +108,6 @@ def test_part_cosines_of_fused_rows() -> None:
     assert np.isnan(part_cosines(fused[:, :6], fused[:, :6], 6)[1]).all()
     blank = np.concatenate([fused[:1], 0 * fused[:1]])
     assert np.isnan(part_cosines(blank, fused, 6)[0]).all(1).tolist() == [False, True]
-
-
-def test_paired_cosine() -> None:
-    a = np.array([[3.0, 4], [1, 0], [0, 0]])
-    b = np.array([[4.0, 3], [0, 2], [1, 1]])
-    np.testing.assert_allclose(paired_cosine(a, b), [24 / 25, 0, np.nan])
 
 
 # ---- Calibrated similarity ----
@@ -173,13 +160,6 @@ def test_log_odds_follow_the_documented_formula(
     assert calibration.logit(foreground, background, angle) == pytest.approx(expected, abs=1e-9)
     unknown = reference_logit(shown, weight, foreground, background)
     assert calibration.logit(foreground, background) == pytest.approx(unknown, abs=1e-9)
-
-
-def test_probability_has_a_prior() -> None:
-    same = SimilarityCalibration()
-    odds = np.exp(same.logit(0.9, 0.9))
-    assert same.probability(0.9, 0.9) == pytest.approx(odds / (1 + odds))
-    assert same.probability(0.9, 0.9, prior=0.2) == pytest.approx(odds / 4 / (1 + odds / 4))
 
 
 def test_probability_adapts_to_the_video() -> None:

@@ -16,10 +16,7 @@ from reobj.types import (
     box_iou,
     class_shares,
     object_classes,
-    object_color,
     one_line,
-    rows_by,
-    unit_rows,
     without_secrets,
 )
 
@@ -52,12 +49,6 @@ def step(*found: tuple[int, int, float]) -> rt.Tracks:
 def test_box_iou(a: tuple[float, ...], b: tuple[float, ...], expected: float) -> None:
     iou = box_iou(np.array([a], float), np.array([b], float))
     assert iou[0, 0] == pytest.approx(expected)
-
-
-def test_box_iou_compares_every_pair() -> None:
-    a, b = np.array([[0, 0, 10, 10], [0, 0, 4, 10.0]]), np.array([[0, 0, 5, 10.0]])
-    np.testing.assert_allclose(box_iou(a, b), [[0.5], [0.8]])
-    assert box_iou(np.empty((0, 4)), np.ones((3, 4))).shape == (0, 3)
 
 
 # ---- Detections ----
@@ -122,10 +113,8 @@ def supervision(**other: Any) -> Any:
     [
         ROWS,
         ROWS.tolist(),
-        tuple(map(tuple, ROWS.tolist())),
         ROWS.astype(object),
         Tensor(ROWS),
-        Tensor(ROWS.astype(np.float32), "cpu"),
         rt.Detections(*PARTS[:2], PARTS[2].astype(np.int64)),
         ultralytics(),
         ultralytics().boxes,
@@ -142,7 +131,6 @@ def test_detections_of_common_libraries(found: Any) -> None:
     assert made.class_id.tolist() == [56, 2] and made.masks is None
     kinds = (made.xyxy.dtype, made.score.dtype, made.class_id.dtype)
     assert kinds == (np.float64, np.float64, np.int64)
-    assert as_detections(made) is made
 
 
 @pytest.mark.parametrize("none", [[], np.empty((0, 6)), np.empty(0), supervision(
@@ -172,34 +160,27 @@ def changed(row: int, column: int, value: float) -> np.ndarray:
 XYXY, SCORE, LABEL = PARTS
 REFUSED = [
     (ROWS[:, :5], r"shape \(2, 5\); expected \(N, 6\) rows"),
-    (np.ones((6, 5)), r"shape \(6, 5\); expected \(N, 6\)"),  # not five rows of six
     (np.ones((6, 7)), r"shape \(6, 7\); expected"),  # rows of trackers have an identity
     (np.ones(6), r"shape \(6,\); expected"),
-    (np.ones((1, 2, 6)), r"shape \(1, 2, 6\); expected"),
     ([ROWS, ROWS], r"shape \(2, 2, 6\); expected"),  # of two frames
-    (np.empty((0, 5)), r"shape \(0, 5\); expected"),
     (None, "are NoneType, no array of numbers; expected"),
     ("det.txt", "are str, no array"),
-    (ROWS.astype(str), "are str.*, no array"),
     (ROWS.astype(complex), "are complex128, no array"),
     ([[1, 2], [3]], "no array of numbers .*inhomogeneous"),
     (object(), "no array of numbers"),
-    ({"boxes": XYXY}, "a dict without scores, labels; expected"),
-    (SimpleNamespace(xyxy=XYXY), "xyxy, but no confidence or conf"),
-    (SimpleNamespace(xyxy=XYXY, conf=SCORE), "xyxy, but no class_id or cls"),
+    ({"boxes": XYXY}, "no score or confidence or scores or conf; expected"),
+    (SimpleNamespace(xyxy=XYXY), "no score or confidence"),
+    (SimpleNamespace(xyxy=XYXY, conf=SCORE), "no class_id or labels or cls"),
     (ultralytics(boxes=None), "Results without boxes"),
-    (ultralytics(SimpleNamespace(data=np.ones((2, 9)))), r"masks are an array of shape \(2, 9\)"),
-    (supervision(xyxy=XYXY[:, :3]), r"boxes are an array of shape \(2, 3\), expected \(N, 4\)"),
+    (supervision(xyxy=XYXY[:, :3]), r"boxes are an array of shape \(2, 3\), expected \(2, 4\)"),
     (supervision(confidence=SCORE[:1]), r"scores are .* \(1,\), expected \(2,\)"),
     (torchvision(labels=LABEL[:, None]), r"classes are .* \(2, 1\), expected \(2,\)"),
-    (supervision(mask=np.ones((1, 4, 4), bool)), r"masks are .* expected \(2, H, W\)"),
+    (supervision(mask=np.ones((1, 4, 4), bool)), r"masks are .* expected \(2, 4, 4\)"),
     (torchvision(masks=np.ones((2, 3, 4, 4))), r"masks are .* \(2, 3, 4, 4\), expected"),
     (changed(1, 0, np.nan), "detection 1: .*expected finite coordinates"),
-    (changed(0, 2, np.inf), "detection 0: .*expected finite"),
     (changed(0, 3, 1.1e7), r"at most 1e\+07"),
     (changed(1, 2, 299), "detection 1: .*x1 <= x2 and y1 <= y2: corners, not x, y, width"),
     (changed(1, 4, 9), r"detection 1: 9.0, expected a confidence in \[0, 1\]"),
-    (changed(0, 4, -1), "detection 0: -1.0, expected a confidence"),
     (changed(0, 4, np.nan), "nan, expected a confidence"),
     (changed(0, 5, -1), "-1.0, expected a class number from 0"),
     (changed(0, 5, 2e9), "expected a class number from 0 to 32767"),  # gigabytes of class votes
@@ -291,22 +272,6 @@ def test_a_class_is_voted_by_the_sum_of_scores() -> None:
 
 
 # ---- Small helpers ----
-
-
-def test_rows_by_value() -> None:
-    assert [r.tolist() for r in rows_by(np.array([4, 1, 4, 9, 1]))] == [[1, 4], [0, 2], [3]]
-    assert rows_by(np.empty(0, np.int64)) == []
-
-
-def test_unit_rows_leave_zero_rows() -> None:
-    np.testing.assert_allclose(unit_rows(np.array([[3, 4], [0, 0.0]])), [[0.6, 0.8], [0, 0]])
-
-
-def test_neighbouring_identities_have_clearly_different_colours() -> None:
-    colors = np.array([object_color(i) for i in range(1, 40)], float)
-    assert colors.min() >= 0 and colors.max() <= 255
-    assert np.linalg.norm(np.diff(colors, axis=0), axis=1).min() > 90
-    assert object_color(3) == object_color(3)
 
 
 # ---- Messages ----
