@@ -398,6 +398,9 @@ class MatchingOptions:
         iou_odds, no_overlap_odds: log odds for the same object per unit of IoU, and log odds
             against it at IoU 0 (of 12 pairs none has .8 more IDF1 at any step of the camera:
             benchmarks/LOG.md).
+        map_agreement: least share of the detections, of classes that a given map has, that lie on
+            one of its objects (`Tracker.start_from`); below it the poses are not in the frame of
+            the map, and no new track gets a number of the map.
     """
 
     gate_chi2: float = 9.2103
@@ -413,6 +416,7 @@ class MatchingOptions:
     ambiguity_margin: float = 0.3
     iou_odds: float = 20.0
     no_overlap_odds: float = 6.0
+    map_agreement: float = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -451,6 +455,7 @@ class TrackerState:
         last_seen: (I,) frame of each identity's last detection, -1: known from a map, not yet
             detected. identity_class: (I,) its class. numbers: (I,) its number, ascending.
         next_number: of the next new identity.
+        map_votes: (2,) detections compared with the objects of a map, and those that lie on one.
         frame_number: of the latest frame, -1 before the first.
         detector_runs: number of frames on which the detector was run, minus one.
         component: component of the trajectory that the latest frame belongs to.
@@ -465,6 +470,7 @@ class TrackerState:
     identity_class: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
     numbers: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
     next_number: int = 1
+    map_votes: IntArray = field(default_factory=lambda: np.zeros(2, np.int64))
     frame_number: int = -1
     detector_runs: int = -1
     next_tracklet: int = 1
@@ -615,6 +621,7 @@ class Tracker:
         self._spawn(frame, track_of)
         self._update_depth_intervals(frame, track_of)
         self._embed(frame, track_of)
+        self._compare_with_map(frame)
         self._confirm(frame)
         tracks = self._report(frame, track_of)
         self._retire()
@@ -1063,6 +1070,9 @@ class Tracker:
         logit += np.where(at_projection, self._place_evidence(iou, weight), 0)
         possible = state.last_seen[identity] < tracks.first[ready][:, None]
         possible &= state.identity_class[identity] == tracks.votes[ready].argmax(1)[:, None]
+        compared, on_map = state.map_votes
+        if frame.view is not None and on_map < self.matching.map_agreement * compared:
+            possible &= state.last_seen[identity] >= 0  # not those known from the map only
         logit[~possible | (iou == 0)] = -np.inf
         probability = match_probability(logit)
         good = probability >= self.config.return_probability
@@ -1070,6 +1080,20 @@ class Tracker:
         taken = assign(row, column, 1 - probability[row, column])
         result[row[taken]] = identity[column[taken]]
         return result
+
+    def _compare_with_map(self, frame: FrameContext) -> None:
+        """Count detections of classes that the given map has, and those that lie on its objects."""
+        identity = np.flatnonzero(self.ellipsoid_map.given & self.ellipsoid_map.known)
+        if frame.view is None or not len(identity):
+            return
+        state = self.state
+        detections = frame.detections
+        same_class = detections.class_id[:, None] == state.identity_class[identity]  # (D, I)
+        rows = (detections.score >= self.config.high_score) & same_class.any(1)
+        where = (frame.box, identity, frame.view, frame.image_size)
+        iou, weight = self.ellipsoid_map.overlap(*where)
+        on_object = (same_class & (iou * weight > self.matching.low_iou)).any(1)
+        state.map_votes += [rows.sum(), (rows & on_object).sum()]
 
     def _report(self, frame: FrameContext, track_of: IntArray) -> Tracks:
         """Return the tracked detections of this frame, tentative ones with track_id 0."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import doctest
 import importlib
 import importlib.util
-import inspect
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -25,13 +24,6 @@ DETECTIONS = ROOM / "detections.npz"
 
 
 # ---- Public names ----
-
-
-def test_public_names_are_few_sorted_and_documented() -> None:
-    assert rt.__all__ == sorted(set(rt.__all__))
-    for name in set(rt.__all__) - {"COCO_NAMES", "__version__"}:
-        assert inspect.getdoc(getattr(rt, name)), name
-        assert not name.startswith("_"), name
 
 
 # ---- Ways to call the tracker ----

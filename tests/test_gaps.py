@@ -55,21 +55,6 @@ def test_gaps_are_filled_with_the_true_boxes(every: int) -> None:
     np.testing.assert_array_equal(filled.xyxy[~new], BOXES[seen])  # detections are unchanged
 
 
-def test_smoothing_is_more_accurate_than_linear_interpolation() -> None:
-    """Boxes with 3 px of noise, gaps of 4 frames, 60 tracks."""
-    rng, error = np.random.default_rng(0), {"rts": [], "line": []}
-    for _ in range(60):
-        seen = np.delete(ALL, [18, 19, 20, 21])
-        noisy = BOXES[seen] + rng.normal(0, 3, (len(seen), 4))
-        filled = fill_gaps(table(seen, noisy), SIZE, 5)
-        truth = BOXES[18:22]
-        error["rts"].append(filled.xyxy[filled.score == 0] - truth)
-        weight = np.arange(1, 5)[:, None] / 5
-        error["line"].append((1 - weight) * noisy[17] + weight * noisy[18] - truth)
-    rms = {name: np.sqrt(np.mean(np.square(values))) for name, values in error.items()}
-    assert rms["rts"] < 0.9 * rms["line"] < 3
-
-
 @pytest.mark.parametrize("every", [1, 3])
 @pytest.mark.parametrize(("max_gap", "filled"), [(0, 0), (3, 0), (4, 4), (5, 4)])
 def test_only_gaps_up_to_the_limit_are_filled(every: int, max_gap: int, filled: int) -> None:

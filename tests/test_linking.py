@@ -170,19 +170,6 @@ def test_objects_seen_together_are_never_joined() -> None:
         assert np.unique(found.track_id).tolist() == [1, 2] and kinds(events) == set()
 
 
-@pytest.mark.parametrize("every", [10**6, 3])  # n-th late box still has the class chair
-def test_another_class_at_the_same_position_is_the_same_object(every: int) -> None:
-    """Late boxes have the class cup, but position and size of the chair."""
-    poses = walk()
-    table = table_of(poses)
-    table = table[(table.detection_index == 0) & ((table.frame < 50) | (table.frame > 70))]
-    late = (table.frame > 70).astype(np.int64)
-    class_id = np.where((late == 1) & (table.frame % every != 0), CUP, CHAIR)
-    table = dataclasses.replace(table, track_id=1 + late, tracklet_id=1 + late, class_id=class_id)
-    found, _ = linked(table, poses)
-    assert len(np.unique(found.track_id)) == 1
-
-
 def test_moving_classes_keep_the_identities_of_the_tracker() -> None:
     """The same rows as chairs are joined by position and by appearance; as persons they are not.
 

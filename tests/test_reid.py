@@ -67,17 +67,6 @@ def test_kept_views(angles, options, expected) -> None:
     np.testing.assert_allclose(lengths, 1, atol=1e-6)
 
 
-def test_a_gallery_is_bounded_and_per_identity() -> None:
-    rng, gallery = np.random.default_rng(9), Gallery(views=6)
-    for _ in range(40):
-        gallery.add(np.array([0, 3]), unit(rng, 2).astype(np.float32), np.repeat(UNKNOWN, 2, 0))
-    assert gallery.count[:5].tolist() == [6, 0, 0, 6, 0]
-    sizes = gallery.rows.nbytes
-    for _ in range(40):
-        gallery.add(one(3), unit(rng, 1).astype(np.float32), UNKNOWN)
-    assert gallery.rows.nbytes == sizes
-
-
 def test_gallery_parts_come_from_the_most_similar_view() -> None:
     gallery = Gallery()
     gallery.foreground_width = 2

@@ -92,17 +92,6 @@ def test_track_writes_identities(
     assert len(re.findall(r"^ +\d+  object +12$", out, re.M)) == 2
 
 
-def test_poses_none_stays_in_2d(
-    clip: Path, detections: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    args = ("run", clip, "-o", tmp_path / "out", "--detections", detections, *QUICK)
-    assert cli(*args, "--poses", "none") == 0
-    said = capsys.readouterr()
-    assert "warning" not in said.err and said.out.count(" object             12\n") == 2
-    assert cli("objects", tmp_path / "out", *QUICK[2:]) == 0
-    assert capsys.readouterr().out.count(" object             12\n") == 2
-
-
 def test_same_input_same_bytes(clip: Path, detections: Path, tmp_path: Path) -> None:
     for name in ("a", "b"):
         assert cli("track", clip, "-o", tmp_path / name, "--detections", detections) == 0
@@ -154,29 +143,6 @@ def test_python_callable_as_detector(clip: Path, tmp_path: Path) -> None:
     rt.refit(tmp_path / "out", {"threads": 3})  # a dict changes the options of the last run
     kept = read_config(rt.Config(), tmp_path / "out/config.toml")
     assert (kept.objects.min_views, kept.threads) == (5, 3)
-
-
-def test_run_from_another_folder(clip: Path, detections: Path, tmp_path: Path) -> None:
-    """`python /somewhere/reobj_track.py run frames -o out`: paths are in the current folder,
-    the package is found beside the script.
-    """
-    args = ["track", "frames", "-o", "out", "--detections", "det.txt", *QUICK]
-    command = [sys.executable, str(Path(rt.__file__).resolve()), *args]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
-    assert done.returncode == 0 and "2 objects: 2 object" in done.stdout, done.stderr
-    assert len(rt.Result.load(tmp_path / "out").tracks) == 2 * FRAMES
-
-
-def test_gaps_are_filled_up_to_the_option(clip: Path, detections: Path, tmp_path: Path) -> None:
-    """Three frames without detections; filled boxes have score 0 and do not affect shapes."""
-    lines = detections.read_text().splitlines(keepends=True)
-    detections.write_text("".join(x for x in lines if x.split(",")[0] not in ("6", "7", "8")))
-    args = ("track", clip, "-o", tmp_path / "out", "--detections", detections, *QUICK)
-    for fill, rows in (("5", 24), ("3", 24), ("2", 18), ("0", 18)):
-        assert cli(*args, "--set", f"output.fill_gaps={fill}") == 0
-        mot = np.loadtxt(tmp_path / "out/tracks.txt", delimiter=",")
-        assert len(mot) == rows and (mot[:, 6] == 0).sum() == rows - 18
-        assert {o.frames_seen for o in rt.Result.load(tmp_path / "out").objects} == {9}
 
 
 # ---- Resume and output folder ----

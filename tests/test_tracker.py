@@ -263,14 +263,6 @@ def test_a_return_is_confirmed_one_detection_earlier() -> None:
     assert ids == [[], [1], [1, 2]]
 
 
-def test_empty_frames_and_empty_first_frame() -> None:
-    tracker = rt.Tracker(rt.TrackerConfig(n_init=1))
-    assert len(tracker.update(NOTHING)) == 0
-    tracker.update(CORNER)
-    assert tracker.update(NOTHING).xyxy.shape == (0, 4)
-    assert tracker.update(CORNER).track_id.tolist() == [1]
-
-
 def test_crossing_objects_keep_their_identity_by_appearance() -> None:
     """Two objects swap positions between frames: motion contradicts the embeddings."""
     views = unit(np.random.default_rng(3), 2)
@@ -291,20 +283,6 @@ def test_a_weak_match_requires_a_similar_appearance(left: int, score: float, kin
         repeat(12, tracker, BOX, embeddings=seen[None])
         found = rows((left, 100, left + 50, 150), score=score, class_id=kind)
         assert tracker.update(found, embeddings=view[None]).track_id.tolist() == expected
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_a_duplicate_box_does_not_take_the_identity(seed: int) -> None:
-    """The track of the second box has no embedding yet, which is no evidence."""
-    rng, tracker = np.random.default_rng(seed), rt.Tracker()
-    own, beside, second = (100, 100, 140, 200), (300, 100, 340, 200), (105, 100, 145, 200)
-    common, seen = unit(rng, 2), []
-    for step in range(30):
-        boxes = [own if step <= 24 else second, beside] + [second] * (step == 24)
-        view = common[[0, 1, 0][: len(boxes)]] + 0.9 * unit(rng, len(boxes))  # cosine .55
-        seen.append(tracker.update(rows(*boxes), embeddings=view).track_id.tolist())
-    assert seen[23] == [1, 2]
-    assert seen[25:] == [[1, 2]] * 5
 
 
 def away_and_back(
@@ -413,19 +391,6 @@ def test_invalid_input_leaves_the_tracker_unchanged(wrong: dict[str, Any], messa
     assert after.frame.tolist() == [1, 1]
 
 
-def test_state_does_not_grow_with_time() -> None:
-    """The same five objects for 600 frames: as many rows at the end as after 100."""
-    rng = np.random.default_rng(12)
-    views, tracker = unit(rng, 5), rt.Tracker(rt.TrackerConfig(embed_every=1))
-    boxes = [(80 * i, 0, 80 * i + 50, 50) for i in range(5)]
-    sizes = []
-    for frame in range(600):
-        tracker.update(rows(*boxes), embeddings=views + 0.3 * unit(rng, 5))
-        if frame in (100, 599):
-            sizes.append((tracker.state.gallery.rows.nbytes, len(tracker.state.tracks.mean)))
-    assert sizes[0] == sizes[1]
-
-
 def test_a_new_object_does_not_take_over_a_missed_track() -> None:
     """An object is missed and another one appears beside it: if similar, the track continues; else
     the detection starts a new track and the missed object returns to its own.
@@ -516,45 +481,6 @@ def test_with_poses_objects_are_reidentified_by_position(posed: bool) -> None:
     before, after = seen[49], seen[-1]
     assert sorted(before) == sorted(after) == [0, 1]
     assert (before == after) is posed
-
-
-def test_with_poses_an_identical_object_elsewhere_is_new() -> None:
-    """All balls look the same. The third appears while the others are out of view."""
-    tracker, view = rt.Tracker(), unit(np.random.default_rng(15), 1)
-    ids: dict[int, set[int]] = {}
-    for pose in (
-        PAST + [pose_at(0.5, t) for t in range(60)] + [pose_at(0.5, 60 - t) for t in range(61)]
-    ):
-        found, which = balls_seen(pose)
-        tracks = tracker.update(
-            found, embeddings=view.repeat(len(found), 0), cam_from_world=pose, camera=CAMERA
-        )
-        for ball, track in zip(which[tracks.detection_index], tracks.track_id, strict=True):
-            ids.setdefault(int(ball), set()).add(int(track))
-    assert [len(ids[k]) for k in range(3)] == [1, 1, 1]
-    assert len(set.union(*ids.values())) == 3
-
-
-@pytest.mark.parametrize(("turn_deg", "known"), [(0, False), (90, True)])
-def test_backgrounds_from_other_viewpoints_are_no_evidence(turn_deg: int, known: bool) -> None:
-    """An object of unknown position (no parallax) returns in front of another background."""
-    tracker, box = rt.Tracker(), rows((300, 200, 340, 260))
-    front, wall = (
-        np.array([[1, 0], [0.9, 0.436]]),
-        np.eye(2),
-    )  # before, after: very similar, dissimilar
-    seen = []
-    for step in range(60):
-        back = step >= 55
-        found = box if step < 15 or back else NOTHING
-        view = (part[[int(back)]][: len(found)] for part in (front, wall))
-        tracks = tracker.update(
-            found, embeddings=rt.Embeddings(*view),
-            cam_from_world=pose_at(0, turn_deg * (step >= 50)), camera=CAMERA,
-        )  # fmt: skip
-        seen.append(tracks.track_id.tolist())
-    assert seen[14] == [1]
-    assert seen[-1] == [1 if known else 2]
 
 
 def test_a_frame_without_pose_changes_no_ellipsoid() -> None:
@@ -749,22 +675,6 @@ def test_the_limit_of_the_matching_distance(
 
 
 # ---- Rules with poses ----
-
-
-def test_tracks_grow_as_the_camera_approaches() -> None:
-    """Steps of a metre towards the balls and back: boxes grow by half."""
-    tracker = rt.Tracker()
-    walk(tracker, PAST)
-    for i in range(6):
-        pose = pose_at(0.5)
-        pose[2, 3] = -1.4 * (i % 2)
-        before = tracker.state.tracks.mean[:, 2, 0].copy()
-        found, _ = balls_seen(pose)
-        tracks = tracker.update(found, cam_from_world=pose, camera=CAMERA)
-        assert tracks.track_id.tolist() == [1, 2]
-        width = found.xyxy[:, 2] - found.xyxy[:, 0]
-        assert (np.abs(np.log(tracker.state.tracks.mean[:, 2, 0] / width)) < 0.15).all()
-        assert i < 2 or (np.abs(np.log(before / width)) > 0.3).all()
 
 
 def test_tracks_of_known_position_do_not_expire_out_of_view() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from types import SimpleNamespace
 from typing import Any
 
@@ -194,20 +193,6 @@ def test_invalid_detections_are_refused_in_one_line(found: Any, message: str) ->
     with pytest.raises(rt.ReobjError, match=message) as caught:
         as_detections(found)
     assert "\n" not in str(caught.value)
-
-
-def test_detections_go_to_supervision(monkeypatch: pytest.MonkeyPatch) -> None:
-    masks = np.zeros((2, 9, 9), bool)
-    masks[1, 2:4] = True
-    own = rt.Detections(*PARTS[:2], PARTS[2].astype(np.int64), masks)
-    monkeypatch.setitem(sys.modules, "supervision", None)
-    with pytest.raises(rt.ReobjError, match="pip install supervision"):
-        own.to_supervision()
-    monkeypatch.undo()
-    pytest.importorskip("supervision")
-    back = as_detections(own.to_supervision())
-    for name in ("xyxy", "score", "class_id", "masks"):
-        np.testing.assert_array_equal(getattr(back, name), getattr(own, name))
 
 
 # ---- Frames ----

@@ -112,18 +112,3 @@ def test_the_wheel_is_used_and_complete(installed: Path, tmp_path: Path) -> None
     assert {
         p for p in others if not re.match(r"reobj_track-.*\.dist-info|present|__py", p)
     } == set()
-
-
-def test_a_users_program_is_type_checked(installed: Path, tmp_path: Path) -> None:
-    """Types of results; the documented calls are accepted, and each mistake is found."""
-    pytest.importorskip("mypy", reason="the types cannot be checked without mypy")
-    (tmp_path / "good.py").write_text(GOOD)
-    (tmp_path / "wrong.py").write_text("import reobj_track as rt\n" + "\n".join(BAD) + "\n")
-    python = program(installed, "python")
-    mypy = (sys.executable, "-m", "mypy", "--strict", "--config-file=", "--no-error-summary")
-    said = call(
-        *mypy, "--python-executable", python, "good.py", "wrong.py", cwd=tmp_path
-    ).splitlines()
-    assert len(said) == len(BAD), said
-    for line, expected in zip(said, BAD.values(), strict=True):
-        assert line.startswith("wrong.py") and expected in line

@@ -226,7 +226,8 @@ class EllipsoidMap:
         view = K @ cam_from_world
         known = rows_of(self.known, identity, False)[:, None]
         ellipsoid_boxes = rows_of(self.project(view, image_size), identity, np.nan)
-        boxes = np.where(known, ellipsoid_boxes, _project_middle(ends, size, K, cam_from_world))
+        interval_boxes = project_depth_intervals(ends, size, K, cam_from_world)
+        boxes = np.where(known, ellipsoid_boxes, interval_boxes)
         ends = np.where(known[..., None], rows_of(self.ends, identity, np.nan), ends)
         return boxes, np.nan_to_num(project_half_intervals(ends, view))
 
@@ -343,7 +344,7 @@ def depth_intervals(
     return ends, per_depth * depth.mean(1, keepdims=True)  # R' (x - t)
 
 
-def _project_middle(ends: Array, size: Array, K: Array, cam_from_world: Array) -> Array:
+def project_depth_intervals(ends: Array, size: Array, K: Array, cam_from_world: Array) -> Array:
     """Project objects of given size (T, 2) in the middle of their depth intervals (T, 2, 3).
 
     Returns:
