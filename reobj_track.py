@@ -246,7 +246,7 @@ class TrackState:
     uncertainty: Array  # (T, 2) px, of the projected position
 
     def select(self, keep: npt.NDArray[Any]) -> TrackState:
-        """Return the chosen tracks."""
+        """Return the tracks of these rows."""
         return TrackState(*(getattr(self, name)[keep] for name in self.__slots__))
 
     def append(self, other: TrackState) -> TrackState:

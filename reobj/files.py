@@ -155,7 +155,7 @@ def part_paths(path: Path) -> list[Path]:
 
 
 MEMORY_MAX = 1 << 31  # bytes that one input file may take; detections of an hour of video in npz
-LINES_MAX = 2_000_000  # of a table; chosen: an hour at 30 Hz with 18 boxes a frame
+LINES_MAX = 2_000_000  # of a table: an hour at 30 Hz with 18 boxes a frame
 
 
 def read_text(path: Path, most: int | None = None, errors: str = "strict") -> str:

@@ -286,24 +286,6 @@ def test_cosines_of_fused_rows_are_weighted_means() -> None:
     assert rows.dtype == np.float32
 
 
-def test_only_requested_rows_are_computed() -> None:
-    asked = []
-
-    def embedder(frame, detections, rows):
-        asked.append(rows.tolist())
-        return rt.Embeddings(np.eye(3)[rows], np.empty((len(rows), 0)))
-
-    found = boxes(*[(0, 0, 9, 9)] * 3)
-    lazy = LazyEmbeddings(None, embedder, np.zeros((9, 9, 3), np.uint8), found, 0.5)
-    assert lazy.available and asked == []
-    for rows in ([1], [1], [2, 1]):
-        np.testing.assert_array_equal(lazy.get(np.array(rows)), np.eye(3)[rows])
-    assert asked == [[1], [2]]
-    assert lazy.get(np.zeros(0, np.int64)).shape == (0, 3)
-    assert not LazyEmbeddings(None, embedder, None, found, 0.5).available
-    assert not LazyEmbeddings(None, None, np.zeros((9, 9, 3), np.uint8), found, 0.5).available
-
-
 @pytest.mark.parametrize(
     ("given", "width", "message"),
     [

@@ -52,8 +52,6 @@ def kept(gallery: Gallery) -> list[int]:
     [
         ((0, 30), {}, [0, 30]),  # cosine .87: a new view
         ((0, 18), {}, [2]),  # cosine .951: blended, nine parts to one
-        ((0, 30), {"novelty": 0.8}, [3]),
-        ((0, 15), {"novelty": 0.98}, [0, 15]),
         ((0, 90, 100), {}, [0, 91]),  # blended into the nearest view
         ((0, 30, 150, 270), {"views": 3}, [270, 30, 150]),  # replaces one of the two most similar
         ((0, 150, 180, 90), {"views": 3}, [0, 90, 180]),

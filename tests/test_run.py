@@ -260,14 +260,6 @@ def assert_one_clear_line(capsys: pytest.CaptureFixture[str], message: str) -> N
         (("broken.mp4",), "broken.mp4"),  # not a video
         (("frames", "--detections", "missing.txt"), "missing.txt"),
         (("frames", "--detections", "det.txt", "--poses", "missing"), "missing"),
-        (
-            ("frames", "--detections", "det.txt", "--set", "tracker.coast_frame=3"),
-            "did you mean tracker.coast_frames",
-        ),
-        (
-            ("frames", "--detections", "det.txt", "--set", "tracker.n_init=many"),
-            "expected a whole number",
-        ),
         (("frames", "--detections", "det.txt", "--start", "99"), "--start"),
         (("frames", "--detector", "text.onnx"), "text.onnx"),  # no ONNX file at all
         (("frames", "--detector", "no-such-model", "--offline"), "no-such-model"),
@@ -520,7 +512,7 @@ def test_words_of_the_user_get_size_priors(
     err = capsys.readouterr().err
     assert {o.class_name for o in rt.Result.load(out).located} == set(word)
     for said in (
-        "espresso machine: size prior .35 x .3 x .4 m (--prior)",
+        "espresso machine: size prior 0.35 x 0.3 x 0.4 m (--prior)",
         "red toolbox: size prior of luggage (--prior)",
         "extension lead: no size prior",
     ):

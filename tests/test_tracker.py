@@ -334,19 +334,6 @@ def test_identical_objects_are_distinguished_by_their_background() -> None:
     assert tracks.track_id.tolist() == [3, 1, 2]
 
 
-def test_embeddings_stay_aligned_with_their_boxes() -> None:
-    """Weak and unmatched detections in between must not shift the rows."""
-    rng = np.random.default_rng(10)
-    views = unit(rng, 2)
-    noise = unit(rng, 1)
-    tracker = rt.Tracker(rt.TrackerConfig(n_init=1))
-    mixed = rt.Embeddings(np.concatenate([noise, views[:1], noise, views[1:]]), np.empty((4, 0)))
-    boxes = [(400, 0, 450, 50, 0.05), (0, 0, 50, 50), (400, 200, 450, 250, 0.05), (100, 0, 150, 50)]
-    tracks = tracker.update(rows(*boxes), embeddings=mixed)
-    assert tracks.detection_index.tolist() == [1, 3]
-    np.testing.assert_allclose(tracker.state.tracks.embedding, views, atol=1e-6)
-
-
 K640 = rt.Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
 AT_ORIGIN = np.eye(4)[:3]
 BEYOND = np.c_[np.eye(3), [1e200, 0, 0]]
@@ -556,19 +543,6 @@ def test_a_new_component_does_not_use_ellipsoids_of_another() -> None:
 
 
 # ---- Rules of the association ----
-
-
-@pytest.mark.parametrize(("kind", "expected"), [(CHAIR, [1]), (CUP, [])])
-def test_another_class_is_evidence_against_a_match(kind: int, expected: list[int]) -> None:
-    """Dissimilar, but overlapping: enough for the same class, too little for another."""
-    seen, new = unit(np.random.default_rng(21), 2)
-    new = new - (new @ seen) * seen
-    new = 0.3 * seen + np.sqrt(1 - 0.3**2) * new / np.linalg.norm(new)
-    tracker = rt.Tracker()
-    repeat(12, tracker, BOX, embeddings=seen[None])
-    repeat(12, tracker, NOTHING)
-    found = rows((114, 100, 164, 150), class_id=kind)
-    assert tracker.update(found, embeddings=new[None]).track_id.tolist() == expected
 
 
 class Counted:

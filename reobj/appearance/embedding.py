@@ -374,7 +374,17 @@ class Embedder:
         latest = self._latest
         if latest is None or latest.frame is not frame or latest.detections is not detections:
             features = self.backbone(frame)
-            latest = self._latest = _LatestFrame(frame, detections, features, self.layout)
+            score = self.layout.object_score
+            occupied = occupancy_map(detections, frame.shape, features.shape[:2], score)
+            known = np.zeros(len(detections), bool)
+            arrays = (
+                features,
+                occupied,
+                detections.score >= score,
+                known,
+                np.zeros((len(known), 0)),
+            )
+            latest = self._latest = _LatestFrame(frame, detections, *arrays)
         return latest
 
     def _embed_cells(self, fore: Floats, back: Floats) -> tuple[Array, Array]:
@@ -386,6 +396,7 @@ class Embedder:
         return _hellinger_rows(fore), np.concatenate([_hellinger_rows(b) for b in boxes], 1)
 
 
+@dataclass(slots=True, eq=False)
 class _LatestFrame:
     """Values that are computed once per frame.
 
@@ -395,17 +406,13 @@ class _LatestFrame:
         known: (D,) detections whose foreground (D, E) is computed.
     """
 
-    def __init__(
-        self, frame: Image, detections: Detections, features: Floats, layout: SamplingLayout
-    ) -> None:
-        self.frame = frame
-        self.detections = detections
-        self.features = features
-        shape = features.shape[:2]
-        self.confident = detections.score >= layout.object_score
-        self.occupied = occupancy_map(detections, frame.shape, shape, layout.object_score)
-        self.known = np.zeros(len(detections), bool)
-        self.foreground = np.zeros((len(detections), 0))
+    frame: Image
+    detections: Detections
+    features: Floats
+    occupied: BoolArray
+    confident: BoolArray
+    known: BoolArray
+    foreground: Array
 
 
 def neighbour_embedding(

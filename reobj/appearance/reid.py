@@ -19,6 +19,10 @@ from reobj.types import Array, Floats, IntArray, unit_rows
 # ---- Gallery -----------------------------------------------------------------------------------
 
 
+NOVELTY = 0.95  # largest cosine to all kept views of a view that is kept as a new one
+BLEND = 0.9  # weight of the kept view where a view that is not new is blended into it
+
+
 class Gallery:
     """A few diverse views of the appearance of every identity of a video; none expires.
 
@@ -26,8 +30,6 @@ class Gallery:
 
     Args:
         views: K, views kept of every identity.
-        novelty: largest cosine to all kept views of a view that is kept as a new one.
-        blend: weight of the kept view where a view that is not new is blended into it.
 
     Attributes:
         rows: (I, K, E) unit rows. viewing_ray: (I, K, 3) viewing directions, NaN unknown.
@@ -36,10 +38,8 @@ class Gallery:
 
     ARRAYS = ("rows", "viewing_ray", "count", "foreground_width")  # the whole state
 
-    def __init__(self, views: int = 12, novelty: float = 0.95, blend: float = 0.9) -> None:
+    def __init__(self, views: int = 12) -> None:
         self.views = views
-        self.novelty = novelty
-        self.blend = blend
         self.rows = np.zeros((0, views, 0), np.float32)
         self.viewing_ray = np.zeros((0, views, 3))
         self.count = np.zeros(0, np.int64)
@@ -60,11 +60,11 @@ class Gallery:
         similarity = np.einsum("nke,ne->nk", views, rows)  # (N, K)
         similarity[np.arange(self.views) >= self.count[identity][:, None]] = -np.inf
         nearest = similarity.argmax(1)  # (N,)
-        novel = similarity.max(1) < self.novelty  # (N,)
+        novel = similarity.max(1) < NOVELTY  # (N,)
         has_slot = self.count[identity] < self.views
         target = np.where(novel & has_slot, self.count[identity], nearest)  # (N,) slot to write
         target[novel & ~has_slot] = _most_redundant(views[novel & ~has_slot])
-        blend = np.where(novel, 0.0, self.blend)[:, None]
+        blend = np.where(novel, 0.0, BLEND)[:, None]
         picked = views[np.arange(len(identity)), target]  # (N, E)
         self.rows[identity, target] = unit_rows(blend * picked + (1 - blend) * rows)
         self.viewing_ray[identity[novel], target[novel]] = viewing_ray[novel]

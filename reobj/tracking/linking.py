@@ -170,7 +170,6 @@ def _viewing_rays(tracks: Tracks, poses: Poses | None) -> Array:
 # ---- Linking -------------------------------------------------------------------------------------
 
 
-# Chosen on examples/room and redkitchen (benchmarks/RESULTS.md) unless a source is given.
 DUPLICATE_IOU = 0.6  # boxes that overlap more may be two boxes of one object (NMS: .5 to .7)
 FRAGMENT_GAP = 5  # frames without a detection after which a tracklet may be another object
 
