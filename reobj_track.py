@@ -94,8 +94,8 @@ from reobj.sources.weights import list_models, model_path
 from reobj.tracking.camera_motion import CameraMotion
 from reobj.tracking.ellipsoid_map import (
     EXPECTED_IN_VIEW,
-    CameraInputs,
     EllipsoidMap,
+    camera_inputs,
     depth_intervals,
     iou_within_uncertainty,
     rows_of,
@@ -1177,7 +1177,7 @@ def track(
     video = video if isinstance(video, Video) else Video(video)
     source = open_detections(video, DetectConfig(), detector)
     tracker = tracker or Tracker(embedder=Embedder())
-    cameras = CameraInputs(poses, video.scale)
+    cameras = camera_inputs(poses, video.scale)
     looked = True if source.always_looks else None
     for frames in in_batches(video, 1 if video.is_live else source.batch):
         for frame, found in zip(frames, source.detect(frames), strict=True):

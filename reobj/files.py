@@ -292,9 +292,11 @@ def restore_state(state: Any, arrays: Mapping[str, Any]) -> None:
 
 def load_cached(path: Path, read: Callable[[Path], T]) -> T | None:
     """Read a file of the cache; None where it is missing or damaged (then it is removed)."""
+    if not path.exists():
+        return None
     try:
-        content = read(path) if path.exists() else None
-        log.debug("read %s from the cache: %s", path, content is not None)
+        content = read(path)
+        log.debug("read %s from the cache", path)
         return content
     except (ReobjError, OSError) as error:
         log.warning("%s; it is removed and computed again", error)

@@ -10,6 +10,7 @@ Axes: I identities, V views, G groups of boxes, D detections, T tracks, N points
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
@@ -158,16 +159,19 @@ class EllipsoidMap:
         # fewer than three boxes leave an ellipsoid undetermined: 9 unknowns, 4 a box
         return np.asarray((count >= 3) & (self.fresh > count // 4) & ~self.given, bool)
 
-    def refit(self, image_size: tuple[int, int]) -> None:
+    def refit(self, image_size: tuple[int, int]) -> bool:
         """Fit the ellipsoids of all identities that are due, in a few steps.
 
         The world may have any unit: its scale for the size prior of the fit is that of the usual
         rough size. A fit that is rejected, lacks parallax or is a needle makes the position
         unknown.
+
+        Returns:
+            Whether any was due.
         """
         due = np.flatnonzero(self.due)
         if not len(due):
-            return
+            return False
         at, slot = np.nonzero(self.frame[due] >= 0)
         views = (due[at], slot)
         frames, first, row = np.unique(self.frame[views], return_index=True, return_inverse=True)
@@ -188,6 +192,7 @@ class EllipsoidMap:
         good &= axes[:, 2] <= MAP_MAX_ELONGATION * axes[:, 1]
         self._set(due, fits.ellipsoids, fits.cov[:, :3, :3], good)
         self.fresh[due] = 0
+        return True
 
     @property
     def known(self) -> BoolArray:
@@ -270,36 +275,32 @@ def rows_of(rows: Any, identity: IntArray, missing: Any) -> npt.NDArray[Any]:
 # ---- Depth intervals of tracks -----------------------------------------------------------------
 
 
-class CameraInputs:
-    """Look up a frame's camera inputs as keyword arguments for `Tracker.update`.
+def camera_inputs(poses: Poses | None, scale: float) -> Callable[[int], dict[str, Any]]:
+    """Return a function: number of a frame in the source -> keyword arguments of `Tracker.update`.
+
+    These are pose, camera, points and component. The points are those nearby, not only those in the
+    image: their median depth is the fallback of boxes without points (cropping them would change
+    depth intervals).
 
     Args:
         poses: of the video; None: no camera inputs. scale: px of the frames per native px.
     """
+    if poses is None:
+        return lambda _: {}
+    row_of = {frame: row for row, frame in enumerate(poses.frame.tolist())}
+    camera = scaled_camera(poses.camera, scale)
+    visible = VisiblePoints(poses)
 
-    def __init__(self, poses: Poses | None, scale: float) -> None:
-        self.poses = poses
-        self.row_of: dict[int, int] = {}
-        if poses is not None:
-            self.row_of = {frame: row for row, frame in enumerate(poses.frame.tolist())}
-            self.camera = scaled_camera(poses.camera, scale)
-            self.visible = VisiblePoints(poses)
-
-    def __call__(self, frame: int) -> dict[str, Any]:
-        """Return pose, camera, points and component of a frame, by its number in the source.
-
-        The points are those nearby, not only those in the image: their median depth is the fallback
-        of boxes without points (cropping them would change depth intervals).
-        """
-        if self.poses is None or frame not in self.row_of:
+    def inputs(frame: int) -> dict[str, Any]:
+        row = row_of.get(frame)
+        if row is None:
             return {}
-        row = self.row_of[frame]
-        return {
-            "cam_from_world": self.poses.cam_from_world[row],
-            "camera": self.camera,
-            "points": np.asarray(self.poses.points[self.visible.nearby(row)], np.float64),
-            "part": int(self.poses.part[row]),
-        }
+        points = np.asarray(poses.points[visible.nearby(row)], np.float64)
+        pose = poses.cam_from_world[row]
+        component = int(poses.part[row])
+        return {"cam_from_world": pose, "camera": camera, "points": points, "part": component}
+
+    return inputs
 
 
 MIN_POINTS = 3  # in a box to estimate its depth; fewer have no median and spread
