@@ -1126,8 +1126,8 @@ class Tracker:
         A tracker that `load` reads continues exactly as this one does.
         """
         options = {name: dataclasses.asdict(getattr(self, name)) for name in ("config", "matching")}
-        options |= {"version": STATE_VERSION, "components": len(self.state.maps)}
-        save_npz(Path(path), state_arrays(self.state), **options)
+        facts = {"version": STATE_VERSION, "components": len(self.state.maps)}
+        save_npz(Path(path), state_arrays(self.state), **facts, **options)
 
     @classmethod
     def load(cls, path: str | Path, embedder: Embedder | None = None) -> Tracker:

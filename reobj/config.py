@@ -277,16 +277,17 @@ def _toml(value: str | float) -> str:
 def add_flags(parser: argparse.ArgumentParser, config: Any, sections: Iterable[str]) -> None:
     """Add the flags of the options in the given sections ("": top level) to a parser."""
     for name, f in every_option(config).items():
-        flag = f.metadata["flag"]
-        if flag and name.rpartition(".")[0] in sections:
+        flags = f.metadata["flags"]
+        if flags and name.rpartition(".")[0] in sections:
             kind = type(f.default)
+            named = flags[0][2:].upper()
             action = "append" if f.metadata["repeated"] else "store"
-            settings: dict[str, Any] = {"type": kind, "metavar": flag[2:].upper(), "action": action}
+            settings: dict[str, Any] = {"type": kind, "metavar": named, "action": action}
             if kind is bool:
                 settings = {"action": "store_true"}
             default = f" (default: {f.default})" if f.default else ""
             text = f"{f.metadata['help']}{default}".replace("%", "%%")
-            parser.add_argument(flag, dest=name, default=None, help=text, **settings)
+            parser.add_argument(*flags, dest=name, default=None, help=text, **settings)
 
 
 def config_from_args(config: C, args: argparse.Namespace) -> C:

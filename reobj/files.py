@@ -54,8 +54,12 @@ def atomic(path: Path) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Convert disk errors of the block that writes `path` to a ReobjError; others pass."""
+def writing(path: Path, named: Path | None = None) -> Iterator[None]:
+    """Convert disk errors of the block that writes `path` to a ReobjError; others pass.
+
+    Args:
+        named: in the error, instead of `path`.
+    """
     try:
         yield
     except OSError as error:
@@ -64,7 +68,7 @@ def writing(path: Path) -> Iterator[None]:
             raise  # of an input
         why = f"cannot be written ({error.strerror or error})"
         raise ReobjError(
-            f"{path}: {why}; make room, or choose a folder that takes files"
+            f"{named or path}: {why}; make room, or choose a folder that takes files"
         ) from error
 
 
@@ -73,16 +77,17 @@ class LockedError(ReobjError):
 
 
 @contextlib.contextmanager
-def locked(path: Path, wait_s: float = 0.0) -> Iterator[None]:
+def locked(path: Path, wait_s: float = 0.0, named: Path | None = None) -> Iterator[None]:
     """Hold the lock of a file; the system releases it when the process ends, even if killed.
 
     Args:
-        wait_s: longest time to wait for another process that holds it.
+        wait_s: longest time to wait for another process that holds it. named: in disk errors,
+            instead of the lock: the file beside it that will be written.
     Raises:
         LockedError: another process, or this one, still holds it.
     """
     lock = filelock.FileLock(path, timeout=wait_s)
-    with writing(path):
+    with writing(path, named):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()  # where that is impossible, filelock would wait
         try:

@@ -135,12 +135,16 @@ COCO_NAMES: tuple[str, ...] = tuple(name.replace("_", " ") for name in (
 ).split())  # fmt: skip
 
 
-def option(default: Any, text: str, flag: str = "", repeated: bool = False) -> Any:
+def option(
+    default: Any, text: str, flag: str = "", old_flag: str = "", repeated: bool = False
+) -> Any:
     """Declare a config field: default, help text and, for common options, a flag.
 
-    repeated: the flag may be given several times; its values are joined by commas.
+    old_flag: an earlier name of the flag that still works. repeated: the flag may be given several
+    times; its values are joined by commas.
     """
-    return field(default=default, metadata={"help": text, "flag": flag, "repeated": repeated})
+    flags = [name for name in (flag, old_flag) if name]
+    return field(default=default, metadata={"help": text, "flags": flags, "repeated": repeated})
 
 
 @dataclass(frozen=True, slots=True)
@@ -405,7 +409,7 @@ def _columns(detections: Any) -> tuple[Any, ...]:
     if not isinstance(source, Mapping):
         names = (*itertools.chain(*COLUMNS), "mask", "masks")
         source = {name: getattr(source, name) for name in names if hasattr(source, name)}
-    columns = []
+    columns: list[Any] = []
     for default, names in zip((np.empty, np.ones, np.zeros), COLUMNS, strict=True):
         name = next((name for name in names if name in source), None)
         if name is None:

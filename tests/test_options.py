@@ -47,7 +47,7 @@ def test_the_list_of_options_is_complete(capsys: pytest.CaptureFixture[str]) -> 
     lines = capsys.readouterr().out.splitlines()
     assert done.value.code == 0 and max(map(len, lines)) <= 120
     assert [line.partition("=")[0] for line in lines if line[0] != " "] == list(OPTIONS)
-    flags = [f.metadata["flag"] for f in OPTIONS.values() if f.metadata["flag"]]
+    flags = [flag for f in OPTIONS.values() for flag in f.metadata["flags"]]
     assert len(set(flags)) == len(flags)
 
 
@@ -57,9 +57,9 @@ def test_every_option_can_be_set_and_every_flag_sets_its_own(tmp_path: Path) -> 
     assert values(given(tmp_path, *words)) == wanted
     words = []
     for name, f in OPTIONS.items():
-        if flag := f.metadata["flag"]:
-            words += [flag] if f.default is False else [flag, str(wanted[name])]
-    flagged = {name: bool(f.metadata["flag"]) for name, f in OPTIONS.items()}
+        if flags := f.metadata["flags"]:
+            words += flags[-1:] if f.default is False else [flags[-1], str(wanted[name])]
+    flagged = {name: bool(f.metadata["flags"]) for name, f in OPTIONS.items()}
     expected = {n: wanted[n] if flagged[n] else f.default for n, f in OPTIONS.items()}
     assert values(given(tmp_path, *words)) == expected
     with pytest.raises(SystemExit):  # no flag of objects

@@ -224,7 +224,7 @@ class SimilarityCalibration:
         usual_deg = 45.0  # between two views of unknown directions
         angle = np.radians(np.where(np.isnan(view_angle_deg), usual_deg, view_angle_deg))
         facing = ((1 + np.cos(angle)) / 2, np.cos(angle).clip(0))
-        logit = 0.0
+        logit: Any = 0.0
         for k, cosine in enumerate(cosines):
             standard = (self.log_similarity(cosine.astype(kind)) - middle[k]) / std[k]
             score = facing[k] * standard * separation[k]

@@ -406,7 +406,7 @@ def map_lock(path: Path) -> Iterator[None]:
     if path.is_file():
         _check_kind(path)
     try:
-        with locked(path.with_name(f".{path.name}.lock")):
+        with locked(path.with_name(f".{path.name}.lock"), named=path):
             yield
     except LockedError:
         what = "another run is updating this map"

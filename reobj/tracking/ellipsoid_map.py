@@ -110,8 +110,9 @@ class EllipsoidMap:
         count = len(ellipsoids)
         self._grow(count)
         finite = np.isfinite(ellipsoids.dual_quadrics()).all((1, 2)) & np.isfinite(cov).all((1, 2))
-        self._set(np.arange(count), ellipsoids, cov, finite)
-        self.given[:count] = finite
+        known = np.asarray(finite, bool)
+        self._set(np.arange(count), ellipsoids, cov, known)
+        self.given[:count] = known
 
     def _set(
         self, identity: IntArray, ellipsoids: quadrics.Ellipsoids, cov: Array, known: BoolArray
