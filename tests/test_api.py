@@ -20,12 +20,6 @@ import reobj_track as rt
 
 ROOT = Path(__file__).resolve().parent.parent
 ROOM = ROOT / "examples" / "room"
-DETECTIONS = ROOM / "detections.npz"
-
-
-# ---- Public names ----
-
-
 # ---- Ways to call the tracker ----
 
 

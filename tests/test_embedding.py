@@ -147,20 +147,6 @@ def test_a_head_is_found_beside_its_backbone_or_given(net: str, tmp_path: Path) 
     assert rt.Embedder(net, str(other), threads=1).layout.size_px == 480
 
 
-def test_a_head_gets_the_cells_of_its_part(net: str, tmp_path: Path) -> None:
-    """Foreground cells of a grey box on black give a different embedding than the background."""
-    sum_head(tmp_path / "net_head.onnx", layout={"neighbours": 0.0})
-    embedder, image = rt.Embedder(net, threads=1), np.zeros((256, 256, 3), np.uint8)
-    image[64:192, 64:192] = 200
-    found = boxes((64, 64, 192, 192))
-    fore, back = embedder.cells(image, found, np.arange(1))
-    look = embedder(image, found)
-    np.testing.assert_allclose(look.foreground[0], fore.sum() * np.array([1, 2]), rtol=1e-5)
-    expected = np.sign(back.sum()) * np.array([1, 3]) / 10**0.5
-    np.testing.assert_allclose(look.background[0], expected, rtol=1e-5)
-    assert fore.sum() > 0 > back[..., :3].sum()
-
-
 # ---- Embedder ----
 
 

@@ -58,19 +58,6 @@ def test_foreground_is_the_inscribed_ellipse_and_background_the_rest() -> None:
     assert back.others.mean() < 0.02  # the rim of its own outline, drawn on the coarse map
 
 
-def test_masks_of_all_objects_are_no_background() -> None:
-    masks = np.zeros((2, 200, 400), bool)
-    masks[0, 50:150, 100:150] = masks[1, :, 200:] = True
-    fore, back = samples(boxes((100, 50, 200, 150), (200, 0, 400, 200), masks=masks))
-    left = fore.index[0] % 100 < 37  # the mask is the left half of the box
-    np.testing.assert_array_equal(fore.weight[0], left)
-    right = back.index[0] % 100 >= 50
-    assert not (back.weight[0] & right).any()
-    assert not (back.weight[0] & masks_at(masks[0], back)).any()
-    assert back.weight[0][~right & ~masks_at(masks[0], back)].all()
-    np.testing.assert_allclose(back.others[0][:, 3], 1.0)
-
-
 def test_the_wider_box_contains_other_objects_but_not_its_own() -> None:
     masks = np.zeros((2, 200, 400), bool)
     masks[0, 80:120, 180:220] = masks[1, :, 240:] = True

@@ -18,7 +18,6 @@ import reobj_track as rt
 from reobj.types import box_iou
 
 CHAIR, CUP = 56, 41
-ROOM = Path(__file__).parent.parent / "examples" / "room"
 
 
 def rows(*boxes: tuple[float, ...], score: float = 0.9, class_id: int = CHAIR) -> rt.Detections:
@@ -51,10 +50,6 @@ def repeat(count: int, tracker: rt.Tracker, *args: Any, **known: Any) -> rt.Trac
 NOTHING = rt.Detections.empty()
 CORNER = rows((0, 0, 50, 50))
 BOX = rows((100, 100, 150, 150))
-LARGE = rows((100, 100, 200, 200))
-TALL = rows((100, 100, 110, 350))
-
-
 # ---- Kalman filter ----
 
 
@@ -645,9 +640,6 @@ def test_the_limit_of_the_matching_distance(
     assert (1 in update(tracker, found).tracklet_id) == same
 
 
-# ---- Rules of re-identification ----
-
-
 # ---- Rules with poses ----
 
 
@@ -675,17 +667,6 @@ def test_a_missed_track_of_known_position_follows_its_projection() -> None:
 
 
 # ---- Appearance: comparison and stored embeddings ----
-
-
-def test_a_rejected_match_is_not_made_by_overlap_alone() -> None:
-    """A box around two tracks, similar to neither: it starts a new track."""
-    views = unit(np.random.default_rng(31), 3)
-    tracker = rt.Tracker()
-    for _ in range(12):
-        both = rows((100, 100, 150, 150), (104, 100, 154, 150))
-        tracker.update(both, embeddings=views[:2])
-    found = update(tracker, rows((88, 87, 165, 164)), embeddings=views[2:])
-    assert found.tracklet_id.tolist() == [3]
 
 
 @pytest.mark.parametrize(("kind", "pairs"), [(CHAIR, 2), (CUP, 0)])

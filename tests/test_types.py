@@ -53,18 +53,6 @@ def test_box_iou(a: tuple[float, ...], b: tuple[float, ...], expected: float) ->
 # ---- Detections ----
 
 
-def test_detections_are_selected_with_their_masks() -> None:
-    found = rt.Detections.from_array([[0, 0, 1, 1, 0.5, 3], [0, 0, 2, 2, 0.7, 4]])
-    masks = np.zeros((2, 4, 4), bool)
-    masks[1] = True
-    found = rt.Detections(found.xyxy, found.score, found.class_id, masks)
-    for keep in (np.array([1]), np.array([False, True]), slice(1, 2)):
-        part = found[keep]
-        assert len(part) == 1 and part.class_id.tolist() == [4] and part.score.tolist() == [0.7]
-        assert part.masks is not None and part.masks.all()
-    assert rt.Detections.from_array([]).xyxy.shape == rt.Detections.empty().xyxy.shape == (0, 4)
-
-
 ROWS = np.array([[10, 20, 110, 220, 0.9, 56], [300, 40, 400, 200, 0.7, 2.0]])
 PARTS = (ROWS[:, :4], ROWS[:, 4], ROWS[:, 5])
 
@@ -254,9 +242,6 @@ def test_a_class_is_voted_by_the_sum_of_scores() -> None:
     assert object_classes(table) == {1: 7, 2: 5}
     shares = class_shares(table, table.track_id - 1, 3)
     np.testing.assert_allclose(shares[:, [5, 7]], [[0.4, 0.6], [1, 0], [0, 0]])
-
-
-# ---- Small helpers ----
 
 
 # ---- Messages ----

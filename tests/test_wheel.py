@@ -24,31 +24,6 @@ DATA = (
     "py.typed",
 )  # of the package, besides its modules
 
-GOOD = """
-from collections.abc import Iterator
-import numpy as np
-import numpy.typing as npt
-import reobj_track as rt
-tracker: rt.Tracker = rt.Tracker(rt.TrackerConfig(n_init=1), embedder=None)
-tracks: rt.Tracks = tracker.update(np.zeros((0, 6)), None)
-rows: npt.NDArray[np.float64] = tracks.to_array()
-ids: npt.NDArray[np.int64] = tracks.track_id
-pairs: Iterator[tuple[rt.Frame, rt.Tracks]] = rt.track("a.mp4", "det.txt", tracker)
-result: rt.Result = rt.run("a.mp4", "out", rt.Config(), tracks="corrected.xml")
-found: rt.Object = rt.Result.load("out").objects[0]
-name: str = found.class_name
-size: npt.NDArray[np.float64] | None = found.size_m
-own: rt.Detections = rt.Detections.from_array([[0, 0, 1, 1, 0.5, 0]])
-"""
-BAD = {
-    "ids: list[str] = rt.Tracker().update([]).track_id": "Incompatible types",
-    "for frame in rt.track('a.mp4'): frame.image": 'no attribute "image"',
-    "rt.TrackerConfig(n_int=1)": "Unexpected keyword argument",
-    "rt.Tracker().update()": "Missing positional argument",
-    "rt.Result.load('out').objects[0].centre": 'no attribute "centre"',
-    "rt.unit_rows": "does not explicitly export",  # a name in its own module
-}
-
 
 def call(*command: str | Path, cwd: Path) -> str:
     """Run a command away from the source tree, with no weights but those of the wheel."""

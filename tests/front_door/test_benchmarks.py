@@ -1,4 +1,4 @@
-"""benchmarks/: floors fail if a figure is worse; mutations change the compiled code."""
+"""benchmarks/truth.py: scores of hand-made results."""
 
 from __future__ import annotations
 
@@ -7,16 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import truth as scores
-
-FIGURES = {
-    "exit": 0, "seconds": 20.0, "mb": 400, "idf1": 0.9, "found": 20, "true": 21, "false": 2,
-    "solids": 18, "solids_true": 20, "cm": 3.0, "cameras": 100, "frames": 100, "off": 0.2,
-    "warnings": 0,
-}  # fmt: skip
-WORSE = {
-    "exit": 1, "idf1": 0.86, "found": 17, "false": 5, "solids": 15, "cm": 6.0, "cameras": 90,
-    "off": 0.5, "mb": 700,
-}  # fmt: skip
 
 
 def output(rows: list[list[float]], names: dict[int, str]) -> scores.Output:

@@ -34,7 +34,6 @@ from front_door.room import (
     true_objects,
 )
 
-SHORT = range(0, 120, 3)  # frames of the `room` fixture
 FILES = {
     "cache", "config.toml", "objects.json", "objects.ply", "poses.txt", "scene.html", "sparse",
     "tracks.txt",
@@ -106,9 +105,6 @@ def test_eval_agrees_with_the_public_files(example: Path, tmp_path: Path) -> Non
     assert found["objects"]["found"] == solids.found and found["objects"]["true"] == 35
     # eval also turns the world by the directions of the cameras: millimetres
     assert found["objects"]["center_error_median"] == pytest.approx(solids.centre_m, abs=0.006)
-
-
-# ---- export ----
 
 
 # ---- models, --options, --version, --help ----
