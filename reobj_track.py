@@ -24,7 +24,7 @@ How it works (start reading at `run()`, then `track()`, then `Tracker.update()`)
 
 This file holds the Kalman filter, association, re-identification and the order of the stages. The
 package `reobj` holds the rest: config, cli, pipeline (the stages), sources/ (video, detections,
-weights), appearance/ (embeddings, gallery), tracking/ (assignment, linking), poses/ (cameras),
+weights), appearance/ (embeddings, gallery), tracking/ (camera motion, linking), poses/ (cameras),
 objects/ (association and fit), results/ (files, pages), maps/ (maps of a room).
 
 Conventions: frames 0-based (1-based in MOT files); boxes `xyxy` in pixels, the top-left pixel spans
@@ -49,6 +49,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.optimize import linear_sum_assignment
 
 from reobj import __version__, cli, pipeline
 from reobj.appearance.crops import CropEmbedder, make_embedder
@@ -90,17 +91,16 @@ from reobj.sources.recorded import Intervals, write_detections_npz
 from reobj.sources.tables import boxes_3d_of
 from reobj.sources.video import InputConfig, Video, in_batches
 from reobj.sources.weights import list_models, model_path
-from reobj.tracking.assignment import Pairs, ambiguous_pairs, assign, touching
 from reobj.tracking.camera_motion import CameraMotion
 from reobj.tracking.ellipsoid_map import (
     EXPECTED_IN_VIEW,
-    CameraInputs,
     EllipsoidMap,
+    camera_inputs,
     depth_intervals,
     iou_within_uncertainty,
     rows_of,
 )  # fmt: skip
-from reobj.tracking.interpolation import STD_POSITION, STD_START
+from reobj.tracking.linking import STD_POSITION, STD_START
 from reobj.types import (
     COCO_NAMES,
     Array,
@@ -144,7 +144,7 @@ def __dir__() -> list[str]:
 # ---- Kalman filter -----------------------------------------------------------------------------
 
 # Noise is relative to the box, as in DeepSORT: its mean side for x and y, its own side for w and h
-# (a measurement has `STD_POSITION` of `reobj.tracking.interpolation` at score .8).
+# (a measurement has `STD_POSITION` of `reobj.tracking.linking` at score .8).
 SCORE_NOISE = 0.25  # it grows with (1 - score) to this power (StrongSORT: 1)
 
 
@@ -246,7 +246,7 @@ class TrackState:
     uncertainty: Array  # (T, 2) px, of the projected position
 
     def select(self, keep: npt.NDArray[Any]) -> TrackState:
-        """Return the chosen tracks."""
+        """Return the tracks of these rows."""
         return TrackState(*(getattr(self, name)[keep] for name in self.__slots__))
 
     def append(self, other: TrackState) -> TrackState:
@@ -276,9 +276,98 @@ class TrackState:
         )  # fmt: skip
 
 
+# ---- Association -------------------------------------------------------------------------------
+
+# Only pairs that pass a gate are stored, a few per track: the cost grows with their number, not
+# with tracks times detections, so it stays low with a thousand objects. Axis M: pairs.
+
+
+@dataclass(frozen=True, slots=True)
+class Pairs:
+    """Gated pairs of a track and a detection of a frame, by track, then by detection.
+
+    Attributes:
+        track, detection: (M,) rows. cost: (M,) of overlap and gated distance, 0 to 1. iou: (M,).
+        overlap_weight: (M,) of the overlap as evidence (`iou_within_uncertainty`).
+        same_class: (M,) the detection has the majority class of the track.
+    """
+
+    track: IntArray
+    detection: IntArray
+    cost: Array
+    iou: Array
+    overlap_weight: Array
+    same_class: BoolArray
+
+
+def touching(center: Array, radius: Array, xyxy: Array) -> tuple[IntArray, IntArray]:
+    """Find the detections (D, 4) that touch the search window of each track.
+
+    Args:
+        center, radius: (2, T) px, centre and half size of the windows.
+    Returns:
+        track, detection: (M,) rows, in the order of tracks, then of detections.
+    """
+    left, top = (center - radius)[..., None]  # (T, 1) each
+    right, bottom = (center + radius)[..., None]
+    x1, y1, x2, y2 = np.ascontiguousarray(xyxy.T)  # (D,) each
+    touch = x1 <= right  # (T, D)
+    touch &= x2 >= left
+    touch &= y1 <= bottom
+    touch &= y2 >= top
+    return np.divmod(np.flatnonzero(touch), max(len(xyxy), 1))
+
+
+def ambiguous_pairs(
+    pairs: Pairs, possible: BoolArray, margin: float
+) -> tuple[BoolArray, BoolArray]:
+    """Mark possible pairs that have a rival of their class, and pairs that are rivals, (M,) each.
+
+    A pair is a rival if it costs at most `margin` more than the best pair of its track and of its
+    detection.
+    (Two boxes of different classes around one object are not rivals: they show the same object.)
+    """
+    rivals = possible & pairs.same_class
+    cost = np.where(possible, pairs.cost, np.inf)
+    best = []  # least cost of the track and of the detection of each pair
+    for side in (pairs.track, pairs.detection):
+        least = np.full(side.max(initial=0) + 1, np.inf)
+        np.minimum.at(least, side, cost)
+        best.append(least[side])
+    rivals &= pairs.cost <= np.minimum(*best) + margin
+    several = [np.bincount(side, rivals)[side] > 1 for side in (pairs.track, pairs.detection)]
+    return rivals & (several[0] | several[1]), rivals
+
+
+def assign(row: IntArray, column: IntArray, cost: Array) -> IntArray:
+    """Find the matching with the most pairs, and among those the least total cost.
+
+    Args:
+        row, column: (M,) possible pairs, in the order of rows. cost: (M,) below 1e3.
+    Returns:
+        numbers of the matched pairs, ascending.
+    """
+    rival = (np.bincount(row)[row] > 1) | (np.bincount(column)[column] > 1)
+    if not rival.any():
+        return np.arange(len(row))
+    matched = ~rival  # need no solver
+    some = np.flatnonzero(rival)
+    r = np.unique(row[some], return_inverse=True)[1]
+    c = np.unique(column[some], return_inverse=True)[1]
+    # columns first: scipy copies and transposes a matrix with more rows than columns, and a frame
+    # usually has more tracks than detections
+    costs = np.full((c.max() + 1, r.max() + 1), 1e3)
+    costs[c, r] = cost[some]
+    solved, row_of_solved = linear_sum_assignment(costs)
+    row_of = np.full(len(costs), -1)
+    row_of[solved] = row_of_solved
+    matched[some] = row_of[c] == r
+    return np.flatnonzero(matched)
+
+
 # ---- Tracker -----------------------------------------------------------------------------------
 
-STATE_VERSION = 9  # of the files of Tracker.save
+STATE_VERSION = 10  # of the files of Tracker.save
 EMBEDDING_MOMENTUM = 0.8  # of a track's mean embedding (StrongSORT: .9 every frame)
 # With poses
 MAP_REFIT = 10  # frames between two fits of the ellipsoids that have new views
@@ -289,8 +378,8 @@ OUT_OF_VIEW = -1e6  # px, position of tracks whose ellipsoid is out of view
 class MatchingOptions:
     """Gates, costs and odds of matching detections to tracks, and of re-identification.
 
-    Costs lie in [0, 1]. Values without a source were chosen on the rendered rooms and redkitchen
-    (benchmarks/RESULTS.md).
+    Costs lie in [0, 1]. Values without a source are those of highest IDF1 on rendered rooms and
+    redkitchen (benchmarks/RESULTS.md).
 
     Attributes:
         gate_chi2: gate on the squared Mahalanobis distance of the centres (chi2 .99, 2 dof).
@@ -309,9 +398,6 @@ class MatchingOptions:
         iou_odds, no_overlap_odds: log odds for the same object per unit of IoU, and log odds
             against it at IoU 0 (of 12 pairs none has .8 more IDF1 at any step of the camera:
             benchmarks/LOG.md).
-        jump_odds: log odds against a return far from the object's own coasting track.
-        jump_gate: squared distance over that of the gate from which it is far: three times its
-            radius.
         map_agreement: least share of the detections, of classes that a given map has, that lie on
             one of its objects (`Tracker.start_from`); below it the poses are not in the frame of
             the map, and no new track gets a number of the map.
@@ -330,8 +416,6 @@ class MatchingOptions:
     ambiguity_margin: float = 0.3
     iou_odds: float = 20.0
     no_overlap_odds: float = 6.0
-    jump_odds: float = 2.0
-    jump_gate: float = 9.0
     map_agreement: float = 0.5
 
 
@@ -344,8 +428,9 @@ class FrameContext:
         detector_ran: False if the detector was not run on this frame.
         box: (D, 4) cx, cy, w, h of the detections, px.
         lazy: embeddings of the detections, computed on request.
-        cam_from_world: (3, 4), None without a pose.
+        cam_from_world: (3, 4), None without a pose. K: (3, 3). image_size: width, height, px.
         points: (N, 3) sparse points in world that this frame observes, None if not given.
+        view: (3, 4) K @ cam_from_world, img_from_world; None without a pose.
     """
 
     number: int
@@ -355,20 +440,10 @@ class FrameContext:
     box: Array
     lazy: LazyEmbeddings
     cam_from_world: Array | None
-    camera: Camera | None
+    K: Array
+    image_size: tuple[int, int]
     points: Array | None
-
-    @property
-    def img_from_world(self) -> Array | None:
-        """Return K @ cam_from_world (3, 4)."""
-        if self.cam_from_world is None or self.camera is None:
-            return None
-        return np.asarray(self.camera.K @ self.cam_from_world)
-
-    @property
-    def image_size(self) -> tuple[int, int]:
-        """Return width and height of the camera's image, px."""
-        return (0, 0) if self.camera is None else (self.camera.width, self.camera.height)
+    view: Array | None
 
 
 @dataclass(slots=True)
@@ -529,24 +604,25 @@ class Tracker:
         weight = self.config.foreground_weight
         lazy = LazyEmbeddings(given, self.embedder, image, detections, weight)
         box = cxcywh_from_xyxy(detections.xyxy)
-        context = FrameContext(
-            state.frame_number, run, image, detections, box, lazy, pose, camera, points
-        )
+        size = (0, 0) if camera is None else (camera.width, camera.height)
+        K = np.eye(3) if camera is None else camera.K
+        view = None if pose is None else K @ pose
+        inputs = (image, detections, box, lazy, pose, K, size, points, view)
+        self._frame = FrameContext(state.frame_number, run, *inputs)
         self._enter(part)
-        self._predict(context)
-        self._frame = context
-        self._latest = self._track(context) if run else Tracks.empty()
+        self._predict(self._frame)
+        self._latest = self._track(self._frame) if run else Tracks.empty()
         return self._latest[self._latest.track_id > 0]
 
     def _track(self, frame: FrameContext) -> Tracks:
         """Match, start, embed, confirm and retire tracks; return the tracks of this frame."""
         track_of = self._associate(frame)  # (D,) row of the tracks' state, or -1
         self._update_states(frame, track_of)
-        track_of = self._spawn(frame, track_of)
+        self._spawn(frame, track_of)
         self._update_depth_intervals(frame, track_of)
         self._embed(frame, track_of)
         self._compare_with_map(frame)
-        track_of = self._confirm(frame, track_of)
+        self._confirm(frame)
         tracks = self._report(frame, track_of)
         self._retire()
         self._add_views(frame, tracks)
@@ -616,32 +692,31 @@ class Tracker:
         pose, tracks whose 3D position is known follow its projection instead.
         """
         state = self.state
-        tracks = self.state.tracks
+        tracks = state.tracks
         tracks.mean, tracks.cov = kalman_predict(tracks.mean, tracks.cov, self.config)
         size = tracks.mean[:, 2:, 0]
         np.maximum(size, 1.0, out=size)  # stays positive
         tracks.uncertainty[:] = 0
         before = tracks.mean[..., 0].copy()
         pose = frame.cam_from_world
-        camera = frame.camera
         if frame.image is not None and self.config.camera_motion:
             motion = state.camera_motion(frame.image)
             tracks.mean, tracks.cov = warp_states(tracks.mean, tracks.cov, motion)
             tracks.mean[:, :2, 0] += state.camera_motion.parallax(before[:, :2])
             if pose is None:
                 state.last_pose = None  # flow moved the tracks away from its projections
-        elif pose is not None and camera is not None and state.last_pose is not None:
+        elif pose is not None and state.last_pose is not None:
             rotation = pose[:, :3] @ state.last_pose[:, :3].T
-            turn = camera.K @ rotation @ np.linalg.inv(camera.K)  # exact for distant objects
+            turn = frame.K @ rotation @ np.linalg.inv(frame.K)  # exact for distant objects
             tracks.mean, tracks.cov = warp_states(tracks.mean, tracks.cov, turn)
         in_view = np.ones(len(tracks.mean), bool)
-        if pose is not None and camera is not None:
-            in_view = self._follow_projections(pose, camera, before)
+        if pose is not None and frame.view is not None:
+            in_view = self._follow_projections(frame, pose, frame.view, before)
         if frame.detector_ran:
             tracks.missed += in_view | (tracks.missed == 0)
 
     def _follow_projections(
-        self, cam_from_world: Array, camera: Camera, predicted: Array
+        self, frame: FrameContext, cam_from_world: Array, view: Array, predicted: Array
     ) -> BoolArray:
         """Move tracks of known 3D position to the projection of ellipsoid or depth interval.
 
@@ -651,26 +726,23 @@ class Tracker:
             (T,) True where a detection is expected.
         """
         tracks = self.state.tracks
-        K = camera.K
-        size = (camera.width, camera.height)
-        view = K @ cam_from_world  # (3, 4)
+        ellipsoids = self.ellipsoid_map
         last = self.state.last_pose
         self.state.last_pose = cam_from_world
-        known = rows_of(self.ellipsoid_map.known, tracks.identity, False)
-        inside = np.isfinite(self.ellipsoid_map.project(view, size, EXPECTED_IN_VIEW)[:, 0])  # (I,)
+        known = rows_of(ellipsoids.known, tracks.identity, False)
+        inside = np.isfinite(ellipsoids.project(view, frame.image_size, EXPECTED_IN_VIEW)[:, 0])
         in_view = ~known | rows_of(inside, tracks.identity, False)
-        tracked = (tracks.identity, tracks.interval, tracks.size, K, size)
-        now, reach = self.ellipsoid_map.project_tracks(cam_from_world, *tracked)
-        located = known | np.isfinite(tracks.interval[:, 0, 0])
-        followed = np.zeros(len(known), bool)
+        tracked = (tracks.identity, tracks.interval, tracks.size, frame.K, frame.image_size)
+        now, reach = ellipsoids.project_tracks(cam_from_world, *tracked)
         if last is not None:
-            before, reach_before = self.ellipsoid_map.project_tracks(last, *tracked)
+            before, reach_before = ellipsoids.project_tracks(last, *tracked)
             followed = (tracks.missed == 0) & np.isfinite(now[:, 0] + before[:, 0])
             shift = now[:, :2] - before[:, :2]
             growth = (now[:, 2:] / before[:, 2:]).clip(0.5, 2)
             moved = np.concatenate([predicted[:, :2] + shift, predicted[:, 2:] * growth], 1)
             tracks.mean[followed, :, 0] = moved[followed]  # (T, 4)
             tracks.uncertainty[followed] = np.abs(reach - reach_before)[followed]
+        located = known | np.isfinite(tracks.interval[:, 0, 0])
         lost = located & (tracks.missed > 0)
         shown = (in_view & np.isfinite(now[:, 0]))[:, None]
         where = np.where(shown, now, [OUT_OF_VIEW, OUT_OF_VIEW, 1, 1])  # matches nothing
@@ -684,16 +756,14 @@ class Tracker:
     def _update_depth_intervals(self, frame: FrameContext, track_of: IntArray) -> None:
         """Estimate depth intervals of matched tracks without an ellipsoid, from points in boxes."""
         pose = frame.cam_from_world
-        camera = frame.camera
-        points = frame.points
-        if points is None or pose is None or camera is None:
+        if frame.points is None or pose is None:
             return
         tracks = self.state.tracks
         rows = np.flatnonzero(track_of >= 0)
         rows = rows[~rows_of(self.ellipsoid_map.known, tracks.identity[track_of[rows]], False)]
-        ends, size = depth_intervals(frame.detections.xyxy[rows], points, pose, camera.K)
-        tracks.interval[track_of[rows]] = ends
-        tracks.size[track_of[rows]] = size
+        t = track_of[rows]
+        found = depth_intervals(frame.detections.xyxy[rows], frame.points, pose, frame.K)
+        tracks.interval[t], tracks.size[t] = found
 
     def _add_views(self, frame: FrameContext, tracks: Tracks) -> None:
         """Add the boxes of confirmed tracks as views of their objects; refit periodically.
@@ -701,17 +771,15 @@ class Tracker:
         Also refit when at least half of the identities in view have enough new views, as after a
         large camera motion.
         """
-        view = frame.img_from_world
-        if view is None:
+        if frame.view is None:
             return
         confirmed = tracks[tracks.track_id > 0]
         identity = np.searchsorted(self.state.numbers, confirmed.track_id)
-        self.ellipsoid_map.add(frame.number, identity, confirmed.xyxy, view)
-        due = self.ellipsoid_map.due
-        if self.state.detector_runs % MAP_REFIT == 0 or 2 * due[identity].sum() >= max(
-            len(identity), 1
-        ):
-            self.ellipsoid_map.refit(frame.image_size)
+        ellipsoids = self.ellipsoid_map
+        ellipsoids.add(frame.number, identity, confirmed.xyxy, frame.view)
+        many_due = 2 * ellipsoids.due[identity].sum() >= max(len(identity), 1)
+        if self.state.detector_runs % MAP_REFIT == 0 or many_due:
+            ellipsoids.refit(frame.image_size)
 
     def _associate(self, frame: FrameContext) -> IntArray:
         """Match detections to tracks: high scores by motion, then the rest by overlap.
@@ -804,20 +872,19 @@ class Tracker:
         while True:
             good = np.flatnonzero(possible & ~refused & (cost < self.matching.max_cost))
             matched = good[assign(t[good], d[good], (cost + priority)[good])]
-            ask = matched[must_agree[matched] & ~compared[d[matched]]]
-            if not len(ask):
+            to_embed = matched[must_agree[matched] & ~compared[d[matched]]]
+            if not len(to_embed):
                 return matched, refused
-            asked_by = np.zeros(len(tracks.mean), bool)
-            asked = np.zeros_like(compared)
-            asked_by[t[ask]] = True
-            asked[d[ask]] = asked[d[rivals & must_agree & asked_by[t]]] = True
-            asked &= ~compared
-            compared |= asked
-            cost, against = self._blend_appearance(pairs, cost, asked, lazy)
+            rivalled = rivals & must_agree & np.isin(t, t[to_embed])
+            requested = np.zeros_like(compared)
+            requested[d[to_embed]] = requested[d[rivalled]] = True
+            requested &= ~compared
+            compared |= requested
+            cost, against = self._blend_appearance(pairs, cost, requested, lazy)
             refused |= against & must_agree
 
     def _blend_appearance(
-        self, pairs: Pairs, cost: Array, asked: BoolArray, lazy: LazyEmbeddings
+        self, pairs: Pairs, cost: Array, requested: BoolArray, lazy: LazyEmbeddings
     ) -> tuple[Array, BoolArray]:
         """Blend the appearance of the requested detections (D,) into the cost.
 
@@ -826,8 +893,8 @@ class Tracker:
         Returns:
             cost (M,), and the pairs (M,) that boxes and appearance together contradict.
         """
-        rows = np.flatnonzero(asked)
-        some = np.flatnonzero(asked[pairs.detection])
+        rows = np.flatnonzero(requested)
+        some = np.flatnonzero(requested[pairs.detection])
         tracks = self.state.tracks
         cosines = part_cosines(tracks.embedding, lazy.get(rows), lazy.foreground_width)
         t = pairs.track[some]
@@ -839,12 +906,15 @@ class Tracker:
         against = np.zeros(len(cost), bool)
         cost = cost.copy()
         cost[some] = (1 - weight) * cost[some] + weight * unlike
-        options = self.matching
-        overlap = pairs.iou[some] - options.penalty * ~pairs.same_class[some]
-        evidence = options.iou_odds * overlap - options.no_overlap_odds
-        evidence *= pairs.overlap_weight[some]
+        overlap = pairs.iou[some] - self.matching.penalty * ~pairs.same_class[some]
+        evidence = self._place_evidence(overlap, pairs.overlap_weight[some])
         against[some] = known & (logit + evidence < 0)
         return cost, against
+
+    def _place_evidence(self, iou: Array, weight: Array) -> Array:
+        """Return the log odds (...) of one object by the overlap of its boxes and its weight."""
+        options = self.matching
+        return (options.iou_odds * iou - options.no_overlap_odds) * weight
 
     def _update_states(self, frame: FrameContext, track_of: IntArray) -> None:
         """Update the matched tracks; boxes of low score have a larger measurement noise."""
@@ -866,20 +936,20 @@ class Tracker:
         tracks.votes = widen(tracks.votes, np.empty((0, classes.max(initial=0) + 1)))
         tracks.votes[t, classes] += detections.score[rows]
 
-    def _spawn(self, frame: FrameContext, track_of: IntArray) -> IntArray:
+    def _spawn(self, frame: FrameContext, track_of: IntArray) -> None:
         """Start a tentative track at every unmatched detection of sufficient score."""
         state = self.state
         detections = frame.detections
         rows = np.flatnonzero((track_of < 0) & (detections.score >= self.config.new_score))
         if not len(rows):
-            return track_of
-        ids = state.next_tracklet + np.arange(len(rows))
-        state.next_tracklet += len(rows)
-        track_of[rows] = len(state.tracks.mean) + np.arange(len(rows))
-        spawned = TrackState.spawn(frame.box[rows], ids, frame.number, self.config)
+            return
+        new = np.arange(len(rows))
+        track_of[rows] = len(state.tracks.mean) + new
+        tracklet = state.next_tracklet + new
+        spawned = TrackState.spawn(frame.box[rows], tracklet, frame.number, self.config)
         state.tracks = state.tracks.append(spawned)
+        state.next_tracklet += len(rows)
         self._count(detections, rows, track_of[rows])
-        return track_of
 
     def _embed(self, frame: FrameContext, track_of: IntArray) -> None:
         """Embed tracks before confirmation and periodically; calibrate the similarity.
@@ -890,38 +960,33 @@ class Tracker:
         lazy = frame.lazy
         if not lazy.available:
             return
-        tracks = self.state.tracks
+        state = self.state
+        tracks = state.tracks
         rows = np.flatnonzero(track_of >= 0)
         t = track_of[rows]
-        soon = (tracks.identity[t] < 0) & (tracks.evidence[t] >= self.config.n_init - 1)
-        periodic = self.state.detector_runs % max(1, self.config.embed_every) == 0
-        due = soon | periodic  # one pass of the network
-        self._calibrate_matches(frame, track_of, rows[lazy.done[rows] | due])
+        confirmed = tracks.identity[t] >= 0
+        soon = ~confirmed & (tracks.evidence[t] >= self.config.n_init - 1)
+        due = soon | (state.detector_runs % max(1, self.config.embed_every) == 0)
+        # Positive pairs: a track and its own detection. Negative pairs: detections of other tracks
+        known = confirmed & (tracks.embedded[t] >= 0) & (lazy.done[rows] | due)
+        if known.any():
+            found = lazy.get(rows[known])
+            parts = part_cosines(tracks.embedding[t[known]], found, lazy.foreground_width)  # (n, n)
+            state.match_calibration.add_frame(*parts, frame.detections.class_id[rows[known]])
         rows = rows[due]
-        t = track_of[rows]
+        t = t[due]
         if not len(rows):
             return
         embedding = lazy.get(rows)  # (n, E)
-        self.state.gallery.foreground_width = lazy.foreground_width
+        state.gallery.foreground_width = lazy.foreground_width
         tracks.embedding = widen(tracks.embedding, embedding)
-        known = tracks.embedded[t] >= 0
-        keep = np.where(known, EMBEDDING_MOMENTUM, 0.0)[:, None]
+        keep = np.where(tracks.embedded[t] >= 0, EMBEDDING_MOMENTUM, 0.0)[:, None]
         tracks.embedding[t] = unit_rows(keep * tracks.embedding[t] + (1 - keep) * embedding)
         tracks.embedded[t] = frame.number
-        old = np.flatnonzero(tracks.identity[t] >= 0)  # those with an identity
-        if len(old):
+        old = tracks.identity[t] >= 0
+        if old.any():
             class_id = frame.detections.class_id[rows[old]]
             self._add_to_gallery(frame, embedding[old], t[old], class_id)
-
-    def _calibrate_matches(self, frame: FrameContext, track_of: IntArray, rows: IntArray) -> None:
-        """Calibrate matches: own detections are the same object, those of other tracks are not."""
-        tracks = self.state.tracks
-        lazy = frame.lazy
-        rows = rows[(tracks.embedded[track_of[rows]] >= 0) & (tracks.identity[track_of[rows]] >= 0)]
-        if len(rows):
-            own = tracks.embedding[track_of[rows]]
-            parts = part_cosines(own, lazy.get(rows), lazy.foreground_width)  # (n, n) each
-            self.state.match_calibration.add_frame(*parts, frame.detections.class_id[rows])
 
     def _add_to_gallery(
         self, frame: FrameContext, embedding: Floats, t: IntArray, class_id: IntArray
@@ -939,85 +1004,74 @@ class Tracker:
 
     def _viewing_rays(self, frame: FrameContext, t: IntArray) -> Array:
         """Return viewing directions (n, 3) of tracks in the world of component 0, else NaN."""
-        view = frame.img_from_world
-        if view is None or self.state.component:
+        if frame.view is None or self.state.component:
             return np.full((len(t), 3), np.nan)
-        return viewing_rays(xyxy_from_cxcywh(self.state.tracks.mean[t, :, 0]), view)
+        return viewing_rays(xyxy_from_cxcywh(self.state.tracks.mean[t, :, 0]), frame.view)
 
-    def _confirm(self, frame: FrameContext, track_of: IntArray) -> IntArray:
+    def _confirm(self, frame: FrameContext) -> None:
         """Assign an identity, known or new, to tracks with enough detections.
 
         A re-identified track needs one detection less, as its appearance agrees. The first tracks
         of a video need only one detection (as in SORT).
         """
         state = self.state
-        tracks = self.state.tracks
+        tracks = state.tracks
         needed = self.config.n_init if (state.last_seen >= 0).any() else 1
-        young = (tracks.identity < 0) & (tracks.missed == 0)
-        ready = np.flatnonzero(young & (tracks.evidence >= min(needed, self.config.n_init - 1)))
-        seen_now = (tracks.identity >= 0) & (tracks.missed == 0)
-        state.last_seen[tracks.identity[seen_now]] = frame.number
+        detected = tracks.missed == 0
+        enough = tracks.evidence >= min(needed, self.config.n_init - 1)
+        ready = np.flatnonzero(detected & (tracks.identity < 0) & enough)
+        state.last_seen[tracks.identity[detected & (tracks.identity >= 0)]] = frame.number
         if not len(ready):
-            return track_of
-        returning = self._reidentify(frame, ready)  # (n,) identity or -1
-        confirmed = (returning >= 0) | (tracks.evidence[ready] >= needed)
+            return
+        identity = self._reidentify(frame, ready)  # (n,) identity or -1
+        confirmed = (identity >= 0) | (tracks.evidence[ready] >= needed)
         ready = ready[confirmed]
-        returning = returning[confirmed]
-        fresh = ready[returning < 0]
-        back = ready[returning >= 0]
-        ids = len(state.last_seen) + np.arange(len(fresh))
-        state.last_seen = np.append(state.last_seen, np.zeros(len(fresh), np.int64))
-        state.identity_class = np.append(state.identity_class, tracks.votes[fresh].argmax(1))
-        state.numbers = np.append(state.numbers, state.next_number + np.arange(len(fresh)))
-        state.next_number += len(fresh)
-        returned = np.zeros(len(state.last_seen) + 1, bool)  # the last entry: no identity (-1)
-        returned[returning[returning >= 0]] = True
-        stale = returned[tracks.identity]  # coasting tracks of identities that returned
-        tracks.identity[back] = returning[returning >= 0]
-        tracks.identity[fresh] = ids
-        state.last_seen[tracks.identity[ready]] = frame.number
+        identity = identity[confirmed]
+        # coasting tracks of identities that returned are retired
+        tracks.missed[np.isin(tracks.identity, identity[identity >= 0])] = np.iinfo(np.int64).max
+        fresh = identity < 0
+        count = np.arange(fresh.sum())
+        identity[fresh] = len(state.last_seen) + count
+        tracks.identity[ready] = identity
+        new_classes = tracks.votes[ready[fresh]].argmax(1)
+        state.last_seen = np.append(state.last_seen, 0 * count)
+        state.identity_class = np.append(state.identity_class, new_classes)
+        state.numbers = np.append(state.numbers, state.next_number + count)
+        state.next_number += len(count)
+        state.last_seen[identity] = frame.number
         seen = ready[tracks.embedded[ready] >= 0]
         if len(seen):
             rays = self._viewing_rays(frame, seen)
             state.gallery.add(tracks.identity[seen], tracks.embedding[seen], rays)
-        if not stale.any():
-            return track_of
-        renumber = np.append(np.where(stale, -1, np.cumsum(~stale) - 1), -1)
-        state.tracks = tracks.select(~stale)
-        return np.asarray(renumber[track_of], np.int64)
 
     def _reidentify(self, frame: FrameContext, ready: IntArray) -> IntArray:
         """Re-identify tracks about to be confirmed: identity (n,), or -1.
 
         A match needs a sufficient probability from appearance and, where known, 3D position,
         relative to the other candidates. It is not gated by overlap, aspect ratio or pixel
-        distance, as the camera may return from anywhere; a coasting track of the identity far away
-        counts against it. Identities seen since the new track started, and those whose ellipsoid
-        projects elsewhere, are excluded. Moving objects have no ellipsoid.
+        distance, as the camera may return from anywhere. Identities seen since the new track
+        started, and those whose ellipsoid projects elsewhere, are excluded. Moving objects have no
+        ellipsoid.
         """
-        options = self.matching
         state = self.state
-        tracks = self.state.tracks
+        tracks = state.tracks
         result = np.full(len(ready), -1, np.int64)
         identity = np.flatnonzero(state.last_seen < tracks.first[ready].max(initial=0))  # (I,)
         if not len(identity) or not self.config.remember:
             return result
         box = tracks.mean[ready, :, 0]
-        view = frame.img_from_world
-        size = frame.image_size
-        iou, weight = self.ellipsoid_map.overlap(box, identity, view, size)
-        at_projection = iou * weight > options.low_iou
+        overlap = (box, identity, frame.view, frame.image_size)
+        iou, weight = self.ellipsoid_map.overlap(*overlap)
+        at_projection = iou * weight > self.matching.low_iou
+        embedding = tracks.embedding[ready]
         rays = self._viewing_rays(frame, ready)
-        logit = state.reid_calibration.logit(
-            *state.gallery.parts(tracks.embedding[ready], identity, rays)
-        )
+        logit = state.reid_calibration.logit(*state.gallery.parts(embedding, identity, rays))
         logit[at_projection & np.isinf(logit)] = 0  # without appearance the position decides
-        evidence = weight * (options.iou_odds * iou - options.no_overlap_odds)
-        logit += np.where(at_projection, evidence, 0)
-        logit -= options.jump_odds * self._far_from_coasting_track(frame, ready, identity)
+        logit += np.where(at_projection, self._place_evidence(iou, weight), 0)
         possible = state.last_seen[identity] < tracks.first[ready][:, None]
         possible &= state.identity_class[identity] == tracks.votes[ready].argmax(1)[:, None]
-        if view is not None and self.ellipsoid_map.given.any() and not self._map_agrees:
+        compared, on_map = state.map_votes
+        if frame.view is not None and on_map < self.matching.map_agreement * compared:
             possible &= state.last_seen[identity] >= 0  # not those known from the map only
         logit[~possible | (iou == 0)] = -np.inf
         probability = match_probability(logit)
@@ -1029,44 +1083,17 @@ class Tracker:
 
     def _compare_with_map(self, frame: FrameContext) -> None:
         """Count detections of classes that the given map has, and those that lie on its objects."""
-        view = frame.img_from_world
         identity = np.flatnonzero(self.ellipsoid_map.given & self.ellipsoid_map.known)
-        if view is None or not len(identity):
+        if frame.view is None or not len(identity):
             return
         state = self.state
         detections = frame.detections
         same_class = detections.class_id[:, None] == state.identity_class[identity]  # (D, I)
         rows = (detections.score >= self.config.high_score) & same_class.any(1)
-        iou, weight = self.ellipsoid_map.overlap(frame.box, identity, view, frame.image_size)
+        where = (frame.box, identity, frame.view, frame.image_size)
+        iou, weight = self.ellipsoid_map.overlap(*where)
         on_object = (same_class & (iou * weight > self.matching.low_iou)).any(1)
         state.map_votes += [rows.sum(), (rows & on_object).sum()]
-
-    @property
-    def _map_agrees(self) -> bool:
-        """Whether the poses are in the frame of the given map, by the detections so far."""
-        compared, matched = self.state.map_votes.tolist()
-        return bool(matched >= self.matching.map_agreement * max(compared, 1))
-
-    def _far_from_coasting_track(
-        self, frame: FrameContext, ready: IntArray, identity: IntArray
-    ) -> BoolArray:
-        """Mark (n, I) where the identity's own track still coasts far from the new track.
-
-        Identities with an ellipsoid are not marked: its projection is the better evidence.
-        """
-        tracks = self.state.tracks
-        row = np.full(len(self.state.last_seen), -1)
-        coasting = np.flatnonzero((tracks.identity >= 0) & (tracks.missed > 0))
-        row[tracks.identity[coasting]] = coasting
-        row = row[identity]  # (I,)
-        center = tracks.mean[:, :2, 0].T
-        variance = center_variance(tracks.mean, tracks.cov).T
-        offset = center[:, ready, None] - center[:, None, row]  # (2, n, I)
-        far_from = self.matching.jump_gate * self.matching.gate_chi2
-        far = squared_mahalanobis(offset, variance[:, None, row]) > far_from
-        has_view = frame.img_from_world is not None
-        located = rows_of(self.ellipsoid_map.known, identity, False) & has_view
-        return np.asarray(far & (row >= 0) & ~located, bool)
 
     def _report(self, frame: FrameContext, track_of: IntArray) -> Tracks:
         """Return the tracked detections of this frame, tentative ones with track_id 0."""
@@ -1098,9 +1125,9 @@ class Tracker:
 
         A tracker that `load` reads continues exactly as this one does.
         """
-        arrays = state_arrays(self.state, "state")
         options = {name: dataclasses.asdict(getattr(self, name)) for name in ("config", "matching")}
-        save_npz(Path(path), arrays, version=STATE_VERSION, **options)
+        facts = {"version": STATE_VERSION, "components": len(self.state.maps)}
+        save_npz(Path(path), state_arrays(self.state), **facts, **options)
 
     @classmethod
     def load(cls, path: str | Path, embedder: Embedder | None = None) -> Tracker:
@@ -1109,9 +1136,10 @@ class Tracker:
             arrays, facts = load_npz(Path(path), sealed=True)
             if facts["version"] != STATE_VERSION:
                 raise ValueError(f"version {facts['version']}, this is {STATE_VERSION}")
-            matching = MatchingOptions(**facts.get("matching", {}))
+            matching = MatchingOptions(**facts["matching"])
             tracker = cls(TrackerConfig(**facts["config"]), embedder, matching)
-            restore_state(tracker.state, "state", arrays)
+            tracker.state.maps = [EllipsoidMap() for _ in range(facts["components"])]
+            restore_state(tracker.state, arrays)
         except (KeyError, TypeError, ValueError) as error:
             raise ReobjError(
                 f"{path}: not the state of a tracker of this version ({error}); "
@@ -1149,12 +1177,9 @@ def track(
     video = video if isinstance(video, Video) else Video(video)
     source = open_detections(video, DetectConfig(), detector)
     tracker = tracker or Tracker(embedder=Embedder())
-    cameras = CameraInputs(poses, video.scale)
+    cameras = camera_inputs(poses, video.scale)
     looked = True if source.always_looks else None
-    ahead = tracker.config.camera_motion and video.has_images and not video.is_live
-    batch = 1 if video.is_live else source.batch
-    motion = tracker.state.camera_motion
-    for frames in motion.ahead(video, batch) if ahead else in_batches(video, batch):
+    for frames in in_batches(video, 1 if video.is_live else source.batch):
         for frame, found in zip(frames, source.detect(frames), strict=True):
             tracks = tracker.update(found, frame.image, looked=looked, **cameras(frame.index))
             yield frame, dataclasses.replace(tracks, frame=np.full(len(tracks), frame.index))
@@ -1202,9 +1227,12 @@ def run(
     """
     if detector is not None and detections is not None:
         raise ReobjError("detector and detections are the same argument: give one of them")
-    config = pipeline.run_config(config, map, map_frozen)
+    config = as_config(Config(), config)
     detect, detections = with_detector(config.detect, detections if detector is None else detector)
-    config = dataclasses.replace(config, detect=detect)
+    room = config.map
+    if map is not None or map_frozen:
+        room = dataclasses.replace(room, path=str(map or room.path), frozen=map_frozen)
+    config = dataclasses.replace(config, detect=detect, map=room)
     with pipeline.open_job(source, out, config, tracks or detections, overwrite, show) as job:
         in_3d = in_3d and job.config.poses.mode != "none"
         supplied = supplied_poses(job.video, job.config.poses) if in_3d else None

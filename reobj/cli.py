@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import io
+import itertools
 import json
 import logging
 import os
@@ -49,9 +50,6 @@ from reobj.types import (
 from reobj.viewer.serve import Server
 
 Arguments = argparse.Namespace
-LEVEL_NAMES = {
-    logging.DEBUG: "debug", logging.INFO: "info", NOTE: "note", logging.WARNING: "warning",
-}  # fmt: skip
 
 
 def main(words: Sequence[str], run: Callable[..., Any], refit: Callable[..., Any]) -> int:
@@ -85,10 +83,9 @@ def _command(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
         return 2
     args = parser.parse_args(words)
     log.setLevel(logging.DEBUG if args.debug else logging.INFO if args.verbose else NOTE)
-    for level, name in LEVEL_NAMES.items():
-        logging.addLevelName(level, name)
+    logging.addLevelName(NOTE, "note")
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(SafeFormatter("%(levelname)s: %(message)s"))
+    handler.setFormatter(SafeFormatter())
     logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
     try:
         return int(args.func(args))
@@ -112,7 +109,8 @@ class SafeFormatter(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """Format a record."""
-        return "\n".join(map(printable, without_secrets(super().format(record)).split("\n")))
+        text = without_secrets(f"{record.levelname.lower()}: {super().format(record)}")
+        return "\n".join(map(printable, text.split("\n")))
 
 
 class Parser(argparse.ArgumentParser):
@@ -121,18 +119,16 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Print one line and stop with exit code 2."""
         if flag := re.match(r"unrecognized arguments: .*?(--[\w-]+)", message):
-            message += did_you_mean(flag[1], self.flags())
+            message += did_you_mean(flag[1], self._known_flags())
         elif choice := re.search(r"invalid choice: '([^']*)'", message):
             message += did_you_mean(choice[1], re.findall(r"'?([\w-]+)'?[,)]", message))
         self.exit(2, f"error: {one_line(message)} (see {self.prog} --help)\n")
 
-    def flags(self) -> list[str]:
+    def _known_flags(self) -> list[str]:
         """List the flags of this parser and of its commands."""
-        parsers: list[argparse.ArgumentParser] = [self]
-        for action in self._actions:
-            if isinstance(action, argparse._SubParsersAction):
-                parsers += action.choices.values()
-        return [f for p in parsers for f in p._option_string_actions if f.startswith("--")]
+        commands = [a.choices for a in self._actions if isinstance(a, argparse._SubParsersAction)]
+        parsers = [self, *itertools.chain(*(choices.values() for choices in commands))]
+        return [flag for parser in parsers for flag in parser._option_string_actions]
 
 
 class _ListOptions(argparse.Action):
@@ -155,13 +151,20 @@ def make_parser(run: Callable[..., Any], refit: Callable[..., Any]) -> argparse.
         epilog=f"Example: {program()} run room.mp4 -o out; then open out/scene.html.",
     )
     parser.add_argument("--version", action="version", version=f"reobj_track {__version__}")
-    text = "list all options of --set section.field=value, and stop"
-    parser.add_argument("--options", action=_ListOptions, nargs=0, help=text)
+    parser.add_argument(
+        "--options",
+        action=_ListOptions,
+        nargs=0,
+        help="list all options of --set section.field=value, and stop",
+    )
     try:
         import shtab
 
-        text = "print a shell completion script for `reobj-track`, and stop"
-        shtab.add_argument_to(parser, "--completion", help=text)
+        shtab.add_argument_to(
+            parser,
+            "--completion",
+            help="print a shell completion script for `reobj-track`, and stop",
+        )
     except ImportError:
         pass
     sub = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
@@ -181,10 +184,13 @@ def make_parser(run: Callable[..., Any], refit: Callable[..., Any]) -> argparse.
         if any(sections):
             add("--config", metavar="FILE", help="options from a TOML file; flags override it")
             add("--save-config", metavar="FILE", help="write the options, for --config")
-        text = "set any option, e.g. tracker.coast_frames=60; --options lists them"
-        add("--set", action="append", metavar="SECTION.FIELD=VALUE", help=text)
-        text = "list all options of --set, and stop"
-        add("--options", action=_ListOptions, nargs=0, help=text)
+        add(
+            "--set",
+            action="append",
+            metavar="SECTION.FIELD=VALUE",
+            help="set any option, e.g. tracker.coast_frames=60; --options lists them",
+        )
+        add("--options", action=_ListOptions, nargs=0, help="list all options of --set, and stop")
         add("-v", "--verbose", action="store_true", help="log each step")
         add("--debug", action="store_true", help="log details, and tracebacks of errors")
         own.set_defaults(func=func, config=None, save_config=None)
@@ -193,10 +199,10 @@ def make_parser(run: Callable[..., Any], refit: Callable[..., Any]) -> argparse.
     _add_run(command, run)
     _add_output_commands(command, refit)
     _add_map(command)
-    text = "list, download and verify weights"
-    add = command("models", _cmd_models, text, "fast", "")
-    text = "weights to download or verify (default: list all)"
-    add("names", nargs="*", metavar="NAME", help=text)
+    add = command("models", _cmd_models, "list, download and verify weights", "fast", "")
+    add(
+        "names", nargs="*", metavar="NAME", help="weights to download or verify (default: list all)"
+    )
     return parser
 
 
@@ -221,19 +227,33 @@ def _add_run(command: Any, run: Callable[..., Any]) -> None:
             text += "; none: no images, only --detections and --poses"
         add("video", nargs="?" if name == "run" else None, metavar="VIDEO", help=text)
         add("-o", "--out", required=True, metavar="FOLDER", help="output folder")
-        text = "use a folder that holds other files or results of another video"
-        add("--overwrite", action="store_true", help=text)
+        add(
+            "--overwrite",
+            action="store_true",
+            help="use a folder that holds other files or results of another video",
+        )
         if name != "poses":
-            text = "file of detections, used instead of the detector: MOT, KITTI, CSV, COCO JSON, "
-            add("--detections", metavar="FILE", help=text + "folder of YOLO labels, CVAT, npz")
+            add(
+                "--detections",
+                metavar="FILE",
+                help="file of detections, used instead of the detector: MOT, KITTI, CSV, COCO "
+                "JSON, folder of YOLO labels, CVAT, npz",
+            )
             _add_tracks(add)
-            text = "show frames and identities live: in rerun's viewer, without rerun on a page"
-            add("--show", action="store_true", help=text)
+            add(
+                "--show",
+                action="store_true",
+                help="show frames and identities live: in rerun's viewer, without rerun on a page",
+            )
 
 
 def _add_tracks(add: Any) -> None:
-    text = "file of identities, used instead of the tracker: CVAT, COCO, MOT, KITTI, CSV, "
-    add("--tracks", metavar="FILE", help=text + "YOLO labels")
+    add(
+        "--tracks",
+        metavar="FILE",
+        help="file of identities, used instead of the tracker: CVAT, COCO, MOT, KITTI, CSV, "
+        "YOLO labels",
+    )
 
 
 def _add_output_commands(command: Any, refit: Callable[..., Any]) -> None:
@@ -252,59 +272,120 @@ def _add_output_commands(command: Any, refit: Callable[..., Any]) -> None:
         text = f"output folder of an earlier `run`{more}"
         add("out", type=Path, metavar="OUT", help=text)
 
-    text = "fit the objects of an output folder again, by default with its last options"
-    add = command("objects", fit_again, text, "out --known-size chair=0.82m", "objects", "output")
+    add = command(
+        "objects",
+        fit_again,
+        "fit the objects of an output folder again, by default with its last options",
+        "out --known-size chair=0.82m",
+        "objects",
+        "output",
+    )
     add_out(add)
-    text = "only validate objects.json against its schema"
-    add("--validate", action="store_true", help=text)
+    add("--validate", action="store_true", help="only validate objects.json against its schema")
     _add_tracks(add)
-    text = "file of corrections, saved by scene.html; later fits apply it too"
-    add("--edits", metavar="FILE", help=text)
-    text = "show the viewer on this machine; saved corrections are applied at once"
-    add = command("serve", _cmd_serve, text, "out --open")
+    add(
+        "--edits",
+        metavar="FILE",
+        help="file of corrections, saved by scene.html; later fits apply it too",
+    )
+    add = command(
+        "serve",
+        _cmd_serve,
+        "show the viewer on this machine; saved corrections are applied at once",
+        "out --open",
+    )
     add_out(add)
-    text = "port of 127.0.0.1 (default: a free one)"
-    add("--port", type=int, default=0, metavar="N", help=text)
+    add("--port", type=int, default=0, metavar="N", help="port of 127.0.0.1 (default: a free one)")
     add("--open", action="store_true", help="open the page in the browser")
-    text = "compare with ground truth: HOTA, IDF1, MOTA, O3D"
-    add = command("eval", _cmd_eval, text, "out --gt gt.txt")
+    add = command(
+        "eval", _cmd_eval, "compare with ground truth: HOTA, IDF1, MOTA, O3D", "out --gt gt.txt"
+    )
     add_out(add, ", or a tracks.txt")
-    text = "true tracks: MOTChallenge gt.txt, KITTI, CVAT or COCO-VID"
-    add("--gt", type=Path, required=True, metavar="FILE", help=text)
-    text = "format of --gt (docs/input_formats.md)"
-    add("--gt-format", default="auto", metavar="FORMAT", help=text)
-    text = "true 3D objects, e.g. gt_objects.json"
-    add("--gt-objects", type=Path, metavar="FILE", help=text)
-    text = "true cameras, TUM or 4x4 world_from_cam a line (default: poses.txt or poses_c2w.txt "
-    add("--gt-poses", type=Path, metavar="FILE", help=text + "beside --gt-objects)")
-    text = "evaluate these classes only, comma-separated"
-    add("--classes", default="", metavar="NAMES", help=text)
-    text = "ignore true boxes of lower visibility (0 to 1)"
-    add("--min-visibility", type=float, default=0.0, metavar="SHARE", help=text)
-    text = "convert the results of an output folder to the format of another tool"
-    add = command("export", _cmd_export, text, "out --to glb")
+    add(
+        "--gt",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help="true tracks: MOTChallenge gt.txt, KITTI, CVAT or COCO-VID",
+    )
+    add(
+        "--gt-format",
+        default="auto",
+        metavar="FORMAT",
+        help="format of --gt (docs/input_formats.md)",
+    )
+    add("--gt-objects", type=Path, metavar="FILE", help="true 3D objects, e.g. gt_objects.json")
+    add(
+        "--gt-poses",
+        type=Path,
+        metavar="FILE",
+        help="true cameras, TUM or 4x4 world_from_cam a line (default: poses.txt or poses_c2w.txt "
+        "beside --gt-objects)",
+    )
+    add(
+        "--classes",
+        default="",
+        metavar="NAMES",
+        help="evaluate these classes only, comma-separated",
+    )
+    add(
+        "--min-visibility",
+        type=float,
+        default=0.0,
+        metavar="SHARE",
+        help="ignore true boxes of lower visibility (0 to 1)",
+    )
+    add = command(
+        "export",
+        _cmd_export,
+        "convert the results of an output folder to the format of another tool",
+        "out --to glb",
+    )
     add_out(add)
     add("--to", required=True, choices=tuple(EXPORTS), help="format to write")
     add("-o", "--output", metavar="FILE", help="file to write (default: in the output folder)")
 
 
 def _add_map(command: Any) -> None:
-    text = "list what a map of a room holds, correct or export it"
-    add = command("map", _cmd_map, text, "flat.map --merge 3 12 --rename 3 armchair")
+    add = command(
+        "map",
+        _cmd_map,
+        "list what a map of a room holds, correct or export it",
+        "flat.map --merge 3 12 --rename 3 armchair",
+    )
     add("map", type=Path, metavar="MAP", help="file of a map")
     many: dict[str, Any] = {"action": "append", "default": []}
-    text = "remove what a session added; its number, or the name of its recording"
-    add("--forget", **many, metavar="SESSION", help=text)
-    text = "join two objects that are one; the number DROP then means KEEP"
-    add("--merge", **many, nargs=2, type=int, metavar=("KEEP", "DROP"), help=text)
-    text = "give an object a class that later detections do not change"
-    add("--rename", **many, nargs=2, metavar=("ID", "NAME"), help=text)
-    text = "mark an object as none: it is left out of results"
-    add("--delete", **many, type=int, metavar="ID", help=text)
+    add(
+        "--forget",
+        **many,
+        metavar="SESSION",
+        help="remove what a session added; its number, or the name of its recording",
+    )
+    add(
+        "--merge",
+        **many,
+        nargs=2,
+        type=int,
+        metavar=("KEEP", "DROP"),
+        help="join two objects that are one; the number DROP then means KEEP",
+    )
+    add(
+        "--rename",
+        **many,
+        nargs=2,
+        metavar=("ID", "NAME"),
+        help="give an object a class that later detections do not change",
+    )
+    add(
+        "--delete",
+        **many,
+        type=int,
+        metavar="ID",
+        help="mark an object as none: it is left out of results",
+    )
     add("--undelete", **many, type=int, metavar="ID", help="undo --delete")
     add("--export", choices=tuple(MAP_EXPORTS), help="format to write the objects in")
-    text = "file to write (default: beside the map)"
-    add("-o", "--output", type=Path, metavar="FILE", help=text)
+    add("-o", "--output", type=Path, metavar="FILE", help="file to write (default: beside the map)")
 
 
 # ---- What the commands do ----

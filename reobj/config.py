@@ -6,11 +6,11 @@ import argparse
 import dataclasses
 import json
 import math
-import re
 import textwrap
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -21,7 +21,7 @@ from reobj.objects.config import ObjectsConfig
 from reobj.poses.estimate import PosesConfig
 from reobj.sources.detection_files import DetectConfig
 from reobj.sources.video import InputConfig
-from reobj.tracking.interpolation import STD_POSITION, STD_VELOCITY
+from reobj.tracking.linking import STD_POSITION, STD_VELOCITY
 from reobj.types import NOTE, ReobjError, log, option
 
 C = TypeVar("C")
@@ -80,10 +80,6 @@ class OutputConfig:
         "objects are also projected into frames from nearby viewpoints",
     )
 
-    def __post_init__(self) -> None:
-        if isinstance(self.overlay, str):  # of 0.2.0: layers of the video, or none
-            object.__setattr__(self, "overlay", self.overlay not in ("none", ""))
-
 
 @dataclass(frozen=True, slots=True)
 class Config:
@@ -108,26 +104,15 @@ class Config:
         return f"Config({', '.join(f'{k}={v!r}' for k, v in changed_options(self).items())})"
 
 
-# Options of earlier versions and what is done instead; they are accepted and have no effect
+# Options of 0.2.0 and what is done instead; they are accepted and have no effect
 GONE = {
     "detect.nms_iou": "models suppress overlapping boxes as their layout demands",
-    "detect.tiles": "frames are detected as a whole",
     "objects.min_score": "the confidence of an object decides",
     "poses.max_gap": "a frame is interpolated where its error is small",
     "poses.max_keyframes": "long videos are reconstructed in windows",
 }
 
 LAYERS = frozenset({"solids", "ellipses", "trails", "boxes"})  # of the overlay video of 0.2.0
-
-# What the value of a flag is, in --help; the flags of other options of type str take a NAME
-VALUES = {
-    "input.max_size": "PIXELS", "detect.model": "MODEL", "detect.words": "WORDS",
-    "detect.classes": "NAMES", "detect.format": "FORMAT", "detect.layout": "LAYOUT",
-    "embed.model": "MODEL", "tracker.high_score": "SCORE", "poses.mode": "FILE",
-    "poses.fmt": "FORMAT", "poses.camera": "CAMERA", "poses.camera_format": "FORMAT",
-    "poses.depth": "FOLDER", "objects.priors": "FILE", "objects.prior": "WORD=SIZE",
-    "objects.known_size": "NAME=HEIGHT", "objects.support": "SHAPE", "map.path": "FILE",
-}  # fmt: skip
 
 EXPECTED = {
     bool: "true or false", int: "a whole number, 0 or more", float: "a number, 0 or more",
@@ -246,12 +231,7 @@ def read_config(config: C, path: str | Path) -> C:
         ReobjError: invalid TOML, no such option, or a value of another type.
     """
     try:
-        text = read_text(Path(path), 1 << 20, "surrogateescape")
-        # bytes of paths, as `_toml` wrote them
-        text = re.sub(
-            r"\\\\udc([89a-f][0-9a-f])", lambda byte: chr(0xDC00 + int(byte[1], 16)), text
-        )
-        table = tomllib.loads(text)
+        table = tomllib.loads(read_text(Path(path), 1 << 20, "surrogateescape"))
     except (ValueError, RecursionError) as error:  # also a number of 5,000 digits
         raise ReobjError(f"{path}: not valid TOML ({error})") from None
     return _with_table(config, table, f"{path}: ")
@@ -259,14 +239,9 @@ def read_config(config: C, path: str | Path) -> C:
 
 def changed_options(config: Any) -> dict[str, Any]:
     """Return the options that differ from the defaults, by their name for --set."""
-
-    def values(config: Any) -> dict[str, Any]:
-        names = every_option(config)
-        sections = {n: config if "." not in n else getattr(config, n.split(".")[0]) for n in names}
-        return {n: getattr(section, n.split(".")[-1]) for n, section in sections.items()}
-
-    default = values(type(config)())
-    return {name: value for name, value in values(config).items() if value != default[name]}
+    values = {name: attrgetter(name) for name in every_option(config)}
+    default = type(config)()
+    return {name: of(config) for name, of in values.items() if of(config) != of(default)}
 
 
 def write_config(config: Any, path: str | Path) -> None:
@@ -283,16 +258,15 @@ def write_config(config: Any, path: str | Path) -> None:
         lines += [f"\n[{section}]"] if section != before else []
         lines.append(f"{field_name} = {_toml(changed[name])}")
     with atomic(Path(path)) as part:
-        part.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        part.write_text("\n".join(lines) + "\n", "utf-8", "surrogateescape")
 
 
 def _toml(value: str | float) -> str:
     """Format a value: strings as in JSON, with DEL escaped too; numbers as in Python.
 
-    Bytes of paths that are not UTF-8 are written as \\udc80 to \\udcff, Python's surrogate escapes.
+    Bytes of paths that are not UTF-8 are written as they are.
     """
     if isinstance(value, str):
-        value = re.sub("[\udc80-\udcff]", lambda byte: f"\\udc{ord(byte[0]) & 255:02x}", value)
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     return str(value).lower()
 
@@ -302,20 +276,17 @@ def _toml(value: str | float) -> str:
 
 def add_flags(parser: argparse.ArgumentParser, config: Any, sections: Iterable[str]) -> None:
     """Add the flags of the options in the given sections ("": top level) to a parser."""
-    chosen = set(sections)
     for name, f in every_option(config).items():
-        flag = f.metadata["flag"]
-        if flag and name.rpartition(".")[0] in chosen:
-            kind: Any = type(f.default)
-            named = VALUES.get(name, "NAME" if kind is str else "N")
-            settings: dict[str, Any] = {"type": kind, "metavar": named}
+        flags = f.metadata["flags"]
+        if flags and name.rpartition(".")[0] in sections:
+            kind = type(f.default)
+            named = flags[0][2:].upper()
+            action = "append" if f.metadata["repeated"] else "store"
+            settings: dict[str, Any] = {"type": kind, "metavar": named, "action": action}
             if kind is bool:
                 settings = {"action": "store_true"}
-            elif f.metadata["repeated"]:
-                settings["action"] = "append"
             default = f" (default: {f.default})" if f.default else ""
             text = f"{f.metadata['help']}{default}".replace("%", "%%")
-            flags = filter(None, (flag, f.metadata["old_flag"]))
             parser.add_argument(*flags, dest=name, default=None, help=text, **settings)
 
 

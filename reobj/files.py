@@ -41,28 +41,16 @@ def atomic(path: Path) -> Iterator[Path]:
         ReobjError: a disk error: where, why and what to do.
     """
     part = path.with_name(f".part-{path.name}")
-    with writing(path), _folder(path.parent):
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
         try:
             yield part
-            _sync(part)
+            with contextlib.suppress(OSError), part.open("rb") as file:  # perhaps a folder
+                os.fsync(file)  # a power cut after the renaming could otherwise leave it empty
             part.replace(path)
             log.debug("wrote %s", path)
         finally:
             part.unlink(missing_ok=True)
-
-
-@contextlib.contextmanager
-def _folder(path: Path) -> Iterator[None]:
-    """Make a folder and its parents; new ones are removed again if the block fails."""
-    new = [folder for folder in (path, *path.parents) if not folder.exists()]
-    path.mkdir(parents=True, exist_ok=True)
-    try:
-        yield
-    except BaseException:
-        for folder in new:
-            with contextlib.suppress(OSError):  # not empty
-                folder.rmdir()
-        raise
 
 
 @contextlib.contextmanager
@@ -78,10 +66,9 @@ def writing(path: Path, named: Path | None = None) -> Iterator[None]:
         at = Path(os.fsdecode(error.filename or path))
         if not (path.is_relative_to(at) or at.is_relative_to(path) or ".part-" in str(at)):
             raise  # of an input
-        shown = Path(*(name for name in (named or path).parts if name != PART_RESULTS))
-        advice = "make room, or choose a folder that takes files"
+        why = f"cannot be written ({error.strerror or error})"
         raise ReobjError(
-            f"{shown}: cannot be written ({error.strerror or error}); {advice}"
+            f"{named or path}: {why}; make room, or choose a folder that takes files"
         ) from error
 
 
@@ -104,13 +91,11 @@ def locked(path: Path, wait_s: float = 0.0, named: Path | None = None) -> Iterat
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()  # where that is impossible, filelock would wait
         try:
-            lock.acquire()
+            held = lock.acquire()
         except filelock.Timeout:
             raise LockedError(f"{path}: locked by another process") from None
-    try:
+    with held:
         yield
-    finally:
-        lock.release()
 
 
 PART_RESULTS = ".part-results"  # folder of unfinished results, in the output folder
@@ -129,9 +114,9 @@ def staged(folder: Path, name: str = PART_RESULTS) -> Iterator[Path]:
         ReobjError: as `check_places`, or a disk error.
     """
     part = folder / name
-    with writing(folder), _folder(folder):
+    with writing(folder):
         shutil.rmtree(part, ignore_errors=True)
-        part.mkdir()
+        part.mkdir(parents=True)
         try:
             yield part
             files = [p.relative_to(part) for p in sorted(part.rglob("*")) if p.is_file()]
@@ -150,25 +135,14 @@ def check_places(folder: Path, names: Iterable[str | Path]) -> None:
         ReobjError: the path of a file is a folder, that of a folder is a file, or a folder is not
             writable.
     """
-    for name in map(Path, names):
-        above = [folder / parent for parent in name.parents]
-        blocked = [path for path in above if os.path.lexists(path) and not path.is_dir()]
-        blocked += [path for path in above if path.is_dir() and not os.access(path, os.W_OK)]
-        if (path := folder / name).is_dir() and not path.is_symlink():
-            blocked.append(path)
-        if blocked:
+    for path in (folder / name for name in names):
+        above = [
+            p for p in (folder, *path.parents) if os.path.lexists(p) and p.is_relative_to(folder)
+        ]
+        blocked = [p for p in above if not (p.is_dir() and os.access(p, os.W_OK))]
+        if blocked or (path.is_dir() and not path.is_symlink()):
             what = "it is not writable, or a file in the place of a folder, or the reverse"
-            raise ReobjError(f"{blocked[0]}: results go here, but {what}; move it away")
-
-
-def _sync(path: Path) -> None:
-    """Flush a file to the disk: a power cut after a rename could otherwise leave it empty."""
-    with contextlib.suppress(OSError):  # a folder, or a file system without fsync
-        handle = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
+            raise ReobjError(f"{(*blocked, path)[0]}: results go here, but {what}; move it away")
 
 
 def part_path(path: Path, part: int) -> Path:
@@ -186,7 +160,7 @@ def part_paths(path: Path) -> list[Path]:
 
 
 MEMORY_MAX = 1 << 31  # bytes that one input file may take; detections of an hour of video in npz
-LINES_MAX = 2_000_000  # of a table; chosen: an hour at 30 Hz with 18 boxes a frame
+LINES_MAX = 2_000_000  # of a table: an hour at 30 Hz with 18 boxes a frame
 
 
 def read_text(path: Path, most: int | None = None, errors: str = "strict") -> str:
@@ -215,9 +189,8 @@ def read_lines(path: Path) -> list[str]:
 def load_json(path: Path) -> Any:
     """Read a JSON file; an error names the line."""
     text = read_text(path)
-    if digits := re.search(r"\d{309}", text):  # no float
-        line = text.count("\n", 0, digits.start()) + 1
-        raise ReobjError(f"{path}, line {line}: a number of more than 308 digits")
+    if re.search(r"\d{309}", text):  # no float
+        raise ReobjError(f"{path}: a number of more than 308 digits")
     try:
         return json.loads(text)
     except json.JSONDecodeError as error:
@@ -289,43 +262,37 @@ def load_npz(path: Path, sealed: bool = False) -> tuple[dict[str, Any], dict[str
     return arrays, metadata
 
 
-def saved_fields(owner: Any) -> Sequence[str]:
-    """Return the names of the attributes that are the state of a dataclass or of another class."""
-    if dataclasses.is_dataclass(owner):
-        return [one.name for one in dataclasses.fields(owner)]
-    return getattr(owner, "ARRAYS", ())
+def _leaves(owner: Any, name: str = "state") -> Iterator[tuple[Any, str, str]]:
+    """Yield the owner, attribute and dotted name of every array and number of a state.
+
+    The state is a dataclass, or has the names of its attributes in `ARRAYS`; so do its parts.
+    """
+    for key in getattr(owner, "ARRAYS", ()) or [f.name for f in dataclasses.fields(owner)]:
+        value = getattr(owner, key)
+        parts = value if isinstance(value, list) else [value]
+        for k, part in enumerate(parts):
+            if dataclasses.is_dataclass(part) or hasattr(part, "ARRAYS"):
+                yield from _leaves(part, f"{name}.{key}.{k}")
+            else:
+                yield owner, key, f"{name}.{key}"
 
 
-def state_arrays(value: Any, name: str) -> dict[str, Any]:
+def state_arrays(state: Any) -> dict[str, Any]:
     """Flatten a state to arrays by dotted names; None is left out."""
-    if value is None:
-        return {}
-    if isinstance(value, list):
-        items = {f"{name}.{k}": item for k, item in enumerate(value)}
-    else:
-        items = {f"{name}.{key}": getattr(value, key) for key in saved_fields(value)}
-    if not items:
-        return {name: value}
-    return {key: x for path, item in items.items() for key, x in state_arrays(item, path).items()}
+    values = {name: getattr(owner, key) for owner, key, name in _leaves(state)}
+    return {name: value for name, value in values.items() if value is not None}
 
 
-def restore_state(value: Any, name: str, arrays: dict[str, Any]) -> Any:
-    """Fill a fresh state from `state_arrays`; returns it, or the array that takes its place.
+def restore_state(state: Any, arrays: Mapping[str, Any]) -> None:
+    """Fill a state whose lists have the saved lengths from `state_arrays`.
 
     Raises:
         KeyError: an array is missing.
     """
-    if isinstance(value, list):
-        prefix = re.compile(re.escape(name) + r"\.(\d+)\.")
-        count = len({found[1] for key in arrays if (found := prefix.match(key))})
-        return [restore_state(type(value[0])(), f"{name}.{k}", arrays) for k in range(count)]
-    if keys := saved_fields(value):
-        for key in keys:
-            setattr(value, key, restore_state(getattr(value, key), f"{name}.{key}", arrays))
-        return value
-    if value is None:
-        return arrays.get(name)
-    return int(arrays[name]) if isinstance(value, int) else arrays[name]
+    for owner, key, name in _leaves(state):
+        fresh = getattr(owner, key)
+        found = arrays.get(name) if fresh is None else arrays[name]
+        setattr(owner, key, int(arrays[name]) if isinstance(fresh, int) else found)
 
 
 def load_cached(path: Path, read: Callable[[Path], T]) -> T | None:
@@ -338,8 +305,7 @@ def load_cached(path: Path, read: Callable[[Path], T]) -> T | None:
         return content
     except (ReobjError, OSError) as error:
         log.warning("%s; it is removed and computed again", error)
-        if path.is_dir():
-            shutil.rmtree(path)
+        shutil.rmtree(path, ignore_errors=True)  # a folder
         path.unlink(missing_ok=True)
         return None
 
@@ -351,18 +317,14 @@ class Progress:
     line every 10 s (environment variable REOBJ_PROGRESS_S), and one at its end. In a `with` block
     the stage is complete if the block ends without an exception, whatever the expected total was.
 
-    Args:
-        counted: the steps have a meaning for the user, such as frames; False: they are fractions
-            of the work, and only their percentage is shown.
     Attributes:
         done, total: steps so far and in all (0: unknown). seconds: duration, 0 until it is closed.
         complete: set it to False where the block ends early without an exception.
     """
 
-    def __init__(self, stage: str, total: int = 0, counted: bool = True) -> None:
+    def __init__(self, stage: str, total: int = 0) -> None:
         self.stage = stage
         self.total = total
-        self.counted = counted
         self.done = 0
         self.seconds = 0.0
         self.complete = True
@@ -383,24 +345,14 @@ class Progress:
         if time.monotonic() - self._shown > self._every_s:
             self._show()
 
-    def _show(self) -> None:
+    def _show(self, end: str = "") -> None:
         self._shown = time.monotonic()
-        parts = ["{desc} {percentage:3.0f} %"] if self.total else ["{desc}"]
-        parts += ["{n_fmt}/{total_fmt}" if self.total else "{n_fmt}"] * self.counted
-        parts += ["[{elapsed}" + "<{remaining}" * bool(self.total) + ", {rate_fmt}" * self.counted]
-        text = tqdm.format_meter(
-            self.done,
-            self.total or None,
-            self._shown - self._started,
-            prefix=f"{self.stage:<9}",
-            unit="",
-            bar_format=" ".join(parts) + "]",
-        )
-        if self._is_terminal:
-            sys.stderr.write(f"\r{text}\x1b[K")  # erases the rest of a longer line
-            sys.stderr.flush()
-        elif sys.stderr is not None:
-            print(text, file=sys.stderr, flush=True)
+        meter = (self.done, self.total or None, self._shown - self._started)
+        text = tqdm.format_meter(*meter, ncols=0, prefix=f"{self.stage:<9}", unit="")
+        # on a terminal the rest of a longer line is erased
+        line = f"\r{text}\x1b[K{end}" if self._is_terminal else f"{text}\n"
+        if sys.stderr is not None:
+            print(line, end="", file=sys.stderr, flush=True)
 
     def close(self, complete: bool = True) -> float:
         """Finish the line, at 100 % if the stage is complete; returns seconds since the start."""
@@ -408,9 +360,7 @@ class Progress:
         if complete:
             self.total = self.done
         if self._is_terminal or self.seconds > 1:
-            self._show()
-        if self._is_terminal:
-            sys.stderr.write("\n")
+            self._show("\n")
         return self.seconds
 
 

@@ -7,13 +7,11 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import functools
-import os
 import re
 import shlex
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,7 +21,7 @@ import numpy as np
 
 import quadrics
 from reobj.cameras import Poses, without_copies
-from reobj.config import Config, as_config, changed_options, read_config, write_config
+from reobj.config import Config, changed_options, read_config, write_config
 from reobj.export.registry import Viewer
 from reobj.files import Progress, part_path, shortened
 from reobj.maps.stage import (
@@ -101,9 +99,9 @@ class Job:
         config = self.config.objects
         check_known_size(config.known_size, config.size_priors(), class_names)
 
-    def progress(self, step: str, total: int = 0, counted: bool = True) -> Progress:
+    def progress(self, step: str, total: int = 0) -> Progress:
         """Begin the progress line of a step of the current stage."""
-        self.lines.append(Progress(step, total, counted))
+        self.lines.append(Progress(step, total))
         return self.lines[-1]
 
     @contextlib.contextmanager
@@ -144,7 +142,6 @@ def open_job(
     """
     if config.threads:
         cv2.setNumThreads(config.threads)
-    _guard_forks()
     check_objects(config.objects)
     video = open_video(source, config.input, config.poses, recorded, config.detect)
     if config.input not in (InputConfig(), video.config):
@@ -163,14 +160,6 @@ def open_job(
         log.debug("options that differ from the defaults: %s", changed_options(config))
         viewer = open_viewer(VideoInfo.of(video), opened) if show else None
         yield Job(video, workspace, config, room, viewer)
-
-
-@functools.cache
-def _guard_forks() -> None:
-    """End OpenCV's threads before a fork: a forked process would wait for them for ever."""
-    if hasattr(os, "register_at_fork"):  # not on Windows
-        one = functools.partial(cv2.setNumThreads, 1)
-        os.register_at_fork(before=one, after_in_parent=functools.partial(cv2.setNumThreads, -1))
 
 
 def check_objects(config: ObjectsConfig) -> None:
@@ -195,18 +184,6 @@ def default_out(source: Video | str | Path | int | None) -> Path:
     text = str(source.source if isinstance(source, Video) else source)
     name = re.sub(r"[^\w.-]+", "_", Path(without_secrets(text)).stem).strip("_.")
     return Path(f"{name}_out" if name else "out")
-
-
-def run_config(
-    config: Config | Mapping[str, Any] | None, path: str | Path | None, frozen: bool
-) -> Config:
-    """Return the options of `run`, with the map that its arguments give."""
-    config = as_config(Config(), config)
-    if path is None and not frozen:
-        return config
-    where = config.map.path if path is None else str(path)
-    of_map = dataclasses.replace(config.map, path=where, frozen=frozen)
-    return dataclasses.replace(config, map=of_map)
 
 
 def last_config(out: str | Path) -> Config:

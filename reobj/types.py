@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import logging
 import re
 from collections.abc import Mapping, Sequence
@@ -61,14 +62,9 @@ def one_line(text: str) -> str:
 
     Removes the secrets of URLs, escapes control characters, cuts the middle out of long texts.
     """
-    return _without_middle(printable(_without_middle(without_secrets(text))))
-
-
-def _without_middle(text: str) -> str:
+    text = printable(without_secrets(text))
     most = 700  # characters: our messages are shorter, longer ones quote the input
-    if len(text) <= most:
-        return text
-    return f"{text[: most // 2]} ... {text[-most // 3 :]}"
+    return text if len(text) <= most else f"{text[: most // 2]} ... {text[-most // 3 :]}"
 
 
 def printable(text: str) -> str:
@@ -147,8 +143,8 @@ def option(
     old_flag: an earlier name of the flag that still works. repeated: the flag may be given several
     times; its values are joined by commas.
     """
-    metadata = {"help": text, "flag": flag, "old_flag": old_flag, "repeated": repeated}
-    return field(default=default, metadata=metadata)
+    flags = [name for name in (flag, old_flag) if name]
+    return field(default=default, metadata={"help": text, "flags": flags, "repeated": repeated})
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,12 +156,7 @@ class Frame:
 
     index: int
     time_s: float
-    image: Image
-
-    def __repr__(self) -> str:
-        """Describe the frame in one line."""
-        size = "no image" if self.image is None else "{1}x{0}".format(*self.image.shape)
-        return f"Frame({self.index}, {self.time_s:.3f} s, {size})"
+    image: Image = field(repr=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,16 +178,6 @@ class Detections:
 
     def __len__(self) -> int:
         return len(self.xyxy)
-
-    def __repr__(self) -> str:
-        """Describe the detections in one line."""
-        facts = [counted(len(self), "box", "boxes")]
-        if len(self):
-            facts.append(counted(len(np.unique(self.class_id)), "class", "classes"))
-            facts.append(f"scores {np.min(self.score):.2f} to {np.max(self.score):.2f}")
-        if self.masks is not None:
-            facts.append("with masks")
-        return f"Detections({', '.join(facts)})"
 
     def __getitem__(self, keep: Any) -> Detections:
         """Select by index array, boolean mask or slice."""
@@ -275,15 +256,6 @@ class Tracks:
     def __len__(self) -> int:
         return len(self.track_id)
 
-    def __repr__(self) -> str:
-        """Describe the tracks in one line."""
-        facts = [counted(len(self), "box", "boxes")]
-        if len(self):
-            identities = np.setdiff1d(self.track_id, [0])
-            facts.append(counted(len(identities), "identity", "identities"))
-            facts.append(f"frames {np.min(self.frame)} to {np.max(self.frame)}")
-        return f"Tracks({', '.join(facts)})"
-
     def __getitem__(self, keep: Any) -> Tracks:
         return Tracks(*(getattr(self, name)[keep] for name in self.__slots__))
 
@@ -303,16 +275,14 @@ class Tracks:
         Args:
             frames: source number of each step. scale: pixels of the frames per native pixel.
         """
-        if not steps:
-            return Tracks.empty()
         table = Tracks._stacked(steps)
         tracklets, inverse = np.unique(table.tracklet_id, return_inverse=True)
         identity = np.zeros(len(tracklets), np.int64)
         np.maximum.at(identity, inverse, table.track_id)
-        frame = np.repeat(np.asarray(frames, np.int64), [len(step) for step in steps])
-        table = dataclasses.replace(
-            table, frame=frame, track_id=identity[inverse], xyxy=table.xyxy / scale
-        )
+        counts = np.array([len(step) for step in steps], np.int64)
+        frame = np.repeat(np.asarray(frames, np.int64), counts)
+        rows = (identity[inverse], table.tracklet_id, table.xyxy / scale)
+        table = Tracks(frame, *rows, table.score, table.class_id, table.detection_index)
         return table[table.track_id > 0]
 
     @staticmethod
@@ -323,7 +293,8 @@ class Tracks:
 
     @staticmethod
     def _stacked(tables: Sequence[Tracks]) -> Tracks:
-        """Concatenate the columns of at least one table."""
+        """Concatenate the columns of tables."""
+        tables = tables or [Tracks.empty()]
         names = Tracks.__slots__
         return Tracks(*(np.concatenate([getattr(t, name) for t in tables]) for name in names))
 
@@ -372,10 +343,10 @@ class LinkEvent:
 
 # ---- Detections of other libraries --------------------------------------------------------------
 
-COORDINATE_MAX = 1e7  # px; chosen: a thousand times the widest images; larger ones are errors
-CLASS_MAX = 32_767  # class number; chosen: above ImageNet-21k's 21,841; costs 8 bytes a track each
-CLASS_NAME_MAX = 200  # characters; chosen: arrays of names are as wide as the longest
-DETECTIONS_MAX = 3_000  # of a frame; chosen: a matrix of as many tracks takes 72 MB
+COORDINATE_MAX = 1e7  # px, a thousand times the widest images; larger ones are errors
+CLASS_MAX = 32_767  # class number, above ImageNet-21k's 21,841; each costs 8 bytes a track
+CLASS_NAME_MAX = 200  # characters; arrays of names are as wide as the longest
+DETECTIONS_MAX = 3_000  # of a frame; a matrix of as many tracks takes 72 MB
 
 
 def as_detections(detections: Any, class_id: Any = None) -> Detections:
@@ -389,22 +360,12 @@ def as_detections(detections: Any, class_id: Any = None) -> Detections:
 
     Args:
         class_id: (D,) replaces the classes, e.g. by the numbers of `text_labels`.
-    Returns:
-        The same object if it is a valid `Detections`.
     Raises:
         ReobjError: another type, or invalid values: inverted boxes, coordinates that are not finite
             or beyond 1e7, scores outside [0, 1], classes that are no index.
     """
-    detections = _single(detections)
-    if class_id is not None and isinstance(detections, Mapping):
-        detections = {**detections, "labels": class_id}
-    xyxy, score, own_class_id, masks = _columns(detections)
-    checked = _checked(xyxy, score, own_class_id if class_id is None else class_id, masks)
-    if not isinstance(detections, Detections):
-        return checked
-    names = detections.__slots__
-    same = all(getattr(checked, name) is getattr(detections, name) for name in names)
-    return detections if same else checked
+    xyxy, score, own_class_id, masks = _columns(_single(detections))
+    return _checked(xyxy, score, own_class_id if class_id is None else class_id, masks)
 
 
 def _unusable(fault: str) -> ReobjError:
@@ -424,17 +385,41 @@ def _single(detections: Any) -> Any:
     return detections
 
 
+# Names of boxes, scores and classes: of ours and supervision, of dicts, of ultralytics
+COLUMNS = (("xyxy", "boxes"), ("score", "confidence", "scores", "conf"),
+           ("class_id", "labels", "cls"))  # fmt: skip
+
+
 def _columns(detections: Any) -> tuple[Any, ...]:
-    """Return boxes, scores, classes and masks of detections of any of the types."""
-    if isinstance(detections, Detections):
-        return detections.xyxy, detections.score, detections.class_id, detections.masks
-    if isinstance(detections, Mapping):
-        return _columns_of_mapping(detections)
+    """Return boxes, scores, classes and masks of detections of any of the types.
+
+    Scores and classes that are None (supervision) become 1 and 0.
+    """
+    source = detections
     if hasattr(detections, "orig_shape") and hasattr(detections, "boxes"):
-        return _columns_of_ultralytics(detections)
-    if hasattr(detections, "xyxy"):
-        return _columns_of_boxes(detections)
-    return _columns_of_rows(detections)
+        source = detections.boxes  # of ultralytics' Results
+        if source is None:
+            raise _unusable("ultralytics Results without boxes (another task?)")
+    elif not isinstance(detections, Mapping) and not hasattr(detections, "xyxy"):
+        rows = as_numbers(detections, "detections")
+        rows = rows if rows.size or rows.ndim > 1 else np.empty((0, 6))
+        if rows.ndim != 2 or rows.shape[1] != 6:
+            raise _unusable(f"detections are an array of shape {rows.shape}")
+        return rows[:, :4], rows[:, 4], rows[:, 5], None
+    if not isinstance(source, Mapping):
+        names = (*itertools.chain(*COLUMNS), "mask", "masks")
+        source = {name: getattr(source, name) for name in names if hasattr(source, name)}
+    columns: list[Any] = []
+    for default, names in zip((np.empty, np.ones, np.zeros), COLUMNS, strict=True):
+        name = next((name for name in names if name in source), None)
+        if name is None:
+            raise _unusable(f"detections have no {' or '.join(names)}")
+        values = source[name]
+        columns.append(default(len(columns[0])) if values is None and columns else values)
+    masks = source.get("masks", source.get("mask"))
+    if hasattr(detections, "orig_shape") and getattr(detections, "masks", None) is not None:
+        masks = _full_masks(detections.masks, detections.orig_shape)
+    return *columns, masks
 
 
 def text_labels(detections: Any) -> list[str] | None:
@@ -470,65 +455,16 @@ def _is_text(labels: Any) -> bool:
     return usable and all(isinstance(label, str) for label in labels)
 
 
-def _columns_of_rows(rows: Any) -> tuple[Any, ...]:
-    """Split (N, 6) rows into boxes, scores and classes."""
-    rows = as_numbers(rows, "detections")
-    if rows.ndim == 1 and not rows.size:
-        rows = np.empty((0, 6))
-    if rows.ndim != 2 or rows.shape[1] != 6:
-        raise _unusable(f"detections are an array of shape {rows.shape}")
-    return rows[:, :4], rows[:, 4], rows[:, 5], None
-
-
-def _columns_of_mapping(detections: Mapping[str, Any]) -> tuple[Any, ...]:
-    """Return boxes, scores, labels and masks, (N, H, W) or (N, 1, H, W), of a dict."""
-    missing = [key for key in ("boxes", "scores", "labels") if key not in detections]
-    if missing:
-        raise _unusable(f"detections are a dict without {', '.join(missing)}")
-    if _is_text(detections["labels"]):
-        raise ReobjError("labels are text; a `Tracker` takes class numbers, functions given to "
-                         "`track` and `run` may return text")  # fmt: skip
-    masks = None if detections.get("masks") is None else as_numbers(detections["masks"], "masks")
-    if masks is not None and masks.ndim == 4 and masks.shape[1] == 1:
-        masks = masks[:, 0]
-    return detections["boxes"], detections["scores"], detections["labels"], masks
-
-
-def _columns_of_boxes(detections: Any) -> tuple[Any, ...]:
-    """Return xyxy, confidence, class_id and mask (supervision) or xyxy, conf and cls (Boxes)."""
-    count = len(detections.xyxy)
-    columns = [detections.xyxy]
-    for names, default in ((("confidence", "conf"), np.ones), (("class_id", "cls"), np.zeros)):
-        name = next((name for name in names if hasattr(detections, name)), None)
-        if name is None:
-            raise _unusable(f"detections have xyxy, but no {' or '.join(names)}")
-        values = getattr(detections, name)
-        columns.append(default(count) if values is None else values)
-    return *columns, getattr(detections, "mask", None)
-
-
-def _columns_of_ultralytics(results: Any) -> tuple[Any, ...]:
-    """Return the boxes of ultralytics' `Results`, and its masks at the size of the image."""
-    if results.boxes is None:
-        raise _unusable("ultralytics Results without boxes (another task?)")
-    columns = _columns_of_boxes(results.boxes)
-    masks = getattr(results, "masks", None)
-    if masks is None:
-        return columns
-    height, width = (int(side) for side in results.orig_shape)
-    maps = as_numbers(masks.data, "masks").astype(np.float32)  # (N, h, w) of the padded input
-    if maps.ndim != 3 or not maps.shape[1] * maps.shape[2]:
-        raise ReobjError(f"masks are an array of shape {maps.shape}, expected (N, h, w)")
-    scale = min(maps.shape[1] / height, maps.shape[2] / width)
-    h = max(round(height * scale), 1)
-    w = max(round(width * scale), 1)
-    top = (maps.shape[1] - h) // 2
-    left = (maps.shape[2] - w) // 2
-    maps = maps[:, top : top + h, left : left + w]
-    full = np.zeros((len(maps), height, width), bool)  # (N, H, W)
-    for mask, small in zip(full, maps, strict=True):
-        mask[:] = cv2.resize(small, (width, height)) > 0.5  # probability
-    return *columns[:3], full
+def _full_masks(masks: Any, size_hw: Sequence[int]) -> BoolArray:
+    """Resize the masks of ultralytics' `Results`, of its padded input, to the image (N, H, W)."""
+    maps = as_numbers(masks.data, "masks").astype(np.float32)  # (N, h, w)
+    image_hw = [int(side) for side in size_hw]
+    scale = min(m / side for m, side in zip(maps.shape[1:], image_hw, strict=True))
+    h, w = (max(round(side * scale), 1) for side in image_hw)
+    top, left = ((m - side) // 2 for m, side in zip(maps.shape[1:], (h, w), strict=True))
+    full = [cv2.resize(m, image_hw[::-1]) > 0.5  # probability
+            for m in maps[:, top : top + h, left : left + w]]  # fmt: skip
+    return np.array(full, bool).reshape(-1, *image_hw)
 
 
 def as_numbers(values: Any, name: str) -> npt.NDArray[Any]:
@@ -552,67 +488,57 @@ def as_numbers(values: Any, name: str) -> npt.NDArray[Any]:
 
 def _checked(xyxy: Any, score: Any, class_id: Any, masks: Any) -> Detections:
     """Validate the arrays and build `Detections`."""
-    xyxy = as_numbers(xyxy, "boxes")
-    score = as_numbers(score, "scores")
-    class_id = as_numbers(class_id, "classes")
-    count = len(xyxy)
-    if xyxy.shape != (count, 4):
-        raise ReobjError(
-            f"boxes are an array of shape {xyxy.shape}, expected (N, 4) x1, y1, x2, y2"
-        )
-    for column, name in ((score, "scores"), (class_id, "classes")):
-        if column.shape != (count,):
-            raise ReobjError(f"{name} are an array of shape {column.shape}, expected ({count},): "
-                             "one for each box")  # fmt: skip
+    given = {"boxes": xyxy, "scores": score, "classes": class_id}
+    arrays = {name: as_numbers(values, name) for name, values in given.items()}
+    count = len(arrays["boxes"])
+    shapes = {"boxes": (count, 4), "scores": (count,), "classes": (count,)}
+    if masks is not None:
+        masks = as_numbers(masks, "masks")
+        masks = masks[:, 0] if masks.ndim == 4 and masks.shape[1] == 1 else masks  # (N, 1, H, W)
+        arrays["masks"] = masks if masks.dtype == bool else masks > 0.5  # probability (torchvision)
+        shapes["masks"] = (count, *masks.shape[-2:])
+    for name, shape in shapes.items():
+        if arrays[name].shape != shape:
+            found = f"{name} are an array of shape {arrays[name].shape}"
+            raise ReobjError(
+                f"{found}, expected {shape}: one for each box, masks of the frame's size"
+            )
     if count > DETECTIONS_MAX:
         raise ReobjError(f"{count} detections in a frame, at most {DETECTIONS_MAX} are allowed: "
                          "keep those of the highest scores")  # fmt: skip
-    if masks is not None:
-        masks = as_numbers(masks, "masks")
-        masks = masks if masks.dtype == bool else masks > 0.5  # probability (torchvision)
-        if masks.ndim != 3 or len(masks) != count:
-            raise ReobjError(f"masks are an array of shape {masks.shape}, expected ({count}, H, W) "
-                             "at the size of the frame")  # fmt: skip
-    xyxy = xyxy.astype(np.float64, copy=False)
-    score = score.astype(np.float64, copy=False)
-    _check_values(xyxy, score, class_id)
-    return Detections(xyxy, score, class_id.astype(np.int64, copy=False), masks)
-
-
-def _check_values(xyxy: Array, score: Array, class_id: npt.NDArray[Any]) -> None:
-    """Refuse invalid boxes (N, 4), scores (N,) and classes (N,)."""
+    xyxy = arrays["boxes"].astype(np.float64, copy=False)
+    score = arrays["scores"].astype(np.float64, copy=False)
+    class_id = arrays["classes"]
     finite = np.abs(xyxy) <= COORDINATE_MAX  # False for NaN
     ordered = xyxy[:, 2:] >= xyxy[:, :2]
-    probability = (score >= 0) & (score <= 1)
     index = (class_id >= 0) & (class_id <= CLASS_MAX) & (class_id == np.floor(class_id))
     for valid, values, expected in (
         (finite, xyxy, f"finite coordinates in pixels, at most {COORDINATE_MAX:g}"),
         (ordered, xyxy, "x1 <= x2 and y1 <= y2: corners, not x, y, width, height"),
-        (probability, score, "a confidence in [0, 1]"),
+        ((score >= 0) & (score <= 1), score, "a confidence in [0, 1]"),
         (index, class_id, f"a class number from 0 to {CLASS_MAX}"),
     ):
         if not valid.all():
             row = int(np.argwhere(~valid)[0, 0])
             raise ReobjError(f"detection {row}: {values[row]}, expected {expected}")
+    class_id = class_id.astype(np.int64, copy=False)
+    return Detections(xyxy, score, class_id, arrays.get("masks"))
 
 
 def as_frame(image: Any, masks: BoolArray | None = None) -> Image:
     """Validate a BGR image (H, W, 3) uint8; a view is copied to C order.
 
     Raises:
-        ReobjError: the image is grey, has alpha or another type; or masks (D, H, W) have another
-            size.
+        ReobjError: the image is grey, has alpha, no pixels or another type; or masks (D, H, W) have
+            another size.
     """
-    if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.shape[2:] != (3,):
-        kind = type(image).__name__
-        if isinstance(image, np.ndarray):
-            kind = f"an array {image.shape} of {image.dtype}"
-        raise ReobjError(f"the frame is {kind}, expected a BGR image (H, W, 3) of uint8, as "
+    shape = getattr(image, "shape", ())
+    if getattr(image, "dtype", None) != np.uint8 or shape[2:] != (3,) or 0 in shape:
+        found = f"{type(image).__name__} {shape} of {getattr(image, 'dtype', 'no dtype')}"
+        raise ReobjError(f"the frame is {found}, expected a BGR image (H, W, 3) of uint8, as "
                          "cv2.imread gives it")  # fmt: skip
-    if not image.size:
-        raise ReobjError(f"the frame has no pixels: {image.shape}, expected (H, W, 3)")
-    if masks is not None and masks.shape[1:] != image.shape[:2]:
-        raise ReobjError(f"masks of (h, w) {masks.shape[1:]}, expected {image.shape[:2]}, as the "
+    if masks is not None and masks.shape[1:] != shape[:2]:
+        raise ReobjError(f"masks of (h, w) {masks.shape[1:]}, expected {shape[:2]}, as the "
                          "frame has")  # fmt: skip
     return np.ascontiguousarray(image)
 

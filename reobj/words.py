@@ -90,7 +90,6 @@ def parse_up(text: str) -> Array:
 
 # ---- Usual sizes: --priors, --prior ----
 
-PRIORS_SHOWN = 8  # words in a message
 USUAL_LOG_STD = 0.25  # of each side of a size that the user gives: median of the bundled priors
 
 
@@ -172,29 +171,23 @@ def priors_used(path: str, given: str, names: Sequence[str]) -> list[str]:
         path, given: as of `load_size_priors`. names: of the classes of the objects.
     """
     of_words = parse_priors(given)
-    plain = load_size_priors(path)
     priors = load_size_priors(path, given)
     word_of = dict(zip(priors.index(list(of_words)).tolist(), of_words, strict=True))
     texts = []
-    used = set[str]()
+    unused = dict.fromkeys(of_words)
     for name in dict.fromkeys(names):
-        word = word_of.get(int(priors.index([name])[0]))
-        if word is not None:
-            used.add(word)
-            texts.append(f"{name}: size prior {_prior_text(of_words[word])} (--prior)")
-        elif not _category(plain, name) and name != "object":
+        row = int(priors.index([name])[0])
+        if word := word_of.get(row):
+            unused.pop(word, None)
+            prior = of_words[word]
+            size = (
+                f"of {prior}" if isinstance(prior, str) else "{:g} x {:g} x {:g} m".format(*prior)
+            )
+            texts.append(f"{name}: size prior {size} (--prior)")
+        elif row < 0 and name != "object":
             texts.append(f"{name}: no size prior")
-    unused = [f"--prior {word}: no object of this class has a shape" for word in of_words
-              if word not in used]  # fmt: skip
-    more = f"; and {len(texts) - PRIORS_SHOWN} more" * (len(texts) > PRIORS_SHOWN)
-    shown = NOTE_START + "; ".join(texts[:PRIORS_SHOWN]) + more
-    return [shown, *unused] if texts else unused
-
-
-def _prior_text(prior: tuple[float, ...] | str) -> str:
-    if isinstance(prior, str):
-        return f"of {prior}"
-    return " x ".join(f"{side:.3g}".removeprefix("0") for side in prior) + " m"
+    shown = [NOTE_START + "; ".join(texts)] if texts else []
+    return shown + [f"--prior {word}: no object of this class has a shape" for word in unused]
 
 
 # ---- Known sizes: --known-size ----

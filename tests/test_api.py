@@ -5,7 +5,6 @@ from __future__ import annotations
 import doctest
 import importlib
 import importlib.util
-import inspect
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -21,19 +20,6 @@ import reobj_track as rt
 
 ROOT = Path(__file__).resolve().parent.parent
 ROOM = ROOT / "examples" / "room"
-DETECTIONS = ROOM / "detections.npz"
-
-
-# ---- Public names ----
-
-
-def test_public_names_are_few_sorted_and_documented() -> None:
-    assert rt.__all__ == sorted(set(rt.__all__))
-    for name in set(rt.__all__) - {"COCO_NAMES", "__version__"}:
-        assert inspect.getdoc(getattr(rt, name)), name
-        assert not name.startswith("_"), name
-
-
 # ---- Ways to call the tracker ----
 
 
@@ -124,27 +110,6 @@ def test_track_is_lazy_and_numbers_frames_as_the_source() -> None:
     assert seen == [(3, 1, 1), (5, 1, 2), (7, 1, 2), (9, 2, 2)]
     assert asked == [(480, 640, 3)] * 4
     assert read in ([3, 5, 7, 9], [3, 5, 7, 9, 11])  # a thread is one frame ahead
-
-
-def test_track_hands_poses_to_the_tracker() -> None:
-    """The pose of the frame number, with the camera at the size of the frames."""
-    video = rt.Video(ROOM / "room.mp4", rt.InputConfig(start=2, every=3, stop=9, max_size=320))
-    camera = rt.Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
-    frame = np.array([2, 8])
-    cams = np.arange(24.0).reshape(2, 3, 4)
-    poses = rt.Poses(camera, frame, frame / 30, cams, np.array(["supplied"] * 2), "user")
-    given = []
-
-    class Noting(rt.Tracker):
-        def update(self, *args: Any, **known: Any) -> rt.Tracks:
-            given.append(known)
-            return rt.Tracks.empty()
-
-    list(rt.track(video, lambda image: [], Noting(), poses=poses))
-    assert [k.get("cam_from_world") is None for k in given] == [False, True, False]
-    np.testing.assert_array_equal([given[0]["cam_from_world"], given[2]["cam_from_world"]], cams)
-    small = rt.Camera("PINHOLE", 320, 240, (250.0, 250.0, 160.0, 120.0))
-    assert [given[0]["camera"], given[2]["camera"]] == [small] * 2
 
 
 # ---- Docstrings ----

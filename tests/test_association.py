@@ -24,7 +24,7 @@ from reobj.objects.description import (
 )
 from reobj.objects.likelihood import EXPECTED, Categories, PosedDetections, Shapes, gather_evidence
 from reobj.objects.observations import Scene, gather_views
-from reobj.tracking.interpolation import fill_from_objects
+from reobj.tracking.linking import fill_from_objects
 from reobj.types import class_shares
 
 

@@ -60,6 +60,8 @@ def test_the_configured_embedder_is_built(net: str, tmp_path: Path) -> None:
     head = str(sum_head(tmp_path / "h.onnx", layout={}))
     with_head = make_embedder(net, head, threads=1)
     assert with_head is not None and with_head.trained
+    with pytest.raises(rt.ReobjError, match="crops:reobj: is a model of whole frames"):
+        make_embedder("crops:reobj", threads=1)
 
 
 # ---- Crops ----
@@ -80,19 +82,11 @@ def test_crops_contain_object_or_surroundings(net: str) -> None:
     assert 0 < np.abs(np.diff(plain, axis=2)).max() < 8  # of 100 grey values: no hard edge
 
 
-def test_without_a_mask_the_inscribed_ellipse_is_the_object(net: str) -> None:
-    image, found = red_on_green()
-    _, own = rt.CropEmbedder(net, threads=1).cut(image, boxes(*found.xyxy), np.arange(1))
-    assert own.mean() == pytest.approx(np.pi / 16, abs=0.01)
-
-
 @pytest.mark.parametrize(
     ("layout", "side"),
     [
         (rt.SamplingLayout(context=1.0), 3 * 40),
         (rt.SamplingLayout(context=0.1, min_margin=0.25), 40 + 2 * 40),  # a quarter of 160
-        (rt.SamplingLayout(surround_scale=1.5, surround_min_margin=0.1), 4 * 40),
-        (rt.SamplingLayout(surround_scale=0.6, surround_min_margin=0.3), 40 + 2 * 48),
         (rt.SamplingLayout(context=0.0), 40 + 2 * 1),  # at least a pixel
     ],
 )
@@ -142,37 +136,3 @@ def test_a_conv_block_defines_the_layout_and_must_match(net: str, tmp_path: Path
     row = str(sum_head(tmp_path / "rows.onnx"))
     with pytest.raises(rt.ReobjError, match="ConvBlock trained with this backbone"):
         rt.CropEmbedder(net, row, threads=1)(image, found)
-
-
-# ---- The bundled weights on crops ----
-
-
-def test_trained_crops_depend_on_their_part_only() -> None:
-    """With the shipped model: another wall changes the background's rows alone."""
-    _, found = red_on_green()
-    walls = np.full((2, 120, 160, 3), 60, np.uint8)
-    walls[0, ..., 2] = walls[1, ..., 0] = 200  # red, blue
-    rng = np.random.default_rng(0)
-    walls[:, 40:80, 60:100] = rng.integers(0, 255, (40, 40, 3), np.uint8)
-    crops = rt.CropEmbedder("reobj", layout=rt.SamplingLayout(crop_px=64), threads=1)
-    one, other = (crops(wall, found) for wall in walls)
-    assert one.foreground.shape == one.background.shape == (1, 128)
-    assert np.allclose(one.foreground, other.foreground, atol=1e-4)
-    assert (one.background @ other.background.T).item() < 0.99
-
-
-@pytest.mark.parametrize(("score", "hides"), [(0.9, True), (0.2, False)])
-def test_trained_crops_mask_confident_other_objects(score: float, hides: bool) -> None:
-    """The wider box includes other objects, but marks them as such."""
-    image, found = red_on_green()
-    masks = np.concatenate([found.masks, np.zeros_like(found.masks)])
-    masks[1, :, 105:] = True
-    two = rt.Detections(
-        np.array([[60.0, 40, 100, 80], [105, 0, 160, 120]]), np.array([0.9, score]),
-        np.zeros(2, np.int64), masks,
-    )  # fmt: skip
-    crops = rt.CropEmbedder("reobj", layout=rt.SamplingLayout(crop_px=64), threads=1)
-    alone, beside = crops(image, found), crops(image, two, np.array([0]))
-    np.testing.assert_allclose(alone.foreground, beside.foreground, atol=1e-5)
-    same = np.allclose(alone.background, beside.background, atol=1e-5)
-    assert same is not hides

@@ -107,19 +107,6 @@ def test_a_foreign_backbone_gets_rgb_normalised_as_imagenet(net: str) -> None:
     )
 
 
-def test_a_network_of_our_own_gets_bgr_bytes() -> None:
-    """Its metadata declare channels-last input; swapping red and blue changes the map."""
-    image = np.zeros((1, 64, 64, 3), np.uint8)
-    image[..., 0] = 250
-    backbone = rt.Embedder("reobj", threads=1).backbone
-    assert backbone.channels_last
-    blue, red = (
-        backbone.session.run(None, {backbone.input: i})[0] for i in (image, image[..., ::-1])
-    )
-    np.testing.assert_array_equal(backbone.maps(image), blue)
-    assert np.abs(blue - red).max() > 0.1
-
-
 def test_a_model_without_a_map_is_refused(tmp_path: Path) -> None:
     nodes = [("GlobalAveragePool", ["image"], ["p"], {}), ("Flatten", ["p"], ["row"], {})]
     ends = ([("image", ["n", 3, "h", "v"])], [("row", ["n", 3])])
@@ -135,7 +122,7 @@ def test_real_backbones_are_found_by_their_file_names(monkeypatch: pytest.Monkey
     image, found = scene_with_identical_objects()
     for name, widths in (("mobilenetv2_feat", (128, 256)), ("squeezenet1.1", None)):
         embedder = rt.Embedder(name, threads=1, offline=True)
-        assert embedder.frozen and embedder.trained == (widths is not None)
+        assert embedder.trained == (widths is not None)
         look = embedder(image, found)
         again = embedder((0.95 * image).astype(np.uint8), found)
         assert (look.foreground * again.foreground).sum(1).min() > 0.9
@@ -158,20 +145,6 @@ def test_a_head_is_found_beside_its_backbone_or_given(net: str, tmp_path: Path) 
     assert found.trained and found.layout == rt.SamplingLayout(size_px=64, neighbours=0.0)
     assert not rt.Embedder(net, "none", threads=1).trained
     assert rt.Embedder(net, str(other), threads=1).layout.size_px == 480
-
-
-def test_a_head_gets_the_cells_of_its_part(net: str, tmp_path: Path) -> None:
-    """Foreground cells of a grey box on black give a different embedding than the background."""
-    sum_head(tmp_path / "net_head.onnx", layout={"neighbours": 0.0})
-    embedder, image = rt.Embedder(net, threads=1), np.zeros((256, 256, 3), np.uint8)
-    image[64:192, 64:192] = 200
-    found = boxes((64, 64, 192, 192))
-    fore, back = embedder.cells(image, found, np.arange(1))
-    look = embedder(image, found)
-    np.testing.assert_allclose(look.foreground[0], fore.sum() * np.array([1, 2]), rtol=1e-5)
-    expected = np.sign(back.sum()) * np.array([1, 3]) / 10**0.5
-    np.testing.assert_allclose(look.background[0], expected, rtol=1e-5)
-    assert fore.sum() > 0 > back[..., :3].sum()
 
 
 # ---- Embedder ----
@@ -213,16 +186,6 @@ def test_a_mask_decides_what_is_foreground(net: str) -> None:
         for picture, found in ((image, masked), (changed, masked), (changed, plain), (image, plain))
     )
     assert before @ after > 0.97 > other @ whole
-
-
-@pytest.mark.parametrize(
-    "box", [(-50, -50, 20, 20), (470, 230, 600, 400), (10, 10, 10.5, 10.5), (900, 900, 950, 950)]
-)
-def test_boxes_at_and_over_the_border(box: tuple[float, ...], net: str) -> None:
-    image, _ = scene_with_identical_objects()
-    for embedder in (rt.Embedder(net, threads=1), rt.Embedder("reobj", threads=1)):
-        found = embedder(image, boxes(box))
-        assert np.isfinite(found.foreground).all() and np.isfinite(found.background).all()
 
 
 @pytest.mark.parametrize("trained", [True, False])
@@ -267,15 +230,6 @@ def test_neighbour_embedding_averages_near_confident_objects() -> None:
     np.testing.assert_allclose(np.linalg.norm(around, axis=1), 1)
     assert around[0, 1] > 0.99 > around[2, 1] > around[2, 0] > 0 and not around[:, 3].any()
     assert not around.diagonal().any() and around[3, 0] > around[3, 1]  # not confident
-    larger = neighbour_embedding(3 * xyxy + 7, look, confident, np.arange(4))
-    np.testing.assert_allclose(around, larger)
-    unlike = np.array(
-        [(0, 0, 40, 10), (30, 0, 110, 80), (60, 0, 70, 10)], float
-    )  # sizes 20, 80, 10
-    found = neighbour_embedding(unlike, np.eye(3), np.ones(3, bool), np.arange(1))[0]
-    weights = np.exp(-np.array([np.hypot(50, 35), 45]) / 20)  # over its own size
-    np.testing.assert_allclose(found[1:], weights / np.linalg.norm(weights))
-    assert not neighbour_embedding(xyxy[:1], look[:1], confident[:1], np.arange(1)).any()
     some = neighbour_embedding(xyxy, look, confident, np.array([2, 3]))
     np.testing.assert_allclose(around[2:], some)
 
@@ -297,23 +251,6 @@ def test_bundled_weights_reidentify_identical_objects() -> None:
     assert cosine.diagonal().min() > cosine[~np.eye(2, dtype=bool)].max() + 0.2
 
 
-def test_bundled_foreground_ignores_the_context() -> None:
-    """Changing all pixels 10 px (of 320) away from the object affects its background
-    embedding only.
-    """
-    noise = np.random.default_rng(0).integers(0, 255, (240, 320, 3)).astype(np.uint8)
-    image, mask = cv2.GaussianBlur(noise, (0, 0), 3), np.zeros((1, 240, 320), bool)
-    mask[0, 100:150, 120:180] = True
-    other, around = 255 - image, (slice(90, 160), slice(110, 190))
-    other[around] = image[around]
-    embedder = rt.Embedder("reobj", threads=1)
-    one, two = (
-        embedder(picture, boxes((120, 100, 180, 150), masks=mask)) for picture in (image, other)
-    )
-    np.testing.assert_allclose(one.foreground, two.foreground, atol=1e-4)
-    assert (one.background * two.background).sum() < 0.95
-
-
 # ---- Embeddings on request ----
 
 
@@ -333,24 +270,6 @@ def test_cosines_of_fused_rows_are_weighted_means() -> None:
     fore, back = (a @ a.T for a in cosine)
     np.testing.assert_allclose(rows @ rows.T, 0.7 * fore + 0.3 * back, atol=1e-6)
     assert rows.dtype == np.float32
-
-
-def test_only_requested_rows_are_computed() -> None:
-    asked = []
-
-    def embedder(frame, detections, rows):
-        asked.append(rows.tolist())
-        return rt.Embeddings(np.eye(3)[rows], np.empty((len(rows), 0)))
-
-    found = boxes(*[(0, 0, 9, 9)] * 3)
-    lazy = LazyEmbeddings(None, embedder, np.zeros((9, 9, 3), np.uint8), found, 0.5)
-    assert lazy.available and asked == []
-    for rows in ([1], [1], [2, 1]):
-        np.testing.assert_array_equal(lazy.get(np.array(rows)), np.eye(3)[rows])
-    assert asked == [[1], [2]]
-    assert lazy.get(np.zeros(0, np.int64)).shape == (0, 3)
-    assert not LazyEmbeddings(None, embedder, None, found, 0.5).available
-    assert not LazyEmbeddings(None, None, np.zeros((9, 9, 3), np.uint8), found, 0.5).available
 
 
 @pytest.mark.parametrize(

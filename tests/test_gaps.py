@@ -6,11 +6,9 @@ import dataclasses
 
 import numpy as np
 import pytest
-from filterpy.kalman import KalmanFilter
 
 import reobj_track as rt
-from reobj.objects.observations import gather_views
-from reobj.tracking.interpolation import fill_gaps, smooth_boxes
+from reobj.tracking.linking import fill_gaps
 
 SIZE = (640, 480)
 
@@ -57,44 +55,6 @@ def test_gaps_are_filled_with_the_true_boxes(every: int) -> None:
     np.testing.assert_array_equal(filled.xyxy[~new], BOXES[seen])  # detections are unchanged
 
 
-def test_smoothing_is_more_accurate_than_linear_interpolation() -> None:
-    """Boxes with 3 px of noise, gaps of 4 frames, 60 tracks."""
-    rng, error = np.random.default_rng(0), {"rts": [], "line": []}
-    for _ in range(60):
-        seen = np.delete(ALL, [18, 19, 20, 21])
-        noisy = BOXES[seen] + rng.normal(0, 3, (len(seen), 4))
-        filled = fill_gaps(table(seen, noisy), SIZE, 5)
-        truth = BOXES[18:22]
-        error["rts"].append(filled.xyxy[filled.score == 0] - truth)
-        weight = np.arange(1, 5)[:, None] / 5
-        error["line"].append((1 - weight) * noisy[17] + weight * noisy[18] - truth)
-    rms = {name: np.sqrt(np.mean(np.square(values))) for name, values in error.items()}
-    assert rms["rts"] < 0.9 * rms["line"] < 3
-
-
-def test_smoother_equals_filterpy() -> None:
-    """filterpy's batch filter and RTS smoother, with the noise of the tracker per mean side."""
-    rng = np.random.default_rng(1)
-    at = np.array([0, 1, 2, 5, 6, 9])
-    xyxy = BOXES[at] + rng.normal(0, 3, (6, 4))
-    box = np.column_stack([(xyxy[:, :2] + xyxy[:, 2:]) / 2, xyxy[:, 2:] - xyxy[:, :2]])
-    side = np.median(np.sqrt(box[:, 2] * box[:, 3]))
-    for axis in range(4):  # each coordinate by itself: a filter of two states
-        kf = KalmanFilter(dim_x=2, dim_z=1)
-        kf.x = np.array([[box[0, axis]], [0.0]])
-        kf.F, kf.H = np.array([[1, 1], [0, 1.0]]), np.array([[1, 0.0]])
-        kf.P = np.diag([0.05 * side, 0.2 * side]) ** 2
-        kf.Q, kf.R = np.diag([0.05 * side, side / 80]) ** 2, np.array([[(0.05 * side) ** 2]])
-        measured = [None] * 10
-        for i, value in zip(at, box[:, axis], strict=True):
-            measured[i] = np.array([[value]])
-        mean, cov, _, _ = kf.batch_filter(measured)
-        expected = kf.rts_smoother(mean, cov)[0][:, 0, 0]
-        found = smooth_boxes(at, xyxy)
-        middle, size = (found[:, :2] + found[:, 2:]) / 2, found[:, 2:] - found[:, :2]
-        np.testing.assert_allclose(np.c_[middle, size][:, axis], expected, atol=1e-9)
-
-
 @pytest.mark.parametrize("every", [1, 3])
 @pytest.mark.parametrize(("max_gap", "filled"), [(0, 0), (3, 0), (4, 4), (5, 4)])
 def test_only_gaps_up_to_the_limit_are_filled(every: int, max_gap: int, filled: int) -> None:
@@ -134,15 +94,3 @@ def test_boxes_stay_in_the_image() -> None:
     filled = fill_gaps(table(seen, boxes[seen]), SIZE, 5)
     new = filled.xyxy[filled.score == 0]
     np.testing.assert_allclose(new, [[590, 0, 640, 75]] * 2, atol=1e-6)
-
-
-def test_filled_rows_affect_no_ellipsoid_and_no_position() -> None:
-    """Their score is 0: fitting and linking exclude them for any min_score above."""
-    seen = np.delete(ALL, [17, 18, 19])
-    filled = fill_gaps(table(seen, BOXES[seen]), SIZE, 5)
-    camera = rt.Camera("PINHOLE", *SIZE, (500.0, 500.0, 320.0, 240.0))
-    pose = np.repeat(np.eye(3, 4)[None], len(ALL), 0)
-    poses = rt.Poses(camera, ALL, ALL / 30, pose, np.full(len(ALL), "supplied"), "user")
-    views = gather_views(filled, poses, np.zeros(len(filled), np.int64), 1, 0.01)
-    unseen = ALL[~np.isfinite(views.boxes[:, 0, 0])]
-    assert unseen.tolist() == [17, 18, 19]

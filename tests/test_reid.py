@@ -9,7 +9,6 @@ from reobj.appearance.reid import (
     Gallery,
     SimilarityCalibration,
     match_probability,
-    paired_cosine,
     part_cosines,
 )
 
@@ -53,8 +52,6 @@ def kept(gallery: Gallery) -> list[int]:
     [
         ((0, 30), {}, [0, 30]),  # cosine .87: a new view
         ((0, 18), {}, [2]),  # cosine .951: blended, nine parts to one
-        ((0, 30), {"novelty": 0.8}, [3]),
-        ((0, 15), {"novelty": 0.98}, [0, 15]),
         ((0, 90, 100), {}, [0, 91]),  # blended into the nearest view
         ((0, 30, 150, 270), {"views": 3}, [270, 30, 150]),  # replaces one of the two most similar
         ((0, 150, 180, 90), {"views": 3}, [0, 90, 180]),
@@ -66,17 +63,6 @@ def test_kept_views(angles, options, expected) -> None:
     assert gallery.rows.shape[1] == options.get("views", 12)
     lengths = np.linalg.norm(gallery.rows[0, : len(expected)], axis=1)
     np.testing.assert_allclose(lengths, 1, atol=1e-6)
-
-
-def test_a_gallery_is_bounded_and_per_identity() -> None:
-    rng, gallery = np.random.default_rng(9), Gallery(views=6)
-    for _ in range(40):
-        gallery.add(np.array([0, 3]), unit(rng, 2).astype(np.float32), np.repeat(UNKNOWN, 2, 0))
-    assert gallery.count[:5].tolist() == [6, 0, 0, 6, 0]
-    sizes = gallery.rows.nbytes
-    for _ in range(40):
-        gallery.add(one(3), unit(rng, 1).astype(np.float32), UNKNOWN)
-    assert gallery.rows.nbytes == sizes
 
 
 def test_gallery_parts_come_from_the_most_similar_view() -> None:
@@ -96,12 +82,6 @@ def test_gallery_parts_come_from_the_most_similar_view() -> None:
     assert (fore, back) == (pytest.approx(0.8), pytest.approx(1))
 
 
-def test_identities_after_the_last_with_a_view_are_unknown() -> None:
-    """They were confirmed in frames without an image; slots are allocated 16 at a time."""
-    fore, _, _ = filled((0, 90)).parts(at_degrees(0), np.array([0, 16, 40]), UNKNOWN)
-    np.testing.assert_allclose(fore, [[1, np.nan, np.nan]], rtol=1e-6)
-
-
 # ---- Cosines ----
 
 
@@ -115,12 +95,6 @@ def test_part_cosines_of_fused_rows() -> None:
     assert np.isnan(part_cosines(fused[:, :6], fused[:, :6], 6)[1]).all()
     blank = np.concatenate([fused[:1], 0 * fused[:1]])
     assert np.isnan(part_cosines(blank, fused, 6)[0]).all(1).tolist() == [False, True]
-
-
-def test_paired_cosine() -> None:
-    a = np.array([[3.0, 4], [1, 0], [0, 0]])
-    b = np.array([[4.0, 3], [0, 2], [1, 1]])
-    np.testing.assert_allclose(paired_cosine(a, b), [24 / 25, 0, np.nan])
 
 
 # ---- Calibrated similarity ----
@@ -173,13 +147,6 @@ def test_log_odds_follow_the_documented_formula(
     assert calibration.logit(foreground, background, angle) == pytest.approx(expected, abs=1e-9)
     unknown = reference_logit(shown, weight, foreground, background)
     assert calibration.logit(foreground, background) == pytest.approx(unknown, abs=1e-9)
-
-
-def test_probability_has_a_prior() -> None:
-    same = SimilarityCalibration()
-    odds = np.exp(same.logit(0.9, 0.9))
-    assert same.probability(0.9, 0.9) == pytest.approx(odds / (1 + odds))
-    assert same.probability(0.9, 0.9, prior=0.2) == pytest.approx(odds / 4 / (1 + odds / 4))
 
 
 def test_probability_adapts_to_the_video() -> None:

@@ -58,43 +58,6 @@ def test_foreground_is_the_inscribed_ellipse_and_background_the_rest() -> None:
     assert back.others.mean() < 0.02  # the rim of its own outline, drawn on the coarse map
 
 
-def test_masks_of_all_objects_are_no_background() -> None:
-    masks = np.zeros((2, 200, 400), bool)
-    masks[0, 50:150, 100:150] = masks[1, :, 200:] = True
-    fore, back = samples(boxes((100, 50, 200, 150), (200, 0, 400, 200), masks=masks))
-    left = fore.index[0] % 100 < 37  # the mask is the left half of the box
-    np.testing.assert_array_equal(fore.weight[0], left)
-    right = back.index[0] % 100 >= 50
-    assert not (back.weight[0] & right).any()
-    assert not (back.weight[0] & masks_at(masks[0], back)).any()
-    assert back.weight[0][~right & ~masks_at(masks[0], back)].all()
-    np.testing.assert_allclose(back.others[0][:, 3], 1.0)
-
-
-@pytest.mark.parametrize(("score", "hides"), [(0.29, False), (0.3, True)])
-def test_only_confident_objects_mask_the_background_of_others(score: float, hides: bool) -> None:
-    masks = np.zeros((2, 200, 400), bool)
-    masks[0, 50:150, 100:200] = masks[1, :, 200:] = True
-    found = rt.Detections(
-        np.array([[100.0, 50, 200, 150], [200, 0, 400, 200]]), np.array([0.9, score]),
-        np.zeros(2, np.int64), masks,
-    )  # fmt: skip
-    _, back = samples(found)
-    right = back.index[0] % 100 >= 50
-    assert back.weight[0][right].any() is np.bool_(not hides)
-    assert bool(back.others[0][:, 3].any()) is hides
-    strict = samples(found, rt.SamplingLayout(object_score=0.95))[1]  # own outline removed too
-    assert strict.weight[0][strict.index[0] % 100 >= 50].all()
-
-
-def test_occupancy_is_drawn_at_the_scale_of_the_map() -> None:
-    occupied = occupancy_map(boxes((100, 50, 200, 150)), (200, 400), (50, 100))
-    y, x = np.mgrid[:50, :100] + 0.5
-    inside = ((x * 4 - 150) / 50) ** 2 + ((y * 4 - 100) / 50) ** 2
-    assert occupied[inside < 0.7].all() and not occupied[inside > 1.4].any()
-    assert not occupancy_map(rt.Detections.empty(), (200, 400), (50, 100)).any()
-
-
 def test_the_wider_box_contains_other_objects_but_not_its_own() -> None:
     masks = np.zeros((2, 200, 400), bool)
     masks[0, 80:120, 180:220] = masks[1, :, 240:] = True
@@ -127,17 +90,6 @@ def test_cells_are_means_of_the_valid_samples() -> None:
     np.testing.assert_allclose(back[0, 0, 1::-1], np.nanmean(first, 1), rtol=1e-5)
     assert fore[0, 0, 1] == both.weight[0].mean()
     assert back[1, 20, 2] == both.weight[4 + 41 + 20].mean()
-
-
-@pytest.mark.parametrize("box", [(-50, -50, 20, 20), (395, 190, 600, 400), (900, 900, 950, 950)])
-def test_samples_outside_the_image_are_ignored(box: tuple[float, ...]) -> None:
-    for part in samples(boxes(box)):
-        assert part.index.min() >= 0 and part.index.max() < 5000
-        assert part.share.max() <= 1
-    fore, back = samples(boxes(box))
-    inside = max(0, min(box[2], 400) - max(box[0], 0)) * max(0, min(box[3], 200) - max(box[1], 0))
-    assert fore.weight.mean() <= inside / (box[2] - box[0]) / (box[3] - box[1]) + 0.05
-    assert box[0] != 900 or not (fore.weight.any() or back.weight.any())
 
 
 def test_layouts_of_older_models_are_read() -> None:

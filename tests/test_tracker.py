@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
+from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import mahalanobis
 from scipy.spatial.transform import Rotation
 
@@ -18,7 +18,6 @@ import reobj_track as rt
 from reobj.types import box_iou
 
 CHAIR, CUP = 56, 41
-ROOM = Path(__file__).parent.parent / "examples" / "room"
 
 
 def rows(*boxes: tuple[float, ...], score: float = 0.9, class_id: int = CHAIR) -> rt.Detections:
@@ -51,10 +50,6 @@ def repeat(count: int, tracker: rt.Tracker, *args: Any, **known: Any) -> rt.Trac
 NOTHING = rt.Detections.empty()
 CORNER = rows((0, 0, 50, 50))
 BOX = rows((100, 100, 150, 150))
-LARGE = rows((100, 100, 200, 200))
-TALL = rows((100, 100, 110, 350))
-
-
 # ---- Kalman filter ----
 
 
@@ -124,16 +119,6 @@ def test_gate_is_the_distance_over_the_whole_innovation() -> None:
         assert found[i, j] == pytest.approx(mahalanobis(center[j], kf.x[:2, 0], inverse) ** 2)
 
 
-def test_overlapping_boxes_pass_the_gate_with_a_distant_centre() -> None:
-    """A static object of 200 px, of which only the right end is detected."""
-    tracker, appearance = rt.Tracker(rt.TrackerConfig(n_init=1)), [[1.0, 0, 0]]
-    whole, end = [100, 100, 300, 300, 0.9, 0], [256, 100, 301, 300, 0.9, 0]
-    repeat(20, tracker, [whole], embeddings=appearance)
-    state = rt.kalman_predict(tracker.state.tracks.mean, tracker.state.tracks.cov, tracker.config)
-    assert 9.21 * rt.center_variance(*state)[0, 0] < (256 - 200) ** 2  # px, to its nearest edge
-    assert tracker.update([end], embeddings=appearance).tracklet_id.tolist() == [1]
-
-
 def test_states_are_scaled_by_the_local_area_of_a_homography() -> None:
     """The scale is the square root of the area ratio of a small square under the homography."""
     homography = np.array([[1.05, 0.02, 4], [-0.03, 0.97, 8], [2e-4, -3e-4, 1]])
@@ -149,15 +134,50 @@ def test_states_are_scaled_by_the_local_area_of_a_homography() -> None:
         assert spread[i, 3, 2] == pytest.approx(edges / 1e-4, rel=1e-3)
 
 
-def test_a_low_score_moves_a_track_less() -> None:
-    """A box of low score has a larger variance: the track moves less towards it."""
-    at = {}
-    for score in (0.95, 0.6):
-        tracker = rt.Tracker()
-        repeat(5, tracker, BOX)
-        tracker.update(rows((110, 100, 160, 150), score=score))
-        at[score] = tracker.state.tracks.mean[0, 0, 0]
-    assert 125 < at[0.6] < at[0.95] - 0.3 < 135
+# ---- Association ----
+
+
+def random_pairs(seed: int, rows: int, columns: int, density: float) -> tuple:
+    """(M, 2) row and column of the allowed pairs, and their costs (M,)."""
+    rng = np.random.default_rng(seed)
+    pairs = np.argwhere(rng.random((rows, columns)) < density)
+    return pairs, rng.random(len(pairs))
+
+
+@pytest.mark.parametrize("density", [0.0, 0.05, 0.3, 1.0])
+@pytest.mark.parametrize(("rows", "columns"), [(0, 3), (1, 1), (6, 9), (30, 20)])
+def test_most_pairs_then_least_cost(rows: int, columns: int, density: float) -> None:
+    """Equals scipy on the full matrix with a prohibitive cost for pairs that are not allowed."""
+    for seed in range(10):
+        pairs, cost = random_pairs(seed, rows, columns, density)
+        whole = np.full((rows, columns), 1e3)
+        whole[tuple(pairs.T)] = cost
+        row, column = linear_sum_assignment(whole)
+        expected = {(r, c) for r, c in zip(row, column, strict=True) if whole[r, c] < 1e3}
+        assert {tuple(p) for p in pairs[rt.assign(*pairs.T, cost)]} == expected
+
+
+@pytest.mark.parametrize("density", [0.0, 0.2, 0.7])
+def test_rivals_cost_little_more_than_the_best_of_track_and_detection(density: float) -> None:
+    """Equals the same rule on the full matrix."""
+    for seed in range(10):
+        pairs, cost = random_pairs(seed, 8, 7, density)
+        rng = np.random.default_rng(seed)
+        same, possible = rng.random((2, len(pairs))) < 0.8
+        given = rt.Pairs(*pairs.T, cost, cost, cost, same)
+        whole = np.full((8, 7), np.inf)
+        whole[tuple(pairs[possible].T)] = cost[possible]
+        near = whole <= np.minimum(whole.min(0)[None], whole.min(1)[:, None]) + 0.3
+        of_class = np.zeros((8, 7), bool)
+        of_class[tuple(pairs[same & possible].T)] = True
+        rivals = near & of_class
+        several = (rivals.sum(0) > 1)[None] | (rivals.sum(1) > 1)[:, None]
+        for found, expected in zip(
+            rt.ambiguous_pairs(given, possible, 0.3), (rivals & several, rivals), strict=True
+        ):
+            whole_found = np.zeros((8, 7), bool)
+            whole_found[tuple(pairs[found].T)] = True
+            np.testing.assert_array_equal(whole_found, expected)
 
 
 # ---- The camera's motion ----
@@ -213,14 +233,6 @@ def test_known_pose_replaces_the_image_motion() -> None:
 # ---- Identities ----
 
 
-def test_identities_start_at_one_in_every_tracker() -> None:
-    for _ in range(2):
-        tracker = rt.Tracker(rt.TrackerConfig(n_init=1))
-        assert tracker.update(rows((0, 0, 50, 50), (100, 0, 150, 50))).track_id.tolist() == [1, 2]
-    tracker.reset()
-    assert tracker.update(CORNER).track_id.tolist() == [1]
-
-
 @pytest.mark.parametrize(
     ("score", "low", "first"), [(0.5, 0.5, 2), (0.74, 0.74, 2), (0.75, 0.75, 1), (0.6, 0.31, 3)]
 )
@@ -246,14 +258,6 @@ def test_a_return_is_confirmed_one_detection_earlier() -> None:
     assert ids == [[], [1], [1, 2]]
 
 
-def test_empty_frames_and_empty_first_frame() -> None:
-    tracker = rt.Tracker(rt.TrackerConfig(n_init=1))
-    assert len(tracker.update(NOTHING)) == 0
-    tracker.update(CORNER)
-    assert tracker.update(NOTHING).xyxy.shape == (0, 4)
-    assert tracker.update(CORNER).track_id.tolist() == [1]
-
-
 def test_crossing_objects_keep_their_identity_by_appearance() -> None:
     """Two objects swap positions between frames: motion contradicts the embeddings."""
     views = unit(np.random.default_rng(3), 2)
@@ -265,19 +269,6 @@ def test_crossing_objects_keep_their_identity_by_appearance() -> None:
     assert tracks.track_id.tolist() == [2, 1]
 
 
-@pytest.mark.parametrize("left", [130, 145])
-def test_a_coasting_track_is_not_matched_to_a_dissimilar_detection(left: int) -> None:
-    """The new object is nearer to a third track, which has its own detection."""
-    seen, gone, new = unit(np.random.default_rng(13), 3)
-    tracker = rt.Tracker(rt.TrackerConfig(n_init=1))
-    both = rows((100, 100, 150, 150), (left, 100, left + 50, 150))
-    repeat(12, tracker, both, embeddings=np.stack([seen, gone]))
-    repeat(5, tracker, both[:1], embeddings=seen[None])
-    found = rows((100, 100, 150, 150), (109, 100, 159, 150))
-    tracks = tracker.update(found, embeddings=np.stack([seen, new]))
-    assert tracks.track_id.tolist() == [1, 3]
-
-
 @pytest.mark.parametrize(("left", "score", "kind"), [(120, 0.2, CHAIR), (112, 0.9, CUP)])
 def test_a_weak_match_requires_a_similar_appearance(left: int, score: float, kind: int) -> None:
     """Low scores and changed classes may continue a track, but not one of another object."""
@@ -287,20 +278,6 @@ def test_a_weak_match_requires_a_similar_appearance(left: int, score: float, kin
         repeat(12, tracker, BOX, embeddings=seen[None])
         found = rows((left, 100, left + 50, 150), score=score, class_id=kind)
         assert tracker.update(found, embeddings=view[None]).track_id.tolist() == expected
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_a_duplicate_box_does_not_take_the_identity(seed: int) -> None:
-    """The track of the second box has no embedding yet, which is no evidence."""
-    rng, tracker = np.random.default_rng(seed), rt.Tracker()
-    own, beside, second = (100, 100, 140, 200), (300, 100, 340, 200), (105, 100, 145, 200)
-    common, seen = unit(rng, 2), []
-    for step in range(30):
-        boxes = [own if step <= 24 else second, beside] + [second] * (step == 24)
-        view = common[[0, 1, 0][: len(boxes)]] + 0.9 * unit(rng, len(boxes))  # cosine .55
-        seen.append(tracker.update(rows(*boxes), embeddings=view).track_id.tolist())
-    assert seen[23] == [1, 2]
-    assert seen[25:] == [[1, 2]] * 5
 
 
 def away_and_back(
@@ -321,19 +298,6 @@ def test_objects_that_return_elsewhere_get_their_identity_back() -> None:
     views = unit(rng, 4)
     back = views[::-1] + 0.05 * unit(rng, 4)
     assert away_and_back(rt.Tracker(), views, back) == [4, 3, 2, 1]
-
-
-@pytest.mark.parametrize(("gone", "expected"), [(3, 2), (100, 1)])
-def test_a_new_object_is_not_one_expected_elsewhere(gone: int, expected: int) -> None:
-    """It is similar to an object that was seen far away a moment ago, or long ago."""
-    rng = np.random.default_rng(4)
-    view = unit(rng, 1)
-    similar = view + 0.09 * rng.normal(size=view.shape)
-    tracker = rt.Tracker()
-    repeat(12, tracker, CORNER, embeddings=view)
-    repeat(gone, tracker, NOTHING)
-    tracks = repeat(4, tracker, rows((600, 400, 650, 450)), embeddings=similar)
-    assert tracks.track_id.tolist() == [expected]
 
 
 def test_a_new_object_does_not_take_an_old_identity() -> None:
@@ -365,32 +329,9 @@ def test_identical_objects_are_distinguished_by_their_background() -> None:
     assert tracks.track_id.tolist() == [3, 1, 2]
 
 
-def test_another_class_never_takes_over_an_identity() -> None:
-    view = unit(np.random.default_rng(8), 1)
-    tracker = rt.Tracker()
-    repeat(5, tracker, CORNER, embeddings=view)
-    repeat(60, tracker, NOTHING)
-    tracks = repeat(5, tracker, rows((300, 0, 350, 50), class_id=CUP), embeddings=view)
-    assert tracks.track_id.tolist() == [2]
-
-
-def test_embeddings_stay_aligned_with_their_boxes() -> None:
-    """Weak and unmatched detections in between must not shift the rows."""
-    rng = np.random.default_rng(10)
-    views = unit(rng, 2)
-    noise = unit(rng, 1)
-    tracker = rt.Tracker(rt.TrackerConfig(n_init=1))
-    mixed = rt.Embeddings(np.concatenate([noise, views[:1], noise, views[1:]]), np.empty((4, 0)))
-    boxes = [(400, 0, 450, 50, 0.05), (0, 0, 50, 50), (400, 200, 450, 250, 0.05), (100, 0, 150, 50)]
-    tracks = tracker.update(rows(*boxes), embeddings=mixed)
-    assert tracks.detection_index.tolist() == [1, 3]
-    np.testing.assert_allclose(tracker.state.tracks.embedding, views, atol=1e-6)
-
-
 K640 = rt.Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
 AT_ORIGIN = np.eye(4)[:3]
-BEYOND, MIRRORED = AT_ORIGIN.copy(), AT_ORIGIN.copy()
-BEYOND[0, 3], MIRRORED[0, 0] = 1e200, -1
+BEYOND = np.c_[np.eye(3), [1e200, 0, 0]]
 
 
 @pytest.mark.parametrize(
@@ -403,17 +344,11 @@ BEYOND[0, 3], MIRRORED[0, 0] = 1e200, -1
         ({"embeddings": np.ones((2, 5))}, "width 5, expected 4, as in earlier frames"),
         ({"cam_from_world": np.eye(4)}, r"shape \(4, 4\), expected \(3, 4\)"),
         ({"cam_from_world": BEYOND}, "units away"),
-        ({"cam_from_world": MIRRORED}, "3x3 block is not a rotation .*determinant -1"),
         ({"cam_from_world": np.zeros((3, 4))}, "3x3 block is not a rotation"),
         ({"camera": None}, "without a camera"),
-        ({"camera": rt.Camera("PINHOLE", 640, 480, (0.0, 0.0, 0.0, 0.0))}, "focal lengths above 0"),
         ({"camera": rt.Camera("PINHOLE", 0, 0, (500.0, 500.0, 0.0, 0.0))}, "expected a size"),
-        ({"camera": rt.Camera("PINHOLE", 640, 480, (np.nan, 5.0, 0.0, 0.0))}, "expected a size"),
         ({"points": np.ones(3)}, r"points of shape \(3,\), expected \(N, 3\)"),
-        ({"points": np.full((1, 3), np.nan)}, "finite"),
         ({"part": -1}, "part -1, expected"),
-        ({"part": 10**9}, "part 1000000000, expected"),
-        ({"part": 0.5}, "part 0.5, expected"),
     ],
 )
 def test_invalid_input_leaves_the_tracker_unchanged(wrong: dict[str, Any], message: str) -> None:
@@ -438,19 +373,6 @@ def test_invalid_input_leaves_the_tracker_unchanged(wrong: dict[str, Any], messa
     assert after.frame.tolist() == [1, 1]
 
 
-def test_state_does_not_grow_with_time() -> None:
-    """The same five objects for 600 frames: as many rows at the end as after 100."""
-    rng = np.random.default_rng(12)
-    views, tracker = unit(rng, 5), rt.Tracker(rt.TrackerConfig(embed_every=1))
-    boxes = [(80 * i, 0, 80 * i + 50, 50) for i in range(5)]
-    sizes = []
-    for frame in range(600):
-        tracker.update(rows(*boxes), embeddings=views + 0.3 * unit(rng, 5))
-        if frame in (100, 599):
-            sizes.append((tracker.state.gallery.rows.nbytes, len(tracker.state.tracks.mean)))
-    assert sizes[0] == sizes[1]
-
-
 def test_a_new_object_does_not_take_over_a_missed_track() -> None:
     """An object is missed and another one appears beside it: if similar, the track continues; else
     the detection starts a new track and the missed object returns to its own.
@@ -467,35 +389,6 @@ def test_a_new_object_does_not_take_over_a_missed_track() -> None:
 
 
 # ---- Saved state ----
-
-
-def rows_of_clip(tracker: rt.Tracker, frames: list[rt.Frame], posed: bool) -> list[np.ndarray]:
-    """Tracks of frames of the example clip."""
-    recorded = rt.read_detections(ROOM / "detections.npz", rt.Video(ROOM / "room.mp4"))
-    inputs: list[dict[str, object]] = [{}] * 100
-    if posed:
-        camera = rt.Camera("PINHOLE", 640, 480, (492.756788421, 492.756788421, 320.0, 240.0))
-        quat = np.loadtxt(ROOM / "poses.txt")  # TUM: seconds, camera centre, quaternion xyzw
-        cam_from_world = Rotation.from_quat(quat[:, 4:]).inv().as_matrix()
-        pose = np.concatenate([cam_from_world, -cam_from_world @ quat[:, 1:4, None]], 2)
-        inputs = [{"cam_from_world": p, "camera": camera} for p in pose]
-    step = [update(tracker, recorded.at(f.index), f.image, **inputs[f.index]) for f in frames]
-    return [np.c_[t.to_array(), t.tracklet_id] for t in step]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("posed", [False, True])
-def test_a_restored_tracker_continues_identically(posed: bool, tmp_path: Path) -> None:
-    frames = list(itertools.islice(rt.Video(ROOM / "room.mp4"), 60))
-    whole = rows_of_clip(rt.Tracker(embedder=rt.Embedder()), frames, posed)
-    first = rt.Tracker(rt.TrackerConfig(), rt.Embedder())
-    rows_of_clip(first, frames[:33], posed)
-    first.save(tmp_path / "state.npz")
-    second = rt.Tracker.load(tmp_path / "state.npz", rt.Embedder())
-    for one, other in zip(whole[33:], rows_of_clip(second, frames[33:], posed), strict=True):
-        np.testing.assert_array_equal(one, other)
-    second.save(tmp_path / "again.npz")
-    assert sum(len(w) for w in whole[33:]) > 300 and second.ellipsoid_map.known.any() == posed
 
 
 def test_matching_options_are_applied_and_saved(tmp_path: Path) -> None:
@@ -572,45 +465,6 @@ def test_with_poses_objects_are_reidentified_by_position(posed: bool) -> None:
     assert (before == after) is posed
 
 
-def test_with_poses_an_identical_object_elsewhere_is_new() -> None:
-    """All balls look the same. The third appears while the others are out of view."""
-    tracker, view = rt.Tracker(), unit(np.random.default_rng(15), 1)
-    ids: dict[int, set[int]] = {}
-    for pose in (
-        PAST + [pose_at(0.5, t) for t in range(60)] + [pose_at(0.5, 60 - t) for t in range(61)]
-    ):
-        found, which = balls_seen(pose)
-        tracks = tracker.update(
-            found, embeddings=view.repeat(len(found), 0), cam_from_world=pose, camera=CAMERA
-        )
-        for ball, track in zip(which[tracks.detection_index], tracks.track_id, strict=True):
-            ids.setdefault(int(ball), set()).add(int(track))
-    assert [len(ids[k]) for k in range(3)] == [1, 1, 1]
-    assert len(set.union(*ids.values())) == 3
-
-
-@pytest.mark.parametrize(("turn_deg", "known"), [(0, False), (90, True)])
-def test_backgrounds_from_other_viewpoints_are_no_evidence(turn_deg: int, known: bool) -> None:
-    """An object of unknown position (no parallax) returns in front of another background."""
-    tracker, box = rt.Tracker(), rows((300, 200, 340, 260))
-    front, wall = (
-        np.array([[1, 0], [0.9, 0.436]]),
-        np.eye(2),
-    )  # before, after: very similar, dissimilar
-    seen = []
-    for step in range(60):
-        back = step >= 55
-        found = box if step < 15 or back else NOTHING
-        view = (part[[int(back)]][: len(found)] for part in (front, wall))
-        tracks = tracker.update(
-            found, embeddings=rt.Embeddings(*view),
-            cam_from_world=pose_at(0, turn_deg * (step >= 50)), camera=CAMERA,
-        )  # fmt: skip
-        seen.append(tracks.track_id.tolist())
-    assert seen[14] == [1]
-    assert seen[-1] == [1 if known else 2]
-
-
 def test_a_frame_without_pose_changes_no_ellipsoid() -> None:
     tracker = rt.Tracker()
     walk(tracker, PAST)
@@ -684,71 +538,6 @@ def test_a_new_component_does_not_use_ellipsoids_of_another() -> None:
 
 
 # ---- Rules of the association ----
-
-
-def test_another_class_has_a_cost() -> None:
-    """Two boxes near a chair's track: the cup is slightly nearer, the chair is matched."""
-    tracker = rt.Tracker()
-    repeat(5, tracker, LARGE)
-    cup, chair = (93, 100, 193, 200, 0.9, CUP), (112, 100, 212, 200)
-    tracks = tracker.update(rows(cup, chair))
-    assert tracks.detection_index[tracks.track_id == 1].tolist() == [1]
-
-
-@pytest.mark.parametrize(("kind", "expected"), [(CHAIR, [1]), (CUP, [])])
-def test_another_class_is_evidence_against_a_match(kind: int, expected: list[int]) -> None:
-    """Dissimilar, but overlapping: enough for the same class, too little for another."""
-    seen, new = unit(np.random.default_rng(21), 2)
-    new = new - (new @ seen) * seen
-    new = 0.3 * seen + np.sqrt(1 - 0.3**2) * new / np.linalg.norm(new)
-    tracker = rt.Tracker()
-    repeat(12, tracker, BOX, embeddings=seen[None])
-    repeat(12, tracker, NOTHING)
-    found = rows((114, 100, 164, 150), class_id=kind)
-    assert tracker.update(found, embeddings=new[None]).track_id.tolist() == expected
-
-
-@pytest.mark.parametrize(
-    ("box", "same"),
-    [
-        ((103, 100, 113, 350), True),
-        ((72, 170, 138, 280), False),  # at the same position, but of another shape
-    ],
-)
-def test_without_appearance_boxes_must_be_similar(box: tuple[float, ...], same: bool) -> None:
-    tracker = rt.Tracker()
-    repeat(5, tracker, TALL)
-    assert (update(tracker, rows(box)).tracklet_id == 1).tolist() == [same]
-
-
-@pytest.mark.parametrize(("left", "same"), [(103, True), (111, False)])
-def test_without_appearance_boxes_must_overlap(left: int, same: bool) -> None:
-    """After some missed frames, a position beside so tall a box is well within the gate."""
-    tracker = rt.Tracker()
-    repeat(5, tracker, TALL)
-    repeat(12, tracker, NOTHING)
-    found = update(tracker, rows((left, 100, left + 10, 350)))
-    assert (found.tracklet_id == 1).tolist() == [same]
-
-
-def test_recently_seen_tracks_are_matched_first() -> None:
-    """One detection between two tracks, a little nearer to the one that was missed for a while."""
-    tracker = rt.Tracker()
-    seen, missed = (100, 100, 200, 200), (110, 100, 210, 200)
-    repeat(8, tracker, rows(seen, missed))
-    repeat(8, tracker, rows(seen))
-    assert tracker.update(rows((107, 100, 207, 200))).track_id.tolist() == [1]
-
-
-def test_confirmed_tracks_are_matched_first() -> None:
-    """One detection between two tracks, a little nearer to the tentative one."""
-    tracker = rt.Tracker()
-    known, tentative = (100, 100, 200, 200), (110, 100, 210, 200)
-    repeat(8, tracker, rows(known))
-    for _ in range(2):
-        tracks = update(tracker, rows(known, tentative, score=0.6))
-    assert tracks.track_id.tolist() == [1, 0]
-    assert tracker.update(rows((107, 100, 207, 200))).track_id.tolist() == [1]
 
 
 class Counted:
@@ -827,13 +616,6 @@ def test_missed_identities_have_predicted_boxes() -> None:
             assert (found.score, found.class_id, found.detection_index) == (0, CHAIR, -1)
 
 
-@pytest.mark.parametrize(("score", "found"), [(0.09, []), (0.11, [1])])
-def test_scores_below_the_low_one_continue_nothing(score: float, found: list[int]) -> None:
-    tracker = rt.Tracker()
-    tracker.update(BOX)
-    assert tracker.update(rows((101, 100, 151, 150), score=score)).track_id.tolist() == found
-
-
 @pytest.mark.parametrize(
     ("shift", "score", "kind", "unseen", "same"),
     [
@@ -858,103 +640,7 @@ def test_the_limit_of_the_matching_distance(
     assert (1 in update(tracker, found).tracklet_id) == same
 
 
-def test_low_scores_are_matched_after_high_ones() -> None:
-    """A low score exactly on the track, a high one beside it: the high one continues it."""
-    tracker = rt.Tracker()
-    repeat(5, tracker, LARGE)
-    tracks = tracker.update(rows((100, 100, 200, 200, 0.3), (115, 100, 215, 200, 0.9)))
-    assert tracks.detection_index.tolist() == [1]
-
-
-# ---- Rules of re-identification ----
-
-
-def gone(tracker: rt.Tracker, view: np.ndarray, frames: int = 60) -> None:
-    """Show one chair of this appearance on the left for 12 frames, then nothing."""
-    repeat(12, tracker, CORNER, embeddings=view)
-    repeat(frames, tracker, NOTHING)
-
-
-def test_an_identity_goes_to_one_of_two_newcomers() -> None:
-    """Both look like the absent object; even with a low threshold one gets a new identity."""
-    view = unit(np.random.default_rng(23), 1)
-    tracker = rt.Tracker(rt.TrackerConfig(return_probability=0.01))
-    gone(tracker, view)
-    for _ in range(5):
-        both = rows((300, 0, 350, 50), (500, 0, 550, 50))
-        tracks = tracker.update(both, embeddings=view.repeat(2, 0))
-    assert sorted(tracks.track_id.tolist()) == [1, 2]
-
-
-def test_simultaneous_objects_are_different() -> None:
-    """The new object appears in the last frame of an identical one, and is missed once; a third
-    one appears a frame later, so that both are confirmed simultaneously.
-    """
-    views = unit(np.random.default_rng(24), 2)
-    old, new, third = (0, 0, 50, 50), (300, 0, 350, 50), (600, 0, 650, 50)
-    tracker = rt.Tracker()
-    repeat(12, tracker, rows(old), embeddings=views[:1])
-    tracker.update(rows(old, new), embeddings=views[[0, 0]])
-    tracker.update(rows(third), embeddings=views[1:])
-    tracks = repeat(3, tracker, rows(new, third), embeddings=views)
-    assert sorted(tracks.track_id.tolist()) == [2, 3]
-
-
-def test_a_return_ends_the_track_that_still_coasts() -> None:
-    """Its object is elsewhere: a detection at the old position is another one."""
-    views = unit(np.random.default_rng(25), 2)
-    old, new = (0, 0, 50, 50), (400, 0, 450, 50)
-    tracker = rt.Tracker()
-    gone(tracker, views[:1], frames=5)
-    tracks = repeat(4, tracker, rows(new), embeddings=views[:1])
-    assert tracks.track_id.tolist() == [1] and tracker.state.tracks.identity.tolist() == [0]
-    tracks = repeat(4, tracker, rows(new, old), embeddings=views)
-    assert tracks.track_id.tolist() == [1, 2]
-
-
-def test_a_track_votes_for_its_class() -> None:
-    """Most of its score is a cup's: it may match the lost cup, although it last was a chair."""
-    view = unit(np.random.default_rng(26), 1)
-    tracker = rt.Tracker()
-    repeat(12, tracker, rows((0, 0, 50, 50), class_id=CUP), embeddings=view)
-    repeat(60, tracker, NOTHING)
-    for kind, score in ((CUP, 0.9), (CHAIR, 0.6)):
-        found = rows((300, 0, 350, 50), score=score, class_id=kind)
-        tracks = tracker.update(found, embeddings=view)
-    assert tracks.track_id.tolist() == [1]
-
-
 # ---- Rules with poses ----
-
-
-def test_tracks_follow_their_positions_under_camera_jerks() -> None:
-    """The camera jumps to and fro by more than a ball's width; no track is lost for a frame."""
-    tracker = rt.Tracker()
-    walk(tracker, PAST)
-    assert tracker.ellipsoid_map.known.sum() == 2
-    tracklets = tracker.latest.tracklet_id.tolist()
-    for i in range(12):
-        pose = pose_at(0.5 - 0.5 * (i % 2))
-        found, _ = balls_seen(pose)
-        tracks = tracker.update(found, cam_from_world=pose, camera=CAMERA)
-        assert sorted(tracks.tracklet_id.tolist()) == sorted(tracklets)
-        assert tracks.track_id.tolist() == [1, 2]
-
-
-def test_tracks_grow_as_the_camera_approaches() -> None:
-    """Steps of a metre towards the balls and back: boxes grow by half."""
-    tracker = rt.Tracker()
-    walk(tracker, PAST)
-    for i in range(6):
-        pose = pose_at(0.5)
-        pose[2, 3] = -1.4 * (i % 2)
-        before = tracker.state.tracks.mean[:, 2, 0].copy()
-        found, _ = balls_seen(pose)
-        tracks = tracker.update(found, cam_from_world=pose, camera=CAMERA)
-        assert tracks.track_id.tolist() == [1, 2]
-        width = found.xyxy[:, 2] - found.xyxy[:, 0]
-        assert (np.abs(np.log(tracker.state.tracks.mean[:, 2, 0] / width)) < 0.15).all()
-        assert i < 2 or (np.abs(np.log(before / width)) > 0.3).all()
 
 
 def test_tracks_of_known_position_do_not_expire_out_of_view() -> None:
@@ -966,16 +652,6 @@ def test_tracks_of_known_position_do_not_expire_out_of_view() -> None:
     assert not len(tracker.predicted())  # nothing is missed
     walk(tracker, [pose_at(0.5, 180 - 3.0 * i) for i in range(61)])
     assert tracker.latest.tracklet_id.tolist() == before
-
-
-def test_tracks_of_known_position_expire_in_view() -> None:
-    tracker = rt.Tracker(rt.TrackerConfig(coast_frames=5))
-    walk(tracker, PAST)
-    counts = []
-    for _ in range(7):
-        tracker.update(NOTHING, cam_from_world=PAST[-1], camera=CAMERA)
-        counts.append(len(tracker.state.tracks.mean))
-    assert counts == [2] * 5 + [0] * 2
 
 
 def test_a_missed_track_of_known_position_follows_its_projection() -> None:
@@ -993,68 +669,6 @@ def test_a_missed_track_of_known_position_follows_its_projection() -> None:
 # ---- Appearance: comparison and stored embeddings ----
 
 
-def test_competing_boxes_are_embedded_in_one_pass() -> None:
-    """Two boxes beside a track: both are embedded, also the one that would not be matched."""
-    tracker, embedder = counted(rt.TrackerConfig(camera_motion=False))
-    image = np.zeros((300, 400, 3), np.uint8)
-    repeat(12, tracker, BOX, image)
-    tracker.update(rows((103, 100, 153, 150), (92, 100, 142, 150)), image)
-    assert embedder.asked[-1] == (12, [0, 1])
-
-
-def test_two_classes_on_one_object_do_not_compete() -> None:
-    tracker, embedder = counted(rt.TrackerConfig(camera_motion=False))
-    image = np.zeros((300, 400, 3), np.uint8)
-    repeat(12, tracker, BOX, image)
-    before = len(embedder.asked)
-    tracker.update(rows((101, 100, 151, 150), (100, 101, 150, 151, 0.9, CUP)), image)
-    assert len(embedder.asked) == before
-
-
-def test_a_rejected_match_is_not_made_by_overlap_alone() -> None:
-    """A box around two tracks, similar to neither: it starts a new track."""
-    views = unit(np.random.default_rng(31), 3)
-    tracker = rt.Tracker()
-    for _ in range(12):
-        both = rows((100, 100, 150, 150), (104, 100, 154, 150))
-        tracker.update(both, embeddings=views[:2])
-    found = update(tracker, rows((88, 87, 165, 164)), embeddings=views[2:])
-    assert found.tracklet_id.tolist() == [3]
-
-
-@pytest.mark.parametrize(("shift", "same"), [(20, True), (32, False)])
-def test_a_match_above_the_cost_limit_is_rejected(shift: int, same: bool) -> None:
-    """A track without an embedding, and a box near the limit of the gate."""
-    view, tracker = unit(np.random.default_rng(32), 1), rt.Tracker()
-    known, new = (300, 300, 350, 350), (100, 20, 110, 270)
-    repeat(4, tracker, rows(known), embeddings=view)
-    before = update(tracker, rows(known, new), embeddings=view.repeat(2, 0)).tracklet_id[1]
-    moved = (100 + shift, 20, 110 + shift, 270)
-    after = update(tracker, rows(known, moved), embeddings=view.repeat(2, 0)).tracklet_id[1]
-    assert (after == before) == same
-
-
-def test_embedding_of_a_track_is_a_running_mean() -> None:
-    """A fifth of the new one, four fifths of the old mean."""
-    first, second = np.eye(2, 8)
-    tracker = rt.Tracker(rt.TrackerConfig(embed_every=1))
-    for view in (first, second):
-        tracker.update(CORNER, embeddings=view[None])
-    expected = (0.8 * first + 0.2 * second) / np.hypot(0.8, 0.2)
-    np.testing.assert_allclose(tracker.state.tracks.embedding[0], expected, atol=1e-6)
-
-
-@pytest.mark.parametrize("weight", [0.5, 0.9])
-def test_the_foreground_weight_of_the_appearance(weight: float) -> None:
-    """The cosine of two fused rows is the weighted mean of the cosines of both parts."""
-    tracker = rt.Tracker(rt.TrackerConfig(foreground_weight=weight, embed_every=1))
-    both = rt.Embeddings(np.eye(2, 3), np.ones((2, 1)))  # unlike objects, one background
-    tracker.update(rows((0, 0, 50, 50), (90, 0, 140, 50)), embeddings=both)
-    index, fused = tracker.latest_embeddings()
-    assert index.tolist() == [0, 1] and fused.shape == (2, 4)
-    assert fused[0] @ fused[1] == pytest.approx(1 - weight, abs=1e-6)
-
-
 @pytest.mark.parametrize(("kind", "pairs"), [(CHAIR, 2), (CUP, 0)])
 def test_simultaneous_objects_of_a_class_calibrate_the_similarity(kind: int, pairs: int) -> None:
     """Two chairs are compared with each other; a chair and a cup are not used."""
@@ -1070,16 +684,6 @@ def test_simultaneous_objects_of_a_class_calibrate_the_similarity(kind: int, pai
 
 
 # ---- Identities by 3D position ----
-
-
-def test_without_appearance_the_position_identifies_an_object() -> None:
-    """No detections for longer than `coast_frames`: tracks are new, identities are not."""
-    tracker = rt.Tracker(rt.TrackerConfig(coast_frames=5))
-    walk(tracker, PAST)
-    repeat(10, tracker, NOTHING, cam_from_world=PAST[-1], camera=CAMERA)
-    assert len(tracker.state.tracks.mean) == 0
-    assert walk(tracker, [PAST[-1]] * 4)[-1] == {0: 1, 1: 2}
-    assert tracker.latest.tracklet_id.tolist() == [3, 4]
 
 
 @pytest.mark.parametrize(("shift", "look", "found"), [(0, 1, 1), (0.3, 1, 3), (0.3, 0, 1)])
@@ -1105,58 +709,30 @@ def test_half_the_overlap_does_not_outweigh_appearance(shift: float, look: int, 
     assert tracks.track_id.tolist() == [found]
 
 
-# ---- The whole state ----
-
-
-NOT_SAVED = ("state.camera_motion.residual_flow", "state.camera_motion._ahead")  # of two frames
-
-
-def everything(owner: Any, name: str = "state") -> dict[str, np.ndarray]:
-    """All attributes of a tracker's state, recursively, by their path."""
-    if isinstance(owner, list):
-        items = dict(enumerate(owner))
-    else:
-        names = getattr(owner, "__slots__", None) or getattr(owner, "__dict__", {})
-        items = {key: getattr(owner, key) for key in names}
-    if not items or isinstance(owner, np.ndarray):
-        return {name: np.asarray(owner)}
-    found: dict[str, np.ndarray] = {}
-    for key, value in items.items():
-        if f"{name}.{key}" not in NOT_SAVED:
-            found |= everything(value, f"{name}.{key}")
-    return found
-
-
-def filled() -> rt.Tracker:
-    """A tracker after frames of the balls with poses and appearance, without images."""
-    views, tracker = unit(np.random.default_rng(35), 3), rt.Tracker()
-    for pose in PAST + AWAY[:10]:
+def test_a_restored_tracker_continues_identically(tmp_path: Path) -> None:
+    """Images, appearance and poses in two components; a reset tracker is like a new one."""
+    rng = np.random.default_rng(35)
+    views = unit(rng, 3)
+    image = textured(rng)
+    inputs: list[dict[str, Any]] = []
+    for i, pose in enumerate(PAST + AWAY[:20]):
         found, which = balls_seen(pose)
-        noise = 0.1 * unit(np.random.default_rng(len(which)), len(which))
-        view = views[which] + noise
-        tracker.update(found, embeddings=view, cam_from_world=pose, camera=CAMERA)
-    return tracker
-
-
-def test_everything_is_saved(tmp_path: Path) -> None:
-    tracker = filled()
+        posed = {"cam_from_world": pose, "camera": CAMERA, "part": int(i < 5)}
+        inputs.append({"detections": found, "embeddings": views[which], **posed})
+        inputs[-1]["frame"] = np.roll(image, 3 * i, 1)
+    whole = rt.Tracker()
+    expected = [update(whole, **given).to_array() for given in inputs]
+    tracker = rt.Tracker()
+    for given in inputs[:45]:
+        tracker.update(**given)
     tracker.save(tmp_path / "state.npz")
-    loaded = rt.Tracker.load(tmp_path / "state.npz")
-    mine, theirs = everything(tracker.state), everything(loaded.state)
-    assert len(mine) > 40 and mine.keys() == theirs.keys()
-    for name, value in mine.items():
-        np.testing.assert_array_equal(value, theirs[name], err_msg=name)
-    for pose in AWAY[10:20]:  # without an image the rotation since the last pose is used
-        for one in (tracker, loaded):
-            one.update(NOTHING, cam_from_world=pose, camera=CAMERA)
-        np.testing.assert_array_equal(tracker.state.tracks.mean, loaded.state.tracks.mean)
-
-
-def test_reset_clears_the_whole_state() -> None:
-    tracker = filled()
-    assert tracker.ellipsoid_map.known.any() and tracker.state.gallery.count.any()
+    for one in (tracker, rt.Tracker.load(tmp_path / "state.npz")):
+        found_later = [update(one, **given).to_array() for given in inputs[45:]]
+        for later, true in zip(found_later, expected[45:], strict=True):
+            np.testing.assert_array_equal(later, true)
+        np.testing.assert_array_equal(one.state.tracks.mean, whole.state.tracks.mean)
+        np.testing.assert_array_equal(one.state.gallery.rows, whole.state.gallery.rows)
+    assert whole.ellipsoid_map.known.any()
     tracker.reset()
-    mine, fresh = everything(tracker.state), everything(rt.Tracker().state)
-    for name, value in fresh.items():
-        np.testing.assert_array_equal(mine[name], value, err_msg=name)
-    assert len(tracker.latest) == 0 and tracker.latest_embeddings()[0].tolist() == []
+    for given, true in zip(inputs, expected, strict=True):
+        np.testing.assert_array_equal(update(tracker, **given).to_array(), true)

@@ -24,31 +24,6 @@ DATA = (
     "py.typed",
 )  # of the package, besides its modules
 
-GOOD = """
-from collections.abc import Iterator
-import numpy as np
-import numpy.typing as npt
-import reobj_track as rt
-tracker: rt.Tracker = rt.Tracker(rt.TrackerConfig(n_init=1), embedder=None)
-tracks: rt.Tracks = tracker.update(np.zeros((0, 6)), None)
-rows: npt.NDArray[np.float64] = tracks.to_array()
-ids: npt.NDArray[np.int64] = tracks.track_id
-pairs: Iterator[tuple[rt.Frame, rt.Tracks]] = rt.track("a.mp4", "det.txt", tracker)
-result: rt.Result = rt.run("a.mp4", "out", rt.Config(), tracks="corrected.xml")
-found: rt.Object = rt.Result.load("out").objects[0]
-name: str = found.class_name
-size: npt.NDArray[np.float64] | None = found.size_m
-own: rt.Detections = rt.Detections.from_array([[0, 0, 1, 1, 0.5, 0]])
-"""
-BAD = {
-    "ids: list[str] = rt.Tracker().update([]).track_id": "Incompatible types",
-    "for frame in rt.track('a.mp4'): frame.image": 'no attribute "image"',
-    "rt.TrackerConfig(n_int=1)": "Unexpected keyword argument",
-    "rt.Tracker().update()": "Missing positional argument",
-    "rt.Result.load('out').objects[0].centre": 'no attribute "centre"',
-    "rt.unit_rows": "does not explicitly export",  # a name in its own module
-}
-
 
 def call(*command: str | Path, cwd: Path) -> str:
     """Run a command away from the source tree, with no weights but those of the wheel."""
@@ -112,18 +87,3 @@ def test_the_wheel_is_used_and_complete(installed: Path, tmp_path: Path) -> None
     assert {
         p for p in others if not re.match(r"reobj_track-.*\.dist-info|present|__py", p)
     } == set()
-
-
-def test_a_users_program_is_type_checked(installed: Path, tmp_path: Path) -> None:
-    """Types of results; the documented calls are accepted, and each mistake is found."""
-    pytest.importorskip("mypy", reason="the types cannot be checked without mypy")
-    (tmp_path / "good.py").write_text(GOOD)
-    (tmp_path / "wrong.py").write_text("import reobj_track as rt\n" + "\n".join(BAD) + "\n")
-    python = program(installed, "python")
-    mypy = (sys.executable, "-m", "mypy", "--strict", "--config-file=", "--no-error-summary")
-    said = call(
-        *mypy, "--python-executable", python, "good.py", "wrong.py", cwd=tmp_path
-    ).splitlines()
-    assert len(said) == len(BAD), said
-    for line, expected in zip(said, BAD.values(), strict=True):
-        assert line.startswith("wrong.py") and expected in line

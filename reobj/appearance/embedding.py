@@ -51,8 +51,7 @@ from reobj.types import (
 class SamplingLayout:
     """Sampling layout of a feature map for foreground and background embeddings.
 
-    Trained models have their own in their metadata; the defaults are for untrained backbones
-    (chosen).
+    Trained models have their own in their metadata; the defaults are for untrained backbones.
 
     Attributes:
         size_px: longer side of the backbone's input.
@@ -65,8 +64,8 @@ class SamplingLayout:
         surround_scale, surround_min_margin, surround_cells: the same for a wider box, in which
             other objects count too; scale 0: no such box.
         foreground_channels: the foreground is pooled from this many first channels only; 0: all.
-        neighbours: weight of `neighbour_embedding` in the background of trained models. 0.2 and its
-            distance were chosen on the six videos of benchmarks/RESULTS.md.
+        neighbours: weight of `neighbour_embedding` in the background of trained models; 0.2 and its
+            distance are best on the six videos of benchmarks/RESULTS.md.
         crop_px: side of the crops of `CropEmbedder` (224: ImageNet's).
     """
 
@@ -330,7 +329,7 @@ class Embedder:
         """
         rows = np.arange(len(detections)) if rows is None else rows
         if not len(rows):
-            return Embeddings(np.zeros((0, 0)), np.zeros((0, 0)))
+            return Embeddings.empty()
         latest = self._frame(frame, detections)
         weight = self.layout.neighbours * self.trained
         wanted = latest.confident & (weight > 0)
@@ -370,17 +369,22 @@ class Embedder:
         """Whether the model has a head."""
         return self.backbone.head is not None
 
-    @property
-    def frozen(self) -> bool:
-        """Whether the backbone was trained for another task (it lacks our metadata)."""
-        return not self.backbone.channels_last
-
     def _frame(self, frame: Image, detections: Detections) -> _LatestFrame:
         """Return the cached values of a frame; computes the feature map of a new frame."""
         latest = self._latest
         if latest is None or latest.frame is not frame or latest.detections is not detections:
             features = self.backbone(frame)
-            latest = self._latest = _LatestFrame(frame, detections, features, self.layout)
+            score = self.layout.object_score
+            occupied = occupancy_map(detections, frame.shape, features.shape[:2], score)
+            known = np.zeros(len(detections), bool)
+            arrays = (
+                features,
+                occupied,
+                detections.score >= score,
+                known,
+                np.zeros((len(known), 0)),
+            )
+            latest = self._latest = _LatestFrame(frame, detections, *arrays)
         return latest
 
     def _embed_cells(self, fore: Floats, back: Floats) -> tuple[Array, Array]:
@@ -392,6 +396,7 @@ class Embedder:
         return _hellinger_rows(fore), np.concatenate([_hellinger_rows(b) for b in boxes], 1)
 
 
+@dataclass(slots=True, eq=False)
 class _LatestFrame:
     """Values that are computed once per frame.
 
@@ -401,17 +406,13 @@ class _LatestFrame:
         known: (D,) detections whose foreground (D, E) is computed.
     """
 
-    def __init__(
-        self, frame: Image, detections: Detections, features: Floats, layout: SamplingLayout
-    ) -> None:
-        self.frame = frame
-        self.detections = detections
-        self.features = features
-        shape = features.shape[:2]
-        self.confident = detections.score >= layout.object_score
-        self.occupied = occupancy_map(detections, frame.shape, shape, layout.object_score)
-        self.known = np.zeros(len(detections), bool)
-        self.foreground = np.zeros((len(detections), 0))
+    frame: Image
+    detections: Detections
+    features: Floats
+    occupied: BoolArray
+    confident: BoolArray
+    known: BoolArray
+    foreground: Array
 
 
 def neighbour_embedding(

@@ -8,7 +8,6 @@ Axes: I identities, K views of an identity in the gallery, E width of an embeddi
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,10 @@ from reobj.types import Array, Floats, IntArray, unit_rows
 # ---- Gallery -----------------------------------------------------------------------------------
 
 
+NOVELTY = 0.95  # largest cosine to all kept views of a view that is kept as a new one
+BLEND = 0.9  # weight of the kept view where a view that is not new is blended into it
+
+
 class Gallery:
     """A few diverse views of the appearance of every identity of a video; none expires.
 
@@ -27,8 +30,6 @@ class Gallery:
 
     Args:
         views: K, views kept of every identity.
-        novelty: largest cosine to all kept views of a view that is kept as a new one.
-        blend: weight of the kept view where a view that is not new is blended into it.
 
     Attributes:
         rows: (I, K, E) unit rows. viewing_ray: (I, K, 3) viewing directions, NaN unknown.
@@ -37,10 +38,8 @@ class Gallery:
 
     ARRAYS = ("rows", "viewing_ray", "count", "foreground_width")  # the whole state
 
-    def __init__(self, views: int = 12, novelty: float = 0.95, blend: float = 0.9) -> None:
+    def __init__(self, views: int = 12) -> None:
         self.views = views
-        self.novelty = novelty
-        self.blend = blend
         self.rows = np.zeros((0, views, 0), np.float32)
         self.viewing_ray = np.zeros((0, views, 3))
         self.count = np.zeros(0, np.int64)
@@ -61,11 +60,11 @@ class Gallery:
         similarity = np.einsum("nke,ne->nk", views, rows)  # (N, K)
         similarity[np.arange(self.views) >= self.count[identity][:, None]] = -np.inf
         nearest = similarity.argmax(1)  # (N,)
-        novel = similarity.max(1) < self.novelty  # (N,)
+        novel = similarity.max(1) < NOVELTY  # (N,)
         has_slot = self.count[identity] < self.views
         target = np.where(novel & has_slot, self.count[identity], nearest)  # (N,) slot to write
         target[novel & ~has_slot] = _most_redundant(views[novel & ~has_slot])
-        blend = np.where(novel, 0.0, self.blend)[:, None]
+        blend = np.where(novel, 0.0, BLEND)[:, None]
         picked = views[np.arange(len(identity)), target]  # (N, E)
         self.rows[identity, target] = unit_rows(blend * picked + (1 - blend) * rows)
         self.viewing_ray[identity[novel], target[novel]] = viewing_ray[novel]
@@ -147,8 +146,8 @@ def _cosine(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> Array:
 
 # ---- Calibrated similarity ---------------------------------------------------------------------
 
-# fraction of pairs of either kind that look like the other kind (chosen: no appearance counts more
-# than log odds of 7, which position and overlap can contradict)
+# fraction of pairs of either kind that look like the other kind: no appearance counts more than log
+# odds of 7, which position and overlap can contradict
 OUTLIERS = 1e-3
 
 
@@ -215,37 +214,26 @@ class SimilarityCalibration:
             view_angle_deg: between the viewing rays. The weight of the foreground decreases with
                 it; from 90 degrees on the background has no weight. NaN: as 45 degrees.
         """
-        foreground = np.asarray(foreground)
-        background = np.asarray(background)
-        kind = np.result_type(foreground, background)
-        cosines = (foreground.astype(kind), background.astype(kind))
-        scores = self.part_scores(*cosines, view_angle_deg)
-        parts = (w * np.where(np.isnan(s), 0, s) for w, s in zip(self.WEIGHTS, scores, strict=True))
-        logit = np.where(np.isnan(foreground), -np.inf, sum(parts))
+        cosines = np.asarray(foreground), np.asarray(background)
+        kind = np.result_type(*cosines)
+        count, total, squares = self.moments.swapaxes(0, 1)  # (2, 2) each: kinds, parts
+        mean = total / count
+        std = np.sqrt((squares / count - mean**2).mean(0).clip(1e-3))  # (2,)
+        middle = mean.mean(0)
+        separation = 1 + ((mean[1] - mean[0]) / std).clip(0)
+        usual_deg = 45.0  # between two views of unknown directions
+        angle = np.radians(np.where(np.isnan(view_angle_deg), usual_deg, view_angle_deg))
+        facing = ((1 + np.cos(angle)) / 2, np.cos(angle).clip(0))
+        logit: Any = 0.0
+        for k, cosine in enumerate(cosines):
+            standard = (self.log_similarity(cosine.astype(kind)) - middle[k]) / std[k]
+            score = facing[k] * standard * separation[k]
+            logit = logit + self.WEIGHTS[k] * np.where(np.isnan(score), 0, score)
+        logit = np.where(np.isnan(foreground), -np.inf, logit)
         # of a mixture of both kinds, in which OUTLIERS of either is like the other
         odds = np.exp(np.minimum(logit, 50))
         bounded = (odds + OUTLIERS) / (1 + OUTLIERS * odds)
         return np.asarray(np.where(odds > 0, np.log(bounded), -np.inf))
-
-    def part_scores(
-        self, foreground: Array, background: Array, view_angle_deg: npt.ArrayLike = np.nan
-    ) -> list[Array]:
-        """Standardise the cosines (...) of foreground and background: evidence for one object."""
-        count, total, squares = self.moments.swapaxes(0, 1)  # (2, 2) each: kinds, parts
-        mean = total / count
-        std = np.sqrt((squares / count - mean**2).mean(0).clip(1e-3))  # (2,)
-        separation = ((mean[1] - mean[0]) / std).clip(0)
-        usual_deg = 45.0  # between two views of unknown directions
-        angle = np.radians(np.where(np.isnan(view_angle_deg), usual_deg, view_angle_deg))
-        facing = ((1 + np.cos(angle)) / 2, np.cos(angle).clip(0))
-        scale = zip(
-            (foreground, background), facing, mean.mean(0), std, 1 + separation, strict=True
-        )
-        return [f * ((self.log_similarity(x) - m) / s) * d for x, f, m, s, d in scale]
-
-    def probability(self, *known: npt.ArrayLike, prior: float = 0.5) -> Array:
-        """Compute the probability of one object from the arguments of `logit` and its prior."""
-        return np.asarray(1 / (1 + np.exp(-self.logit(*known) - math.log(prior / (1 - prior)))))
 
 
 # prior odds that a new track is one given known object rather than a new one: fitted with WEIGHTS

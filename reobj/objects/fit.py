@@ -35,8 +35,7 @@ from reobj.results.edits import Edits, apply_edits
 from reobj.results.links import ComponentShapes, Links, tracked_key
 from reobj.results.result import Object, Result
 from reobj.sources.tables import Boxes3D
-from reobj.tracking.interpolation import fill_from_objects, fill_gaps
-from reobj.tracking.linking import FRAGMENT_GAP, link
+from reobj.tracking.linking import FRAGMENT_GAP, fill_from_objects, fill_gaps, link
 from reobj.types import (
     BoolArray,
     Embeddings,

@@ -6,14 +6,13 @@ residual motion near a point of a deep scene. Neither poses nor depth are needed
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
 
-from reobj.sources.video import in_batches, one_ahead, shrunk
-from reobj.types import Array, Floats, Frame, Image
+from reobj.sources.video import shrunk
+from reobj.types import Array, Floats, Image
 
 FLOW_SIZE_PX = 320  # px, longer side of the image in which corners are followed: for speed
 
@@ -39,38 +38,33 @@ class CameraMotion:
         self.gray: Image | None = None
         self.corners: Floats | None = None
         self.residual_flow = np.empty((0, 4))
-        self._ahead: list[_Step] = []  # precomputed by `ahead` for the next images
 
     def __call__(self, image: Image) -> Array:
         """Estimate new_from_old (3, 3) between the previous image and this one (H, W, 3) BGR.
 
         In pixels of `image`; the identity for a first image and after a change of size.
         """
-        known = (s for s in self._ahead if s.image is image and s.old is self.gray)
-        step = next(known, None) or _step(self.gray, self.corners, image)
-        self.gray = step.gray
-        self.corners = step.corners
-        self.residual_flow = step.residual_flow
-        return step.new_from_old
-
-    def ahead(self, frames: Iterable[Frame], batch: int) -> Iterator[list[Frame]]:
-        """Group frames; a thread reads the next group and estimates its motion meanwhile.
-
-        The state changes only when the motion of a frame is requested.
-        """
-
-        def steps() -> Iterator[tuple[Frame, _Step]]:
-            gray = self.gray
-            corners = self.corners
-            for frame in frames:
-                step = _step(gray, corners, frame.image)
-                gray = step.gray
-                corners = step.corners
-                yield frame, step
-
-        for several in one_ahead(in_batches(steps(), batch)):
-            self._ahead = [step for _, step in several]
-            yield [frame for frame, _ in several]
+        shrink = min(1.0, FLOW_SIZE_PX / max(image.shape[:2]))
+        small = shrunk(image, FLOW_SIZE_PX)
+        gray = np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), np.uint8)
+        old = self.gray
+        fit = None
+        if old is not None and self.corners is not None and old.shape == gray.shape:
+            moved, status, _ = cv2.calcOpticalFlowPyrLK(
+                old, gray, self.corners, np.empty_like(self.corners)
+            )  # (C, 1, 2), (C, 1)
+            found = status.ravel() == 1
+            fit = _fit_similarity(self.corners[found, 0], np.asarray(moved)[found, 0])
+            fit = fit or _fit_similarity(*_orb_matches(old, gray))
+        new_from_old, residual_flow = fit or (np.eye(3), np.empty((0, 4)))
+        # number: for speed (BoT-SORT: 1000). Quality: strength over that of the strongest corner
+        # (as BoT-SORT); the distance, px of the small image, spreads the corners
+        good = cv2.goodFeaturesToTrack(gray, maxCorners=100, qualityLevel=0.01, minDistance=12)
+        self.corners = None if good is None else np.asarray(good, np.float32)
+        self.gray = gray
+        self.residual_flow = residual_flow / shrink
+        small_from_image = np.diag([shrink, shrink, 1.0])
+        return np.asarray(np.linalg.inv(small_from_image) @ new_from_old @ small_from_image)
 
     def parallax(self, xy: Array, nearest: int = 5) -> Array:
         """Estimate the parallax at points of the old image: their residual motion.
@@ -93,51 +87,6 @@ class CameraMotion:
         return np.asarray(np.median(self.residual_flow[corners, 2:], 1))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Step:
-    """Motion from one image to the next, and the state of `CameraMotion` after it.
-
-    Attributes:
-        old: previous gray image, None at first. image, gray: the next image, original and small.
-    """
-
-    old: Image | None
-    image: Image
-    gray: Image
-    corners: Floats | None
-    new_from_old: Array
-    residual_flow: Array
-
-
-def _step(old: Image | None, corners: Floats | None, image: Image) -> _Step:
-    """Estimate the motion from a small gray image, with its corners, to the next image."""
-    shrink = min(1.0, FLOW_SIZE_PX / max(image.shape[:2]))
-    small = shrunk(image, FLOW_SIZE_PX)
-    gray = np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), np.uint8)
-    new_from_old = np.eye(3)
-    residual_flow = np.empty((0, 4))
-    if old is not None and corners is not None and old.shape == gray.shape:
-        moved, status, _ = cv2.calcOpticalFlowPyrLK(
-            old, gray, corners, np.empty_like(corners)
-        )  # (C, 1, 2), (C, 1)
-        found = status.ravel() == 1
-        fit = _fit_similarity(corners[found, 0], np.asarray(moved)[found, 0])
-        fit = fit or _fit_similarity(*_orb_matches(old, gray))
-        new_from_old, residual_flow = fit or (new_from_old, residual_flow)
-    # number: for speed (BoT-SORT: 1000). Quality: strength over that of the strongest corner (as
-    # BoT-SORT); the distance, px of the small image, spreads the corners
-    good = cv2.goodFeaturesToTrack(gray, maxCorners=100, qualityLevel=0.01, minDistance=12)
-    small_from_image = np.diag([shrink, shrink, 1.0])
-    return _Step(
-        old,
-        image,
-        gray,
-        None if good is None else np.asarray(good, np.float32),
-        np.asarray(np.linalg.inv(small_from_image) @ new_from_old @ small_from_image),
-        residual_flow / shrink,
-    )
-
-
 def _orb_matches(old: Image, new: Image) -> tuple[Floats, Floats]:
     """Match ORB points of two gray images by mutual nearest descriptors, at any distance.
 
@@ -149,13 +98,12 @@ def _orb_matches(old: Image, new: Image) -> tuple[Floats, Floats]:
     (in_old, old_words), (in_new, new_words) = (
         orb.detectAndCompute(image, None) for image in (old, new)
     )
-    if old_words is None or new_words is None:
-        return np.empty((0, 2), np.float32), np.empty((0, 2), np.float32)
-    pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(old_words, new_words)
-    index = np.array([(m.queryIdx, m.trainIdx) for m in pairs], np.int64).reshape(-1, 2)
-    points = (np.array(cv2.KeyPoint.convert(found), np.float32) for found in (in_old, in_new))
-    at_old, at_new = (xy[rows] for xy, rows in zip(points, index.T, strict=True))
-    return at_old, at_new
+    pairs: Sequence[cv2.DMatch] = ()
+    if old_words is not None and new_words is not None:
+        pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(old_words, new_words)
+    old_xy = np.array([in_old[m.queryIdx].pt for m in pairs], np.float32).reshape(-1, 2)
+    new_xy = np.array([in_new[m.trainIdx].pt for m in pairs], np.float32).reshape(-1, 2)
+    return old_xy, new_xy
 
 
 # inliers that make a fit: in 450 pairs of frames of different videos at most 7 corners agreed

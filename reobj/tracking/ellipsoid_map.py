@@ -10,48 +10,23 @@ Axes: I identities, V views, G groups of boxes, D detections, T tracks, N points
 
 from __future__ import annotations
 
-import dataclasses
-from typing import Any
+from collections.abc import Callable
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 import quadrics
 from reobj.cameras import Poses, VisiblePoints, scaled_camera, viewing_rays
-from reobj.types import Array, BoolArray, IntArray, cxcywh_from_xyxy
+from reobj.types import Array, BoolArray, IntArray, box_area, cxcywh_from_xyxy
 
 # ---- Ellipsoids of identities ------------------------------------------------------------------
 
 
-# between the views of a fit (chosen; lower: positions whose depth is the prior of the size, higher:
-# objects are unknown until the camera has walked round them)
+VIEWS = 16  # V, kept of every identity: memory, and time of a fit
+# between the views of a fit; lower: positions whose depth is the prior of the size, higher: objects
+# are unknown until the camera has walked round them
 MIN_PARALLAX_DEG = 2.0
-
-
-def quick_fit(
-    boxes: Array, img_from_world: Array, image_size: tuple[int, int], usual_size: float
-) -> quadrics.ObjectFits:
-    """Fit ellipsoids of any size to boxes (V, G, 4) in a few steps (`quadrics.fit_objects`).
-
-    Args:
-        img_from_world: (V, 3, 4) K @ cam_from_world.
-        usual_size: of the scene's objects in the unit of the world (`usual_size`): the world may
-            have any unit, but the prior of the fit is in metres.
-    """
-    ratio = float(np.exp(np.log(quadrics.UNKNOWN_SIZE.mean_m).mean())) / usual_size
-    cameras = img_from_world.copy()
-    cameras[..., 3] *= ratio
-    config = quadrics.FitConfig(iterations=10, start_views=4, start_iterations=4)
-    fits = quadrics.fit_objects(boxes, cameras, image_size, support="ellipsoid", config=config)
-    ellipsoids = dataclasses.replace(
-        fits.ellipsoids,
-        center_in_world=fits.ellipsoids.center_in_world / ratio,
-        half_axes=fits.ellipsoids.half_axes / ratio,
-    )
-    cov = fits.cov.copy()
-    cov[:, :3] /= ratio
-    cov[:, :, :3] /= ratio
-    return dataclasses.replace(fits, ellipsoids=ellipsoids, size=fits.size / ratio, cov=cov)
 
 
 def rough_sizes(boxes: Array, img_from_world: Array) -> Array:
@@ -79,12 +54,6 @@ def rough_sizes(boxes: Array, img_from_world: Array) -> Array:
     return np.where(use, side * depth / focal[:, None], np.nan)
 
 
-def usual_size(sizes: Array) -> float:
-    """Return the median of an array of sizes, ignoring NaN; 1 if all are NaN."""
-    known = sizes[np.isfinite(sizes) & (sizes > 0)]
-    return float(np.median(known)) if len(known) else 1.0
-
-
 # fraction of a projected box in the image above which the object is expected there (not measured)
 EXPECTED_IN_VIEW = 0.5
 # longest half axis over the middle one: half-occluded objects give needles that reach behind the
@@ -99,9 +68,6 @@ class EllipsoidMap:
     ellipsoid is fitted to them from time to time. Memory grows with the number of identities, not
     with time.
 
-    Args:
-        views: V, views kept of every identity.
-
     Attributes:
         frame: (I, V) frame of each view, -1: free slot. boxes: (I, V, 4) x1, y1, x2, y2.
         img_from_world: (I, V, 3, 4). rays: (I, V, 3) viewing rays, NaN: free slot.
@@ -111,22 +77,29 @@ class EllipsoidMap:
         given: (I,) ellipsoids known from a map of the room; they are not fitted.
     """
 
-    ARRAYS = (
-        "frame", "boxes", "img_from_world", "rays", "step_deg", "fresh", "size", "dual_q", "ends",
-        "given",
-    )  # fmt: skip
+    # values of a new identity; step_deg is doubled when all slots are used
+    NEW: ClassVar[dict[str, npt.NDArray[Any]]] = {
+        "frame": np.full(VIEWS, -1, np.int64), "boxes": np.zeros((VIEWS, 4)),
+        "img_from_world": np.zeros((VIEWS, 3, 4)), "rays": np.full((VIEWS, 3), np.nan),
+        "step_deg": np.array(1.0), "fresh": np.array(0, np.int64), "size": np.full(VIEWS, np.nan),
+        "dual_q": np.full((4, 4), np.nan), "ends": np.full((2, 3), np.nan),
+        "given": np.array(False),
+    }  # fmt: skip
+    ARRAYS = tuple(NEW)
+    frame: IntArray
+    boxes: Array
+    img_from_world: Array
+    rays: Array
+    step_deg: Array
+    fresh: IntArray
+    size: Array
+    dual_q: Array
+    ends: Array
+    given: BoolArray
 
-    def __init__(self, views: int = 16) -> None:
-        self.frame = np.zeros((0, views), np.int64)
-        self.boxes = np.zeros((0, views, 4))
-        self.img_from_world = np.zeros((0, views, 3, 4))
-        self.rays = np.zeros((0, views, 3))
-        self.step_deg = np.zeros(0)
-        self.fresh = np.zeros(0, np.int64)
-        self.size = np.zeros((0, views))
-        self.dual_q = np.zeros((0, 4, 4))
-        self.ends = np.zeros((0, 2, 3))
-        self.given = np.zeros(0, bool)
+    def __init__(self) -> None:
+        for name, new in self.NEW.items():
+            setattr(self, name, new[None][:0])
 
     def give(self, ellipsoids: quadrics.Ellipsoids, cov: Array) -> None:
         """Set the ellipsoids of the first identities, which are then not fitted.
@@ -136,15 +109,26 @@ class EllipsoidMap:
         """
         count = len(ellipsoids)
         self._grow(count)
-        dual_q = ellipsoids.dual_quadrics()
-        finite = np.isfinite(dual_q).all((1, 2)) & np.isfinite(cov).all((1, 2))
+        finite = np.isfinite(ellipsoids.dual_quadrics()).all((1, 2)) & np.isfinite(cov).all((1, 2))
         known = np.asarray(finite, bool)
-        value, vector = np.linalg.eigh(np.where(known[:, None, None], cov, 0.0))
-        sigma = np.sqrt(value[:, -1:].clip(0)) * vector[..., -1]  # (I, 3)
-        ends = ellipsoids.center_in_world[:, None] + np.stack([-sigma, sigma], 1)
-        self.dual_q[:count] = np.where(known[:, None, None], dual_q, np.nan)
-        self.ends[:count] = np.where(known[:, None, None], ends, np.nan)
+        self._set(np.arange(count), ellipsoids, cov, known)
         self.given[:count] = known
+
+    def _set(
+        self, identity: IntArray, ellipsoids: quadrics.Ellipsoids, cov: Array, known: BoolArray
+    ) -> None:
+        """Set the ellipsoids of identities (n,), unknown where `known` is False.
+
+        Args:
+            cov: (n, 3, 3) of the centres.
+        """
+        known = known[:, None, None]
+        value, vector = np.linalg.eigh(np.where(known, cov, 0.0))
+        sigma = np.sqrt(value[:, -1:].clip(0)) * vector[..., -1]  # (n, 3)
+        centre = ellipsoids.center_in_world
+        ends = np.stack([centre - sigma, centre + sigma], 1)  # (n, 2, 3)
+        self.dual_q[identity] = np.where(known, ellipsoids.dual_quadrics(), np.nan)
+        self.ends[identity] = np.where(known, ends, np.nan)
 
     def add(self, frame: int, identity: IntArray, xyxy: Array, img_from_world: Array) -> None:
         """Add a view (N, 4) of each of N different identities that are seen from a new direction.
@@ -177,34 +161,37 @@ class EllipsoidMap:
         return np.asarray((count >= 3) & (self.fresh > count // 4) & ~self.given, bool)
 
     def refit(self, image_size: tuple[int, int]) -> bool:
-        """Fit the ellipsoids of all identities that are due.
+        """Fit the ellipsoids of all identities that are due, in a few steps.
 
-        A fit that is rejected, lacks parallax or is a needle makes the position unknown.
+        The world may have any unit: its scale for the size prior of the fit is that of the usual
+        rough size. A fit that is rejected, lacks parallax or is a needle makes the position
+        unknown.
 
         Returns:
             Whether any was due.
         """
-        seen = self.frame >= 0  # (I, V)
         due = np.flatnonzero(self.due)
         if not len(due):
             return False
-        at, slot = np.nonzero(seen[due])
-        frames, first, row = np.unique(
-            self.frame[due][at, slot], return_index=True, return_inverse=True
-        )
+        at, slot = np.nonzero(self.frame[due] >= 0)
+        views = (due[at], slot)
+        frames, first, row = np.unique(self.frame[views], return_index=True, return_inverse=True)
         boxes = np.full((len(frames), len(due), 4), np.nan)  # (F, O, 4)
-        boxes[row, at] = self.boxes[due][at, slot]
-        cameras = self.img_from_world[due][at, slot][first]  # (F, 3, 4)
-        self.size[due[at], slot] = rough_sizes(boxes, cameras)[row, at]
-        fits = quick_fit(boxes, cameras, image_size, usual_size(self.size))
+        boxes[row, at] = self.boxes[views]
+        cameras = self.img_from_world[views][first]  # (F, 3, 4)
+        self.size[views] = rough_sizes(boxes, cameras)[row, at]
+        known = self.size[self.size > 0]  # False for NaN
+        usual_size = np.median(known) if len(known) else 1.0
+        usual_m = np.exp(np.log(quadrics.UNKNOWN_SIZE.mean_m).mean())
+        fits = quadrics.fit_objects(
+            boxes, cameras, image_size, support="ellipsoid",
+            metric=quadrics.Scale(float(usual_m / usual_size), 0.0, "usual size"),
+            config=quadrics.FitConfig(iterations=10, start_views=4, start_iterations=4),
+        )  # fmt: skip
         good = (fits.status != "rejected") & (fits.parallax_deg >= MIN_PARALLAX_DEG)  # (O,)
         axes = np.sort(fits.ellipsoids.half_axes, 1)  # (O, 3)
         good &= axes[:, 2] <= MAP_MAX_ELONGATION * axes[:, 1]
-        self.dual_q[due] = np.where(good[:, None, None], fits.ellipsoids.dual_quadrics(), np.nan)
-        value, vector = np.linalg.eigh(np.where(good[:, None, None], fits.cov[:, :3, :3], 0.0))
-        sigma = np.sqrt(value[:, -1:].clip(0)) * vector[..., -1]  # (O, 3)
-        centre = np.where(good[:, None], fits.ellipsoids.center_in_world, np.nan)
-        self.ends[due] = np.stack([centre - sigma, centre + sigma], 1)
+        self._set(due, fits.ellipsoids, fits.cov[:, :3, :3], good)
         self.fresh[due] = 0
         return True
 
@@ -214,7 +201,7 @@ class EllipsoidMap:
         return np.asarray(np.isfinite(self.dual_q[:, 0, 0]), bool)
 
     def project(
-        self, img_from_world: Array, image_size: tuple[int, int], min_visible: float
+        self, img_from_world: Array, image_size: tuple[int, int], min_visible: float = 0.0
     ) -> Array:
         """Project the ellipsoids into an image.
 
@@ -227,8 +214,7 @@ class EllipsoidMap:
         dual_c, in_front = quadrics.project(self.dual_q, img_from_world[None])
         boxes = quadrics.boxes_from_dual_conics(dual_c[0])  # (I, 4)
         clipped = quadrics.clip_boxes(boxes, image_size)
-        area, whole = ((b[:, 2:] - b[:, :2]).prod(1) for b in (clipped, boxes))
-        seen = in_front[0] & (area > min_visible * whole)
+        seen = in_front[0] & (box_area(clipped) > min_visible * box_area(boxes))
         return np.where(seen[:, None], cxcywh_from_xyxy(clipped), np.nan)
 
     def project_tracks(
@@ -244,14 +230,12 @@ class EllipsoidMap:
             one sigma of the centre along the direction of largest uncertainty.
         """
         view = K @ cam_from_world
-        known = rows_of(self.known, identity, False)
-        boxes = rows_of(self.project(view, image_size, 0.0), identity, np.nan)
+        known = rows_of(self.known, identity, False)[:, None]
+        ellipsoid_boxes = rows_of(self.project(view, image_size), identity, np.nan)
         interval_boxes = project_depth_intervals(ends, size, K, cam_from_world)
-        ellipsoid_ends = rows_of(self.ends, identity, np.nan)
-        uncertainty = project_half_intervals(
-            np.where(known[:, None, None], ellipsoid_ends, ends), view
-        )
-        return np.where(known[:, None], boxes, interval_boxes), np.nan_to_num(uncertainty)
+        boxes = np.where(known, ellipsoid_boxes, interval_boxes)
+        ends = np.where(known[..., None], rows_of(self.ends, identity, np.nan), ends)
+        return boxes, np.nan_to_num(project_half_intervals(ends, view))
 
     def overlap(
         self, box: Array, identity: IntArray, view: Array | None, image_size: tuple[int, int]
@@ -263,30 +247,24 @@ class EllipsoidMap:
         Returns:
             iou: (n, I), NaN unknown. weight: (I,) of the overlap (`iou_within_uncertainty`).
         """
-        iou = np.full((len(box), len(identity)), np.nan)
-        weight = np.ones(len(identity))
-        if view is not None and len(identity):
-            projected = rows_of(self.project(view, image_size, 0.0), identity, np.nan)  # (I, 4)
-            ends = rows_of(self.ends, identity, np.nan)
-            uncertainty = np.nan_to_num(2 * np.abs(project_half_intervals(ends, view)))  # (I, 2)
-            found, weight = iou_within_uncertainty(
-                projected.T[:, None], uncertainty.T[:, None], box.T[..., None]
-            )  # (n, I), (1, I)
-            known = rows_of(self.known, identity, False)
-            iou[:, known] = np.nan_to_num(found[:, known])
-            weight = np.nan_to_num(weight[0])
-        return iou, weight
+        if view is None:
+            return np.full((len(box), len(identity)), np.nan), np.ones(len(identity))
+        projected = rows_of(self.project(view, image_size), identity, np.nan)  # (I, 4)
+        ends = rows_of(self.ends, identity, np.nan)
+        uncertainty = np.nan_to_num(2 * np.abs(project_half_intervals(ends, view)))  # (I, 2)
+        iou, weight = iou_within_uncertainty(
+            projected.T[:, None], uncertainty.T[:, None], box.T[..., None]
+        )  # (n, I), (1, I)
+        known = rows_of(self.known, identity, False)
+        return np.where(known, np.nan_to_num(iou), np.nan), np.nan_to_num(weight[0])
 
     def _grow(self, identities: int) -> None:
         extra = identities - len(self.frame)
         if extra > 0:
             extra = max(extra, len(self.frame), 16)  # doubling: amortised O(1)
-            fills = {"frame": -1, "dual_q": np.nan, "rays": np.nan, "ends": np.nan}
-            fills |= {"size": np.nan, "step_deg": 1.0}  # between viewing rays; doubled when full
-            for name in self.ARRAYS:
-                old = getattr(self, name)
-                new = np.full((extra, *old.shape[1:]), fills.get(name, 0), old.dtype)
-                setattr(self, name, np.concatenate([old, new]))
+            for name, new in self.NEW.items():
+                rows = np.broadcast_to(new, (extra, *new.shape))
+                setattr(self, name, np.concatenate([getattr(self, name), rows]))
 
 
 def rows_of(rows: Any, identity: IntArray, missing: Any) -> npt.NDArray[Any]:
@@ -298,40 +276,39 @@ def rows_of(rows: Any, identity: IntArray, missing: Any) -> npt.NDArray[Any]:
 # ---- Depth intervals of tracks -----------------------------------------------------------------
 
 
-class CameraInputs:
-    """Look up a frame's camera inputs as keyword arguments for `Tracker.update`.
+def camera_inputs(poses: Poses | None, scale: float) -> Callable[[int], dict[str, Any]]:
+    """Return a function: number of a frame in the source -> keyword arguments of `Tracker.update`.
+
+    These are pose, camera, points and component. The points are those nearby, not only those in the
+    image: their median depth is the fallback of boxes without points (cropping them would change
+    depth intervals).
 
     Args:
         poses: of the video; None: no camera inputs. scale: px of the frames per native px.
     """
+    if poses is None:
+        return lambda _: {}
+    row_of = {frame: row for row, frame in enumerate(poses.frame.tolist())}
+    camera = scaled_camera(poses.camera, scale)
+    visible = VisiblePoints(poses)
 
-    def __init__(self, poses: Poses | None, scale: float) -> None:
-        self.poses = poses
-        self.row_of: dict[int, int] = {}
-        if poses is not None:
-            self.row_of = {frame: row for row, frame in enumerate(poses.frame.tolist())}
-            self.camera = scaled_camera(poses.camera, scale)
-            self.visible = VisiblePoints(poses)
-
-    def __call__(self, frame: int) -> dict[str, Any]:
-        """Return pose, camera, points and component of a frame, by its number in the source.
-
-        The points are those nearby, not only those in the image: their median depth is the fallback
-        of boxes without points (cropping them would change depth intervals).
-        """
-        if self.poses is None or frame not in self.row_of:
+    def inputs(frame: int) -> dict[str, Any]:
+        row = row_of.get(frame)
+        if row is None:
             return {}
-        row = self.row_of[frame]
-        return {
-            "cam_from_world": self.poses.cam_from_world[row],
-            "camera": self.camera,
-            "points": np.asarray(self.poses.points[self.visible.nearby(row)], np.float64),
-            "part": int(self.poses.part[row]),
-        }
+        points = np.asarray(poses.points[visible.nearby(row)], np.float64)
+        pose = poses.cam_from_world[row]
+        component = int(poses.part[row])
+        return {"cam_from_world": pose, "camera": camera, "points": points, "part": component}
+
+    return inputs
+
+
+MIN_POINTS = 3  # in a box to estimate its depth; fewer have no median and spread
 
 
 def depth_intervals(
-    xyxy: Array, points: Array, cam_from_world: Array, K: Array, min_points: int = 3
+    xyxy: Array, points: Array, cam_from_world: Array, K: Array
 ) -> tuple[Array, Array]:
     """Estimate the depth intervals of the objects in boxes from the sparse points in the boxes.
 
@@ -340,43 +317,33 @@ def depth_intervals(
 
     Args:
         xyxy: (D, 4) px. points: (N, 3) in world, seen in this frame.
-        min_points: in a box to estimate its depth; fewer than 3 have no median and spread.
     Returns:
         ends: (D, 2, 3) in world, end points of the interval on the viewing ray, one sigma in front
         of and behind the depth. size: (D, 2) width and height there, in the unit of the world. NaN
-        with too few points.
+        with fewer than MIN_POINTS points.
     """
-    ends = np.full((len(xyxy), 2, 3), np.nan)
-    size = np.full((len(xyxy), 2), np.nan)
     in_cam = points @ cam_from_world[:, :3].T + cam_from_world[:, 3]  # (N, 3)
     in_cam = in_cam[in_cam[:, 2] > 0]
-    if len(in_cam) < min_points:
-        return ends, size
+    if len(in_cam) < MIN_POINTS:
+        return np.full((len(xyxy), 2, 3), np.nan), np.full((len(xyxy), 2), np.nan)
     xy = (in_cam @ K.T)[:, :2] / in_cam[:, 2:]
     log_depth = np.log(in_cam[:, 2])
     box = cxcywh_from_xyxy(xyxy)
     offset = np.abs(xy - box[:, None, :2]) / box[:, None, 2:].clip(1e-9)  # (D, N, 2) box sizes
     offset = offset.max(-1)  # (D, N)
-    of_image = _median_and_spread(log_depth)
-    median = np.empty(len(xyxy))
-    sigma = np.empty(len(xyxy))
+    median = np.empty((len(xyxy), 1))
+    sigma = np.empty((len(xyxy), 1))
     for d, distance in enumerate(offset):  # each box has its own number of points
-        sets = (log_depth[distance < limit] for limit in (0.25, 0.5))
-        found = next((s for s in sets if len(s) >= min_points), None)
-        median[d], sigma[d] = of_image if found is None else _median_and_spread(found)
-    least = (box[:, 2:] / np.diag(K)[:2]).mean(1) / 2  # (D,) half the size over the depth
-    depth = np.exp(median[:, None] + np.maximum(sigma, least)[:, None] * [-1, 1])  # (D, 2)
+        sets = (log_depth[distance < limit] for limit in (0.25, 0.5, np.inf))
+        found = next(s for s in sets if len(s) >= MIN_POINTS)
+        median[d] = np.median(found)
+        sigma[d] = 1.4826 * np.median(np.abs(found - median[d]))  # normal distribution
+    per_depth = box[:, 2:] / np.diag(K)[:2]  # (D, 2) width and height over the depth
+    least = per_depth.mean(1, keepdims=True) / 2
+    depth = np.exp(median + np.maximum(sigma, least) * [-1, 1])  # (D, 2)
     rays = np.c_[box[:, :2], np.ones(len(box))] @ np.linalg.inv(K).T  # (D, 3) depth 1
-    rotation = cam_from_world[:, :3]
-    offset_in_cam = cam_from_world[:, 3]
-    ends = (depth[..., None] * rays[:, None] - offset_in_cam) @ rotation  # R' (x - t)
-    return ends, box[:, 2:] / np.diag(K)[:2] * depth.mean(1, keepdims=True)
-
-
-def _median_and_spread(values: Array) -> tuple[float, float]:
-    """Return the median, and sigma from the median absolute deviation."""
-    median = float(np.median(values))
-    return median, 1.4826 * float(np.median(np.abs(values - median)))
+    ends = (depth[..., None] * rays[:, None] - cam_from_world[:, 3]) @ cam_from_world[:, :3]
+    return ends, per_depth * depth.mean(1, keepdims=True)  # R' (x - t)
 
 
 def project_depth_intervals(ends: Array, size: Array, K: Array, cam_from_world: Array) -> Array:

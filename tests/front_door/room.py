@@ -142,13 +142,6 @@ def assert_right(
     assert solids.centre_m <= centre_m and solids.size <= size, solids
 
 
-def idf1_of_rows(rows: np.ndarray, names: dict[int, str], frames: range) -> float:
-    """Score rows (N, 6) `frame, identity, x1, y1, x2, y2` of objects with these classes."""
-    objects = [{"id": i, "class": name} for i, name in names.items()]
-    output = scores.Output({}, np.asarray(rows, np.float64), objects, {})
-    return scores.score_2d(true_boxes().of_frames(frames), output).idf1
-
-
 def assert_example_right(out: Path) -> None:
     """Compare the output folder of README's first command with the truth."""
     assert_right(out, range(240), own_cameras=True, idf1=0.98, centre_m=0.04, hit_rate=0.94)

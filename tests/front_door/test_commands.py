@@ -27,7 +27,6 @@ from front_door.room import (
     assert_example_right,
     assert_right,
     cli,
-    idf1_of_rows,
     info,
     overlay_frames,
     true_boxes,
@@ -35,18 +34,10 @@ from front_door.room import (
     true_objects,
 )
 
-SHORT = range(0, 120, 3)  # frames of the `room` fixture
 FILES = {
     "cache", "config.toml", "objects.json", "objects.ply", "poses.txt", "scene.html", "sparse",
     "tracks.txt",
 }  # fmt: skip
-
-
-@pytest.fixture
-def out(room: Path, tmp_path: Path) -> Path:
-    """A copy of the output folder of the clip's first half, with true cameras."""
-    shutil.copytree(room, tmp_path / "out")
-    return tmp_path / "out"
 
 
 # ---- run, track, poses ----
@@ -116,48 +107,6 @@ def test_eval_agrees_with_the_public_files(example: Path, tmp_path: Path) -> Non
     assert found["objects"]["center_error_median"] == pytest.approx(solids.centre_m, abs=0.006)
 
 
-def printed(capsys: pytest.CaptureFixture[str]) -> dict[str, float]:
-    """The first row of the table that `eval` prints, as fractions."""
-    names, numbers = capsys.readouterr().out.splitlines()[:2]
-    return dict(zip(names.split(), map(float, numbers.split()[1:]), strict=True))
-
-
-def test_eval_scores_drop_after_an_identity_swap(
-    out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """A tracks.txt, and one in which the identities of two chairs are swapped half way."""
-    lines = (out / "tracks.txt").read_text().splitlines()
-    rows = np.loadtxt(lines, delimiter=",")
-    late = rows[:, 0] > 60
-    chairs = [o["id"] for o in info(out)["objects"] if o["class"] == "chair"]
-    chairs = [i for i in chairs if {*late[rows[:, 1] == i]} == {False, True}][:2]
-    number = rows[:, 1].copy()
-    for old, new in (chairs, chairs[::-1]):
-        number[late & (rows[:, 1] == old)] = new
-    names = {o["id"]: o["class"] for o in info(out)["objects"]}
-    xyxy = np.hstack([rows[:, 2:4], rows[:, 2:4] + rows[:, 4:6]])
-    found = []
-    for ids in (rows[:, 1], number):
-        pieces = [line.split(",", 2) for line in lines]
-        path = tmp_path / "tracks.txt"
-        path.write_text(
-            "".join(f"{p[0]},{i:.0f},{p[2]}\n" for p, i in zip(pieces, ids, strict=True))
-        )
-        few = tmp_path / "gt.txt"  # of the frames that were read
-        truth = (ROOM / "gt_mot.txt").read_text().splitlines()
-        few.write_text("\n".join(t for t in truth if int(t.split(",")[0]) - 1 in SHORT) + "\n")
-        capsys.readouterr()
-        assert cli("eval", path, "--gt", few) == 0
-        found.append(printed(capsys))
-        own = idf1_of_rows(np.column_stack([rows[:, 0] - 1, ids, xyxy]), names, SHORT)
-        assert found[-1]["IDF1"] == pytest.approx(100 * own, abs=0.1)
-    assert [f["IDSW"] for f in found] == [0, 2]
-    assert found[1]["IDF1"] < found[0]["IDF1"] - 1
-
-
-# ---- export ----
-
-
 # ---- models, --options, --version, --help ----
 
 
@@ -183,13 +132,6 @@ def test_models_lists_and_verifies(capsys: pytest.CaptureFixture[str]) -> None:
     assert re.search(r"^reobj +backbone .*verified", listed, re.M)
     assert cli("models", "reobj") == 0
     assert Path(capsys.readouterr().out.strip()).name == "reobj.onnx"
-
-
-def test_every_listed_option_can_be_set(room: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """`--options` as it is printed, into `--set` as it is read."""
-    options = re.findall(r"^(\w+\.\w+=\S*)(?:  |$)", printed_by(capsys, "--options"), re.M)
-    assert len(options) > 40 and len({o.split(".")[0] for o in options}) >= 7
-    assert cli("objects", room, "--validate", *(w for o in options for w in ("--set", o))) == 0
 
 
 def test_a_reader_that_stops_early_is_no_error() -> None:

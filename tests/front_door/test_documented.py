@@ -1,7 +1,7 @@
 """Commands and Python code of README and docs/ work as they are written.
 
 Commands are run in a folder with the files that they name, plus options (`more`) that make them
-fast. tests/test_docs.py runs the blocks of the tutorials.
+fast.
 """
 
 from __future__ import annotations
@@ -24,16 +24,13 @@ import truth as scores
 import reobj_track as rt
 from front_door.room import (
     CAMERA,
-    FEW,
     ROOM,
     ROOT,
     SHORTEST,
     SHORTEST_FRAMES,
-    SMALL,
     assert_right,
     cli,
     info,
-    true_boxes,
     true_cameras,
     true_centres,
     true_objects,
@@ -124,36 +121,19 @@ def quadrics_quaternion(turn: np.ndarray) -> np.ndarray:
 
 
 def output(desk: Path) -> None:
-    """An output folder of the whole clip with reconstructed cameras; edits for it."""
+    """An output folder of the whole clip with reconstructed cameras."""
     recording(desk)
-    rows = np.loadtxt(desk / "out" / "tracks.txt", delimiter=",")
-    frame, number, left, top, width, height = rows[0, :6].tolist()
-    box = [left, top, left + width, top + height]
-    renamed = {"id": int(number), "frame": int(frame) - 1, "box": box}
-    edits = [{"do": "rename", "object": renamed, "class": "armchair"}]
-    data = {"format": "reobj-edits", "version": 1, "edits": edits}
-    (desk / "edits.json").write_text(json.dumps(data))
 
 
 # ---- Expected results ----
 
 SUPPLIED = f"--poses poses.txt --camera {CAMERA}"
-QUICKLY = " ".join(SMALL)
 PLAIN = "--set output.overlay=none --set output.scene=0"
-LONG = f"{' '.join(map(str, FEW))} {PLAIN}"
 SHORT = f"{' '.join(map(str, SHORTEST))} {PLAIN}"
 
 
 def right(desk: Path, warning: str = "") -> None:
     assert_right(desk / "out", SHORTEST_FRAMES, warning=warning)
-
-
-def right_identities(desk: Path) -> None:
-    assert_right(desk / "out", hit_rate=0, idf1=0.94)
-
-
-def right_without_images(desk: Path) -> None:
-    assert_right(desk / "out", idf1=0.94, warning="note: no images")
 
 
 def scaled(desk: Path) -> None:
@@ -184,20 +164,6 @@ def exported(desk: Path) -> None:
     assert len(data["annotations"]) == len((desk / "out/tracks.txt").read_text().splitlines())
 
 
-def located(desk: Path) -> None:
-    """Reconstructed cameras are right up to a similarity."""
-    rows = np.loadtxt(desk / "out/poses.txt")
-    true = true_centres()[np.round(rows[:, 0] * 12).astype(int)]
-    scale, turn, shift = scores.similarity(rows[:, 1:4], true)
-    error = np.linalg.norm(scale * rows[:, 1:4] @ turn.T + shift - true, axis=1)
-    assert len(rows) >= 20 and np.median(error) < 0.01 * np.linalg.norm(np.ptp(true, axis=0))
-
-
-def renamed(desk: Path) -> None:
-    classes = [o["class"] for o in info(desk / "out")["objects"]]
-    assert classes.count("armchair") == 1
-
-
 @dataclass(frozen=True)
 class Shown:
     """How a documented command is run.
@@ -219,8 +185,7 @@ class Shown:
 
 
 TOOL = "python reobj_track.py "
-NAMED = {"VIDEO": "phone.mp4", "OUT": "out"}
-FIRST = f"--every 4 --stop 80 {QUICKLY}"
+NAMED = {"OUT": "out"}
 SHOWN = {
     TOOL + "run phone.mp4 -o out": Shown(
         recording, more="--offline", code=2, says="set REOBJ_MODELS"
@@ -231,20 +196,9 @@ SHOWN = {
     TOOL + "run phone.mp4 -o out --poses colmap_model/": Shown(
         colmap_model, right, f"--detections det.npz {SHORT} --metric"
     ),
-    TOOL + "track phone.mp4 -o out": Shown(
-        recording, right_identities, f"--detections det.npz {LONG}"
-    ),
     TOOL + "objects out --known-size chair=0.82m": Shown(output, scaled, PLAIN, folder="out"),
     TOOL + "eval out --gt gt.txt": Shown(output, evaluated, folder="out"),
     TOOL + "export out --to coco-vid": Shown(output, exported, folder="out"),
-    TOOL + "poses VIDEO -o OUT": Shown(recording, located, FIRST, NAMED),
-    TOOL + 'run -o OUT --detections FILE --poses FILE --camera "MODEL WIDTH HEIGHT PARAMS"': Shown(
-        recording, right_without_images, LONG,
-        {"OUT": "out", "--detections FILE": "--detections det.npz",
-         "--poses FILE": "--poses poses.txt",
-         "MODEL WIDTH HEIGHT PARAMS": "PINHOLE 640 480 " + CAMERA.replace(",", " ")},
-    ),
-    TOOL + "objects OUT --edits edits.json": Shown(output, renamed, PLAIN, NAMED, "out"),
     TOOL + "eval OUT --gt gt.txt [--gt-objects gt_objects.json] [--classes chair,cup]": Shown(
         output, evaluated_in_3d, "", {"[": "", "]": "", "OUT": "out"}, "out"
     ),
@@ -300,7 +254,7 @@ def test_documented_command(
     shown.check(desk, *[shown.warning] * bool(shown.warning))
 
 
-# ---- Python outside the tutorials ----
+# ---- Python ----
 
 QUICK = rt.Config(
     input=rt.InputConfig(every=4, stop=64),
@@ -332,29 +286,3 @@ def test_python_in_readme(desk: Path, capsys: pytest.CaptureFixture[str]) -> Non
     lines = capsys.readouterr().out.splitlines()
     assert sum(line.split()[0].isdigit() for line in lines) >= 16 + 14
     assert len(scope["result"].objects) == len(info(desk / "out")["objects"])
-
-
-def test_python_in_quadrics(desk: Path) -> None:
-    """Fits a chair and a cup of the clip to unoccluded true boxes with true cameras."""
-    (code,) = python_of("docs/quadrics.md")
-    truth, frames = true_boxes(min_visible=0.95), range(0, 240, 2)
-    views = {o["id"]: (truth.clear & (truth.identity == o["id"])).sum() for o in true_objects()}
-    chosen = [
-        max((o for o in true_objects() if o["class"] == c), key=lambda o: int(views[o["id"]]))
-        for c in ("chair", "cup")
-    ]
-    boxes = np.full((len(frames), 2, 4), np.nan)
-    for k, o in enumerate(chosen):
-        rows = truth.clear & (truth.identity == o["id"]) & np.isin(truth.frame, list(frames))
-        boxes[truth.frame[rows] // 2, k] = truth.xyxy[rows]
-    fx, fy, cx, cy = map(float, CAMERA.split(","))
-    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    scope: dict[str, Any] = {
-        "boxes_xyxy": boxes, "img_from_world": K @ true_cameras(frames), "width": 640,
-        "height": 480,
-    }  # fmt: skip
-    exec(compile(code, "quadrics.md", "exec"), scope)
-    fits = scope["fits"]
-    goal = np.array([o["center"] for o in chosen])
-    assert np.linalg.norm(fits.ellipsoids.center_in_world - goal, axis=1).max() < 0.06
-    assert list(fits.status) == ["ok", "ok"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from pathlib import Path
 
@@ -62,22 +61,3 @@ def test_a_recording_in_a_map_has_the_name_of_its_viewer(tmp_path: Path) -> None
     assert cli("run", folder, "-o", tmp_path / "out", *more) == 0
     changes = rt.Result.load(tmp_path / "out").changes
     assert changes is not None and changes.session == "flat"
-
-
-def test_true_boxes_without_a_class_do_not_count(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Class -1 in a truth with classes: areas that are not annotated."""
-    folder = photos(tmp_path / "images", 8)
-    chairs = [f"{f},1,{100 + f},50,60,90" for f in range(1, 9)]
-    areas = [f"{f},2,200,20,100,200" for f in range(1, 9)]
-    (tmp_path / "det.txt").write_text("\n".join(f"{r},.9,56" for r in chairs + areas) + "\n")
-    truth = [f"{row},1,56,1" for row in chairs] + [f"{row},1,-1,1" for row in areas]
-    (tmp_path / "gt.txt").write_text("\n".join(truth) + "\n")
-    out = tmp_path / "out"
-    assert cli("track", folder, "-o", out, "--tracks", tmp_path / "det.txt") == 0
-    capsys.readouterr()
-    assert cli("eval", out, "--gt", tmp_path / "gt.txt") == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert re.search(r"all 100\.0 100\.0 100\.0", said) and "not found" not in said
-    assert "8 true boxes without a class (below 0) do not count, nor do boxes on them" in said
