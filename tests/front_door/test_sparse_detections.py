@@ -14,7 +14,6 @@ from simulated import unlinked, walk
 import reobj_track as rt
 from reobj.objects.fit import link_and_fit
 from reobj.sources.recorded import frames_looked_at
-from reobj.tracking.linking import fill_gaps
 
 TABLE, CHAIR = 60, 56
 FRAMES = 60
