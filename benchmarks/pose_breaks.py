@@ -58,7 +58,10 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
-import render_room as rr
+from rendering.camera import TURNS_FROM_TO, camera_matrix
+from rendering.config import RoomConfig
+from rendering.photograph import render_clip
+from rendering.room import make_room
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import reobj_track as rt
@@ -405,14 +408,14 @@ class Recording:
     every: int = 1
     truth: str = ""
     focal: float = 0.0
-    room: rr.RoomConfig | None = None
+    room: RoomConfig | None = None
     good_every: int = 1
     today: int = 0
     noise: float = 0.0
     plan: str = ""
 
 
-SMALL = rr.RoomConfig(width=400, height=300, supersample=1, texels_per_m=200, light_rays=2)
+SMALL = RoomConfig(width=400, height=300, supersample=1, texels_per_m=200, light_rays=2)
 
 
 def rendered(seed: int, path: str, frames: int, plan: str = "home", today: int = 0) -> Recording:
@@ -483,9 +486,9 @@ class Shelf:
 
     def _render(self, name: str) -> Clip:
         config = RECORDINGS[name].room or SMALL
-        frames = list(rr.render_clip(rr.make_room(config), config))
+        frames = list(render_clip(make_room(config), config))
         truth = np.stack([f.cam_from_world for f in frames])
-        focal = float(rr.camera_matrix(config)[0, 0]) / config.width
+        focal = float(camera_matrix(config)[0, 0]) / config.width
         images = np.stack([f.image for f in frames])
         return Clip(images, truth, np.zeros(len(frames), np.int64), focal)
 
@@ -642,7 +645,7 @@ def turn(shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
     name = str(rng.choice(["turn", "turn_b"]))
     clip, every = shelf.clip(name), int(rng.integers(1, 5))
     count = len(clip.images)
-    first, last = (round(fraction * count) for fraction in rr.TURNS_FROM_TO)
+    first, last = (round(fraction * count) for fraction in TURNS_FROM_TO)
     before, after = rng.integers(8, first + 1), rng.integers(8, count - last + 1)
     rows = np.r_[first - before : first, first:last:every, last : last + after]
     if rng.random() < 0.25:
