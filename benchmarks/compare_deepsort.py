@@ -47,7 +47,7 @@ import render_room
 from benchmark import TUNED, Array, IntArray, Options, Stream, run_tracker, table
 from splits import MARK, SPLITS, add_choosing, held_out, room_name, usable
 
-sys.path.insert(0, os.environ.get("REOBJ_TRACK", str(Path(__file__).resolve().parent.parent)))
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import reobj_track as rt
 from reobj.evaluation.tracks import return_ranks, score_tracks
 from reobj.evaluation.truth import LabelledBoxes, labelled, read_truth
@@ -259,23 +259,12 @@ def stream_of(seq: Sequence, embedded: list[Array] | None) -> Stream:
     return Stream(len(count), frame, box, score, cls, *facts)
 
 
-def peer_run(
-    peer: str, options: Options, seq: Sequence, venvs: Path, embedded: Embedded | None
-) -> IntArray:
-    """Run a peer: identity of every detection (N,), 0 for none."""
-    return run_tracker(peer, stream_of(seq, embedded), venvs, options)[0]
-
-
-def ours(
-    seq: Sequence, embedded: Embedded | None, config: rt.TrackerConfig | None = None
-) -> IntArray:
-    """Our tracker alone, frame by frame, its own embedder unless embeddings are given."""
-    embedder = rt.Embedder() if seq.images is not None and embedded is None else None
-    tracker, identity = rt.Tracker(config, embedder), []
+def ours(seq: Sequence) -> IntArray:
+    """Our tracker alone, frame by frame, with its own embedder where there are images."""
+    tracker, identity = rt.Tracker(None, rt.Embedder() if seq.images is not None else None), []
     frames = iter(seq.video()) if seq.images is not None else None
-    for f, found in enumerate(seq.detections):
-        image = None if frames is None else next(frames).image
-        tracks = tracker.update(found, image, embeddings=None if embedded is None else embedded[f])
+    for found in seq.detections:
+        tracks = tracker.update(found, None if frames is None else next(frames).image)
         ids = np.zeros(len(found), np.int64)
         ids[tracks.detection_index] = tracks.track_id
         identity.append(ids)
@@ -354,39 +343,31 @@ def appearance_ranks(seq: Sequence, embedded: Callable[[], Embedded]) -> IntArra
     return return_ranks(seq.truth, found, stream.embedding)
 
 
-def with_embeddings(
-    make: Callable[[Embedded], IntArray], embedded: Callable[[], Embedded]
-) -> IntArray:
-    """A tracker's run on embeddings that are only computed now."""
-    return make(embedded())
-
-
 def jobs(seq: Sequence, args: Any) -> dict[str, tuple[str, Callable[[], IntArray]]]:
     """For every tracker: what its result depends on, and how to make it.
 
     `appearance NAME` gives the ranks of the returns instead of identities.
     """
     part, source = functools.partial, SOURCE + EMBEDDER
-    result: dict[str, tuple[str, Callable[[], IntArray]]] = {
-        "ours": (source, part(ours, seq, None))
-    }
+    result: dict[str, tuple[str, Callable[[], IntArray]]] = {"ours": (source, part(ours, seq))}
     settings: dict[str, tuple[str, Options]] = {peer: (peer, {}) for peer in TUNED}
     settings |= {f"{peer} tuned": (peer, TUNED[peer]) for peer in TUNED if TUNED[peer]}
-    settings = settings if args.peers else {}
-    nets = networks(seq)
-    for name, net in nets.items():
+
+    def peer_run(peer: str, options: Options, embedded: Callable[[], Embedded | None]) -> IntArray:
+        return run_tracker(peer, stream_of(seq, embedded()), args.peers, options)[0]
+
+    # what DeepSORT may look at: name, what it depends on, embeddings when they are needed
+    looks: list[tuple[str, str, Callable[[], Embedded | None]]] = []
+    for name, net in networks(seq).items():
         embedded = functools.cache(part(embed_all, seq, net))
         key = digest(net.path) if name != "own embedding" else EMBEDDER
         result[f"appearance {name}"] = (key, part(appearance_ranks, seq, embedded))
-        for label, (peer, options) in settings.items():
-            if peer == "deepsort":
-                run = part(peer_run, peer, options, seq, args.peers)
-                job = (key + str(options), part(with_embeddings, run, embedded))
-                result[f"{label}, {name}"] = job
-    for label, (peer, options) in settings.items():
-        if peer != "deepsort" or not nets:
-            run = part(peer_run, peer, options, seq, args.peers, None)
-            result[label + ", no appearance" * (peer == "deepsort")] = (str(options), run)
+        looks.append((f", {name}", key, embedded))
+    nothing = ("", "", lambda: None)
+    for label, (peer, options) in settings.items() if args.peers else ():
+        blind = [nothing] if peer != "deepsort" else [(", no appearance", *nothing[1:])]
+        for name, key, look in looks if peer == "deepsort" and looks else blind:
+            result[label + name] = (key + str(options), part(peer_run, peer, options, look))
     if seq.images is not None and seq.group.startswith("rooms"):
         chain = args.out / "chain"
         result["ours, whole video, no poses"] = (source, part(whole_chain, seq, chain, "none"))
@@ -410,9 +391,6 @@ def kept_run(
 def variants(seq: Sequence, args: Any) -> dict[str, IntArray]:
     """Identities (N,) of every tracker on one sequence."""
     return {t: kept_run(seq, t, *job, args.out) for t, job in jobs(seq, args).items()}
-
-
-# ---- Tuning the peers --------------------------------------------------------------------------
 
 
 # ---- Output ------------------------------------------------------------------------------------
@@ -481,28 +459,6 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     return "\n".join(table(f"**{n}**", HEADER, lines) for n, lines in body.items())
 
 
-def verdicts(rows: list[dict[str, Any]]) -> list[str]:
-    """For every sequence: ours online against the best peer, and identities against DeepSORT."""
-    lines = []
-    for name in dict.fromkeys(r["sequence"] for r in rows):
-        part = {r["tracker"]: r for r in rows if r["sequence"] == name}
-        peers = [r for t, r in part.items() if not t.startswith("ours")]
-        if not peers:
-            continue
-        text = ", ".join(
-            f"{100 * (part['ours'][c] - max(p[c] for p in peers)):+.1f} {c}"
-            for c in ("IDF1", "AssA", "HOTA")
-        )
-        other = next(p["ids_per_object"] for p in peers if p["tracker"].startswith("deepsort"))
-        mine = [r["ids_per_object"] for t, r in part.items() if t.startswith("ours")]
-        online, last = (f"{100 * (ids / other - 1):+.0f} %" for ids in (mine[0], mine[-1]))
-        lines.append(
-            f"{name}: ours {text} against the best peer; identities per real object against "
-            f"DeepSORT {online} online, {last} in our last row"
-        )
-    return lines
-
-
 def rendered(names: list[str], folder: Path) -> list[Path]:
     """Rooms of render_room.py by seed, made where missing; v7: of its own plan."""
     rooms = [folder / f"room_{name}" for name in names]
@@ -566,7 +522,7 @@ def main() -> int:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
-    print(markdown(rows), *verdicts(rows), sep="\n- ")
+    print(markdown(rows))
     return 0
 
 
