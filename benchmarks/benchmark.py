@@ -32,6 +32,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from tables import table
 
 Array = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -438,12 +439,6 @@ def revisit_row(row: str, venvs: Path | None, objects: int) -> list[str]:
     return cells
 
 
-def table(title: str, header: str, rows: list[list[str]]) -> str:
-    """Format a Markdown table."""
-    lines = [f"\n{title}\n", f"| {header} |", "|---" * (header.count("|") + 1) + "|"]
-    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
-
-
 def main() -> int:
     """Run the benchmark and print its tables."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
@@ -459,14 +454,14 @@ def main() -> int:
         return 0
     names = [n for n, (tracker, _) in ROWS.items() if args.peers or tracker == "ours"]
     names = [n for n in names if n in (args.only or n).split(",")]
-    header = " | ".join(f"{n} objects" for n in STEADY)
+    head = ["tracker", *(f"{n} objects" for n in STEADY), "IDF1 of each"]
     steady = steady_rows(names, args.peers, args.runs)
     title = f"Steady, ms a frame, median / p95; load of the machine {os.getloadavg()[0]:.1f}"
-    print(table(title, f"tracker | {header} | IDF1 of each", steady), flush=True)
-    header = "tracker | revisit: recovered, stolen, IDF1 | hard | shape"
+    print(table(head, steady, title), flush=True)
+    head = ["tracker", "revisit: recovered, stolen, IDF1", "hard", "shape"]
     for objects in (int(n) for n in args.revisit.split(",") if n):
         revisit = [revisit_row(n, args.peers, objects) for n in names]
-        print(table(f"Revisit, {objects} objects", header, revisit), flush=True)
+        print(table(head, revisit, f"Revisit, {objects} objects"), flush=True)
     return 0
 
 

@@ -44,8 +44,9 @@ from typing import Any
 import cv2
 import numpy as np
 import render_room
-from benchmark import TUNED, Array, IntArray, Options, Stream, run_tracker, table
+from benchmark import TUNED, Array, IntArray, Options, Stream, run_tracker
 from splits import MARK, SPLITS, add_choosing, held_out, room_name, usable
+from tables import table
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import reobj_track as rt
@@ -162,12 +163,12 @@ def mot_sequences(folder: Path) -> list[Sequence]:
 def kitchen_sequence(folder: Path) -> Sequence:
     """A recording with detections_yolov8s.csv and gt_mot.txt of some classes."""
     truth = read_truth(folder / "gt_mot.txt", rt.COCO_NAMES, 0.0)
-    truth = truth[np.isin(truth.name, KITCHEN)]
     rows = np.loadtxt(folder / "detections_yolov8s.csv", delimiter=",")
     rows = rows[np.isin(rows[:, 6], [rt.COCO_NAMES.index(n) for n in KITCHEN])]
     count = len(list((folder / "images").iterdir()))
     found = split_frames(rows[:, 0].astype(np.int64), rows[:, 1:], count)
     out = held_out("recordings", folder.name)
+    truth = truth[np.isin(truth.name, KITCHEN)]
     return Sequence(folder.name, "rooms", found, truth, folder / "images", held_out=out)
 
 
@@ -433,30 +434,28 @@ def report(found: dict[str, dict[str, IntArray]], seqs: list[Sequence]) -> list[
     return rows
 
 
+SPREAD = ("HOTA", "IDF1")  # scores with the least and largest of the sequences
+SCORES = ("HOTA", "DetA", "AssA", "IDF1", "MOTA")
+HEAD = ("tracker", *SCORES, "IDSW", "ids per object", "ids / objects", "returns kept", "Rank-1")
+
+
 def cells(row: dict[str, Any]) -> list[str]:
     """One line of a table."""
-    scores = [f"{100 * row[c]:.1f}" for c in "HOTA DetA AssA IDF1 MOTA".split()]
-    for c, at in SPREAD.items():
+    found = {c: f"{100 * row[c]:.1f}" for c in SCORES}
+    for c in SPREAD:
         if row[f"{c}_min"] < row[f"{c}_max"]:
-            scores[at] += f" ({100 * row[f'{c}_min']:.0f}-{100 * row[f'{c}_max']:.0f})"
+            found[c] += f" ({100 * row[f'{c}_min']:.0f}-{100 * row[f'{c}_max']:.0f})"
     kept = f"{round(row['returns'] * row['returns_kept'])} of {row['returns']}"
     rank1 = "-" if np.isnan(row["rank1"]) else f"{100 * row['rank1']:.0f}"
     ids = [f"{row['ids_per_object']:.2f}", f"{row['identities']} / {row['gt_objects']}"]
-    return [row["tracker"], *scores, str(row["IDSW"]), *ids, kept, rank1]
-
-
-SPREAD = {"HOTA": 0, "IDF1": 3}  # columns with the least and largest of the sequences
-HEADER = (
-    "tracker | HOTA | DetA | AssA | IDF1 | MOTA | IDSW | ids per object | ids / objects | "
-    "returns kept | Rank-1"
-)
+    return [row["tracker"], *found.values(), str(row["IDSW"]), *ids, kept, rank1]
 
 
 def markdown(rows: list[dict[str, Any]]) -> str:
     """One table for each sequence."""
     names = dict.fromkeys(r["sequence"] for r in rows)
     body = {n: [cells(r) for r in rows if r["sequence"] == n] for n in names}
-    return "\n".join(table(f"**{n}**", HEADER, lines) for n, lines in body.items())
+    return "\n".join(table(HEAD, lines, f"**{n}**") for n, lines in body.items())
 
 
 def rendered(names: list[str], folder: Path) -> list[Path]:

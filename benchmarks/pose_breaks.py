@@ -63,6 +63,7 @@ from rendering.camera import TURNS_FROM_TO, camera_matrix
 from rendering.config import RoomConfig
 from rendering.photograph import render_clip
 from rendering.room import make_room
+from tables import table
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import reobj_track as rt
@@ -79,16 +80,18 @@ SHORT = rt.PosesConfig(size_px=320)  # for 24-40 pictures, of which all are keyf
 
 # ---- Verdict ------------------------------------------------------------------------------------
 
-# Error of a centre over the extent of its part's true path. Good recordings stay below .06
+# Error of a centre over the extent of its component's true path. Good recordings stay below .06
 # (benchmarks/RESULTS.md: redkitchen against a Kinect), a wrong loop of the corridor is at .6.
 MAX_CENTRE = 0.1
 LEAST_EXTENT = 0.05  # of that path over all of its world's: below it a component hardly moved
-# Local scale within a part over that of most of it. Half as much again bends a straight path by no
+# Local scale within a component over that of most of it. Half as much again bends a straight path by no
 # more than .05 of its extent, which MAX_CENTRE lets pass.
 MAX_SCALE_JUMP = 1.35
 MAX_TURN_DEG = 10.0  # error of an orientation; good recordings stay below 3 in the median
-STRAY_SHARE = 0.05  # of a part's frames, at least one: so many are strays, counted and not a break
-WHOLE_SHARE = 0.9  # of the frames in one part: whole
+STRAY_SHARE = (
+    0.05  # of a component's frames, at least one: so many are strays, counted and not a break
+)
+WHOLE_SHARE = 0.9  # of the frames in one component: whole
 
 
 def align(found: Array, truth: Array) -> tuple[Array, Array]:
@@ -137,8 +140,8 @@ def misfit(
     return error, np.degrees(np.arccos(np.clip(cosine, -1, 1)))
 
 
-def fit_part(found: Array, truth: Array, least_extent: float = 1e-9) -> tuple[Array, Array]:
-    """Measure the cameras (n, 3, 4) of one part under the similarity on which most agree.
+def fit_component(found: Array, truth: Array, least_extent: float = 1e-9) -> tuple[Array, Array]:
+    """Measure the cameras (n, 3, 4) of one component under the similarity on which most agree.
 
     Hypotheses are fitted to all, to halves, quarters and eighths of the path and to random samples.
 
@@ -173,7 +176,7 @@ def local_scale(found: Array, truth: Array, noise: float = 0.0) -> Array:
     """Measure by how much the path around each frame is larger or smaller than most of it is.
 
     Args:
-        found, truth: cam_from_world (n, 3, 4) of a part, in order. noise: of the true centres.
+        found, truth: cam_from_world (n, 3, 4) of a component, in order. noise: of the true centres.
     Returns:
         (n,) true over found spread of the centres in a window, over the value on which most frames
         agree; 1 where the camera hardly moved.
@@ -204,17 +207,17 @@ class Verdict:
 
     Attributes:
         outcome: whole, partly, refused, said or passed (head of this file).
-        posed: fraction of the frames that have a pose. right: frames whose pose is right. parts:
-        number of parts with poses.
-        strays: frames off their part that are too few to be a break. wrong: frame numbers of those
-        that do not belong to their part. centre, turn_deg: their median errors (of all frames, if
-        none is wrong), centres over the extent of the part. look: what to look at.
+        posed: fraction of the frames that have a pose. right: frames whose pose is right.
+        components: number of those with poses.
+        strays: frames off their component that are too few to be a break. wrong: frame numbers of those
+        that do not belong to their component. centre, turn_deg: their median errors (of all frames, if
+        none is wrong), centres over the extent of the component. look: what to look at.
     """
 
     outcome: str
     posed: float
     right: int
-    parts: int
+    components: int
     strays: int
     wrong: tuple[int, ...]
     centre: float
@@ -233,8 +236,8 @@ def judge(poses: rt.Poses, truth: Array, world: IntArray, noise: float = 0.0) ->
     posed = poses.known & (poses.status != "interpolated")
     wrong, strays, looks, right = list[int](), 0, list[str](), [0]
     errors, bad_errors = list[Array](), list[Array]()
-    for part in np.unique(poses.part[posed]):
-        rows = np.flatnonzero(posed & (poses.part == part))
+    for component in np.unique(poses.part[posed]):
+        rows = np.flatnonzero(posed & (poses.part == component))
         rows = rows[np.isfinite(truth[poses.frame[rows]]).all((1, 2))]
         if not len(rows):
             continue
@@ -245,7 +248,7 @@ def judge(poses: rt.Poses, truth: Array, world: IntArray, noise: float = 0.0) ->
         pair, scale = (poses.cam_from_world[rows[own]], truth[frame[own]]), np.ones(len(rows))
         of_world = np.isfinite(truth).all((1, 2)) & (world == at[0][at[1].argmax()])
         least = max(LEAST_EXTENT * extent_of(truth[of_world]), noise / MAX_CENTRE, 1e-9)
-        error[own], turn[own] = fit_part(*pair, least)
+        error[own], turn[own] = fit_component(*pair, least)
         good = fits(error, turn)
         scale[good] = local_scale(pair[0][good[own]], pair[1][good[own]], noise)
         good &= np.abs(np.log(scale)) <= np.log(MAX_SCALE_JUMP)
@@ -256,7 +259,7 @@ def judge(poses: rt.Poses, truth: Array, world: IntArray, noise: float = 0.0) ->
         elif not good.all():
             wrong += frame[~good].tolist()
             bad_errors.append(errors[-1][:, ~good])
-            looks.append(describe(int(part), frame, own, good, errors[-1]))
+            looks.append(describe(int(component), frame, own, good, errors[-1]))
     known = np.isfinite(truth).all((1, 2)).sum()
     if not errors:
         return Verdict("refused", 0.0, 0, 0, 0, (), 0.0, 0.0, "; ".join(poses.messages)[:200])
@@ -272,7 +275,7 @@ def judge(poses: rt.Poses, truth: Array, world: IntArray, noise: float = 0.0) ->
 
 
 def describe(
-    part: int,
+    component: int,
     frame: IntArray,
     own: BoolArray,
     good: BoolArray,
@@ -282,7 +285,7 @@ def describe(
     other = f", {(~own).sum()} of them of another world" if not own.all() else ""
     off, turn = np.median(errors[:, ~good], axis=1)
     far = f"{100 * off:.0f} % of the path" if np.isfinite(off) else "no place at all in it"
-    text = f"part {part} of {len(frame)} frames: {(~good).sum()} wrong ({spans(frame[~good])})"
+    text = f"component {component} of {len(frame)} frames: {(~good).sum()} wrong ({spans(frame[~good])})"
     return f"{text}{other}; in the median off by {far} and {turn:.0f} deg"
 
 
@@ -399,7 +402,7 @@ class Recording:
         source: file or folder below --data or examples/. every: of its pictures, for the clip.
         truth: file of true poses, "" without: the poses of the whole recording, found once at the
         defaults, take its place. focal: true one over the width (0: the one found).
-        room: RoomConfig of a rendered one. today: frames with a right pose, in one part, at the
+        room: RoomConfig of a rendered one. today: frames with a right pose, in one component, at the
         defaults with `good_every`, at commit a196537; interpolated ones do not count. 0: broken.
         noise: largest error of a true centre, in its unit: smaller errors are not significant.
         plan: of a rendered room, "" without. Rooms of one plan are one scene in other colours, to
@@ -649,11 +652,9 @@ def two_rooms(shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
         focal = max(clip.focal for clip in clips)
         clips = [with_focal(clip, focal, size) for clip in clips]
     turns = int(rng.choice([1, 1, 2, 3]))
-    pieces = [
-        replace(clip, world=clip.world + i).rows(rows)
-        for rows_of_both in zip(*(np.array_split(np.arange(len(c.images)), turns) for c in clips))
-        for i, (clip, rows) in enumerate(zip(clips, rows_of_both, strict=True))
-    ]
+    splits = [np.array_split(np.arange(len(clip.images)), turns) for clip in clips]
+    worlds = [replace(clip, world=clip.world + i) for i, clip in enumerate(clips)]
+    pieces = [worlds[i].rows(splits[i][k]) for k in range(turns) for i in (0, 1)]
     columns = [
         np.concatenate([getattr(p, k) for p in pieces]) for k in ("images", "truth", "world")
     ]
@@ -794,7 +795,7 @@ def planned(args: argparse.Namespace, shelf: Shelf) -> list[str]:
 
 QUICK_CASES = 12
 QUICK_WALKS = ("room", "walk", "tour")  # needs nothing but this repository
-PARTS_OF_OUTCOME = ("whole", "partly", "refused", "said", "passed", "crashed")
+OUTCOMES = ("whole", "partly", "refused", "said", "passed", "crashed")
 
 
 def main() -> int:
@@ -832,9 +833,9 @@ def main() -> int:
             left = (time.monotonic() - started) / count * (len(jobs) - count) / 60
             print(f"{count}/{len(jobs)} {line['case']}: {line['outcome']} {line['cpu_s']} s, "
                   f"{left:.0f} min left", file=sys.stderr, flush=True)  # fmt: skip
-    chosen = [done[name] for name in names if name in done]
-    print(table(chosen))
-    return int(any(failed(line) for line in chosen))
+    lines = [done[name] for name in names if name in done]
+    print(summary(lines))
+    return int(any(failed(line) for line in lines))
 
 
 def make_clips(shelf: Shelf, walks: Sequence[str], names: Sequence[str], jobs: int) -> None:
@@ -871,37 +872,36 @@ def failed(line: dict[str, Any]) -> bool:
     today = RECORDINGS[line["case"].partition("-")[2]].today if line["kind"] == "good" else 0
     if not today:
         return False
-    torn = line["outcome"] == "said" or line["parts"] != 1
+    torn = line["outcome"] == "said" or line["components"] != 1
     return bool(torn or line["right"] < WHOLE_SHARE * today)
 
 
-def table(lines: Sequence[dict[str, Any]]) -> str:
+def summary(lines: Sequence[dict[str, Any]]) -> str:
     """Format the summary: a row a kind, good recordings, failing cases."""
-    text = ["| kind | cases | " + " | ".join(PARTS_OF_OUTCOME) + " | stray frames | s a case |"]
-    text += ["|---" * (len(PARTS_OF_OUTCOME) + 4) + "|"]
     broken = [line for line in lines if line["kind"] != "good"]
+    rows = []
     for kind in [*dict.fromkeys(line["kind"] for line in broken), "all"]:
-        rows = [line for line in broken if kind in (line["kind"], "all")]
-        counts = [sum(row["outcome"] == o for row in rows) for o in PARTS_OF_OUTCOME]
-        strays = sum(row.get("strays", 0) for row in rows)
-        seconds = np.mean([row["cpu_s"] for row in rows]) if rows else 0.0
-        numbers = " | ".join(map(str, [len(rows), *counts, strays]))
-        text.append(f"| {kind} | {numbers} | {seconds:.1f} |")
+        own = [line for line in broken if kind in (line["kind"], "all")]
+        counts = [sum(line["outcome"] == o for line in own) for o in OUTCOMES]
+        strays = sum(line.get("strays", 0) for line in own)
+        seconds = np.mean([line["cpu_s"] for line in own]) if own else 0.0
+        rows.append([kind, len(own), *counts, strays, f"{seconds:.1f}"])
+    text = [table(["kind", "cases", *OUTCOMES, "stray frames", "s a case"], rows)]
     good = [line for line in lines if line["kind"] == "good"]
     if good:
-        text += [
-            "",
-            "| recording | with pose | right | right at a196537 | parts | outcome | centre, % | "
-            "turn, deg | focal / true |",
+        keys = ("known", "frames", "right", "components", "outcome", "centre", "turn_deg")
+        rows = [
+            [
+                g["case"][5:],
+                *map(g.get, keys),
+                g.get("focal_ratio"),
+                RECORDINGS[g["case"][5:]].today,
+            ]
+            for g in good
         ]
-        text += ["|---" * 9 + "|"]
-    for g in good:
-        text.append(
-            f"| {g['case'][5:]} | {g.get('known')} of {g.get('frames')} | {g.get('right')} | "
-            f"{RECORDINGS[g['case'][5:]].today} | {g.get('parts')} | "
-            f"{g['outcome']} | {100 * g.get('centre', 0):.2f} | {g.get('turn_deg', 0):.2f} | "
-            f"{g.get('focal_ratio')} |"
-        )
+        head = ["recording", "with pose", "of", "right", "components", "outcome", "centre", "turn, deg",
+                "focal / true", "right at a196537"]  # fmt: skip
+        text += ["", table(head, rows)]
     lost = sum(failed(g) for g in good)
     passed = sum(line["outcome"] == "passed" for line in broken)
     text += ["", f"passed as good though wrong: {passed} of {len(broken)}; good recordings refused "

@@ -20,6 +20,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+from tables import table
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import quadrics
@@ -268,12 +269,6 @@ def coverage(
 
 
 # ---- Tables --------------------------------------------------------------------------------
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """Markdown table."""
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    return "\n".join(lines + ["| " + " | ".join(str(x) for x in row) + " |" for row in rows])
 
 
 def lfd_overlap(boxes: Array, cams: Array, truth: Ellipsoids) -> tuple[float, float]:
