@@ -84,13 +84,11 @@ SHORT = rt.PosesConfig(size_px=320)  # for 24-40 pictures, of which all are keyf
 # (benchmarks/RESULTS.md: redkitchen against a Kinect), a wrong loop of the corridor is at .6.
 MAX_CENTRE = 0.1
 LEAST_EXTENT = 0.05  # of that path over all of its world's: below it a component hardly moved
-# Local scale within a component over that of most of it. Half as much again bends a straight path by no
-# more than .05 of its extent, which MAX_CENTRE lets pass.
+# Local scale within a component over that of most of it. Half as much again bends a straight path
+# by no more than .05 of its extent, which MAX_CENTRE lets pass.
 MAX_SCALE_JUMP = 1.35
 MAX_TURN_DEG = 10.0  # error of an orientation; good recordings stay below 3 in the median
-STRAY_SHARE = (
-    0.05  # of a component's frames, at least one: so many are strays, counted and not a break
-)
+STRAY_SHARE = 0.05  # of a component's frames, at least one, may be strays: counted, no break
 WHOLE_SHARE = 0.9  # of the frames in one component: whole
 
 
@@ -208,10 +206,10 @@ class Verdict:
     Attributes:
         outcome: whole, partly, refused, said or passed (head of this file).
         posed: fraction of the frames that have a pose. right: frames whose pose is right.
-        components: number of those with poses.
-        strays: frames off their component that are too few to be a break. wrong: frame numbers of those
-        that do not belong to their component. centre, turn_deg: their median errors (of all frames, if
-        none is wrong), centres over the extent of the component. look: what to look at.
+        components: number of those with poses. strays: frames off their component that are too few
+        to be a break. wrong: numbers of frames that do not belong to their component.
+        centre, turn_deg: their median errors (of all frames, if none is wrong), centres over the
+        extent of the component. look: what to look at.
     """
 
     outcome: str
@@ -285,8 +283,8 @@ def describe(
     other = f", {(~own).sum()} of them of another world" if not own.all() else ""
     off, turn = np.median(errors[:, ~good], axis=1)
     far = f"{100 * off:.0f} % of the path" if np.isfinite(off) else "no place at all in it"
-    text = f"component {component} of {len(frame)} frames: {(~good).sum()} wrong ({spans(frame[~good])})"
-    return f"{text}{other}; in the median off by {far} and {turn:.0f} deg"
+    text = f"component {component} of {len(frame)} frames: {(~good).sum()} wrong"
+    return f"{text} ({spans(frame[~good])}){other}; in the median off by {far} and {turn:.0f} deg"
 
 
 def spans(numbers: Iterable[int]) -> str:
@@ -402,8 +400,9 @@ class Recording:
         source: file or folder below --data or examples/. every: of its pictures, for the clip.
         truth: file of true poses, "" without: the poses of the whole recording, found once at the
         defaults, take its place. focal: true one over the width (0: the one found).
-        room: RoomConfig of a rendered one. today: frames with a right pose, in one component, at the
-        defaults with `good_every`, at commit a196537; interpolated ones do not count. 0: broken.
+        room: RoomConfig of a rendered one. today: frames with a right pose, in one component, at
+        the defaults with `good_every`, at commit a196537; interpolated ones do not count. 0:
+        broken.
         noise: largest error of a true centre, in its unit: smaller errors are not significant.
         plan: of a rendered room, "" without. Rooms of one plan are one scene in other colours, to
         15 cm, and are rightly joined.
@@ -890,17 +889,13 @@ def summary(lines: Sequence[dict[str, Any]]) -> str:
     good = [line for line in lines if line["kind"] == "good"]
     if good:
         keys = ("known", "frames", "right", "components", "outcome", "centre", "turn_deg")
-        rows = [
-            [
-                g["case"][5:],
-                *map(g.get, keys),
-                g.get("focal_ratio"),
-                RECORDINGS[g["case"][5:]].today,
-            ]
-            for g in good
-        ]
-        head = ["recording", "with pose", "of", "right", "components", "outcome", "centre", "turn, deg",
-                "focal / true", "right at a196537"]  # fmt: skip
+        rows = []
+        for g in good:
+            name = g["case"][5:]
+            today = RECORDINGS[name].today
+            rows.append([name, *map(g.get, keys), g.get("focal_ratio"), today])
+        titles = ("with pose", "of", "right", "components", "outcome", "centre", "turn, deg")
+        head = ["recording", *titles, "focal / true", "right at a196537"]
         text += ["", table(head, rows)]
     lost = sum(failed(g) for g in good)
     passed = sum(line["outcome"] == "passed" for line in broken)

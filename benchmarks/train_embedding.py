@@ -488,25 +488,21 @@ class ColourMap(nn.Module):
     """
 
     def __init__(self) -> None:
-        super().__init__()
-        turn = torch.arange(6) * (2 * np.pi / 6)
-        self.register_buffer("turns", torch.stack([turn.cos(), turn.sin()], 1)[..., None, None])
-        xyz = [[0.1805 / 0.9505, 0.3576 / 0.9505, 0.4124 / 0.9505], [0.0722, 0.7152, 0.2126],
-               [0.9505 / 1.089, 0.1192 / 1.089, 0.0193 / 1.089]]  # fmt: skip
-        self.register_buffer("xyz", torch.tensor(xyz)[..., None, None])  # sRGB, D65, BGR order
-        sobel = torch.tensor([[-1.0, 0, 1], [-2, 0, 2], [-1, 0, 1]]) / 2
-        self.register_buffer("sobel", torch.stack([sobel, sobel.T])[:, None])
-        self.fuse()
-
-    def fuse(self) -> None:
         """Put in one convolution each what is linear: mean and range of the pixels; of the roots of
         X, Y, Z: chroma, its length in every direction, four times the lightness; its edges.
         """
-        turns, sobel = self.turns[:, :, 0, 0], 1.16 * self.sobel[:, 0]  # (6, 2), (2, 3, 3)
+        super().__init__()
+        turn = torch.arange(6) * (2 * np.pi / 6)
+        turns = torch.stack([turn.cos(), turn.sin()], 1)  # (6, 2)
+        xyz = [[0.1805 / 0.9505, 0.3576 / 0.9505, 0.4124 / 0.9505], [0.0722, 0.7152, 0.2126],
+               [0.9505 / 1.089, 0.1192 / 1.089, 0.0193 / 1.089]]  # fmt: skip
+        sobel = torch.tensor([[-1.0, 0, 1], [-2, 0, 2], [-1, 0, 1]]) * 0.58
+        sobel = torch.stack([sobel, sobel.T])  # (2, 3, 3)
         chroma = torch.tensor([[12.5, -12.5, 0], [0, 5, -5]])
         level = torch.tensor([[0, 4.64, 0]]).repeat(5, 1)
         parts = {
             "mean": torch.eye(3)[..., None, None].repeat(1, 1, 4, 4) / (16 * 255),
+            "xyz": torch.tensor(xyz)[..., None, None],  # sRGB, D65, BGR order
             "linear": torch.cat([chroma, turns @ chroma, level])[..., None, None],
             "offset": torch.cat([torch.zeros(8), -0.64 - torch.arange(5.0)]),
             "edges": torch.cat([sobel, torch.einsum("kc,cij->kij", turns, sobel)])[:, None],
@@ -761,24 +757,16 @@ def rank_one(net: Net, clips: Sequence[Clip], device: Any) -> dict[str, float]:
 
 
 def mean_hits(clips: Sequence[Any]) -> dict[str, float]:
-    """Rank-1 of each part and of all together, from (rows of the parts, frame, identity, look) of
-    each clip.
-    """
-    hits: dict[str, list[float]] = {f"{p}_{g}": [] for p in PARTS for g in GROUPS}
+    """Rank-1 of all parts together, from (rows of parts, frame, identity, look) of each clip."""
+    hits: dict[str, list[float]] = {"single": [], "all": []}
     for rows, frame, identity, look in clips:
-        cosines = [part @ part.T for part in rows]
-        named = dict(zip(PARTS, cosines, strict=False)) if len(rows) > 1 else {}
+        cosine = sum(part @ part.T for part in rows)
         far = np.abs(frame[:, None] - frame) >= max(1, int(0.3 * (frame.max() + 1)))
         identical = far & (look[:, None] == look)
-        galleries = {"single": single_views(identical, identity), "all": [far]}
-        for part, cosine in {**named, "fused": sum(cosines)}.items():
-            for group, draws in galleries.items():
-                for gallery in draws:
-                    hits[f"{part}_{group}"] += first_hits(cosine, identity, gallery)
+        for gallery in single_views(identical, identity):
+            hits["single"] += first_hits(cosine, identity, gallery)
+        hits["all"] += first_hits(cosine, identity, far)
     return {name: float(np.mean(found)) if found else float("nan") for name, found in hits.items()}
-
-
-PARTS, GROUPS = ("fg", "bg", "fused"), ("single", "all")
 
 
 def single_views(gallery: Any, identity: IntArray, draws: int = 10) -> list[Any]:
@@ -948,7 +936,7 @@ class Trainer:
                 writer.writeheader()
             writer.writerow(row)
         print(json.dumps(row), flush=True)
-        score = float(np.nan_to_num([row["room_fused_single"], row["real_fused_all"]]).sum())
+        score = float(np.nan_to_num([row["room_single"], row["real_all"]]).sum())
         names = ["last.pt", "best.pt"] if score >= self.best else ["last.pt"]
         self.best = max(self.best, score)
         state = {"net": self.net.state_dict(), "optimizer": self.optimizer.state_dict()}
