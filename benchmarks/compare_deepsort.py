@@ -6,8 +6,8 @@
 Prints Markdown tables; writes OUT/compare.csv.
 All sequences use the same settings. A tracker's rows are the detections that it assigned an
 identity to, never predicted boxes. `whole chain` decides identities over the whole video, all
-others frame by frame. Results are kept in OUT/runs: an interrupted comparison resumes, and a change
-of reobj_track.py recomputes only our own rows.
+others frame by frame. Results are kept in OUT/runs: an interrupted comparison resumes; after a
+change of the code or of --every give another OUT.
 
 splits.json lists the rooms, recordings and pedestrians for reporting. All others are left out;
 --choosing includes them, marked. The rows `tuned` have the best settings of a sweep over one option
@@ -31,7 +31,6 @@ from __future__ import annotations
 import argparse
 import csv
 import functools
-import hashlib
 import os
 import re
 import sys
@@ -54,32 +53,11 @@ from reobj.evaluation.tracks import return_ranks, score_tracks
 from reobj.evaluation.truth import LabelledBoxes, labelled, read_truth
 from reobj.files import atomic
 from reobj.sources.tables import read_mot_rows
-from reobj.sources.weights import IMAGENET_MEAN, IMAGENET_STD, onnx_session, own_models
+from reobj.sources.weights import IMAGENET_MEAN, IMAGENET_STD, onnx_session
 from reobj.types import Image
 
 Embedded = list[Array]  # embeddings of every frame's detections
 KITCHEN = ("chair", "dining table", "cup")  # what redkitchen's truth knows
-
-
-def digest(*parts: Any) -> str:
-    """Twelve hex digits of bytes, arrays, the contents of files (paths) or anything that prints."""
-    total = hashlib.sha256()
-    for part in parts:
-        if isinstance(part, np.ndarray):
-            total.update(part.tobytes())
-        else:
-            total.update(part.read_bytes() if isinstance(part, Path) else str(part).encode())
-    return total.hexdigest()[:12]
-
-
-CODE = Path(rt.__file__).parent
-SOURCE = digest(
-    *(CODE / f"{m}.py" for m in ("reobj_track", "quadrics")), *sorted(CODE.glob("reobj/**/*.py"))
-)  # what our own rows depend on
-EMBEDDER = digest(  # what our own embedding depends on
-    *(CODE / f"reobj/appearance/{m}.py" for m in ("embedding", "sampling")),
-    *sorted(own_models().glob("*.onnx")),
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,7 +185,6 @@ class CropNet:
     """Unit rows from one crop a box, as DeepSORT does: resized, ImageNet mean and deviation."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
         self.session = onnx_session(path, 1)
         entry = self.session.get_inputs()[0]
         self.name, shape = entry.name, entry.shape
@@ -314,17 +291,6 @@ def joined(parts: list[LabelledBoxes]) -> LabelledBoxes:
     return LabelledBoxes(*(np.concatenate([getattr(p, k) for p in shifted]) for k in names))
 
 
-def cached(path: Path, make: Callable[[], IntArray]) -> IntArray:
-    """The result in the file, or made and written there."""
-    if path.exists():
-        with np.load(path) as data:
-            return np.asarray(data["identity"])
-    identity = make()
-    with atomic(path) as part, part.open("wb") as file:
-        np.savez_compressed(file, identity=identity)
-    return identity
-
-
 def networks(seq: Sequence) -> dict[str, Any]:
     """Appearance by name for a sequence: (image, detections) -> rows."""
     if seq.images is None:
@@ -344,54 +310,50 @@ def appearance_ranks(seq: Sequence, embedded: Callable[[], Embedded]) -> IntArra
     return return_ranks(seq.truth, found, stream.embedding)
 
 
-def jobs(seq: Sequence, args: Any) -> dict[str, tuple[str, Callable[[], IntArray]]]:
-    """For every tracker: what its result depends on, and how to make it.
+def jobs(seq: Sequence, args: Any) -> dict[str, Callable[[], IntArray]]:
+    """How to make the result of every tracker: identities (N,), 0 for none.
 
-    `appearance NAME` gives the ranks of the returns instead of identities.
+    `appearance NAME` gives the ranks of the returns instead.
     """
-    part, source = functools.partial, SOURCE + EMBEDDER
-    result: dict[str, tuple[str, Callable[[], IntArray]]] = {"ours": (source, part(ours, seq))}
+    part = functools.partial
+    result: dict[str, Callable[[], IntArray]] = {"ours": part(ours, seq)}
     settings: dict[str, tuple[str, Options]] = {peer: (peer, {}) for peer in TUNED}
     settings |= {f"{peer} tuned": (peer, TUNED[peer]) for peer in TUNED if TUNED[peer]}
 
     def peer_run(peer: str, options: Options, embedded: Callable[[], Embedded | None]) -> IntArray:
         return run_tracker(peer, stream_of(seq, embedded()), args.peers, options)[0]
 
-    # what DeepSORT may look at: name, what it depends on, embeddings when they are needed
-    looks: list[tuple[str, str, Callable[[], Embedded | None]]] = []
+    looks: dict[str, Callable[[], Embedded | None]] = {}  # what DeepSORT sees
     for name, net in networks(seq).items():
         embedded = functools.cache(part(embed_all, seq, net))
-        key = digest(net.path) if name != "own embedding" else EMBEDDER
-        result[f"appearance {name}"] = (key, part(appearance_ranks, seq, embedded))
-        looks.append((f", {name}", key, embedded))
-    nothing = ("", "", lambda: None)
+        result[f"appearance {name}"] = part(appearance_ranks, seq, embedded)
+        looks[f", {name}"] = embedded
     for label, (peer, options) in settings.items() if args.peers else ():
-        blind = [nothing] if peer != "deepsort" else [(", no appearance", *nothing[1:])]
-        for name, key, look in looks if peer == "deepsort" and looks else blind:
-            result[label + name] = (key + str(options), part(peer_run, peer, options, look))
+        if peer != "deepsort":
+            result[label] = part(peer_run, peer, options, lambda: None)
+        else:
+            for name, embeddings in (looks or {", no appearance": lambda: None}).items():
+                result[label + name] = part(peer_run, peer, options, embeddings)
     if seq.images is not None and seq.group.startswith("rooms"):
         chain = args.out / "chain"
-        result["ours, whole video, no poses"] = (source, part(whole_chain, seq, chain, "none"))
-        result["ours, whole chain"] = (source, part(whole_chain, seq, chain, "auto"))
+        result["ours, whole video, no poses"] = part(whole_chain, seq, chain, "none")
+        result["ours, whole chain"] = part(whole_chain, seq, chain, "auto")
     return result
 
 
-def kept_run(
-    seq: Sequence, tracker: str, key: str, make: Callable[[], IntArray], out: Path
-) -> IntArray:
-    """Identities (N,) of a tracker on one sequence, from OUT/runs where known."""
-    stream = stream_of(seq, None)
-    boxes = digest(stream.frame, stream.xyxy, stream.score, stream.class_id)
-    name = f"{seq.name}-{tracker}-{digest(boxes, key)}.npz".replace(", ", "-")
-    path = out / "runs" / re.sub(r"[^\w.()-]+", "_", name)
-    if not path.exists():
-        print(f"{time.strftime('%H:%M:%S')} {seq.name}: {tracker}", file=sys.stderr, flush=True)
-    return cached(path, make)
-
-
 def variants(seq: Sequence, args: Any) -> dict[str, IntArray]:
-    """Identities (N,) of every tracker on one sequence."""
-    return {t: kept_run(seq, t, *job, args.out) for t, job in jobs(seq, args).items()}
+    """Result of every tracker on one sequence, from OUT/runs where it is there."""
+    found: dict[str, IntArray] = {}
+    for tracker, make in jobs(seq, args).items():
+        name = re.sub(r"[^\w.()-]+", "_", f"{seq.name}-{tracker}")
+        path = args.out / "runs" / f"{name}.npy"
+        if not path.exists():
+            print(f"{time.strftime('%H:%M:%S')} {seq.name}: {tracker}", file=sys.stderr, flush=True)
+            identity = make()
+            with atomic(path) as file:
+                np.save(file, identity)
+        found[tracker] = np.load(path)
+    return found
 
 
 # ---- Output ------------------------------------------------------------------------------------
