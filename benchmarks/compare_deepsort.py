@@ -171,7 +171,7 @@ def thinned(seq: Sequence, every: int) -> Sequence:
     return replace(seq, name=name, group=group, detections=found, truth=truth, every=every)
 
 
-def chosen_on(seq: Sequence) -> Sequence:
+def marked(seq: Sequence) -> Sequence:
     """Mark a sequence that is not held out, and its group."""
     if seq.held_out:
         return seq
@@ -443,7 +443,7 @@ def wanted(args: argparse.Namespace) -> list[Sequence]:
     seqs += [kitchen_sequence(p) for p in args.recordings if allowed("recordings", p.name)]
     if args.mot:
         seqs += [s for s in mot_sequences(args.mot) if allowed("pedestrians", s.name)]
-    return [chosen_on(s) for s in seqs]
+    return [marked(s) for s in seqs]
 
 
 def make_parser() -> argparse.ArgumentParser:

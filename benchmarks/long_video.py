@@ -91,13 +91,13 @@ def measure(out: Path, count: int, options: Sequence[str]) -> dict[str, float]:
     words = [sys.executable, str(ROOT / "reobj_track.py"), "run", "clip.mp4", "--detections"]
     words += ["boxes.csv", "-o", "out", "--overwrite", *options]
     shutil.rmtree(folder / "out", ignore_errors=True)
-    largest, together = 0.0, 0.0  # MB
+    samples: list[tuple[float, float]] = []  # MB of the largest process, of all
     began = time.monotonic()
     with open(folder / "log.txt", "w") as log, open(folder / "progress.txt", "w") as progress:
         process = subprocess.Popen(words, stdout=log, stderr=progress, cwd=folder)
         while process.poll() is None:
             sizes = resident_mb(process.pid) or [0.0]
-            largest, together = max(largest, *sizes), max(together, sum(sizes))
+            samples.append((max(sizes), sum(sizes)))
             time.sleep(0.2)
     whole = time.monotonic() - began
     if process.returncode:
@@ -107,6 +107,7 @@ def measure(out: Path, count: int, options: Sequence[str]) -> dict[str, float]:
     line = re.findall(r"^seconds: (.*)$", text, re.MULTILINE)[-1]
     seconds = dict(re.findall(r"(\w+) ([\d.]+)", re.sub(r"\([^)]*\)", "", line)))
     stages = {stage: float(seconds.get(stage, 0)) for stage in STAGES}
+    largest, together = np.max(samples, axis=0)
     return {"whole": whole, **stages, "MB": largest, "MB_all": together}
 
 

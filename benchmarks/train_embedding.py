@@ -950,7 +950,8 @@ class Trainer:
         state = torch.load(self.args.out / name, map_location=self.device, weights_only=True)
         self.net.load_state_dict(state["net"])
         self.optimizer.load_state_dict(state["optimizer"])
-        self.step, self.seconds, self.best = state["step"], state["seconds"], state["best"]
+        for name in ("step", "seconds", "best"):
+            setattr(self, name, state[name])
 
 
 # ---- Export --------------------------------------------------------------------------------------
