@@ -69,7 +69,7 @@ def placed(parts: Iterable[Part], rotation: Array, offset: npt.ArrayLike = 0.0) 
     result = []
     for part in parts:
         frame = rotation @ part.obj_from_patch  # (3, 4)
-        frame[:, 3] += offset
+        frame[:, 3] += np.asarray(offset, float)
         result.append(replace(part, obj_from_patch=frame))
     return result
 

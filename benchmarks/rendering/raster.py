@@ -174,7 +174,8 @@ def sample_atlas(
         maps = np.zeros((2, -(-len(rows) // columns) * columns), np.float32)
         maps[:, : len(rows)] = np.stack([u[rows], v[rows]]) / 2**number - 0.5
         if len(rows):
-            picked = cv2.remap(image, *maps.reshape(2, -1, columns), cv2.INTER_LINEAR)
+            map_u, map_v = maps.reshape(2, -1, columns)
+            picked = cv2.remap(image, map_u, map_v, cv2.INTER_LINEAR)
             colors[rows] = picked.reshape(-1, 3)[: len(rows)]
     return colors
 
@@ -196,7 +197,8 @@ def shade_layers(
     level = np.floor(level + tiles.ravel())  # the mean over 2x2 samples blends two levels
     level = np.clip(level, 0, MIP_LEVELS - 1).astype(np.int64)
     rect = surfaces.texture_rect.astype(np.float32)[patch]  # (N, 4)
-    albedo = sample_atlas(room.atlas, *(rect[:, :2] + st * rect[:, 2:]).T, level)
+    u, v = (rect[:, :2] + st * rect[:, 2:]).T
+    albedo = sample_atlas(room.atlas, u, v, level)
     spot = surfaces.light_rect.astype(np.float32)[patch]
     at = spot[:, :2] + np.clip(st * spot[:, 2:], 0.5, spot[:, 2:] - 0.5) - 0.5
     u, v = (np.ascontiguousarray(column).reshape(shape) for column in at.T)

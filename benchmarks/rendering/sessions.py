@@ -207,7 +207,7 @@ def session_path(
         drop = rng.uniform(0.4, 0.9, count) - heights
         pitch = np.arctan2(drop, np.linalg.norm(away, axis=1))
         keys = np.column_stack([spots, heights, np.unwrap(yaw), pitch])  # (K, 5)
-        cameras = walk(config, rng, np.arange(count), keys, 0.035)
+        cameras = walk(config, rng, np.arange(float(count)), keys, 0.035)
         centers = -np.einsum("fij,fi->fj", cameras[:, :, :3], cameras[:, :, 3])
         if box_clearance_m(room, fixed, centers) >= clearance_m:
             return cameras

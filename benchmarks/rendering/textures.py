@@ -57,9 +57,9 @@ def finished(
     rng: Rng, image: npt.NDArray[Any], grain: float, tone: float = 0.0, cells: Sequence[float] = ()
 ) -> Image:
     """The picture with fine grain, and with smooth tones if there are cells."""
-    shape = image.shape[:2]
-    smooth = tone * fractal_noise(rng, *shape, cells) if cells else 0
-    return to_image(image * (1 + (smooth + speckle(rng, *shape, grain))[..., None]))
+    height, width = image.shape[:2]
+    smooth = tone * fractal_noise(rng, height, width, cells) if cells else 0
+    return to_image(image * (1 + (smooth + speckle(rng, height, width, grain))[..., None]))
 
 
 # ---- Drawing -------------------------------------------------------------------------------------
