@@ -334,8 +334,8 @@ def worker(name: str, options: Options, job: Path, result: Path) -> None:
         seen, seconds[f] = None if motions is None else next(motions), 0.0
         for k, (c, step) in enumerate(steps.items()):
             own = a + np.flatnonzero(stream.class_id[a:b] == c)
-            columns = (stream.xyxy, stream.score, stream.class_id, stream.embedding)
-            shown = Shown(*(column[own] for column in columns), seen)
+            boxes = (stream.xyxy[own], stream.score[own], stream.class_id[own])
+            shown = Shown(*boxes, stream.embedding[own], seen)
             started = time.process_time()
             rows, ids = step(shown)
             seconds[f] += time.process_time() - started

@@ -654,10 +654,10 @@ def two_rooms(shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
     splits = [np.array_split(np.arange(len(clip.images)), turns) for clip in clips]
     worlds = [replace(clip, world=clip.world + i) for i, clip in enumerate(clips)]
     pieces = [worlds[i].rows(splits[i][k]) for k in range(turns) for i in (0, 1)]
-    columns = [
+    images, truth, world = (
         np.concatenate([getattr(p, k) for p in pieces]) for k in ("images", "truth", "world")
-    ]
-    joined = Clip(*columns, clips[0].focal, max(clip.noise for clip in clips))
+    )
+    joined = Clip(images, truth, world, clips[0].focal, max(clip.noise for clip in clips))
     return joined, f"{pair[0][1]} and {pair[1][1]} in {2 * turns} pieces"
 
 

@@ -224,7 +224,8 @@ def keep_identities(clip: Clip, wanted: IntArray) -> Clip:
     """Drop all boxes but those of the wanted identities."""
     for frame, identity in enumerate(clip.identity):
         keep = np.isin(identity, wanted)
-        for column in (clip.xyxy, clip.identity, clip.look):
+        columns: tuple[list[Any], ...] = (clip.xyxy, clip.identity, clip.look)
+        for column in columns:
             column[frame] = column[frame][keep]
     return clip
 

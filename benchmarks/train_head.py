@@ -122,8 +122,10 @@ class Frozen:
                 look = clip.look[frame][rows]
                 seen.append([*parts, clip.identity[frame][rows], look, np.full(len(rows), frame)])
         columns = [np.concatenate(column) for column in zip(*seen, strict=True)]
+        names = (*PARTS, "identity", "look", "frame")
+        table: dict[str, Any] = dict(zip(names, columns, strict=True))
         with atomic(path) as part, part.open("wb") as file:
-            np.savez(file, **dict(zip((*PARTS, "identity", "look", "frame"), columns, strict=True)))
+            np.savez(file, **table)
 
 
 class CellHead(nn.Module):
