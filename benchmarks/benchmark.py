@@ -28,18 +28,17 @@ import venv
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from tables import table
 
 Array = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 Options = dict[str, Any]
-# boxes, scores, classes, embeddings, what the frame shows -> detection rows, identities
-Step = Callable[[Array, Array, IntArray, Array, Any], tuple[Any, Any]]
 
-ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 SIZE = np.array([1920.0, 1080.0])
 # cosine within a visit, between objects, across visits, as trackers measure them
 COSINES = {"hard": (0.82, 0.44, 0.72)}
@@ -141,18 +140,13 @@ def revisit_paths(rng: np.random.Generator, objects: int, frames: int, shape: bo
     return Paths(np.concatenate([center, size], -1), (t < leave) | (t >= back), visit)
 
 
-def make_stream(
-    kind: str, objects: int, dim: int = 128, frames: int = 500, seed: int = 0
-) -> Stream:
-    """Generate one of the streams: steady, stay, revisit, hard, shape."""
-    rng = np.random.default_rng([seed, objects, frames] if seed else [objects, frames])
+def make_stream(kind: str, objects: int, frames: int = 500, dim: int = 128) -> Stream:
+    """Generate one of the streams: steady, revisit, hard, shape."""
+    rng = np.random.default_rng([objects, frames])
     if kind == "steady":
         paths = crossing_paths(rng, objects, frames)
     else:
         paths = revisit_paths(rng, objects, frames, kind == "shape")
-        if kind == "stay":
-            box = paths.box[:1].repeat(frames, 0)
-            paths = Paths(box, np.ones_like(paths.seen), 0 * paths.visit)
     shake = rng.normal(0, 2, (frames, 2))
     for i in range(1, frames):
         shake[i] += 0.9 * shake[i - 1]
@@ -214,36 +208,45 @@ def embeddings(
 # ---- Trackers: one plain function each ---------------------------------------------------------
 
 
+class Shown(NamedTuple):
+    """What a tracker gets of a frame with D detections."""
+
+    xyxy: Array  # (D, 4)
+    score: Array  # (D,)
+    class_id: IntArray  # (D,)
+    embedding: Array  # (D, E), E may be 0
+    motion: Any  # of the camera, for BoT-SORT
+
+
+Step = Callable[[Shown], tuple[Any, Any]]  # rows of detections, their identities
+
+
 def _ours(**options: Any) -> Step:
-    sys.path.insert(0, os.environ.get("REOBJ_TRACK", str(ROOT)))
     import reobj_track as rt
 
     tracker = rt.Tracker(rt.TrackerConfig(**options))
 
-    def step(
-        xyxy: Array, score: Array, class_id: IntArray, embedding: Array, seen: Any
-    ) -> tuple[Any, Any]:
-        found = rt.Detections(xyxy, score, class_id)
-        tracks = tracker.update(found, embeddings=embedding if embedding.shape[1] else None)
+    def step(shown: Shown) -> tuple[Any, Any]:
+        found = rt.Detections(*shown[:3])
+        embeddings = shown.embedding if shown.embedding.shape[1] else None
+        tracks = tracker.update(found, embeddings=embeddings)
         return tracks.detection_index, tracks.track_id
 
     return step
 
 
-def _deepsort(min_score: float = 0.3, **options: Any) -> Step:
+def _deepsort(**options: Any) -> Step:
     """deep-sort-realtime; detections below .3 are left out, as DeepSORT's own evaluation does."""
     from deep_sort_realtime.deepsort_tracker import DeepSort
 
     tracker = DeepSort(embedder=None, **options)
 
-    def step(
-        xyxy: Array, score: Array, class_id: IntArray, embedding: Array, seen: Any
-    ) -> tuple[Any, Any]:
-        rows = np.flatnonzero(score >= min_score)
-        ltwh = np.c_[xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]]
-        raw = [(ltwh[i].tolist(), float(score[i]), int(class_id[i])) for i in rows]
-        embeds = [embedding[i] for i in rows] if embedding.shape[1] else [np.ones(1) for _ in rows]
-        tracks = tracker.update_tracks(raw, embeds=embeds, others=rows.tolist())
+    def step(shown: Shown) -> tuple[Any, Any]:
+        rows = np.flatnonzero(shown.score >= 0.3)
+        ltwh = np.c_[shown.xyxy[:, :2], shown.xyxy[:, 2:] - shown.xyxy[:, :2]]
+        raw = [(ltwh[i].tolist(), float(shown.score[i]), int(shown.class_id[i])) for i in rows]
+        embeds = shown.embedding if shown.embedding.shape[1] else np.ones((len(shown.score), 1))
+        tracks = tracker.update_tracks(raw, embeds=list(embeds[rows]), others=rows.tolist())
         # only detections of this frame: predicted boxes of the frame after are not counted
         good = [t for t in tracks if t.is_confirmed() and t.time_since_update == 0]
         return [t.get_det_supplementary() for t in good], [int(t.track_id) for t in good]
@@ -260,14 +263,15 @@ def _roboflow(name: str, **options: Any) -> Step:
     if botsort:
         tracker.cmc.estimate = lambda motion, boxes: motion  # of `camera_motions`
 
-    def step(
-        xyxy: Array, score: Array, class_id: IntArray, embedding: Array, seen: Any
-    ) -> tuple[Any, Any]:
-        rows = {"row": np.arange(len(xyxy))}
-        motion = (seen,) if botsort else ()
-        found = tracker.update(sv.Detections(xyxy, None, score, class_id, data=rows), *motion)
-        good = found.tracker_id >= 0 if len(found) else np.zeros(0, bool)
-        return (found.data["row"][good], found.tracker_id[good]) if len(found) else ([], [])
+    def step(shown: Shown) -> tuple[Any, Any]:
+        rows = {"row": np.arange(len(shown.xyxy))}
+        motion = (shown.motion,) if botsort else ()
+        found = sv.Detections(shown.xyxy, None, shown.score, shown.class_id, data=rows)
+        found = tracker.update(found, *motion)
+        if not len(found):
+            return [], []
+        good = found.tracker_id >= 0
+        return found.data["row"][good], found.tracker_id[good]
 
     return step
 
@@ -298,15 +302,10 @@ def _norfair(**options: Any) -> Step:
         initialization_delay=3, **{"reid_hit_counter_max": 30, **options},
     )  # fmt: skip
 
-    def step(
-        xyxy: Array, score: Array, class_id: IntArray, embedding: Array, seen: Any
-    ) -> tuple[Any, Any]:
-        corners = xyxy.reshape(-1, 2, 2)
-        found = [
-            norfair.Detection(b, data=i, embedding=embedding[i]) for i, b in enumerate(corners)
-        ]
-        tracks = tracker.update(found)
-        good = [t for t in tracks if t.last_detection in found]
+    def step(shown: Shown) -> tuple[Any, Any]:
+        corners = zip(shown.xyxy.reshape(-1, 2, 2), shown.embedding, strict=True)
+        found = [norfair.Detection(b, data=i, embedding=e) for i, (b, e) in enumerate(corners)]
+        good = [t for t in tracker.update(found) if t.last_detection in found]
         return [t.last_detection.data for t in good], [t.id for t in good]
 
     return step
@@ -335,10 +334,10 @@ def worker(name: str, options: Options, job: Path, result: Path) -> None:
         seen, seconds[f] = None if motions is None else next(motions), 0.0
         for k, (c, step) in enumerate(steps.items()):
             own = a + np.flatnonzero(stream.class_id[a:b] == c)
-            xyxy, score, class_id = stream.xyxy[own], stream.score[own], stream.class_id[own]
-            embedding = stream.embedding[own]
+            boxes = (stream.xyxy[own], stream.score[own], stream.class_id[own])
+            shown = Shown(*boxes, stream.embedding[own], seen)
             started = time.process_time()
-            rows, ids = step(xyxy, score, class_id, embedding, seen)
+            rows, ids = step(shown)
             seconds[f] += time.process_time() - started
             identity[own[np.asarray(rows, np.int64)]] = (
                 1 + k + len(steps) * np.asarray(ids, np.int64)
@@ -382,7 +381,6 @@ def python_of(venvs: Path, group: str) -> Path:
 
 def scores(stream: Stream, identity: IntArray, until: int) -> dict[str, float]:
     """Identity scores of the first frames (objects count while in view, detected or not)."""
-    sys.path.insert(0, os.environ.get("REOBJ_TRACK", str(ROOT)))
     from reobj.evaluation.tracks import score_tracks
     from reobj.evaluation.truth import labelled
 
@@ -396,16 +394,15 @@ def scores(stream: Stream, identity: IntArray, until: int) -> dict[str, float]:
 def recovery(stream: Stream, identity: IntArray) -> tuple[float, float]:
     """Shares of objects whose main identity of visit 2 is their own of visit 1, or another's."""
     main: dict[tuple[int, int], int] = {}
-    for o in range(int(stream.owner.max()) + 1):
-        for v in (0, 1):
-            ids = identity[(stream.owner == o) & (stream.visit == v) & (identity > 0)]
-            main[o, v] = int(np.bincount(ids).argmax()) if len(ids) else -1 - o
-    first = {main[o, 0]: o for o, v in main if v == 0}
-    came = [o for o, v in main if v == 1 and main[o, 1] > 0]
-    owner = [first.get(main[o, 1]) for o in came]
-    own = sum(a == b for a, b in zip(owner, came, strict=True))
-    other = sum(a is not None and a != b for a, b in zip(owner, came, strict=True))
-    return own / max(len(came), 1), other / max(len(came), 1)
+    for o, v in itertools.product(range(int(stream.owner.max()) + 1), (0, 1)):
+        ids = identity[(stream.owner == o) & (stream.visit == v) & (identity > 0)]
+        if len(ids):
+            main[o, v] = int(np.bincount(ids).argmax())
+    first = {identity: o for (o, v), identity in main.items() if v == 0}
+    owners = [(o, first.get(identity)) for (o, v), identity in main.items() if v == 1]
+    own = sum(owner == o for o, owner in owners)
+    other = sum(owner not in (o, None) for o, owner in owners)
+    return own / max(len(owners), 1), other / max(len(owners), 1)
 
 
 def best_of(row: str, stream: Stream, venvs: Path | None, runs: int) -> tuple[IntArray, Array]:
@@ -430,31 +427,16 @@ def steady_rows(names: list[str], venvs: Path | None, runs: int) -> list[list[st
     return [[*cells[name], " / ".join(idf1[name])] for name in names]
 
 
-def revisit_row(row: str, venvs: Path | None, objects: int, seeds: int) -> list[str]:
-    """The worst of all seeds."""
+def revisit_row(row: str, venvs: Path | None, objects: int) -> list[str]:
+    """Returns recognised, identities given to another object, and IDF1 of each kind."""
     cells, (name, options) = [row], ROWS[row]
     for kind in ("revisit", "hard", "shape"):
-        found = []
-        for seed in range(seeds):
-            stream = make_stream(kind, objects, seed=seed)
-            identity, _ = run_tracker(name, stream, venvs, options)
-            own, other = recovery(stream, identity)
-            found.append((own, -other, scores(stream, identity, stream.frames)["IDF1"]))
-        own, other, idf1 = (min(column) for column in zip(*found, strict=True))
-        cells.append(f"{100 * own:.0f} %, {-100 * other:.0f} %, {idf1:.3f}")
+        stream = make_stream(kind, objects)
+        identity, _ = run_tracker(name, stream, venvs, options)
+        own, other = recovery(stream, identity)
+        idf1 = scores(stream, identity, stream.frames)["IDF1"]
+        cells.append(f"{100 * own:.0f} %, {100 * other:.0f} %, {idf1:.3f}")
     return cells
-
-
-def flat_row(name: str, venvs: Path | None, runs: int) -> list[str]:
-    stream = make_stream("stay", 10, frames=1500)
-    ms = 1e3 * best_of(name, stream, venvs, runs)[1]
-    return [name, *(f"{np.nanmedian(ms[f - 25 : f + 25]):.2f}" for f in (50, 450, 950, 1450))]
-
-
-def table(title: str, header: str, rows: list[list[str]]) -> str:
-    """Format a Markdown table."""
-    lines = [f"\n{title}\n", f"| {header} |", "|---" * (header.count("|") + 1) + "|"]
-    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
 
 
 def main() -> int:
@@ -464,7 +446,6 @@ def main() -> int:
     parser.add_argument("--only", default="", help="names of trackers, comma-separated")
     parser.add_argument("--runs", type=int, default=2, help="timed runs; the fastest counts")
     parser.add_argument("--revisit", default="50", help="numbers of objects, e.g. 10,50,200, or ''")
-    parser.add_argument("--seeds", type=int, default=1, help="random scenes for each number")
     parser.add_argument("--worker", nargs=4, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.worker:
@@ -473,17 +454,14 @@ def main() -> int:
         return 0
     names = [n for n, (tracker, _) in ROWS.items() if args.peers or tracker == "ours"]
     names = [n for n in names if n in (args.only or n).split(",")]
-    header = " | ".join(f"{n} objects" for n in STEADY)
+    head = ["tracker", *(f"{n} objects" for n in STEADY), "IDF1 of each"]
     steady = steady_rows(names, args.peers, args.runs)
     title = f"Steady, ms a frame, median / p95; load of the machine {os.getloadavg()[0]:.1f}"
-    print(table(title, f"tracker | {header} | IDF1 of each", steady), flush=True)
-    header = "tracker | revisit: recovered, stolen, IDF1 | hard | shape"
+    print(table(head, steady, title), flush=True)
+    head = ["tracker", "revisit: recovered, stolen, IDF1", "hard", "shape"]
     for objects in (int(n) for n in args.revisit.split(",") if n):
-        revisit = [revisit_row(n, args.peers, objects, args.seeds) for n in names]
-        title = f"Revisit, {objects} objects, the worst of {args.seeds} scenes"
-        print(table(title, header, revisit), flush=True)
-    flat = [flat_row(n, args.peers, args.runs) for n in names]
-    print(table("10 objects that stay, ms at frame", "tracker | 50 | 450 | 950 | 1450", flat))
+        revisit = [revisit_row(n, args.peers, objects) for n in names]
+        print(table(head, revisit, f"Revisit, {objects} objects"), flush=True)
     return 0
 
 

@@ -6,8 +6,8 @@
 Prints Markdown tables; writes OUT/compare.csv.
 All sequences use the same settings. A tracker's rows are the detections that it assigned an
 identity to, never predicted boxes. `whole chain` decides identities over the whole video, all
-others frame by frame. Results are kept in OUT/runs: an interrupted comparison resumes, and a change
-of reobj_track.py recomputes only our own rows.
+others frame by frame. Results are kept in OUT/runs: an interrupted comparison resumes; after a
+change of the code or of --every give another OUT.
 
 splits.json lists the rooms, recordings and pedestrians for reporting. All others are left out;
 --choosing includes them, marked. The rows `tuned` have the best settings of a sweep over one option
@@ -31,7 +31,6 @@ from __future__ import annotations
 import argparse
 import csv
 import functools
-import hashlib
 import os
 import re
 import sys
@@ -44,41 +43,21 @@ from typing import Any
 import cv2
 import numpy as np
 import render_room
-from benchmark import TUNED, Array, IntArray, Options, Stream, run_tracker, table
+from benchmark import TUNED, Array, IntArray, Options, Stream, run_tracker
 from splits import MARK, SPLITS, add_choosing, held_out, room_name, usable
+from tables import table
 
-sys.path.insert(0, os.environ.get("REOBJ_TRACK", str(Path(__file__).resolve().parent.parent)))
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import reobj_track as rt
 from reobj.evaluation.tracks import return_ranks, score_tracks
 from reobj.evaluation.truth import LabelledBoxes, labelled, read_truth
 from reobj.files import atomic
 from reobj.sources.tables import read_mot_rows
-from reobj.sources.weights import IMAGENET_MEAN, IMAGENET_STD, onnx_session, own_models
+from reobj.sources.weights import IMAGENET_MEAN, IMAGENET_STD, onnx_session
 from reobj.types import Image
 
 Embedded = list[Array]  # embeddings of every frame's detections
 KITCHEN = ("chair", "dining table", "cup")  # what redkitchen's truth knows
-
-
-def digest(*parts: Any) -> str:
-    """Twelve hex digits of bytes, arrays, the contents of files (paths) or anything that prints."""
-    total = hashlib.sha256()
-    for part in parts:
-        if isinstance(part, np.ndarray):
-            total.update(part.tobytes())
-        else:
-            total.update(part.read_bytes() if isinstance(part, Path) else str(part).encode())
-    return total.hexdigest()[:12]
-
-
-CODE = Path(rt.__file__).parent
-SOURCE = digest(
-    *(CODE / f"{m}.py" for m in ("reobj_track", "quadrics")), *sorted(CODE.glob("reobj/**/*.py"))
-)  # what our own rows depend on
-EMBEDDER = digest(  # what our own embedding depends on
-    *(CODE / f"reobj/appearance/{m}.py" for m in ("embedding", "sampling")),
-    *sorted(own_models().glob("*.onnx")),
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,12 +141,12 @@ def mot_sequences(folder: Path) -> list[Sequence]:
 def kitchen_sequence(folder: Path) -> Sequence:
     """A recording with detections_yolov8s.csv and gt_mot.txt of some classes."""
     truth = read_truth(folder / "gt_mot.txt", rt.COCO_NAMES, 0.0)
-    truth = truth[np.isin(truth.name, KITCHEN)]
     rows = np.loadtxt(folder / "detections_yolov8s.csv", delimiter=",")
     rows = rows[np.isin(rows[:, 6], [rt.COCO_NAMES.index(n) for n in KITCHEN])]
     count = len(list((folder / "images").iterdir()))
     found = split_frames(rows[:, 0].astype(np.int64), rows[:, 1:], count)
     out = held_out("recordings", folder.name)
+    truth = truth[np.isin(truth.name, KITCHEN)]
     return Sequence(folder.name, "rooms", found, truth, folder / "images", held_out=out)
 
 
@@ -192,7 +171,7 @@ def thinned(seq: Sequence, every: int) -> Sequence:
     return replace(seq, name=name, group=group, detections=found, truth=truth, every=every)
 
 
-def chosen_on(seq: Sequence) -> Sequence:
+def marked(seq: Sequence) -> Sequence:
     """Mark a sequence that is not held out, and its group."""
     if seq.held_out:
         return seq
@@ -206,7 +185,6 @@ class CropNet:
     """Unit rows from one crop a box, as DeepSORT does: resized, ImageNet mean and deviation."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
         self.session = onnx_session(path, 1)
         entry = self.session.get_inputs()[0]
         self.name, shape = entry.name, entry.shape
@@ -259,23 +237,12 @@ def stream_of(seq: Sequence, embedded: list[Array] | None) -> Stream:
     return Stream(len(count), frame, box, score, cls, *facts)
 
 
-def peer_run(
-    peer: str, options: Options, seq: Sequence, venvs: Path, embedded: Embedded | None
-) -> IntArray:
-    """Run a peer: identity of every detection (N,), 0 for none."""
-    return run_tracker(peer, stream_of(seq, embedded), venvs, options)[0]
-
-
-def ours(
-    seq: Sequence, embedded: Embedded | None, config: rt.TrackerConfig | None = None
-) -> IntArray:
-    """Our tracker alone, frame by frame, its own embedder unless embeddings are given."""
-    embedder = rt.Embedder() if seq.images is not None and embedded is None else None
-    tracker, identity = rt.Tracker(config, embedder), []
+def ours(seq: Sequence) -> IntArray:
+    """Our tracker alone, frame by frame, with its own embedder where there are images."""
+    tracker, identity = rt.Tracker(None, rt.Embedder() if seq.images is not None else None), []
     frames = iter(seq.video()) if seq.images is not None else None
-    for f, found in enumerate(seq.detections):
-        image = None if frames is None else next(frames).image
-        tracks = tracker.update(found, image, embeddings=None if embedded is None else embedded[f])
+    for found in seq.detections:
+        tracks = tracker.update(found, None if frames is None else next(frames).image)
         ids = np.zeros(len(found), np.int64)
         ids[tracks.detection_index] = tracks.track_id
         identity.append(ids)
@@ -324,17 +291,6 @@ def joined(parts: list[LabelledBoxes]) -> LabelledBoxes:
     return LabelledBoxes(*(np.concatenate([getattr(p, k) for p in shifted]) for k in names))
 
 
-def cached(path: Path, make: Callable[[], IntArray]) -> IntArray:
-    """The result in the file, or made and written there."""
-    if path.exists():
-        with np.load(path) as data:
-            return np.asarray(data["identity"])
-    identity = make()
-    with atomic(path) as part, part.open("wb") as file:
-        np.savez_compressed(file, identity=identity)
-    return identity
-
-
 def networks(seq: Sequence) -> dict[str, Any]:
     """Appearance by name for a sequence: (image, detections) -> rows."""
     if seq.images is None:
@@ -354,65 +310,50 @@ def appearance_ranks(seq: Sequence, embedded: Callable[[], Embedded]) -> IntArra
     return return_ranks(seq.truth, found, stream.embedding)
 
 
-def with_embeddings(
-    make: Callable[[Embedded], IntArray], embedded: Callable[[], Embedded]
-) -> IntArray:
-    """A tracker's run on embeddings that are only computed now."""
-    return make(embedded())
+def jobs(seq: Sequence, args: Any) -> dict[str, Callable[[], IntArray]]:
+    """How to make the result of every tracker: identities (N,), 0 for none.
 
-
-def jobs(seq: Sequence, args: Any) -> dict[str, tuple[str, Callable[[], IntArray]]]:
-    """For every tracker: what its result depends on, and how to make it.
-
-    `appearance NAME` gives the ranks of the returns instead of identities.
+    `appearance NAME` gives the ranks of the returns instead.
     """
-    part, source = functools.partial, SOURCE + EMBEDDER
-    result: dict[str, tuple[str, Callable[[], IntArray]]] = {
-        "ours": (source, part(ours, seq, None))
-    }
+    part = functools.partial
+    result: dict[str, Callable[[], IntArray]] = {"ours": part(ours, seq)}
     settings: dict[str, tuple[str, Options]] = {peer: (peer, {}) for peer in TUNED}
     settings |= {f"{peer} tuned": (peer, TUNED[peer]) for peer in TUNED if TUNED[peer]}
-    settings = settings if args.peers else {}
-    nets = networks(seq)
-    for name, net in nets.items():
+
+    def peer_run(peer: str, options: Options, embedded: Callable[[], Embedded | None]) -> IntArray:
+        return run_tracker(peer, stream_of(seq, embedded()), args.peers, options)[0]
+
+    looks: dict[str, Callable[[], Embedded | None]] = {}  # what DeepSORT sees
+    for name, net in networks(seq).items():
         embedded = functools.cache(part(embed_all, seq, net))
-        key = digest(net.path) if name != "own embedding" else EMBEDDER
-        result[f"appearance {name}"] = (key, part(appearance_ranks, seq, embedded))
-        for label, (peer, options) in settings.items():
-            if peer == "deepsort":
-                run = part(peer_run, peer, options, seq, args.peers)
-                job = (key + str(options), part(with_embeddings, run, embedded))
-                result[f"{label}, {name}"] = job
-    for label, (peer, options) in settings.items():
-        if peer != "deepsort" or not nets:
-            run = part(peer_run, peer, options, seq, args.peers, None)
-            result[label + ", no appearance" * (peer == "deepsort")] = (str(options), run)
+        result[f"appearance {name}"] = part(appearance_ranks, seq, embedded)
+        looks[f", {name}"] = embedded
+    for label, (peer, options) in settings.items() if args.peers else ():
+        if peer != "deepsort":
+            result[label] = part(peer_run, peer, options, lambda: None)
+        else:
+            for name, embeddings in (looks or {", no appearance": lambda: None}).items():
+                result[label + name] = part(peer_run, peer, options, embeddings)
     if seq.images is not None and seq.group.startswith("rooms"):
         chain = args.out / "chain"
-        result["ours, whole video, no poses"] = (source, part(whole_chain, seq, chain, "none"))
-        result["ours, whole chain"] = (source, part(whole_chain, seq, chain, "auto"))
+        result["ours, whole video, no poses"] = part(whole_chain, seq, chain, "none")
+        result["ours, whole chain"] = part(whole_chain, seq, chain, "auto")
     return result
 
 
-def kept_run(
-    seq: Sequence, tracker: str, key: str, make: Callable[[], IntArray], out: Path
-) -> IntArray:
-    """Identities (N,) of a tracker on one sequence, from OUT/runs where known."""
-    stream = stream_of(seq, None)
-    boxes = digest(stream.frame, stream.xyxy, stream.score, stream.class_id)
-    name = f"{seq.name}-{tracker}-{digest(boxes, key)}.npz".replace(", ", "-")
-    path = out / "runs" / re.sub(r"[^\w.()-]+", "_", name)
-    if not path.exists():
-        print(f"{time.strftime('%H:%M:%S')} {seq.name}: {tracker}", file=sys.stderr, flush=True)
-    return cached(path, make)
-
-
 def variants(seq: Sequence, args: Any) -> dict[str, IntArray]:
-    """Identities (N,) of every tracker on one sequence."""
-    return {t: kept_run(seq, t, *job, args.out) for t, job in jobs(seq, args).items()}
-
-
-# ---- Tuning the peers --------------------------------------------------------------------------
+    """Result of every tracker on one sequence, from OUT/runs where it is there."""
+    found: dict[str, IntArray] = {}
+    for tracker, make in jobs(seq, args).items():
+        name = re.sub(r"[^\w.()-]+", "_", f"{seq.name}-{tracker}")
+        path = args.out / "runs" / f"{name}.npy"
+        if not path.exists():
+            print(f"{time.strftime('%H:%M:%S')} {seq.name}: {tracker}", file=sys.stderr, flush=True)
+            identity = make()
+            with atomic(path) as file:
+                np.save(file, identity)
+        found[tracker] = np.load(path)
+    return found
 
 
 # ---- Output ------------------------------------------------------------------------------------
@@ -455,52 +396,28 @@ def report(found: dict[str, dict[str, IntArray]], seqs: list[Sequence]) -> list[
     return rows
 
 
+SPREAD = ("HOTA", "IDF1")  # scores with the least and largest of the sequences
+SCORES = ("HOTA", "DetA", "AssA", "IDF1", "MOTA")
+HEAD = ("tracker", *SCORES, "IDSW", "ids per object", "ids / objects", "returns kept", "Rank-1")
+
+
 def cells(row: dict[str, Any]) -> list[str]:
     """One line of a table."""
-    scores = [f"{100 * row[c]:.1f}" for c in "HOTA DetA AssA IDF1 MOTA".split()]
-    for c, at in SPREAD.items():
+    found = {c: f"{100 * row[c]:.1f}" for c in SCORES}
+    for c in SPREAD:
         if row[f"{c}_min"] < row[f"{c}_max"]:
-            scores[at] += f" ({100 * row[f'{c}_min']:.0f}-{100 * row[f'{c}_max']:.0f})"
+            found[c] += f" ({100 * row[f'{c}_min']:.0f}-{100 * row[f'{c}_max']:.0f})"
     kept = f"{round(row['returns'] * row['returns_kept'])} of {row['returns']}"
     rank1 = "-" if np.isnan(row["rank1"]) else f"{100 * row['rank1']:.0f}"
     ids = [f"{row['ids_per_object']:.2f}", f"{row['identities']} / {row['gt_objects']}"]
-    return [row["tracker"], *scores, str(row["IDSW"]), *ids, kept, rank1]
-
-
-SPREAD = {"HOTA": 0, "IDF1": 3}  # columns with the least and largest of the sequences
-HEADER = (
-    "tracker | HOTA | DetA | AssA | IDF1 | MOTA | IDSW | ids per object | ids / objects | "
-    "returns kept | Rank-1"
-)
+    return [row["tracker"], *found.values(), str(row["IDSW"]), *ids, kept, rank1]
 
 
 def markdown(rows: list[dict[str, Any]]) -> str:
     """One table for each sequence."""
     names = dict.fromkeys(r["sequence"] for r in rows)
     body = {n: [cells(r) for r in rows if r["sequence"] == n] for n in names}
-    return "\n".join(table(f"**{n}**", HEADER, lines) for n, lines in body.items())
-
-
-def verdicts(rows: list[dict[str, Any]]) -> list[str]:
-    """For every sequence: ours online against the best peer, and identities against DeepSORT."""
-    lines = []
-    for name in dict.fromkeys(r["sequence"] for r in rows):
-        part = {r["tracker"]: r for r in rows if r["sequence"] == name}
-        peers = [r for t, r in part.items() if not t.startswith("ours")]
-        if not peers:
-            continue
-        text = ", ".join(
-            f"{100 * (part['ours'][c] - max(p[c] for p in peers)):+.1f} {c}"
-            for c in ("IDF1", "AssA", "HOTA")
-        )
-        other = next(p["ids_per_object"] for p in peers if p["tracker"].startswith("deepsort"))
-        mine = [r["ids_per_object"] for t, r in part.items() if t.startswith("ours")]
-        online, last = (f"{100 * (ids / other - 1):+.0f} %" for ids in (mine[0], mine[-1]))
-        lines.append(
-            f"{name}: ours {text} against the best peer; identities per real object against "
-            f"DeepSORT {online} online, {last} in our last row"
-        )
-    return lines
+    return "\n".join(table(HEAD, lines, f"**{n}**") for n, lines in body.items())
 
 
 def rendered(names: list[str], folder: Path) -> list[Path]:
@@ -526,7 +443,7 @@ def wanted(args: argparse.Namespace) -> list[Sequence]:
     seqs += [kitchen_sequence(p) for p in args.recordings if allowed("recordings", p.name)]
     if args.mot:
         seqs += [s for s in mot_sequences(args.mot) if allowed("pedestrians", s.name)]
-    return [chosen_on(s) for s in seqs]
+    return [marked(s) for s in seqs]
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -566,7 +483,7 @@ def main() -> int:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
-    print(markdown(rows), *verdicts(rows), sep="\n- ")
+    print(markdown(rows))
     return 0
 
 

@@ -10,8 +10,6 @@ length is one command in a process of its own. A clip keeps its file names and i
     whole    wall time of the command, s
     poses, track, objects, write     wall times that it reports, s
     MB       largest resident size of one process, and of all together at one time
-
-OUT/long_video.json has all figures, also the largest resident size in each stage.
 """
 
 from __future__ import annotations
@@ -19,7 +17,6 @@ from __future__ import annotations
 import argparse
 import csv
 import itertools
-import json
 import os
 import re
 import shutil
@@ -28,7 +25,6 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -87,7 +83,7 @@ def resident_mb(root: int) -> list[float]:
     return [size[pid] for pid in family if pid in size]
 
 
-def measure(out: Path, count: int, options: Sequence[str]) -> dict[str, Any]:
+def measure(out: Path, count: int, options: Sequence[str]) -> dict[str, float]:
     """Run the command on a clip of `count` frames."""
     folder = out / str(count)
     if not (folder / "clip.mp4").exists():
@@ -95,13 +91,13 @@ def measure(out: Path, count: int, options: Sequence[str]) -> dict[str, Any]:
     words = [sys.executable, str(ROOT / "reobj_track.py"), "run", "clip.mp4", "--detections"]
     words += ["boxes.csv", "-o", "out", "--overwrite", *options]
     shutil.rmtree(folder / "out", ignore_errors=True)
-    samples = []  # seconds since the start, MB of the largest process, MB of all
+    samples: list[tuple[float, float]] = []  # MB of the largest process, of all
     began = time.monotonic()
     with open(folder / "log.txt", "w") as log, open(folder / "progress.txt", "w") as progress:
         process = subprocess.Popen(words, stdout=log, stderr=progress, cwd=folder)
         while process.poll() is None:
             sizes = resident_mb(process.pid) or [0.0]
-            samples.append((time.monotonic() - began, max(sizes), sum(sizes)))
+            samples.append((max(sizes), sum(sizes)))
             time.sleep(0.2)
     whole = time.monotonic() - began
     if process.returncode:
@@ -109,20 +105,10 @@ def measure(out: Path, count: int, options: Sequence[str]) -> dict[str, Any]:
         raise SystemExit(f"{count} frames: exit code {process.returncode}: {last}")
     text = (folder / "log.txt").read_text()
     line = re.findall(r"^seconds: (.*)$", text, re.MULTILINE)[-1]
-    steps = dict(re.findall(r"(\w+) [\d.]+ \(([^)]*)\)", line))
     seconds = dict(re.findall(r"(\w+) ([\d.]+)", re.sub(r"\([^)]*\)", "", line)))
-    result: dict[str, Any] = {"whole": whole} | {s: float(seconds.get(s, 0)) for s in STAGES}
-    result["MB"] = max(one for _, one, _ in samples)
-    result["MB_all"] = max(every for _, _, every in samples)
-    result["steps"] = steps
-    result["stage_MB"] = {}
-    end = whole - sum(result[s] for s in STAGES)
-    for stage in STAGES:  # they follow each other to the end
-        start = end
-        end = start + result[stage]
-        inside = [every for t, _, every in samples if start <= t <= end]
-        result["stage_MB"][stage] = max(inside, default=0.0)
-    return result
+    stages = {stage: float(seconds.get(stage, 0)) for stage in STAGES}
+    largest, together = np.max(samples, axis=0)
+    return {"whole": whole, **stages, "MB": largest, "MB_all": together}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -135,14 +121,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("options", nargs="*", help="further options of `run`, after --")
     args = parser.parse_args(argv)
     names = ("whole", *STAGES, "MB", "MB_all")
-    found: dict[int, dict[str, Any]] = {}
+    found: dict[int, dict[str, float]] = {}
     titles = [*names[:-2], "MB, largest process", "MB, together"]
     print("| frames | " + " | ".join(titles) + " |\n" + "|---" * (len(names) + 1) + "|")
     for count in args.frames:
         found[count] = measure(args.out, count, args.options)
         cells = [f"{found[count][name]:.{0 if name.startswith('MB') else 1}f}" for name in names]
         print(f"| {count} | " + " | ".join(cells) + " |", flush=True)
-        (args.out / "long_video.json").write_text(json.dumps(found, indent=1))
     if {600, 2400} <= found.keys():
         ratios = [found[2400][n] / max(found[600][n], 1e-9) for n in names]
         print("| 2400 / 600 | " + " | ".join(f"{r:.1f}" for r in ratios) + " |")

@@ -24,7 +24,7 @@ import json
 import re
 import subprocess
 import sys
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -41,22 +41,18 @@ SEEN_FRAMES = 10  # in which the place of a gone object must be visible
 def read_mot(path: Path) -> Array:
     """Read frame, id and box (x1, y1, x2, y2) of a MOTChallenge file, (N, 6)."""
     rows = np.loadtxt(path, delimiter=",", ndmin=2)[:, :6]
-    rows[:, 4:6] += rows[:, 2:4]
-    return np.asarray(rows)
+    return np.hstack([rows[:, :4], rows[:, 2:4] + rows[:, 4:6]])
 
 
 def true_objects(tracks: Array, truth: Array, overlap: float = 0.5) -> dict[int, int]:
     """Return the true object of each track: that which most of its boxes overlap (IoU)."""
-    votes: dict[int, Counter[int]] = {}
-    for frame in np.unique(tracks[:, 0]):
-        found = tracks[tracks[:, 0] == frame]
-        true = truth[truth[:, 0] == frame]
-        if len(true):
-            iou = box_iou(found[:, 2:], true[:, 2:])
-            for row, best in enumerate(iou.argmax(1)):
-                if iou[row, best] >= overlap:
-                    vote = votes.setdefault(int(found[row, 1]), Counter())
-                    vote[int(true[best, 1])] += 1
+    votes: dict[int, Counter[int]] = defaultdict(Counter)
+    for frame in np.intersect1d(tracks[:, 0], truth[:, 0]):
+        found, true = (rows[rows[:, 0] == frame] for rows in (tracks, truth))
+        iou = box_iou(found[:, 2:], true[:, 2:])
+        for track, best, value in zip(found[:, 1], iou.argmax(1), iou.max(1), strict=True):
+            if value >= overlap:
+                votes[int(track)][int(true[best, 1])] += 1
     return {track: vote.most_common(1)[0][0] for track, vote in votes.items()}
 
 
@@ -154,8 +150,8 @@ def score_session(
     row["changes said, true, right"] = (
         sum(map(len, said.values())), sum(map(len, expected.values())), right,
     )  # fmt: skip
-    row["wrong"] = {k: sorted(said[k] - expected[k]) for k in said if said[k] - expected[k]}
-    row["missed"] = {k: sorted(expected[k] - said[k]) for k in said if expected[k] - said[k]}
+    for name, first, second in (("wrong", said, expected), ("missed", expected, said)):
+        row[name] = {k: sorted(first[k] - second[k]) for k in said if first[k] - second[k]}
     row["not seen, called gone"] = sum(
         t in state and state[t]["state"] != "gone" and not state[t].get("frames_old_place_seen", 0)
         for t in said["gone"]

@@ -6,7 +6,7 @@
 A copy of the checkout is changed, never the checkout. First the tests run once with a tracer that
 records the lines executed by each test and its run time. Mutants are drawn by the seed among the
 covered lines, equally over the modules. For each mutant, the tests that cover its line
-run until one fails: the mutant is killed. Tests longer than --longest seconds are left out. Prints
+run until one fails: the mutant is killed. Tests longer than LONGEST_S are left out. Prints
 the fraction of killed mutants by module and the survivors; OUT/mutants.json lists all of them. A
 survivor may be an equivalent program (`<` for `<=` where equality never occurs), a tuning constant,
 or a gap in the tests; this needs reading.
@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 import ast
 import copy
+import itertools
 import json
 import multiprocessing
 import os
@@ -37,6 +38,8 @@ ROOT = Path(__file__).resolve().parent.parent
 SOURCES = ("reobj_track.py", "quadrics.py", "reobj/**/*.py")
 UNTRACED = ("test_batch.py", "test_docs.py", "test_wheel.py")  # they run other processes
 Lines = dict[str, set[int]]  # by file
+LONGEST_S = 8.0  # of a test that is used
+TESTS_S = 30.0  # of all tests of a mutant, the shortest first
 
 
 # ---- Which tests execute which lines -----------------------------------------------------------
@@ -220,35 +223,25 @@ def try_mutant(root: Path, mutant: Mutant, tests: Sequence[str], limit_s: float)
         mutant.seconds = round(time.monotonic() - began, 1)
 
 
-def affordable(tests: Sequence[str], seconds_of: dict[str, float], budget_s: float) -> list[str]:
-    """Return the first tests whose sum of seconds stays below a limit, at least one."""
-    found: list[str] = []
-    for test in tests:
-        budget_s -= seconds_of[test]
-        if found and budget_s < 0:
-            break
-        found.append(test)
-    return found
+def affordable(tests: Sequence[str], seconds_of: dict[str, float]) -> list[str]:
+    """Return the first tests that together take TESTS_S, at least one."""
+    total = list(itertools.accumulate(seconds_of[test] for test in tests))
+    return [test for k, test in enumerate(tests) if not k or total[k] <= TESTS_S]
 
 
-def chosen(by_file: dict[str, list[Mutant]], count: int) -> list[Mutant]:
-    """Choose changes in turn from all files, those of small files all."""
-    found: list[Mutant] = []
-    while len(found) < count and any(by_file.values()):
-        for file in list(by_file):
-            if by_file[file] and len(found) < count:
-                found.append(by_file[file].pop())
-    return found
+def in_turn(by_file: dict[str, list[Mutant]], count: int) -> list[Mutant]:
+    """Take changes in turn from all files, those of small files all."""
+    rounds = itertools.zip_longest(*(reversed(mutants) for mutants in by_file.values()))
+    return [mutant for taken in rounds for mutant in taken if mutant][:count]
 
 
 def report(mutants: Sequence[Mutant]) -> str:
     """Format the fraction of killed changes of each file, and the survivors."""
-    lines = []
     done = [m for m in mutants if m.seconds]
-    for file in sorted({m.file for m in done}):
-        own = [m for m in done if m.file == file]
+    lines = []
+    for file in [*sorted({m.file for m in done}), "all"]:
+        own = [m for m in done if file in (m.file, "all")]
         lines.append(f"{file:<36} {sum(bool(m.killed_by) for m in own):3d} of {len(own):3d}")
-    lines.append(f"{'all':<36} {sum(bool(m.killed_by) for m in done):3d} of {len(done):3d}")
     lines += [
         f"survived: {m.file}:{m.line}: {m.before}  ->  {m.text[:100]}"
         for m in done
@@ -272,11 +265,11 @@ def names_of_tests(root: Path) -> list[str]:
     return [p.name for p in found if p.match("test_*.py") or any(p.glob("test_*.py"))]
 
 
-def tests_by_line(by_test: dict[str, Any], longest_s: float) -> dict[tuple[str, int], list[str]]:
+def tests_by_line(by_test: dict[str, Any]) -> dict[tuple[str, int], list[str]]:
     """Return the tests that execute each line, the shortest first."""
     tests_of: dict[tuple[str, int], list[str]] = defaultdict(list)
     for test, (seconds, lines) in sorted(by_test.items(), key=lambda item: item[1][0]):
-        if seconds <= longest_s:
+        if seconds <= LONGEST_S:
             for file, numbers in lines.items():
                 for number in numbers:
                     tests_of[file, number].append(test)
@@ -293,9 +286,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     add("--count", type=int, default=250, help="number of mutants")
     add("--seed", type=int, default=0)
     add("--only", nargs="+", default=[], metavar="FILE", help="source files, as in the report")
-    add("--tests", nargs="+", metavar="NAME", help="files and folders of tests/ (default: all)")
-    add("--longest", type=float, default=8.0, help="leave out tests longer than this (s)")
-    add("--seconds", type=float, default=30.0, help="test time a mutant, shortest tests first (s)")
     add("--jobs", type=int, default=1, help="mutants at once")
     args = parser.parse_args(argv)
     args.out.mkdir(parents=True, exist_ok=True)
@@ -308,17 +298,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     import scipy.spatial.transform  # noqa: F401
 
     if not (args.out / "lines.json").exists():
-        trace_tests(root, files, args.tests or names_of_tests(root), args.out.resolve())
+        trace_tests(root, files, names_of_tests(root), args.out.resolve())
     if not (by_test := json.loads((args.out / "lines.json").read_text())):
         raise SystemExit(f"error: no test ran: python -m pytest in {root} says why")
-    tests_of = tests_by_line(by_test, args.longest)
+    tests_of = tests_by_line(by_test)
     rng = random.Random(args.seed)
     by_file = {
         file: mutants_of(root, file, {n for f, n in tests_of if f == file}, rng)
         for file in files
         if not args.only or file in args.only
     }
-    mutants = chosen(by_file, args.count)
+    mutants = in_turn(by_file, args.count)
     seconds_of = {test: seconds for test, (seconds, _) in by_test.items()}
 
     def work(job: int) -> None:
@@ -326,7 +316,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         shutil.copytree(root, own, dirs_exist_ok=True)
         for number, mutant in enumerate(mutants):
             if number % args.jobs == job:
-                tests = affordable(tests_of[mutant.file, mutant.line], seconds_of, args.seconds)
+                tests = affordable(tests_of[mutant.file, mutant.line], seconds_of)
                 limit = 60 + 5 * sum(seconds_of[test] for test in tests)
                 try_mutant(own, mutant, tests, limit)
                 state = f"{mutant.killed_by or 'SURVIVED'} {mutant.seconds}"

@@ -1,14 +1,12 @@
 #!/usr/bin/env python3
 """Measure the cameras: reconstruct clips with known poses and print one table row each.
 
-    python benchmarks/pose_accuracy.py -o OUT [--choosing] [--data FOLDER] [--set FIELD=VALUE]...
-        [NAME...]
+    python benchmarks/pose_accuracy.py -o OUT [--choosing] [--data FOLDER] [NAME...]
 
 Clips: the recordings of FOLDER that are there, examples/room, and every folder made by
 `benchmarks/render_room.py` and given with --room. Clips that were used for choosing (splits.json:
-all but some rooms) are left out; --choosing includes them, marked. All clips run with the defaults;
---set changes a field of PosesConfig for an experiment. Each clip runs in a process of its own, so
-that its memory can be measured.
+all but some rooms) are left out; --choosing includes them, marked. All clips run with the defaults,
+each in a process of its own, so that its memory can be measured.
 
 Columns: frames with a pose; error of the camera centres after a similarity alignment (Umeyama, PAMI
 1991) as median, root mean square and largest, in % of the diagonal of the path's bounding box, and
@@ -26,7 +24,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import resource
 import shutil
 import subprocess
@@ -43,6 +40,7 @@ from scipy.spatial.transform import Rotation
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from splits import add_choosing, marked, split_name, usable
+from truth import similarity
 
 import reobj_track as rt
 
@@ -97,8 +95,6 @@ def main() -> int:
     parser.add_argument(
         "--room", type=Path, action="append", default=[], help="a rendered room (repeatable)"
     )
-    parser.add_argument("--set", action="append", default=[], metavar="FIELD=VALUE")
-    parser.add_argument("--known-camera", action="store_true", help="give the true intrinsics")
     add_choosing(parser)
     parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -121,15 +117,11 @@ def main() -> int:
 
 def rows(name: str, clip: Clip, args: argparse.Namespace) -> Iterator[str]:
     """Reconstruct one clip and format its row(s)."""
-    config = rt.PosesConfig(camera=clip.camera if args.known_camera else "")
-    for item in args.set:
-        field, _, value = item.partition("=")
-        config = dataclasses.replace(config, **{field: json.loads(value)})
     video, work = rt.Video(clip.source), args.out / name
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
     started = time.monotonic()
-    poses = rt.estimate_poses(video, config, work)
+    poses = rt.estimate_poses(video, rt.PosesConfig(), work)
     seconds = time.monotonic() - started
     kib = sum(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, -1))
     end = f"{len(poses.frame) / seconds:.1f} | {kib / 1000:.0f} |"
@@ -161,16 +153,6 @@ def world_from_cam(poses: rt.Poses, rows: Array) -> tuple[Array, Array]:
     cams = poses.cam_from_world[rows]
     turn = np.swapaxes(cams[:, :, :3], 1, 2)
     return -(turn @ cams[:, :, 3:])[:, :, 0], turn
-
-
-def similarity(a: Array, b: Array) -> tuple[float, Array, Array]:
-    """Scale, rotation and shift that bring points a (N, 3) closest to b (Umeyama, PAMI 1991)."""
-    a0, b0 = a - a.mean(0), b - b.mean(0)
-    u, singular, vt = np.linalg.svd(b0.T @ a0)
-    sign = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
-    rotation = u * sign @ vt
-    scale = float((singular * sign).sum() / (a0**2).sum())
-    return scale, rotation, b.mean(0) - scale * rotation @ a.mean(0)
 
 
 def row(name: str, found: rt.Poses, truth: rt.Poses | None, metric: bool) -> str:

@@ -42,6 +42,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import json
 import multiprocessing
 import os
@@ -58,7 +59,11 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
-import render_room as rr
+from rendering.camera import TURNS_FROM_TO, camera_matrix
+from rendering.config import RoomConfig
+from rendering.photograph import render_clip
+from rendering.room import make_room
+from tables import table
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import reobj_track as rt
@@ -70,21 +75,21 @@ Images = npt.NDArray[np.uint8]
 Rng = np.random.Generator
 
 ROOT = Path(__file__).resolve().parent.parent
-CLIP_PX = 480  # longer side of the pictures that are kept (chosen)
+CLIP_PX = 480  # longer side of the pictures that are kept
 SHORT = rt.PosesConfig(size_px=320)  # for 24-40 pictures, of which all are keyframes
 
 # ---- Verdict ------------------------------------------------------------------------------------
 
-# Error of a centre over the extent of its part's true path. Good recordings stay below .06
+# Error of a centre over the extent of its component's true path. Good recordings stay below .06
 # (benchmarks/RESULTS.md: redkitchen against a Kinect), a wrong loop of the corridor is at .6.
 MAX_CENTRE = 0.1
-LEAST_EXTENT = 0.05  # of that path over all of its world's: a part that hardly moved (chosen)
-# Local scale within a part over that of most of it. Half as much again bends a straight path by no
-# more than .05 of its extent, which MAX_CENTRE lets pass (chosen).
+LEAST_EXTENT = 0.05  # of that path over all of its world's: below it a component hardly moved
+# Local scale within a component over that of most of it. Half as much again bends a straight path
+# by no more than .05 of its extent, which MAX_CENTRE lets pass.
 MAX_SCALE_JUMP = 1.35
 MAX_TURN_DEG = 10.0  # error of an orientation; good recordings stay below 3 in the median
-STRAY_SHARE = 0.05  # of a part's frames, at least one: so many are strays, counted and not a break
-WHOLE_SHARE = 0.9  # of the frames in one part: whole
+STRAY_SHARE = 0.05  # of a component's frames, at least one, may be strays: counted, no break
+WHOLE_SHARE = 0.9  # of the frames in one component: whole
 
 
 def align(found: Array, truth: Array) -> tuple[Array, Array]:
@@ -133,8 +138,8 @@ def misfit(
     return error, np.degrees(np.arccos(np.clip(cosine, -1, 1)))
 
 
-def fit_part(found: Array, truth: Array, least_extent: float = 1e-9) -> tuple[Array, Array]:
-    """Measure the cameras (n, 3, 4) of one part under the similarity on which most agree.
+def fit_component(found: Array, truth: Array, least_extent: float = 1e-9) -> tuple[Array, Array]:
+    """Measure the cameras (n, 3, 4) of one component under the similarity on which most agree.
 
     Hypotheses are fitted to all, to halves, quarters and eighths of the path and to random samples.
 
@@ -161,15 +166,15 @@ def fit_part(found: Array, truth: Array, least_extent: float = 1e-9) -> tuple[Ar
     return best
 
 
-WINDOW_SHARE = 6  # of a part's frames on each side in which its local scale is taken (chosen)
-LEAST_SPREAD = 0.1  # of the true centres in it over that of all; less is uninformative (chosen)
+WINDOW_SHARE = 6  # a sixth of the frames on each side is the window of a local scale
+LEAST_SPREAD = 0.1  # of the true centres in it over that of all; less is uninformative
 
 
 def local_scale(found: Array, truth: Array, noise: float = 0.0) -> Array:
     """Measure by how much the path around each frame is larger or smaller than most of it is.
 
     Args:
-        found, truth: cam_from_world (n, 3, 4) of a part, in order. noise: of the true centres.
+        found, truth: cam_from_world (n, 3, 4) of a component, in order. noise: of the true centres.
     Returns:
         (n,) true over found spread of the centres in a window, over the value on which most frames
         agree; 1 where the camera hardly moved.
@@ -200,17 +205,17 @@ class Verdict:
 
     Attributes:
         outcome: whole, partly, refused, said or passed (head of this file).
-        posed: fraction of the frames that have a pose. right: frames whose pose is right. parts:
-        number of parts with poses.
-        strays: frames off their part that are too few to be a break. wrong: frame numbers of those
-        that do not belong to their part. centre, turn_deg: their median errors (of all frames, if
-        none is wrong), centres over the extent of the part. look: what to look at.
+        posed: fraction of the frames that have a pose. right: frames whose pose is right.
+        components: number of those with poses. strays: frames off their component that are too few
+        to be a break. wrong: numbers of frames that do not belong to their component.
+        centre, turn_deg: their median errors (of all frames, if none is wrong), centres over the
+        extent of the component. look: what to look at.
     """
 
     outcome: str
     posed: float
     right: int
-    parts: int
+    components: int
     strays: int
     wrong: tuple[int, ...]
     centre: float
@@ -229,8 +234,8 @@ def judge(poses: rt.Poses, truth: Array, world: IntArray, noise: float = 0.0) ->
     posed = poses.known & (poses.status != "interpolated")
     wrong, strays, looks, right = list[int](), 0, list[str](), [0]
     errors, bad_errors = list[Array](), list[Array]()
-    for part in np.unique(poses.part[posed]):
-        rows = np.flatnonzero(posed & (poses.part == part))
+    for component in np.unique(poses.part[posed]):
+        rows = np.flatnonzero(posed & (poses.part == component))
         rows = rows[np.isfinite(truth[poses.frame[rows]]).all((1, 2))]
         if not len(rows):
             continue
@@ -241,7 +246,7 @@ def judge(poses: rt.Poses, truth: Array, world: IntArray, noise: float = 0.0) ->
         pair, scale = (poses.cam_from_world[rows[own]], truth[frame[own]]), np.ones(len(rows))
         of_world = np.isfinite(truth).all((1, 2)) & (world == at[0][at[1].argmax()])
         least = max(LEAST_EXTENT * extent_of(truth[of_world]), noise / MAX_CENTRE, 1e-9)
-        error[own], turn[own] = fit_part(*pair, least)
+        error[own], turn[own] = fit_component(*pair, least)
         good = fits(error, turn)
         scale[good] = local_scale(pair[0][good[own]], pair[1][good[own]], noise)
         good &= np.abs(np.log(scale)) <= np.log(MAX_SCALE_JUMP)
@@ -252,7 +257,7 @@ def judge(poses: rt.Poses, truth: Array, world: IntArray, noise: float = 0.0) ->
         elif not good.all():
             wrong += frame[~good].tolist()
             bad_errors.append(errors[-1][:, ~good])
-            looks.append(describe(int(part), frame, own, good, errors[-1], pair))
+            looks.append(describe(int(component), frame, own, good, errors[-1]))
     known = np.isfinite(truth).all((1, 2)).sum()
     if not errors:
         return Verdict("refused", 0.0, 0, 0, 0, (), 0.0, 0.0, "; ".join(poses.messages)[:200])
@@ -268,25 +273,18 @@ def judge(poses: rt.Poses, truth: Array, world: IntArray, noise: float = 0.0) ->
 
 
 def describe(
-    part: int,
+    component: int,
     frame: IntArray,
     own: BoolArray,
     good: BoolArray,
     errors: Array,
-    pair: Sequence[Array],
 ) -> str:
-    """Say which frames of a part are wrong, and how; `pair`: found and true poses of its world."""
+    """Say which frames of a component are wrong, and how."""
     other = f", {(~own).sum()} of them of another world" if not own.all() else ""
     off, turn = np.median(errors[:, ~good], axis=1)
     far = f"{100 * off:.0f} % of the path" if np.isfinite(off) else "no place at all in it"
-    text = f"part {part} of {len(frame)} frames: {(~good).sum()} wrong ({spans(frame[~good])})"
-    text += f"{other}; in the median off by {far} and {turn:.0f} deg"
-    ratio = [
-        np.divide(*(np.sqrt(world_from_cam(side[rows])[0].var(0).sum()) for side in pair))
-        for rows in (good[own], ~good[own])
-        if rows.sum() >= 2
-    ]
-    return text + (f", scale {ratio[1] / ratio[0]:.2f} of the rest" if len(ratio) == 2 else "")
+    text = f"component {component} of {len(frame)} frames: {(~good).sum()} wrong"
+    return f"{text} ({spans(frame[~good])}){other}; in the median off by {far} and {turn:.0f} deg"
 
 
 def spans(numbers: Iterable[int]) -> str:
@@ -339,7 +337,15 @@ class Clip:
         images = np.asarray(self.images[rows])
         return replace(self, images=images, truth=self.truth[rows], world=self.world[rows])
 
+    def changed(self, rows: IntArray, change: Callable[[Any], Any]) -> Clip:
+        """Change some pictures."""
+        images = self.images.copy()
+        for row in rows:
+            images[row] = change(images[row])
+        return replace(self, images=images)
 
+
+NO_IMAGES = np.empty((0, 0, 0, 3), np.uint8)
 FLIP = np.diag([-1.0, 1.0, 1.0])
 
 
@@ -348,12 +354,12 @@ def mirrored(clip: Clip, rows: IntArray) -> Clip:
 
     x_cam = R X + t becomes F x_cam = (F R F) (F X) + F t with F the flip of x.
     """
-    images, truth, world = clip.images.copy(), clip.truth.copy(), clip.world.copy()
-    images[rows] = images[rows][:, :, ::-1]
+    truth, world = clip.truth.copy(), clip.world.copy()
     truth[rows] = FLIP @ truth[rows]
     truth[rows, :, :3] = truth[rows, :, :3] @ FLIP
     world[rows] = -1 - world[rows]
-    return replace(clip, images=images, truth=truth, world=world)
+    flipped = clip.changed(rows, lambda image: image[:, ::-1])
+    return replace(flipped, truth=truth, world=world)
 
 
 def zoomed(image: Any, factor: float, size: tuple[int, int]) -> Any:
@@ -394,8 +400,9 @@ class Recording:
         source: file or folder below --data or examples/. every: of its pictures, for the clip.
         truth: file of true poses, "" without: the poses of the whole recording, found once at the
         defaults, take its place. focal: true one over the width (0: the one found).
-        room: RoomConfig of a rendered one. today: frames with a right pose, in one part, at the
-        defaults with `good_every`, at commit a196537; interpolated ones do not count. 0: broken.
+        room: RoomConfig of a rendered one. today: frames with a right pose, in one component, at
+        the defaults with `good_every`, at commit a196537; interpolated ones do not count. 0:
+        broken.
         noise: largest error of a true centre, in its unit: smaller errors are not significant.
         plan: of a rendered room, "" without. Rooms of one plan are one scene in other colours, to
         15 cm, and are rightly joined.
@@ -405,14 +412,14 @@ class Recording:
     every: int = 1
     truth: str = ""
     focal: float = 0.0
-    room: rr.RoomConfig | None = None
+    room: RoomConfig | None = None
     good_every: int = 1
     today: int = 0
     noise: float = 0.0
     plan: str = ""
 
 
-SMALL = rr.RoomConfig(width=400, height=300, supersample=1, texels_per_m=200, light_rays=2)
+SMALL = RoomConfig(width=400, height=300, supersample=1, texels_per_m=200, light_rays=2)
 
 
 def rendered(seed: int, path: str, frames: int, plan: str = "home", today: int = 0) -> Recording:
@@ -483,9 +490,9 @@ class Shelf:
 
     def _render(self, name: str) -> Clip:
         config = RECORDINGS[name].room or SMALL
-        frames = list(rr.render_clip(rr.make_room(config), config))
+        frames = list(render_clip(make_room(config), config))
         truth = np.stack([f.cam_from_world for f in frames])
-        focal = float(rr.camera_matrix(config)[0, 0]) / config.width
+        focal = float(camera_matrix(config)[0, 0]) / config.width
         images = np.stack([f.image for f in frames])
         return Clip(images, truth, np.zeros(len(frames), np.int64), focal)
 
@@ -541,7 +548,7 @@ class Shelf:
             (Path(work) / "truth.npz").replace(saved)
 
 
-# ---- Breaks: (shelf, names of recordings there, rng) -> clip, what was done ---------------------
+# ---- Breaks: (clip, rng) -> broken clip, what was done to it -------------------------------------
 
 Broken = tuple[Clip, str]
 
@@ -559,18 +566,21 @@ def stretch(shelf: Shelf, names: Sequence[str], rng: Rng, least: int = 24) -> Br
     return clip.rows(rows), f"{name} {rows[0]}..{rows[-1]} by {stride}"
 
 
-def mirrored_half(shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
+def unbroken(clip: Clip, rng: Rng) -> Broken:
+    """Leave the clip as it is: it is difficult by itself."""
+    return clip, ""
+
+
+def mirror_half(clip: Clip, rng: Rng) -> Broken:
     """Mirror all pictures after a cut."""
-    clip, what = stretch(shelf, names, rng)
     cut = round(len(clip.images) * rng.uniform(0.35, 0.65))
-    return mirrored(clip, np.arange(cut, len(clip.images))), f"{what}, mirrored from {cut} on"
+    return mirrored(clip, np.arange(cut, len(clip.images))), f", mirrored from {cut} on"
 
 
-def mirrored_middle(shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
+def mirror_middle(clip: Clip, rng: Rng) -> Broken:
     """Mirror the pictures of a stretch in the middle."""
-    clip, what = stretch(shelf, names, rng)
     rows = middle(len(clip.images), rng, 0.25, 0.5)
-    return mirrored(clip, rows), f"{what}, {rows[0]}-{rows[-1]} mirrored"
+    return mirrored(clip, rows), f", {rows[0]}-{rows[-1]} mirrored"
 
 
 def middle(count: int, rng: Rng, least: float, most: float) -> IntArray:
@@ -580,21 +590,19 @@ def middle(count: int, rng: Rng, least: float, most: float) -> IntArray:
     return np.arange(first, first + length)
 
 
-def left_out(shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
+def leave_out(clip: Clip, rng: Rng) -> Broken:
     """Leave out the interval, a fraction of the clip, over which the view turns most."""
-    clip, what = stretch(shelf, [n for n in names if n != "table"], rng, 36)
     count, gap = len(clip.images), round(len(clip.images) * rng.uniform(0.3, 0.55))
     starts = np.arange(count // 5, max(count // 5 + 1, count - gap - count // 5))
     axis = clip.truth[:, 2, :3]  # viewing directions
     cosine = np.nan_to_num((axis[starts - 1] * axis[starts + gap]).sum(1), nan=1.0)
     first = int(rng.choice(starts[np.argsort(cosine)][:3]))
     rows = np.r_[0:first, first + gap : count]
-    return clip.rows(rows), f"{what}, {first}-{first + gap - 1} left out"
+    return clip.rows(rows), f", {first}-{first + gap - 1} left out"
 
 
-def permuted(shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
+def permute(clip: Clip, rng: Rng) -> Broken:
     """Shuffle: all pictures, those of blocks, or blocks of them."""
-    clip, what = stretch(shelf, names, rng)
     way = str(rng.choice(["all", "in blocks", "blocks"]))
     size = len(clip.images) if way == "all" else int(rng.integers(4, 9))
     blocks = np.split(np.arange(len(clip.images)), np.arange(size, len(clip.images), size))
@@ -602,7 +610,32 @@ def permuted(shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
         blocks = [blocks[i] for i in rng.permutation(len(blocks))]
     else:
         blocks = [rng.permutation(block) for block in blocks]
-    return clip.rows(np.concatenate(blocks)), f"{what}, shuffled: {way} of {size}"
+    return clip.rows(np.concatenate(blocks)), f", shuffled: {way} of {size}"
+
+
+def zoom_stretch(clip: Clip, rng: Rng) -> Broken:
+    """Zoom a stretch in the middle or the rest."""
+    count = len(clip.images)
+    rows = middle(count, rng, 0.3, 0.5) if rng.random() < 0.5 else np.arange(count // 2, count)
+    factor = float(rng.uniform(1.25, 1.5))
+    size = (clip.images.shape[2], clip.images.shape[1])
+    broken = clip.changed(rows, lambda image: zoomed(image, factor, size))
+    return broken, f", {rows[0]}-{rows[-1]} zoomed by {factor:.2f}"
+
+
+def thin_out(clip: Clip, rng: Rng) -> Broken:
+    """Blur or darken a stretch in the middle, by far too much or nearly."""
+    rows = middle(len(clip.images), rng, 0.2, 0.4)
+    what = f", {rows[0]}-{rows[-1]}"
+    if rng.random() < 0.5:
+        sigma = float(rng.uniform(2, 6)) * clip.images.shape[2] / 400
+        broken = clip.changed(rows, lambda image: cv2.GaussianBlur(image, (0, 0), sigma))
+        return broken, f"{what} blurred by {sigma:.1f}"
+    light = float(rng.uniform(0.02, 0.1))
+    broken = clip.changed(
+        rows, lambda image: (image * light + rng.normal(0, 1.5, image.shape)).clip(0, 255).round()
+    )
+    return broken, f"{what} at {light:.2f} of the light"
 
 
 def two_rooms(shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
@@ -613,28 +646,19 @@ def two_rooms(shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
     second = str(rng.choice(others))
     pair = [stretch(shelf, [name], rng) for name in (first, second)]
     clips = [clip.rows(np.arange(min(len(clip.images), 24))) for clip, _ in pair]
-    height, width = clips[0].images.shape[1:3]
-    size = (width, height)
+    size = (clips[0].images.shape[2], clips[0].images.shape[1])
     for _ in range(2):  # the second time to what the first has reached by cutting
         focal = max(clip.focal for clip in clips)
         clips = [with_focal(clip, focal, size) for clip in clips]
     turns = int(rng.choice([1, 1, 2, 3]))
-    pieces = [np.array_split(np.arange(len(clip.images)), turns) for clip in clips]
+    splits = [np.array_split(np.arange(len(clip.images)), turns) for clip in clips]
     worlds = [replace(clip, world=clip.world + i) for i, clip in enumerate(clips)]
-    parts = [worlds[i].rows(pieces[i][k]) for k in range(turns) for i in (0, 1)]
-    joined = Clip(
-        np.concatenate([p.images for p in parts]),
-        np.concatenate([p.truth for p in parts]),
-        np.concatenate([p.world for p in parts]),
-        clips[0].focal,
-        max(clip.noise for clip in clips),
+    pieces = [worlds[i].rows(splits[i][k]) for k in range(turns) for i in (0, 1)]
+    images, truth, world = (
+        np.concatenate([getattr(p, k) for p in pieces]) for k in ("images", "truth", "world")
     )
+    joined = Clip(images, truth, world, clips[0].focal, max(clip.noise for clip in clips))
     return joined, f"{pair[0][1]} and {pair[1][1]} in {2 * turns} pieces"
-
-
-def corridor(shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
-    """Walk past rooms that look the same."""
-    return stretch(shelf, ("corridor", "corridor_b"), rng, 36)
 
 
 def turn(shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
@@ -642,7 +666,7 @@ def turn(shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
     name = str(rng.choice(["turn", "turn_b"]))
     clip, every = shelf.clip(name), int(rng.integers(1, 5))
     count = len(clip.images)
-    first, last = (round(fraction * count) for fraction in rr.TURNS_FROM_TO)
+    first, last = (round(fraction * count) for fraction in TURNS_FROM_TO)
     before, after = rng.integers(8, first + 1), rng.integers(8, count - last + 1)
     rows = np.r_[first - before : first, first:last:every, last : last + after]
     if rng.random() < 0.25:
@@ -650,43 +674,39 @@ def turn(shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
     return clip.rows(rows), f"{name} {rows[0]}..{rows[-1]}, every {every} of the turn"
 
 
-def zoomed_stretch(shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
-    """Zoom a stretch in the middle or the rest."""
-    clip, what = stretch(shelf, names, rng)
-    count = len(clip.images)
-    rows = middle(count, rng, 0.3, 0.5) if rng.random() < 0.5 else np.arange(count // 2, count)
-    images, factor = clip.images.copy(), float(rng.uniform(1.25, 1.5))
-    size = (images.shape[2], images.shape[1])
-    images[rows] = [zoomed(images[i], factor, size) for i in rows]
-    return replace(clip, images=images), f"{what}, {rows[0]}-{rows[-1]} zoomed by {factor:.2f}"
+@dataclass(frozen=True, slots=True)
+class OneClip:
+    """How one clip is broken.
 
+    Attributes:
+        least: number of its pictures. names: recordings instead of the walks. not_of: recordings
+            that are left out.
+    """
 
-def thin(shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
-    """Blur or darken a stretch in the middle, by far too much or nearly."""
-    clip, what = stretch(shelf, names, rng, 30)
-    rows, images = middle(len(clip.images), rng, 0.2, 0.4), clip.images.copy()
-    if rng.random() < 0.5:
-        sigma = float(rng.uniform(2, 6)) * images.shape[2] / 400
-        images[rows] = [cv2.GaussianBlur(images[i], (0, 0), sigma) for i in rows]
-        return replace(clip, images=images), f"{what}, {rows[0]}-{rows[-1]} blurred by {sigma:.1f}"
-    light = float(rng.uniform(0.02, 0.1))
-    dark = images[rows] * light + rng.normal(0, 1.5, images[rows].shape)
-    images[rows] = dark.clip(0, 255).round().astype(np.uint8)
-    return replace(clip, images=images), f"{what}, {rows[0]}-{rows[-1]} at {light:.2f} of the light"
+    damage: Callable[[Clip, Rng], Broken]
+    least: int = 24
+    names: Sequence[str] = ()
+    not_of: Sequence[str] = ()
+
+    def __call__(self, shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
+        kept = [name for name in self.names or names if name not in self.not_of]
+        clip, what = stretch(shelf, kept, rng, self.least)
+        broken, done = self.damage(clip, rng)
+        return broken, what + done
 
 
 KINDS: dict[str, Callable[[Shelf, Sequence[str], Rng], Broken]] = {
-    "mirrored_half": mirrored_half,
-    "mirrored_middle": mirrored_middle,
-    "left_out": left_out,
-    "permuted": permuted,
+    "mirrored_half": OneClip(mirror_half),
+    "mirrored_middle": OneClip(mirror_middle),
+    "left_out": OneClip(leave_out, 36, not_of=["table"]),
+    "permuted": OneClip(permute),
     "two_rooms": two_rooms,
-    "corridor": corridor,
+    "corridor": OneClip(unbroken, 36, names=["corridor", "corridor_b"]),
     "turn": turn,
-    "zoomed": zoomed_stretch,
-    "thin": thin,
+    "zoomed": OneClip(zoom_stretch),
+    "thin": OneClip(thin_out, 30),
 }
-KNOWN_CAMERA = 0.25  # fraction of the cases with given intrinsics (chosen)
+KNOWN_CAMERA = 0.25  # fraction of the cases with given intrinsics
 
 
 # ---- Running ------------------------------------------------------------------------------------
@@ -713,13 +733,13 @@ def run_case(job: Job) -> dict[str, Any]:
     shutil.rmtree(folder, ignore_errors=True)
     line: dict[str, Any] = {"case": job.name, "kind": kind}
     try:
-        case = prepare(job, kind, tail, folder)
+        video, clip, config, what = prepare(job, kind, tail, folder)
         started, cpu = time.monotonic(), cpu_s()
         (folder / "sfm").mkdir(parents=True)
-        poses = rt.estimate_poses(case.video, case.config, folder / "sfm")
-        found = judge(poses, case.truth, case.world, case.noise)
-        ratio = poses.camera.K[0, 0] / poses.camera.width / case.focal
-        line |= {"what": case.what, "frames": len(poses.frame), "known": int(poses.known.sum())}
+        poses = rt.estimate_poses(video, config, folder / "sfm")
+        found = judge(poses, clip.truth, clip.world, clip.noise)
+        ratio = poses.camera.K[0, 0] / poses.camera.width / clip.focal
+        line |= {"what": what, "frames": len(poses.frame), "known": int(poses.known.sum())}
         line |= {"focal_ratio": round(float(ratio), 4), "messages": list(poses.messages)}
         line |= dataclasses.asdict(found)
     except Exception as error:  # a bench goes on: the summary counts it
@@ -736,45 +756,30 @@ def cpu_s() -> float:
     return used.user + used.system + used.children_user + used.children_system
 
 
-@dataclass(frozen=True, slots=True)
-class Case:
-    """A video, what is known of it, and what was done to it."""
-
-    video: rt.Video
-    truth: Array
-    world: IntArray
-    config: rt.PosesConfig
-    what: str
-    focal: float
-    noise: float
-
-
-def prepare(job: Job, kind: str, tail: str, folder: Path) -> Case:
-    """Make the pictures of a case."""
+def prepare(
+    job: Job, kind: str, tail: str, folder: Path
+) -> tuple[rt.Video, Clip, rt.PosesConfig, str]:
+    """Make the pictures of a case; returns its video, the truth, options and what was done."""
+    recording = RECORDINGS[tail] if kind == "good" else Recording()
+    if recording.source:  # as it is, all of it
+        video = rt.Video(job.shelf.path(tail), rt.InputConfig(every=recording.good_every))
+        truth, focal = job.shelf.truth(tail)
+        kept = np.arange(len(truth)) % recording.good_every == 0
+        truth = np.where(kept[:, None, None], truth, np.nan)
+        clip = Clip(NO_IMAGES, truth, np.zeros(len(truth), np.int64), focal, recording.noise)
+        return video, clip, rt.PosesConfig(), "as it is"
     if kind == "good":
-        recording = RECORDINGS[tail]
-        if recording.room is None:
-            video = rt.Video(job.shelf.path(tail), rt.InputConfig(every=recording.good_every))
-            truth, focal = job.shelf.truth(tail)
-            kept = np.arange(len(truth)) % recording.good_every == 0
-            truth = np.where(kept[:, None, None], truth, np.nan)
-        else:
-            clip = job.shelf.clip(tail)
-            write_pictures(clip, folder / "images")
-            video, truth, focal = rt.Video(folder / "images"), clip.truth, clip.focal
-        world, config = np.zeros(len(truth), np.int64), rt.PosesConfig()
-        return Case(video, truth, world, config, "as it is", focal, recording.noise)
-    number = int(tail)
-    rng = np.random.default_rng([job.seed, list(KINDS).index(kind), number])
-    clip, what = KINDS[kind](job.shelf, job.names, rng)
+        clip, what, config = job.shelf.clip(tail), "as it is", rt.PosesConfig()
+    else:
+        rng = np.random.default_rng([job.seed, list(KINDS).index(kind), int(tail)])
+        clip, what = KINDS[kind](job.shelf, job.names, rng)
+        config, (height, width) = SHORT, clip.images.shape[1:3]
+        if rng.random() < KNOWN_CAMERA:
+            focal = clip.focal * width
+            config = replace(config, camera=f"{focal:.3f},{focal:.3f},{width / 2},{height / 2}")
+            what += ", camera given"
     write_pictures(clip, folder / "images")
-    config, (height, width) = SHORT, clip.images.shape[1:3]
-    if rng.random() < KNOWN_CAMERA:
-        focal = clip.focal * width
-        config = replace(config, camera=f"{focal:.3f},{focal:.3f},{width / 2},{height / 2}")
-        what += ", camera given"
-    video = rt.Video(folder / "images")
-    return Case(video, clip.truth, clip.world, config, what, clip.focal, clip.noise)
+    return rt.Video(folder / "images"), clip, config, what
 
 
 def planned(args: argparse.Namespace, shelf: Shelf) -> list[str]:
@@ -789,7 +794,7 @@ def planned(args: argparse.Namespace, shelf: Shelf) -> list[str]:
 
 QUICK_CASES = 12
 QUICK_WALKS = ("room", "walk", "tour")  # needs nothing but this repository
-PARTS_OF_OUTCOME = ("whole", "partly", "refused", "said", "passed", "crashed")
+OUTCOMES = ("whole", "partly", "refused", "said", "passed", "crashed")
 
 
 def main() -> int:
@@ -827,9 +832,9 @@ def main() -> int:
             left = (time.monotonic() - started) / count * (len(jobs) - count) / 60
             print(f"{count}/{len(jobs)} {line['case']}: {line['outcome']} {line['cpu_s']} s, "
                   f"{left:.0f} min left", file=sys.stderr, flush=True)  # fmt: skip
-    chosen = [done[name] for name in names if name in done]
-    print(table(chosen))
-    return int(any(failed(line) for line in chosen))
+    lines = [done[name] for name in names if name in done]
+    print(summary(lines))
+    return int(any(failed(line) for line in lines))
 
 
 def make_clips(shelf: Shelf, walks: Sequence[str], names: Sequence[str], jobs: int) -> None:
@@ -841,20 +846,15 @@ def make_clips(shelf: Shelf, walks: Sequence[str], names: Sequence[str], jobs: i
     needed |= {n for n in ("turn", "turn_b") if "turn" in kinds}
     missing = sorted(n for n in needed if not (shelf.cache / n / "truth.npz").exists())
     with multiprocessing.get_context("spawn").Pool(jobs) as pool:
-        for name in pool.imap_unordered(MakeClip(shelf), missing):
+        for name in pool.imap_unordered(functools.partial(make_clip, shelf), missing):
             print(f"clip {name}", file=sys.stderr, flush=True)
 
 
-@dataclass(frozen=True, slots=True)
-class MakeClip:
+def make_clip(shelf: Shelf, name: str) -> str:
     """Make a clip in another process."""
-
-    shelf: Shelf
-
-    def __call__(self, name: str) -> str:
-        cv2.setNumThreads(1)
-        self.shelf.clip(name)
-        return name
+    cv2.setNumThreads(1)
+    shelf.clip(name)
+    return name
 
 
 def read_results(path: Path) -> dict[str, dict[str, Any]]:
@@ -871,37 +871,32 @@ def failed(line: dict[str, Any]) -> bool:
     today = RECORDINGS[line["case"].partition("-")[2]].today if line["kind"] == "good" else 0
     if not today:
         return False
-    torn = line["outcome"] == "said" or line["parts"] != 1
+    torn = line["outcome"] == "said" or line["components"] != 1
     return bool(torn or line["right"] < WHOLE_SHARE * today)
 
 
-def table(lines: Sequence[dict[str, Any]]) -> str:
+def summary(lines: Sequence[dict[str, Any]]) -> str:
     """Format the summary: a row a kind, good recordings, failing cases."""
-    text = ["| kind | cases | " + " | ".join(PARTS_OF_OUTCOME) + " | stray frames | s a case |"]
-    text += ["|---" * (len(PARTS_OF_OUTCOME) + 4) + "|"]
     broken = [line for line in lines if line["kind"] != "good"]
+    rows = []
     for kind in [*dict.fromkeys(line["kind"] for line in broken), "all"]:
-        rows = [line for line in broken if kind in (line["kind"], "all")]
-        counts = [sum(row["outcome"] == o for row in rows) for o in PARTS_OF_OUTCOME]
-        strays = sum(row.get("strays", 0) for row in rows)
-        seconds = np.mean([row["cpu_s"] for row in rows]) if rows else 0.0
-        numbers = " | ".join(map(str, [len(rows), *counts, strays]))
-        text.append(f"| {kind} | {numbers} | {seconds:.1f} |")
+        own = [line for line in broken if kind in (line["kind"], "all")]
+        counts = [sum(line["outcome"] == o for line in own) for o in OUTCOMES]
+        strays = sum(line.get("strays", 0) for line in own)
+        seconds = np.mean([line["cpu_s"] for line in own]) if own else 0.0
+        rows.append([kind, len(own), *counts, strays, f"{seconds:.1f}"])
+    text = [table(["kind", "cases", *OUTCOMES, "stray frames", "s a case"], rows)]
     good = [line for line in lines if line["kind"] == "good"]
     if good:
-        text += [
-            "",
-            "| recording | with pose | right | right at a196537 | parts | outcome | centre, % | "
-            "turn, deg | focal / true |",
-        ]
-        text += ["|---" * 9 + "|"]
-    for g in good:
-        text.append(
-            f"| {g['case'][5:]} | {g.get('known')} of {g.get('frames')} | {g.get('right')} | "
-            f"{RECORDINGS[g['case'][5:]].today} | {g.get('parts')} | "
-            f"{g['outcome']} | {100 * g.get('centre', 0):.2f} | {g.get('turn_deg', 0):.2f} | "
-            f"{g.get('focal_ratio')} |"
-        )
+        keys = ("known", "frames", "right", "components", "outcome", "centre", "turn_deg")
+        rows = []
+        for g in good:
+            name = g["case"][5:]
+            today = RECORDINGS[name].today
+            rows.append([name, *map(g.get, keys), g.get("focal_ratio"), today])
+        titles = ("with pose", "of", "right", "components", "outcome", "centre", "turn, deg")
+        head = ["recording", *titles, "focal / true", "right at a196537"]
+        text += ["", table(head, rows)]
     lost = sum(failed(g) for g in good)
     passed = sum(line["outcome"] == "passed" for line in broken)
     text += ["", f"passed as good though wrong: {passed} of {len(broken)}; good recordings refused "

@@ -42,8 +42,10 @@ from typing import Any
 
 import numpy as np
 import render_room
+from tables import table
 from truth import (
     Array,
+    Found,
     Output,
     Truth,
     counted,
@@ -88,22 +90,14 @@ class Case:
         return f"{self.recording} {boxes} {'supplied' if self.poses else 'own'}"
 
 
-def kitchen(boxes: str, poses: str, every: int, stop: int = 0) -> Case:
-    """Return a case of hololens_kitchen."""
-    return Case("hololens_kitchen", "hololens_kitchen/images", boxes, poses, every, stop)
-
-
-def red(boxes: str, poses: str, every: int) -> Case:
-    """Return a case of redkitchen_7scenes."""
-    return Case("redkitchen_7scenes", "redkitchen_7scenes/images", boxes, poses, every)
-
-
 C2W = "poses_c2w.txt"
+KITCHEN = ("hololens_kitchen", "hololens_kitchen/images")
+RED = ("redkitchen_7scenes", "redkitchen_7scenes/images")
 CASES = [
-    kitchen(YOLO, C2W, 5),
-    kitchen(FAST, C2W, 12),
-    red(YOLO, C2W, 5),
-    red(FAST, C2W, 16),
+    Case(*KITCHEN, YOLO, C2W, 5),
+    Case(*KITCHEN, FAST, C2W, 12),
+    Case(*RED, YOLO, C2W, 5),
+    Case(*RED, FAST, C2W, 16),
     Case("office_loop", "office_loop/images", YOLO, stop=120),
     Case("bonsai_mip360", "bonsai_mip360/images", FAST, every=6),
     Case("livingroom13", "livingroom13/images", FAST),
@@ -125,8 +119,8 @@ CASES = [
 # objects, as TUD-Campus. sun3d s2: supplied cameras alone, as s1.
 LONG = [
     Case("room", str(ROOT / "examples/room/room.mp4"), FAST, every=3),
-    kitchen(YOLO, "", 1, 120),
-    red(YOLO, "", 5),
+    Case(*KITCHEN, YOLO, "", 1, 120),
+    Case(*RED, YOLO, "", 5),
     Case("office_loop", "office_loop/images", FAST, every=2, stop=120),
     Case("cubeslam_cabinet", "cubeslam_cabinet/images", FAST, stop=30),
     Case("sun3d s2", "sun3d_studyroom_fragments/s2/images", FAST, C2W, 2),
@@ -203,12 +197,8 @@ def run(case: Case, data: Path, out: Path, without: str = "") -> Figures:
     """Run a case; returns its exit code, seconds, memory and figures."""
     work = out / case.name.replace(" ", "_")
     work.mkdir(parents=True)
-    tool = (
-        [str(ROOT / "benchmarks/without.py"), without]
-        if without
-        else [str(ROOT / "reobj_track.py")]
-    )
-    words = [sys.executable, *tool, *command(case, data, work)]
+    tool = ["benchmarks/without.py", without] if without else ["reobj_track.py"]
+    words = [sys.executable, str(ROOT / tool[0]), *tool[1:], *command(case, data, work)]
     began = time.monotonic()
     with open(work / "log.txt", "w") as log:
         process = subprocess.Popen(words, stdout=log, stderr=subprocess.STDOUT, cwd=work)
@@ -248,30 +238,25 @@ def truth_2d(case: Case, data: Path) -> tuple[Truth, float, float] | None:
         return read_mot_truth(folder / "gt_mot.txt", names), 0.5, 0.4
     if (folder / "objects_2d.json").exists():
         return read_mot_truth(folder / "gt_mot.txt", COCO, folder / "objects_2d.json"), 0.4, 0.4
-    if case.recording == "redkitchen_7scenes":
+    if case.recording == RED[0]:
         names, complete = classes(folder / "gt_mot_format.json"), RED_COMPLETE
         return read_mot_truth(folder / "gt_mot.txt", names, complete=complete), 0.5, 0.4
-    if case.recording == "hololens_kitchen":
+    if case.recording == KITCHEN[0]:
         names = classes(folder / "gt_amodal_format.json")
         every = set(names.values()) - {"none"}
         truth = read_mot_truth(folder / "gt_amodal.txt", names, None, every, 0.3)
         return truth, 0.3, 0.3
-    if case.recording == "TUD-Campus":
-        return read_people(data / "mot/MOT15-train/TUD-Campus/gt/gt.txt", case), 0.5, 0.5
-    if case.recording == "PETS-S3-MF1":
-        return read_people(folder / "gt/gt.txt", case), 0.5, 0.5
+    if case.boxes == MOT or case.recording == "TUD-Campus":
+        mot15 = data / "mot/MOT15-train/TUD-Campus"
+        path = (mot15 if case.recording == "TUD-Campus" else folder) / "gt/gt.txt"
+        name = "person" if case.boxes == FAST else "object"  # recorded boxes have no class
+        return read_mot_truth(path, name, complete=[name]), 0.5, 0.5
     return None
 
 
 def classes(path: Path) -> dict[int, str]:
     """Read the names of the class numbers of a file of truth."""
     return {int(k): v for k, v in json.loads(path.read_text())["classes"].items()}
-
-
-def read_people(path: Path, case: Case) -> Truth:
-    """Read boxes of pedestrians; recorded boxes have no class and are called `object`."""
-    name = "person" if case.boxes == FAST else "object"
-    return read_mot_truth(path, name, complete=[name])
 
 
 KNOWN_NUMBERS = {
@@ -325,16 +310,17 @@ def score(case: Case, data: Path, out: Path) -> Figures:
         "cameras": int(world.get("registered_frames") or 0),
         "frames": int(world.get("frames") or 0),
     }
+    found: Found | None = None
     if case.recording in KNOWN_NUMBERS:
         found = counted(output, KNOWN_NUMBERS[case.recording])
-        figures |= {"found": found.found, "true": found.true, "false": found.false}
     elif given := truth_2d(case, data):
         truth, *overlaps = given
         every = range(0, case.stop or 1 << 20, case.every)
-        found = score_2d(truth.of_frames([f for f in np.unique(truth.frame) if f in every]),
-                         output, *overlaps)  # fmt: skip
-        figures |= {"found": found.found, "true": found.true, "false": found.false}
+        shown = truth.of_frames([f for f in np.unique(truth.frame) if f in every])
+        found = score_2d(shown, output, *overlaps)
         figures["idf1"] = found.idf1
+    if found:
+        figures |= {"found": found.found, "true": found.true, "false": found.false}
     true = true_cameras(case, data)
     if true and (cameras := score_cameras(output, true, own=not case.poses)):
         figures["off"] = 100 * cameras.median / cameras.extent
@@ -385,29 +371,20 @@ def missed(figures: Figures, floors: Mapping[str, float] | None) -> list[str]:
                     if k in floors and not figures.get(k, math.inf) <= floors[k]]  # fmt: skip
 
 
-def table(made: Mapping[str, Figures]) -> str:
-    """Format the figures, a line for each command."""
+COLUMNS = {  # of the table: figure, format, figure of the total
+    "IDF1": ("idf1", ".3f", ""), "found": ("found", "d", "true"), "false": ("false", "d", ""),
+    "solids": ("solids", "d", "solids_true"), "cm": ("cm", ".1f", ""),
+    "cameras": ("cameras", "d", "frames"), "off %": ("off", ".2f", ""), "s": ("seconds", ".0f", ""),
+    "MB": ("mb", "d", ""), "warnings": ("warnings", "d", ""), "exit": ("exit", "d", ""),
+}  # fmt: skip
 
-    def cell(figures: Figures, key: str, form: str, of: str = "") -> str:
-        if key not in figures:
-            return "-"
-        return format(figures[key], form) + (f" of {figures[of]}" if of else "")
 
-    columns: list[tuple[str, str, str, str]] = [
-        ("IDF1", "idf1", ".3f", ""), ("found", "found", "d", "true"), ("false", "false", "d", ""),
-        ("solids", "solids", "d", "solids_true"), ("cm", "cm", ".1f", ""),
-        ("cameras", "cameras", "d", "frames"), ("off %", "off", ".2f", ""),
-        ("s", "seconds", ".0f", ""), ("MB", "mb", "d", ""), ("warnings", "warnings", "d", ""),
-        ("exit", "exit", "d", ""),
-    ]  # fmt: skip
-    rows = [["command", *(title for title, *_ in columns)]]
-    for name, figures in made.items():
-        rows.append([name, *(cell(figures, *column[1:]) for column in columns)])
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = [
-        "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows
+def cells(figures: Figures) -> list[str]:
+    """Format the figures of a command."""
+    return [
+        format(figures[key], form) + (f" of {figures[of]}" if of else "") if key in figures else "-"
+        for key, form, of in COLUMNS.values()
     ]
-    return "\n".join(lines)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -438,7 +415,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         out = (args.out or Path(temporary)).resolve()
         tasks = {c.name: pool.submit(run, c, args.data.resolve(), out, args.without) for c in order}
         made = {c.name: tasks[c.name].result() for c in cases}
-    print(table(made))
+    print(table(["command", *COLUMNS], ([name, *cells(f)] for name, f in made.items())))
     if args.out:
         (args.out / "recordings.json").write_text(json.dumps(made, indent=1) + "\n")
     if args.write_floors:

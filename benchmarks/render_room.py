@@ -37,143 +37,70 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from rendering.camera import TURNS_FROM_TO, camera_matrix, camera_path, look_along
-from rendering.config import COCO_NAMES, NEAR_M, PATHS, PLANS, DetectorConfig, RoomConfig
-from rendering.detector import simulate_detections
-from rendering.ground_truth import ground_truth, project_points
-from rendering.models import (
-    DISC,
-    FRUSTUM,
-    QUAD,
-    SPHERE,
-    furniture_models,
-    office_chair_model,
-    stretched,
-)
-from rendering.photograph import render_clip
-from rendering.plans import room_shell, varied_models, varied_plan
-from rendering.raster import rasterize, render
-from rendering.room import make_room, rooms_in_a_row
-from rendering.surfaces import Room, Surfaces, build_surfaces, place_object, surface_points
-from rendering.writers import objects_json, quaternion_xyzw, run_lengths, write_clip
-
-__all__ = [
-    "COCO_NAMES",
-    "DISC",
-    "FRUSTUM",
-    "NEAR_M",
-    "PATHS",
-    "PLANS",
-    "QUAD",
-    "SPHERE",
-    "TURNS_FROM_TO",
-    "DetectorConfig",
-    "Room",
-    "RoomConfig",
-    "Surfaces",
-    "build_surfaces",
-    "camera_matrix",
-    "camera_path",
-    "furniture_models",
-    "ground_truth",
-    "look_along",
-    "make_room",
-    "objects_json",
-    "office_chair_model",
-    "place_object",
-    "project_points",
-    "quaternion_xyzw",
-    "rasterize",
-    "render",
-    "render_clip",
-    "room_shell",
-    "rooms_in_a_row",
-    "run_lengths",
-    "simulate_detections",
-    "stretched",
-    "surface_points",
-    "varied_models",
-    "varied_plan",
-    "write_clip",
-]
+from rendering.config import PATHS, PLANS, RoomConfig
+from rendering.writers import write_clip
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """Options come from the config's defaults."""
+def build_parser(description: str) -> argparse.ArgumentParser:
+    """Options that single rooms and rooms of several sessions share."""
     base = RoomConfig()
-    parser = argparse.ArgumentParser(
-        description="Render a hand-held video of a furnished room with ground truth."
-    )
+    parser = argparse.ArgumentParser(description=description)
     add: Callable[..., Any] = parser.add_argument
     add("-o", "--out", type=Path, required=True, help="folder to write to")
     add("--seed", type=int, default=base.seed, help="random seed")
-    add("--frames", type=int, default=base.frames)
-    add(
-        "--size",
-        default=f"{base.width}x{base.height}",
-        help="WIDTHxHEIGHT in pixels (default %(default)s)",
-    )
+    add("--frames", type=int, default=base.frames, help="of each recording (default %(default)s)")
+    size = f"{base.width}x{base.height}"
+    add("--size", default=size, help="WIDTHxHEIGHT in pixels (default %(default)s)")
     add("--fps", type=float, default=base.fps)
-    add(
-        "--path",
-        choices=PATHS,
-        default=base.path,
-        help="camera path: " + "; ".join(f"{k}: {v}" for k, v in PATHS.items()),
-    )
-    add(
-        "--plan",
-        choices=PLANS,
-        default=base.plan,
-        help="; ".join(f"{k}: {v}" for k, v in PLANS.items()),
-    )
-    add("--chairs", type=int, default=base.chairs, help="identical chairs, up to 6")
-    add("--monitors", type=int, default=base.monitors)
-    add("--noise", type=float, default=base.noise, help="sensor noise in grey levels")
-    add(
-        "--shutter",
-        type=float,
-        default=base.shutter,
-        help="motion blur as a fraction of the frame interval",
-    )
-    add("--texels", type=float, default=base.texels_per_m, help="texture resolution per metre")
     add("--crf", type=int, help="write H.264 of this quality with PyAV, e.g. 26")
-    add("--own-world", action="store_true", help="poses in a world that begins at the first camera")
     add("--png", action="store_true", help="also write every frame as PNG")
     return parser
 
 
+def room_config(args: argparse.Namespace, **more: Any) -> RoomConfig:
+    """Read the options of `build_parser`.
+
+    Raises: ValueError for a size or number of frames that cannot be.
+    """
+    width, _, height = args.size.lower().partition("x")
+    if not (width.isdigit() and height.isdigit() and min(int(width), int(height)) >= 16) or (
+        args.frames < 1
+    ):
+        raise ValueError(
+            f"--size {args.size} --frames {args.frames}: expected e.g. 640x480, at least 16x16, "
+            "and at least one frame"
+        )
+    return RoomConfig(args.seed, int(width), int(height), frames=args.frames, fps=args.fps, **more)
+
+
+def report(make: Callable[[], Any]) -> int:
+    """Print what was rendered; 0 on success, 2 on bad input."""
+    try:
+        print(json.dumps(make()))
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line entry; 0 on success, 2 on bad input."""
-    args = build_parser().parse_args(argv)
-    try:
-        width, height = (int(side) for side in args.size.lower().split("x"))
-        if width < 16 or height < 16 or args.frames < 1:
-            raise ValueError
-    except ValueError:
-        print(
-            f"error: --size {args.size} --frames {args.frames}: expected e.g. 640x480 and >= 1",
-            file=sys.stderr,
+    parser = build_parser("Render a hand-held video of a furnished room with ground truth.")
+    add: Callable[..., Any] = parser.add_argument
+    for name, choices in (("path", PATHS), ("plan", PLANS)):
+        text = "; ".join(f"{choice}: {about}" for choice, about in choices.items())
+        add(f"--{name}", choices=choices, default=getattr(RoomConfig(), name), help=text)
+    add("--own-world", action="store_true", help="poses in a world that begins at the first camera")
+    args = parser.parse_args(argv)
+    return report(
+        lambda: write_clip(
+            args.out,
+            room_config(args, path=args.path, plan=args.plan),
+            args.png,
+            args.crf,
+            args.own_world,
         )
-        return 2
-    config = RoomConfig(
-        seed=args.seed,
-        width=width,
-        height=height,
-        frames=args.frames,
-        fps=args.fps,
-        path=args.path,
-        plan=args.plan,
-        chairs=args.chairs,
-        monitors=args.monitors,
-        noise=args.noise,
-        shutter=args.shutter,
-        texels_per_m=args.texels,
     )
-    counts = write_clip(
-        args.out, config, DetectorConfig(), args.png, args.crf, own_world=args.own_world
-    )
-    print(json.dumps(counts))
-    return 0
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Checks of the fitted shapes that need no ground truth, on finished output folders of `run`.
 
-    python benchmarks/shape_checks.py OUT [OUT ...] [--json FILE]
+    python benchmarks/shape_checks.py OUT [OUT ...]
 
 Cameras, sparse points, boxes and options are those of the run; its boxes are linked and fitted
 again by the code of this checkout, corrections by hand are left out. A folder called "out" has the
@@ -38,7 +38,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import itertools
-import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -48,6 +47,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
+from tables import table
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
@@ -157,18 +157,12 @@ class Comparison:
     size: Array = field(default_factory=lambda: np.empty(0))
     sides: Array = field(default_factory=lambda: np.empty(0))
 
-    def figures(self) -> dict[str, Any]:
-        """Return the figures of a row."""
+    def figures(self) -> list[str]:
+        """Return the cells of COMPARED."""
         both = len(self.sides)
-        return {
-            "a": self.a,
-            "b": self.b,
-            "both": both,
-            "one_only": self.a + self.b - 2 * both,
-            "centres": _mean(self.centre <= REGION),
-            "sizes": _mean(self.size <= REGION),
-            "sides": _percentile(self.sides, 50),
-        }
+        shares = [_mean(self.centre <= REGION), _mean(self.size <= REGION)]
+        counts = map(str, (self.a, self.b, both, self.a + self.b - 2 * both))
+        return [*counts, *shares, _percentile(self.sides, 50)]
 
 
 def compare(first: Result, second: Result, tracked: Result) -> Comparison:
@@ -253,18 +247,13 @@ class Checks:
     halves: Comparison
     noise: Comparison
 
-    def figures(self) -> dict[str, Any]:
-        """Return the figures of a row."""
+    def figures(self) -> list[str]:
+        """Return the cells of HEAD but the first."""
         off = (self.depth < 0.5) | (self.depth > 2)
-        return {
-            "objects": len(self.depth),
-            "runaway": int(off.sum()),
-            "absurd": int((self.oversize > 3).sum()),
-            "implausible": self.implausible,
-            "depth": [_percentile(self.depth, p) for p in (50, 5, 95)],
-            "halves": self.halves.figures(),
-            "noise": self.noise.figures(),
-        }
+        low, median, high = (_percentile(self.depth, p) for p in (5, 50, 95))
+        counts = (off.sum(), (self.oversize > 3).sum(), self.implausible)
+        return [str(len(self.depth)), f"{median} ({low}-{high})", *map(str, counts),
+                *self.halves.figures(), *self.noise.figures()]  # fmt: skip
 
 
 def pooled(checks: Sequence[Any]) -> Any:
@@ -300,39 +289,18 @@ def check(out: Path) -> Checks:
     )
 
 
-COMPARED = "  a   b both one only centres sizes sides"
-HEAD = f"""{"":53s} depth {"":26s} {"halves":^{len(COMPARED)}}   {"noise":^{len(COMPARED)}}
-{"recording":35s} objects median (5-95 %)   runaway absurd implausible   {COMPARED}   {COMPARED}"""
+COMPARED = ("a", "b", "both", "one only", "centres", "sizes", "sides")
+HEAD = ("recording", "objects", "depth (5-95 %)", "runaway", "absurd", "implausible",
+        *(f"{kind}: {name}" for kind in ("halves", "noise") for name in COMPARED))  # fmt: skip
 
 
-def line(name: str, figures: dict[str, Any]) -> str:
-    """Return a row of the table."""
-    median, low, high = map(_text, figures["depth"])
-    counts = "{runaway:7d} {absurd:6d} {implausible:11d}".format(**figures)
-    compared = "   ".join(_compared(figures[kind]) for kind in ("halves", "noise"))
-    spread = "" if low == "-" else f"({low}-{high})"
-    return (
-        f"{name[:35]:35s} {figures['objects']:7d} {median:>6s} {spread:10s} {counts}   {compared}"
-    )
+def _mean(values: BoolArray) -> str:
+    return f"{np.mean(values):.2f}" if len(values) else "-"
 
 
-def _compared(figures: dict[str, Any]) -> str:
-    counts = "{a:3d} {b:3d} {both:4d} {one_only:8d}".format(**figures)
-    centres, sizes, sides = (_text(figures[name]) for name in ("centres", "sizes", "sides"))
-    return f"{counts} {centres:>7s} {sizes:>5s} {sides:>5s}"
-
-
-def _text(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
-
-
-def _mean(values: BoolArray) -> float | None:
-    return float(np.mean(values)) if len(values) else None
-
-
-def _percentile(values: Array, percent: float) -> float | None:
+def _percentile(values: Array, percent: float) -> str:
     known = values[np.isfinite(values)]
-    return float(np.percentile(known, percent)) if len(known) else None
+    return f"{np.percentile(known, percent):.2f}" if len(known) else "-"
 
 
 def name_of(out: Path) -> str:
@@ -347,22 +315,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("out", type=Path, nargs="+", metavar="OUT", help="output folders of `run`")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there too")
     args = parser.parse_args(argv)
-    checks: dict[str, Checks] = {}
-    print(HEAD)
     try:
-        for out in args.out:
-            checks[name_of(out)] = check(out)
-            print(line(name_of(out), checks[name_of(out)].figures()), flush=True)
+        checks = {name_of(out): check(out) for out in args.out}
     except ReobjError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     checks["all"] = pooled(list(checks.values()))
-    print(line("all", checks["all"].figures()))
-    if args.json:
-        figures = {name: found.figures() for name, found in checks.items()}
-        args.json.write_text(json.dumps(figures, indent=1) + "\n")
+    print(table(HEAD, ([name, *found.figures()] for name, found in checks.items())))
     return 0
 
 

@@ -19,11 +19,10 @@ def held_out(kind: str, name: str) -> bool:
     """Return whether a sequence is for reporting: nothing was chosen on it.
 
     Args:
-        kind: rooms, recordings, pedestrians or scans.
+        kind: rooms, recordings or pedestrians.
         name: of the recording or sequence; of a room `room_name`.
     """
-    names = SPLITS["reporting"][kind]
-    return names == "all" or name in names
+    return name in SPLITS["reporting"][kind]
 
 
 def usable(kind: str, name: str, choosing: bool) -> bool:
@@ -51,9 +50,7 @@ def add_choosing(parser: argparse.ArgumentParser) -> None:
 
 
 def split_name(folder: Path) -> tuple[str, str]:
-    """Return the kind and the name of a folder's video: a scan, a rendered room or a recording."""
-    if (folder / "color").is_dir() or (folder / "house_segmentations").is_dir():
-        return "scans", folder.name
+    """Return the kind and the name of a folder's video: a rendered room or a recording."""
     truth = folder / "gt_objects.json"
     if truth.exists() and "config" in json.loads(truth.read_text()):
         return "rooms", room_name(folder)

@@ -20,6 +20,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+from tables import table
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import quadrics
@@ -270,12 +271,6 @@ def coverage(
 # ---- Tables --------------------------------------------------------------------------------
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """Markdown table."""
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    return "\n".join(lines + ["| " + " | ".join(str(x) for x in row) + " |" for row in rows])
-
-
 def lfd_overlap(boxes: Array, cams: Array, truth: Ellipsoids) -> tuple[float, float]:
     """Mean O3D of closed-form LfD (0 if it is no ellipsoid) and fraction of ellipsoids."""
     dual_q, real = quadrics.fit_lfd(*as_one(boxes, cams))
@@ -316,20 +311,6 @@ def cuboids_table(trials: int) -> str:
             row.append(f"{iou:.3f}" + (f" ({cuboids:.0%} boxes)" if support == "evidence" else ""))
         rows.append(row)
     return table(["size m", "ellipsoid", "box", "evidence"], rows)
-
-
-def coverage_table(trials: int) -> str:
-    """Fraction of truths inside the 95 % region."""
-    rows = []
-    config = FitConfig(correlation_deg=0.0)  # the noise of these boxes is independent
-    for support in quadrics.SUPPORTS:
-        for views, arc in ((3, 20), (3, 90), (6, 60), (10, 20), (10, 120)):
-            rng = np.random.default_rng(5)
-            inside = coverage(trials, views, arc, 0.02, support, rng, config)
-            rows.append([support, views, arc, *(f"{100 * x:.1f}" for x in inside.values())])
-    mean = [f"**{np.mean([float(str(r[k])) for r in rows]):.1f}**" for k in range(3, 7)]
-    rows.append(["mean", "", "", *mean])
-    return table(["shape", "views", "arc deg", "all 9", "center", "size", "rotation"], rows)
 
 
 def room_table(trials: int) -> str:
@@ -388,12 +369,11 @@ def ratio_priors(mean_log: Array, cov_log: Array) -> Priors:
     return Priors(names, {}, log_mean, full, mean_log, cov_log, code, ~flags, flags, ~flags)
 
 
-def thesis_trial(rotation_deg: float, size: float, seed: int) -> list[float]:
-    """Mean O3D of SfMO, PSfMO, PSfMO with cameras and fit_objects for one disturbed scene.
+METHODS = ["SfMO", "PSfMO", "PSfMO, cameras known", "fit_objects, cameras known"]
 
-    Then the noise variance that PSfMO estimates, without and with cameras: the mean over objects,
-    of shape rows relative to their mean.
-    """
+
+def thesis_trial(rotation_deg: float, size: float, seed: int) -> list[float]:
+    """Mean O3D of METHODS for one disturbed scene."""
     rng = np.random.default_rng(seed)
     truth, cams = far_scene(15, 8, 25.0, rng)
     table_ = quadrics.load_priors()
@@ -409,43 +389,38 @@ def thesis_trial(rotation_deg: float, size: float, seed: int) -> list[float]:
     affine = quadrics.fit_psfmo(None, known, names, None, dual_c)
     posed = quadrics.fit_psfmo(None, known, names, cams, dual_c)
     ours = quadrics.fit_objects(boxes, cams, (10**5, 10**5), names, known, up=UP)
-    assert affine.start is not None and affine.mirrored is not None
-    pairs = ((affine.start.ellipsoids, affine.start.mirrored), (affine.ellipsoids, affine.mirrored))
-    scores = [
-        max(float(quadrics.volume_overlap(align(x, truth), truth).mean()) for x in pair)
-        for pair in pairs
-    ]
-    rest = [quadrics.volume_overlap(x.ellipsoids, truth).mean() for x in (posed, ours)]
-    variance = [float(np.nanmean(x.noise**2)) for x in (affine, posed)]
-    return scores + [float(np.nan_to_num(x)) for x in rest] + variance
+    assert affine.start is not None
+
+    def score(*found: Ellipsoids | None) -> float:
+        return max(
+            float(np.nan_to_num(quadrics.volume_overlap(x, truth).mean()))
+            for x in found
+            if x is not None
+        )
+
+    pairs = ((x.ellipsoids, x.mirrored) for x in (affine.start, affine))
+    free = [score(*(align(x, truth) for x in pair if x is not None)) for pair in pairs]
+    return [*free, score(posed.ellipsoids), score(ours.ellipsoids)]
 
 
 def thesis_table(trials: int) -> str:
-    """O3D and PSfMO's noise variance (mean and sigma over scenes) against both ellipse errors."""
-    methods = ["SfMO", "PSfMO", "PSfMO, cameras known", "fit_objects, cameras known"]
-    columns = [*methods, *(f"noise variance, {m}" for m in methods[1:3])]
+    """O3D (mean and sigma over scenes) against both errors of the ellipses."""
     sweeps = {
-        "ellipse rotation error, deg": [(x, 0.02) for x in (0, 5, 10, 20, 30, 45)],
-        "size error, %": [(2, x / 100) for x in (0, 5, 10, 20, 30, 50)],
+        "ellipse rotation error, deg": [(x, 0.02, x) for x in (0, 5, 10, 20, 30, 45)],
+        "size error, %": [(2, x / 100, x) for x in (0, 5, 10, 20, 30, 50)],
     }
     rows = []
     for label, settings in sweeps.items():
-        for rotation, size in settings:
-            seeds = range(max(6, trials // 10))
-            scores = np.array([thesis_trial(rotation, size, seed) for seed in seeds])  # (S, 6)
-            x = rotation if "rotation" in label else 100 * size
-            mean = scores.mean(0)
-            sigma = scores.std(0)
-            digits = [2] * len(methods) + [4] * 2
-            cells = [f"{m:.{d}f} ± {s:.{d}f}" for m, s, d in zip(mean, sigma, digits, strict=True)]
-            rows.append([label, f"{x:g}", *cells])
-    return table(["disturbance", "value", *columns], rows)
+        for rotation, size, value in settings:
+            scores = [thesis_trial(rotation, size, seed) for seed in range(max(6, trials // 10))]
+            pairs = zip(np.mean(scores, 0), np.std(scores, 0), strict=True)
+            rows.append([label, value, *(f"{mean:.2f} ± {sigma:.2f}" for mean, sigma in pairs)])
+    return table(["disturbance", "value", *METHODS], rows)
 
 
 TABLES: dict[str, Callable[[int], str]] = {
     "ellipsoids": ellipsoids_table,
     "cuboids": cuboids_table,
-    "coverage": coverage_table,
     "room": room_table,
     "thesis": thesis_table,
 }

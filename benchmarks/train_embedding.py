@@ -21,9 +21,8 @@ Method: each step takes several scenes and several views of each, and augments e
 (colour, gamma, white balance, blur, noise, JPEG, jittered boxes, ellipses instead of masks half of
 the time). Triplet loss on cosines of (foreground, background) together and of each alone. For every
 anchor and positive the negative is the soft maximum over all (mostly an identical instance
-elsewhere in the room). After the fraction --hard-after of the steps, negatives are from the same
-scene only. Ref: Bansal et al., re-OBJ, ICIAP 2019; Sandler et
-al., MobileNetV2, CVPR 2018 (inverted residual); Izmailov et al., UAI 2018 (--average).
+elsewhere in the room). Ref: Bansal et al., re-OBJ, ICIAP 2019; Sandler et al., MobileNetV2, CVPR
+2018 (inverted residual).
 
 Axes: B frames of a batch, D detections of a frame, N of a batch, C channels of the map.
 """
@@ -47,10 +46,13 @@ import numpy as np
 import numpy.typing as npt
 
 sys.path[:0] = [str(Path(__file__).resolve().parent), str(Path(__file__).resolve().parents[1])]
-import render_room as rr  # noqa: E402
+from rendering.config import RoomConfig  # noqa: E402
+from rendering.photograph import render_clip  # noqa: E402
+from rendering.room import make_room  # noqa: E402
 
 import reobj_track as rt  # noqa: E402
 from reobj.appearance.embedding import PartSamples, occupancy_map, sample_parts  # noqa: E402
+from reobj.files import atomic  # noqa: E402
 from reobj.sources.recorded import RecordedDetections, read_npz  # noqa: E402
 from reobj.types import Array, Image, IntArray, box_iou  # noqa: E402
 
@@ -58,7 +60,6 @@ try:
     import torch
     from torch import nn
     from torch.nn import functional as F
-    from torch.optim import swa_utils
 except ImportError:
     sys.exit("train_embedding.py needs PyTorch: pip install torch onnx")
 
@@ -67,6 +68,10 @@ STRIDE = 16  # sides of the network's input are multiples of it
 # Channels of the map: fixed colours, learned from 15 pixels, learned from the surroundings.
 COLOURS, NEAR, DEEP = 17, 24, 40
 CHANNELS, WIDTH = COLOURS + NEAR + DEEP, 128  # of the map and of each embedding
+FRAMES = 40  # views of each rendered room
+SCENES, VIEWS = 3, 8  # of a batch: scenes, and views of each
+MOST_IDENTITIES = 24  # of a scene
+LOG_STEPS = 100  # between two rows of the log
 LAYOUT = {
     "size_px": 320, "context": 0.5, "min_margin": 0.05, "samples": 3, "foreground_cells": 3,
     "background_cells": 4, "surround_scale": 1.5, "surround_min_margin": 0.2,
@@ -104,23 +109,11 @@ class Clip:
         return np.asarray(seen @ seen.T, np.float32)
 
 
-def room_config(seed: int, frames: int = 40, fine: bool = False) -> rr.RoomConfig:
-    """One training room: small pictures (fine: of twice the width), coarse light, its own lens and
-    eye height.
-    """
-    rng = np.random.default_rng([seed, 8])
-    lens, eye = float(rng.uniform(52, 76)), float(rng.uniform(1.15, 1.75))
-    return rr.RoomConfig(seed=seed, frames=frames, width=SIZE_WH[0] * (1 + fine),
-                         height=SIZE_WH[1] * (1 + fine), texels_per_m=300.0 if fine else 200.0,
-                         light_rays=4, shutter=0.1 * fine, noise=0.0, exposure=0.1,
-                         plan="varied", path="tour", hfov_deg=lens, eye_m=eye)  # fmt: skip
-
-
-def room_clip(seed: int, cache: Path, frames: int = 40, fine: bool = False) -> Clip:
+def room_clip(seed: int, cache: Path) -> Clip:
     """Render a room, or read it from the cache."""
-    path = room_path(seed, cache, fine)
+    path = room_path(seed, cache)
     if not path.exists():
-        render_to(path, room_config(seed, frames, fine))
+        render_to(path, seed)
     data = np.load(path)
     boxes, visibility, labels = data["xyxy"], data["visibility"], data["instance"]
     sides = (boxes[..., 2:] - boxes[..., :2]).min(2)  # (F, O), NaN where not in view
@@ -133,27 +126,32 @@ def room_clip(seed: int, cache: Path, frames: int = 40, fine: bool = False) -> C
     )  # fmt: skip
 
 
-def room_path(seed: int, cache: Path, fine: bool = False) -> Path:
+def room_path(seed: int, cache: Path) -> Path:
     """Where a rendered room is kept."""
-    return cache / f"{'fine' if fine else 'room'}_{seed}.npz"
+    return cache / f"room_{seed}.npz"
 
 
-def render_to(path: Path, config: rr.RoomConfig) -> None:
-    """Render one room into a cache file."""
-    room = rr.make_room(config)
-    frames = list(rr.render_clip(room, config))
-    part = path.with_suffix(".part.npz")
+def render_to(path: Path, seed: int) -> None:
+    """Render a room into a cache file: small, in coarse light, its own lens and eye height."""
+    rng = np.random.default_rng([seed, 8])
+    lens, eye = float(rng.uniform(52, 76)), float(rng.uniform(1.15, 1.75))
+    config = RoomConfig(
+        seed=seed, frames=FRAMES, width=SIZE_WH[0], height=SIZE_WH[1], texels_per_m=200.0,
+        light_rays=4, shutter=0.0, noise=0.0, exposure=0.1, plan="varied", path="tour",
+        hfov_deg=lens, eye_m=eye,
+    )  # fmt: skip
+    room = make_room(config)
+    frames = list(render_clip(room, config))
     path.parent.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(
-        part,
-        image=np.stack([f.image for f in frames]),
-        instance=np.stack([f.instance for f in frames]).astype(np.uint8),  # -1 becomes 255
-        xyxy=np.stack([f.truth.visible_xyxy for f in frames]).astype(np.float32),
-        visibility=np.stack([f.truth.visibility for f in frames]).astype(np.float32),
-        class_id=np.array([o.class_id for o in room.objects]),
-        look=np.array([o.twin_group for o in room.objects]),
-    )
-    part.replace(path)
+    with atomic(path) as part, part.open("wb") as file:
+        np.savez_compressed(
+            file,
+            image=np.stack([f.image for f in frames]),
+            instance=np.stack([f.instance for f in frames]).astype(np.uint8),  # -1 becomes 255
+            xyxy=np.stack([f.truth.visible_xyxy for f in frames]).astype(np.float32),
+            visibility=np.stack([f.truth.visibility for f in frames]).astype(np.float32),
+            look=np.array([o.twin_group for o in room.objects]),
+        )
 
 
 @functools.lru_cache
@@ -174,7 +172,10 @@ def read_pictures(folder: Path) -> dict[str, tuple[Image, float]]:
     return pictures
 
 
-def sparse_clip(folder: Path, model: Path, seed: int = 0, points: int = 400) -> Clip:
+POINTS = 400  # pseudo-objects of a clip
+
+
+def sparse_clip(folder: Path, model: Path, seed: int = 0) -> Clip:
     """Pseudo-objects of a COLMAP model: balls around 3D points that three views or more observe."""
     import pycolmap
 
@@ -182,11 +183,10 @@ def sparse_clip(folder: Path, model: Path, seed: int = 0, points: int = 400) -> 
     scene = pycolmap.Reconstruction(str(model))
     rng = np.random.default_rng([seed, 9])
     long = sorted(i for i, point in scene.points3D.items() if point.track.length() >= 3)
-    keep = rng.permutation(long)[: 4 * points]
+    keep = rng.permutation(long)[: 4 * POINTS]
     row_of = {int(point): row for row, point in enumerate(keep)}
-    relative = np.exp(
-        rng.uniform(np.log(0.05), np.log(0.3), len(keep))
-    )  # box side / picture's height
+    # box side over the picture's height
+    relative = np.exp(rng.uniform(np.log(0.05), np.log(0.3), len(keep)))
     size = np.zeros(len(keep))  # ball's diameter, set by the first view
     clip = Clip(f"{folder.parent.name}/{folder.name}", [], None, [], [], [], False)
     for image in sorted(scene.images.values(), key=lambda image: str(image.name)):
@@ -204,7 +204,7 @@ def sparse_clip(folder: Path, model: Path, seed: int = 0, points: int = 400) -> 
         xy = np.array([p.xy for p in seen]).reshape(-1, 2) * (picture.shape[1] / image.camera.width)
         add_view(clip, picture, np.c_[xy - side[:, None] / 2, xy + side[:, None] / 2], rows)
     center = np.array([scene.points3D[int(point)].xyz for point in keep])
-    return keep_identities(clip, apart(center, size)[:points])
+    return keep_identities(clip, apart(center, size)[:POINTS])
 
 
 def apart(center: Array, size: Array) -> IntArray:
@@ -224,8 +224,9 @@ def keep_identities(clip: Clip, wanted: IntArray) -> Clip:
     """Drop all boxes but those of the wanted identities."""
     for frame, identity in enumerate(clip.identity):
         keep = np.isin(identity, wanted)
-        clip.xyxy[frame], clip.identity[frame] = clip.xyxy[frame][keep], identity[keep]
-        clip.look[frame] = clip.look[frame][keep]
+        columns: tuple[list[Any], ...] = (clip.xyxy, clip.identity, clip.look)
+        for column in columns:
+            column[frame] = column[frame][keep]
     return clip
 
 
@@ -273,15 +274,10 @@ def paint(label: Image, found: rt.Detections, xyxy: Array, identity: IntArray) -
 
 
 def add_view(
-    clip: Clip,
-    picture: Image,
-    xyxy: Array,
-    identity: IntArray,
-    look: IntArray | None = None,
-    label: Image | None = None,
+    clip: Clip, picture: Image, xyxy: Array, identity: IntArray, label: Image | None = None
 ) -> None:
     """Append a view with those boxes that lie in it for the most part and are neither tiny nor
-    huge. look: default, the identity. label: for clips that have labels.
+    huge. label: for clips that have labels.
     """
     limit = np.array(picture.shape[1::-1] * 2, float)
     inside = np.clip(xyxy, 0, limit)
@@ -292,7 +288,7 @@ def add_view(
     clip.images.append(picture)
     clip.xyxy.append(inside[keep])
     clip.identity.append(identity[keep])
-    clip.look.append((identity if look is None else look)[keep])
+    clip.look.append(identity[keep])
     if clip.labels is not None and label is not None:
         clip.labels.append(label)
 
@@ -435,29 +431,27 @@ def jittered(
     return keep, cut
 
 
-def pick_frames(clip: Clip, shared: Any, views: int, rng: np.random.Generator) -> IntArray:
+def pick_frames(clip: Clip, shared: Any, rng: np.random.Generator) -> IntArray:
     """A frame, frames that show some of the same objects, and two of anywhere."""
     first = int(rng.choice(len(shared), p=shared.diagonal() / shared.diagonal().sum()))
     chance = np.minimum(shared[first], 3) + 0.0  # so that the other visit is not outnumbered
     chance[first] = 0
     friends = rng.permutation(np.flatnonzero(chance))
     weights = chance[friends] / max(chance.sum(), 1e-9)
-    count = min(views - 3, len(friends))
-    chosen = rng.choice(friends, count, replace=False, p=weights) if count else friends
-    rest = np.setdiff1d(np.arange(len(shared)), [first, *chosen])
-    others = rng.choice(rest, min(views - 1 - count, len(rest)), replace=False)
-    return np.concatenate([[first], chosen, others]).astype(np.int64)
+    count = min(VIEWS - 3, len(friends))
+    picked = rng.choice(friends, count, replace=False, p=weights) if count else friends
+    rest = np.setdiff1d(np.arange(len(shared)), [first, *picked])
+    others = rng.choice(rest, min(VIEWS - 1 - count, len(rest)), replace=False)
+    return np.concatenate([[first], picked, others]).astype(np.int64)
 
 
-def draw_scene(
-    clip: Clip, shared: Any, views: int, rng: np.random.Generator, most: int = 24
-) -> list[View]:
-    """Several augmented views of one scene with at most so many identities."""
-    frames = pick_frames(clip, shared, views, rng)
+def draw_scene(clip: Clip, shared: Any, rng: np.random.Generator) -> list[View]:
+    """Several augmented views of one scene."""
+    frames = pick_frames(clip, shared, rng)
     tone, flip = photo_tone(rng, 1.0), bool(rng.random() < 0.5)
     seen, times = np.unique(np.concatenate([clip.identity[f] for f in frames]), return_counts=True)
     order = np.argsort(-times + rng.random(len(times)))
-    wanted = seen[order[:most]]
+    wanted = seen[order[:MOST_IDENTITIES]]
     return [make_view(clip, int(f), rng, tone, flip, wanted) for f in frames]
 
 
@@ -495,25 +489,21 @@ class ColourMap(nn.Module):
     """
 
     def __init__(self) -> None:
-        super().__init__()
-        turn = torch.arange(6) * (2 * np.pi / 6)
-        self.register_buffer("turns", torch.stack([turn.cos(), turn.sin()], 1)[..., None, None])
-        xyz = [[0.1805 / 0.9505, 0.3576 / 0.9505, 0.4124 / 0.9505], [0.0722, 0.7152, 0.2126],
-               [0.9505 / 1.089, 0.1192 / 1.089, 0.0193 / 1.089]]  # fmt: skip
-        self.register_buffer("xyz", torch.tensor(xyz)[..., None, None])  # sRGB, D65, BGR order
-        sobel = torch.tensor([[-1.0, 0, 1], [-2, 0, 2], [-1, 0, 1]]) / 2
-        self.register_buffer("sobel", torch.stack([sobel, sobel.T])[:, None])
-        self.fuse()
-
-    def fuse(self) -> None:
         """Put in one convolution each what is linear: mean and range of the pixels; of the roots of
         X, Y, Z: chroma, its length in every direction, four times the lightness; its edges.
         """
-        turns, sobel = self.turns[:, :, 0, 0], 1.16 * self.sobel[:, 0]  # (6, 2), (2, 3, 3)
+        super().__init__()
+        turn = torch.arange(6) * (2 * np.pi / 6)
+        turns = torch.stack([turn.cos(), turn.sin()], 1)  # (6, 2)
+        xyz = [[0.1805 / 0.9505, 0.3576 / 0.9505, 0.4124 / 0.9505], [0.0722, 0.7152, 0.2126],
+               [0.9505 / 1.089, 0.1192 / 1.089, 0.0193 / 1.089]]  # fmt: skip
+        sobel = torch.tensor([[-1.0, 0, 1], [-2, 0, 2], [-1, 0, 1]]) * 0.58
+        sobel = torch.stack([sobel, sobel.T])  # (2, 3, 3)
         chroma = torch.tensor([[12.5, -12.5, 0], [0, 5, -5]])
         level = torch.tensor([[0, 4.64, 0]]).repeat(5, 1)
         parts = {
             "mean": torch.eye(3)[..., None, None].repeat(1, 1, 4, 4) / (16 * 255),
+            "xyz": torch.tensor(xyz)[..., None, None],  # sRGB, D65, BGR order
             "linear": torch.cat([chroma, turns @ chroma, level])[..., None, None],
             "offset": torch.cat([torch.zeros(8), -0.64 - torch.arange(5.0)]),
             "edges": torch.cat([sobel, torch.einsum("kc,cij->kij", turns, sobel)])[:, None],
@@ -725,31 +715,17 @@ def triplet_loss(rows: Any, same: Any, different: Any, temperature: float = 0.1)
     return (F.softplus((far - cosine[anchor, positive]) / temperature) * temperature).mean()
 
 
-def batch_loss(foreground: Any, background: Any, scenes: list[list[View]], late: bool) -> Any:
-    """Triplet loss of both parts together, and a quarter as much of each alone."""
-    views = [(s, f, v) for s, scene in enumerate(scenes) for f, v in enumerate(scene)]
-    scene = np.concatenate([np.full(len(v.identity), s) for s, _, v in views])
-    identity = np.concatenate([v.identity for _, _, v in views])
-    frame = np.concatenate([np.full(len(v.identity), f) for _, f, v in views])
-    return parts_loss([foreground, background], (scene, identity, frame), late)
-
-
-def parts_loss(parts: Sequence[Any], of: tuple[IntArray, IntArray, IntArray], late: bool) -> Any:
+def parts_loss(parts: Sequence[Any], scene: IntArray, identity: IntArray, frame: IntArray) -> Any:
     """Triplet loss of all parts (N, E) together, and a quarter as much of each, if there are two.
 
     Args:
-        of: (N,) scene, identity within it and frame of each row.
-        late: negatives are of the same scene only.
+        scene, identity, frame: (N,) of each row; identities are those within the scene.
     """
-    scene, frame, device = of[0], of[2], parts[0].device
-    identity = of[1] + 10000 * scene
-    one = torch.from_numpy(identity[:, None] == identity).to(device)
-    apart = torch.from_numpy(frame[:, None] != frame).to(device)
-    near = torch.from_numpy(scene[:, None] == scene).to(device)
-    fused = torch.cat(list(parts), 1) * len(parts) ** -0.5
-    same = one & apart
-    different = ~one & (near if late else torch.ones_like(near))
-    loss = triplet_loss(fused, same, different)
+    identity = identity + 10000 * scene
+    one = identity[:, None] == identity
+    apart = frame[:, None] != frame
+    same, different = (torch.from_numpy(x).to(parts[0].device) for x in (one & apart, ~one))
+    loss = triplet_loss(torch.cat(list(parts), 1) * len(parts) ** -0.5, same, different)
     for alone in parts if len(parts) > 1 else ():
         loss = loss + 0.25 * triplet_loss(alone, same, different)
     return loss
@@ -759,9 +735,9 @@ def parts_loss(parts: Sequence[Any], of: tuple[IntArray, IntArray, IntArray], la
 
 
 def rank_one(net: Net, clips: Sequence[Clip], device: Any) -> dict[str, float]:
-    """Rank-1 among objects of one scene: `twins`: only identical instances, where there are
-    two or more; `single`: as twins, among one random view of each (ten draws); `all`: any. Queries
-    search frames at least 30 % of the clip away from their own.
+    """Rank-1 among objects of one scene: `single`: identical instances, where there are two or
+    more, among one random view of each (ten draws); `all`: any. Queries search frames at least
+    30 % of the clip away from their own.
     """
     net.eval()
     found = []
@@ -782,28 +758,16 @@ def rank_one(net: Net, clips: Sequence[Clip], device: Any) -> dict[str, float]:
 
 
 def mean_hits(clips: Sequence[Any]) -> dict[str, float]:
-    """Rank-1 of each part and of all together, from (rows of the parts, frame, identity, look) of
-    each clip.
-    """
-    hits: dict[str, list[float]] = {f"{p}_{g}": [] for p in PARTS for g in GROUPS}
+    """Rank-1 of all parts together, from (rows of parts, frame, identity, look) of each clip."""
+    hits: dict[str, list[float]] = {"single": [], "all": []}
     for rows, frame, identity, look in clips:
-        cosines = [part @ part.T for part in rows]
-        named = dict(zip(PARTS, cosines, strict=False)) if len(rows) > 1 else {}
+        cosine = sum(part @ part.T for part in rows)
         far = np.abs(frame[:, None] - frame) >= max(1, int(0.3 * (frame.max() + 1)))
         identical = far & (look[:, None] == look)
-        galleries = {
-            "twins": [identical],
-            "single": single_views(identical, identity),
-            "all": [far],
-        }
-        for part, cosine in {**named, "fused": sum(cosines)}.items():
-            for group, draws in galleries.items():
-                for gallery in draws:
-                    hits[f"{part}_{group}"] += first_hits(cosine, identity, gallery)
+        for gallery in single_views(identical, identity):
+            hits["single"] += first_hits(cosine, identity, gallery)
+        hits["all"] += first_hits(cosine, identity, far)
     return {name: float(np.mean(found)) if found else float("nan") for name, found in hits.items()}
-
-
-PARTS, GROUPS = ("fg", "bg", "fused"), ("twins", "single", "all")
 
 
 def single_views(gallery: Any, identity: IntArray, draws: int = 10) -> list[Any]:
@@ -842,36 +806,22 @@ def real_clips(args: argparse.Namespace) -> list[Clip]:
 
 
 class Pool:
-    """Training clips; rooms that appear in the cache while training runs join in."""
+    """Training clips, each with the objects that its frames share."""
 
     def __init__(self, args: argparse.Namespace) -> None:
-        self.args = args
-        self.real = [(clip, clip.shared()) for clip in real_clips(args)]
-        self.rooms: list[tuple[Clip, Any]] = []
-        wanted = ((args.rooms, False), (args.fine_rooms, True))
-        self.waiting = [(s, fine) for rooms, fine in wanted for s in parse_range(rooms or "0:0")]
-        self.fill()
-        if not self.real and not self.rooms:
+        self.clips = [real_clips(args), [room_clip(seed, args.cache) for seed in args.rooms]]
+        self.shared = [[clip.shared() for clip in clips] for clips in self.clips]
+        if not any(self.clips):
             raise SystemExit("error: nothing to train on: give --rooms, --sparse or --tracks")
-
-    def fill(self) -> None:
-        """Take in rooms: those of the cache, or render one if there is nothing at all yet."""
-        for seed, fine in list(self.waiting):
-            there = room_path(seed, self.args.cache, fine).exists()
-            if there or not self.args.no_render:
-                clip = room_clip(seed, self.args.cache, self.args.frames, fine)
-                self.rooms.append((clip, clip.shared()))
-                self.waiting.remove((seed, fine))
 
     def draw(self, rng: np.random.Generator) -> list[list[View]]:
         """Scenes of one batch: recordings for a third of them, if there are any."""
+        real, rooms = self.clips
         scenes: list[list[View]] = []
-        while len(scenes) < self.args.scenes:
-            pool = (
-                self.real if self.real and (not self.rooms or rng.random() < 0.34) else self.rooms
-            )
-            clip, shared = pool[int(rng.integers(len(pool)))]
-            views = draw_scene(clip, shared, self.args.views, rng)
+        while len(scenes) < SCENES:
+            kind = 0 if real and (not rooms or rng.random() < 0.34) else 1
+            row = int(rng.integers(len(self.clips[kind])))
+            views = draw_scene(self.clips[kind][row], self.shared[kind][row], rng)
             if sum(len(v.identity) for v in views) >= 4:
                 scenes.append(views)
         return scenes
@@ -882,30 +832,18 @@ class Trainer:
 
     def __init__(self, args: argparse.Namespace) -> None:
         torch.manual_seed(args.seed)
-        torch.set_num_threads(args.threads)
+        torch.set_num_threads(1)
         self.args = args
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         self.pool = self.make_pool()
         self.net = self.make_net().to(self.device)
         self.optimizer = torch.optim.AdamW(self.net.parameters(), args.rate, weight_decay=0.05)
         self.step, self.seconds, self.best = 0, 0.0, -1.0
-        self.mean: Any = None  # the network with the mean of the weights of the last steps
-        last = args.out / "last.pt"
-        if args.resume and last.exists():
-            state = torch.load(last, map_location=self.device, weights_only=True)
-            self.net.load_state_dict(state["net"])
-            self.optimizer.load_state_dict(state["optimizer"])
-            self.step, self.seconds = state["step"], state["seconds"]
-            self.best = state.get("best", -1.0)
         args.out.mkdir(parents=True, exist_ok=True)
-        if self.step == 0:
+        if args.resume and (args.out / "last.pt").exists():
+            self.restore("last.pt")
+        else:
             self.start()
-        if args.average:
-            rule = swa_utils.get_ema_multi_avg_fn(args.average)
-            self.mean = swa_utils.AveragedModel(self.net, multi_avg_fn=rule, use_buffers=True)
-            self.mean.update_parameters(self.net)
-            if self.step:
-                self.mean.load_state_dict(state["mean"])
         self.val = self.make_val()
 
     def make_pool(self) -> Any:
@@ -918,19 +856,13 @@ class Trainer:
 
     def make_val(self) -> dict[str, Any]:
         """Clips to validate with."""
-        args = self.args
-        rooms = parse_range(args.val_rooms) if args.val_rooms else ()
         return {
-            "room": [room_clip(seed, args.cache, args.frames) for seed in rooms],
-            "real": [sparse_clip(*source) for source in args.val_sparse],
+            "room": [room_clip(seed, self.args.cache) for seed in self.args.val_rooms],
+            "real": [sparse_clip(*source) for source in self.args.val_sparse],
         }
 
     def start(self) -> None:
-        """Start from a checkpoint (--start), or the heads from the training-free descriptor."""
-        if self.args.start:
-            state = torch.load(self.args.start, map_location=self.device, weights_only=True)
-            self.net.load_state_dict(state["net"])
-            return
+        """Start the heads from the training-free descriptor."""
         rng = np.random.default_rng([self.args.seed, 10])
         views = [view for _ in range(12) for scene in self.pool.draw(rng) for view in scene]
         self.net.eval()
@@ -948,59 +880,55 @@ class Trainer:
         rate = min((self.step + 1) / 40, max(0.02, 0.5 + 0.5 * float(np.cos(np.pi * done))))
         for group in self.optimizer.param_groups:
             group["lr"] = self.args.rate * rate
-        loss = self.loss(self.batch(), done > self.args.hard_after)
+        rng = np.random.default_rng([self.args.seed, self.step])
+        loss = self.loss(self.pool.draw(rng))
         self.optimizer.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(self.net.parameters(), 5.0)
         self.optimizer.step()
-        if self.mean is not None:
-            self.mean.update_parameters(self.net)
         self.step += 1
         return float(np.asarray(loss.detach().cpu()))
 
-    def batch(self) -> Any:
-        """Scenes of this step, drawn by the seed and the number of the step."""
-        return self.pool.draw(np.random.default_rng([self.args.seed, self.step]))
-
-    def loss(self, scenes: Any, late: bool) -> Any:
-        """Loss of one batch; late: as in `parts_loss`."""
-        parts = self.net([view for scene in scenes for view in scene], self.device)
-        return batch_loss(parts[0], parts[1], scenes, late)
+    def loss(self, scenes: Any) -> Any:
+        """Loss of one batch."""
+        views = [(s, f, v) for s, scene in enumerate(scenes) for f, v in enumerate(scene)]
+        count = [len(v.identity) for _, _, v in views]
+        scene, frame = (np.repeat([view[k] for view in views], count) for k in (0, 1))
+        identity = np.concatenate([v.identity for _, _, v in views])
+        parts = self.net([v for _, _, v in views], self.device)
+        return parts_loss(parts, scene, identity, frame)
 
     def score(self, clips: Any) -> dict[str, float]:
         """Rank-1 on validation clips."""
-        return rank_one(self.taken(), clips, self.device)
-
-    def taken(self) -> Any:
-        """The network that is validated and exported."""
-        return self.net if self.mean is None else self.mean.module
+        return rank_one(self.net, clips, self.device)
 
     def summary(self) -> dict[str, Any]:
         """How it was trained, for the files."""
         return {
             "steps": self.step, "seed": self.args.seed, "minutes": round(self.seconds / 60, 1),
-            "rooms": len(self.pool.rooms), "torch": torch.__version__,
+            "rooms": len(self.args.rooms), "torch": torch.__version__,
         }  # fmt: skip
 
     def run(self) -> None:
-        """Train to the end; log, validate and save every so many steps."""
+        """Train to the end, with a log and checkpoints; go back to the best validation (the last
+        of equals).
+        """
         losses: list[float] = []
         while self.progress() < 1:
             began = time.monotonic()
             losses.append(self.learn())
             self.seconds += time.monotonic() - began
-            if self.step % self.args.every == 0 or self.progress() >= 1:
+            if self.step % LOG_STEPS == 0 or self.progress() >= 1:
                 self.report(float(np.mean(losses)))
                 losses.clear()
-                self.pool.fill()
+        self.restore("best.pt")
 
     def report(self, loss: float) -> None:
         """A row of the log and a checkpoint."""
         row: dict[str, float] = {"step": self.step, "minutes": round(self.seconds / 60, 2)}
-        row |= {"rooms": len(self.pool.rooms), "loss": round(loss, 5)}
+        row["loss"] = round(loss, 5)
         for name, clips in self.val.items():
-            found = self.score(clips)
-            row |= {f"{name}_{k}": round(v, 4) for k, v in found.items()}
+            row |= {f"{name}_{k}": round(v, 4) for k, v in self.score(clips).items()}
         log = self.args.out / "log.csv"
         fresh = not log.exists()
         with log.open("a", newline="") as file:
@@ -1009,26 +937,22 @@ class Trainer:
                 writer.writeheader()
             writer.writerow(row)
         print(json.dumps(row), flush=True)
-        score = float(np.nan_to_num(row["room_fused_single"])) + float(
-            np.nan_to_num(row["real_fused_all"])
-        )
+        score = float(np.nan_to_num([row["room_single"], row["real_all"]]).sum())
         names = ["last.pt", "best.pt"] if score >= self.best else ["last.pt"]
         self.best = max(self.best, score)
         state = {"net": self.net.state_dict(), "optimizer": self.optimizer.state_dict()}
         state |= {"step": self.step, "seconds": self.seconds, "best": self.best}
-        if self.mean is not None:
-            state["mean"] = self.mean.state_dict()
         for name in names:
-            torch.save(state, self.args.out / "part")
-            (self.args.out / "part").replace(self.args.out / name)
+            with atomic(self.args.out / name) as part:
+                torch.save(state, part)
 
-    def take_best(self) -> None:
-        """Go back to the checkpoint with the best validation (the last one of equals)."""
-        state = torch.load(self.args.out / "best.pt", map_location=self.device, weights_only=True)
+    def restore(self, name: str) -> None:
+        """Go back to a checkpoint."""
+        state = torch.load(self.args.out / name, map_location=self.device, weights_only=True)
         self.net.load_state_dict(state["net"])
-        if self.mean is not None:
-            self.mean.load_state_dict(state["mean"])
-        self.step = state["step"]
+        self.optimizer.load_state_dict(state["optimizer"])
+        for name in ("step", "seconds", "best"):
+            setattr(self, name, state[name])
 
 
 # ---- Export --------------------------------------------------------------------------------------
@@ -1094,37 +1018,16 @@ def common_options(description: str | None) -> argparse.ArgumentParser:
     )
     add: Callable[..., Any] = parser.add_argument
     add("-o", "--out", type=Path, required=True, help="folder for models, checkpoint, log")
-    add("--rooms", default="", help="A:B, seeds of rendered rooms to train on")
-    add("--fine-rooms", default="", help="A:B, seeds of rooms in 640 x 480")
-    add("--val-rooms", default="", help="A:B, seeds to validate with")
+    for name, use in (("--rooms", "train on"), ("--val-rooms", "validate with")):
+        add(name, type=parse_range, default=range(0), metavar="A:B",
+            help=f"seeds of rendered rooms to {use}")  # fmt: skip
     add("--cache", type=Path, default=Path("rooms_cache"), help="folder of rendered rooms")
-    add("--frames", type=int, default=40, help="views of each room")
-    add("--no-render", action="store_true", help="only use the cache; another process fills it")
     for name in ("--sparse", "--val-sparse", "--tracks"):
         add(name, type=pair, action="append", default=[], metavar="IMAGES=PATH")
-    add("--scenes", type=int, default=3, help="scenes a step")
-    add("--views", type=int, default=8, help="views of each scene")
     add("--steps", type=int, default=3000)
-    add(
-        "--minutes",
-        type=float,
-        default=0.0,
-        help="stop after N minutes of steps (0: never)",
-    )
+    add("--minutes", type=float, default=0.0, help="stop after N minutes of steps (0: never)")
     add("--rate", type=float, default=1e-3, help="peak learning rate (AdamW, cosine)")
-    add(
-        "--average", type=float, default=0.0, metavar="DECAY",
-        help="take the moving average of the weights (.9995; 0: the last weights)",
-    )  # fmt: skip
-    add(
-        "--hard-after",
-        type=float,
-        default=1.0,
-        help="fraction of the steps after which negatives are of the same scene",
-    )
-    add("--every", type=int, default=100, help="steps between two rows of the log")
     add("--seed", type=int, default=0)
-    add("--threads", type=int, default=1)
     add("--resume", action="store_true", help="resume from OUT/last.pt")
     return parser
 
@@ -1133,22 +1036,18 @@ def parsed(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> argpa
     """Read the options; warns of rooms that both train and validate."""
     args = parser.parse_args(argv)
     cv2.setNumThreads(0)  # a forked process has no threads of its parent
-    both = set(parse_range(args.rooms or "0:0")) & set(parse_range(args.val_rooms or "0:0"))
-    if both:
+    if both := set(args.rooms) & set(args.val_rooms):
         print(f"warning: rooms {sorted(both)} both train and validate", file=sys.stderr)
     return args
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Train and export."""
-    parser = common_options(__doc__)
-    parser.add_argument("--start", type=Path, help="initial weights: a checkpoint (.pt)")
-    args = parsed(parser, argv)
+    args = parsed(common_options(__doc__), argv)
     trainer = Trainer(args)
     trainer.run()
-    trainer.take_best()
     out: Path = args.out
-    export(trainer.taken(), out, trainer.summary())
+    export(trainer.net, out, trainer.summary())
     print(f"{out / 'reobj.onnx'}: use it with --embed {out / 'reobj.onnx'}")
     return 0
 

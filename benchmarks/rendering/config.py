@@ -1,7 +1,8 @@
-"""Options of the renderer and of the simulated detector, shared types and constants."""
+"""Options of the renderer, shared types and constants."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,9 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]
 Rng = np.random.Generator
-Color = tuple[float, float, float]  # B, G, R in 0..255
+Color = Sequence[float]  # B, G, R in 0..255
+Size = tuple[float, float, float]  # width, depth, height in m
+Rect = tuple[int, int, int, int]  # x, y, w, h in the atlas, texels
 
 
 NEAR_M = 0.05  # nothing closer to the camera plane is drawn
@@ -49,7 +52,7 @@ PLANS = {
 
 @dataclass(frozen=True, slots=True)
 class RoomConfig:
-    """Everything that decides a clip. Counts are limited by the plan."""
+    """Everything that decides a clip."""
 
     seed: int = 0
     width: int = 640  # px
@@ -57,16 +60,8 @@ class RoomConfig:
     frames: int = 240
     fps: float = 12.0
     hfov_deg: float = 66.0  # a phone's main camera in video mode
-    room_m: tuple[float, float, float] = (6.6, 5.4, 2.6)  # width, depth, height before jitter
+    room_m: Size = (6.6, 5.4, 2.6)  # width, depth, height before jitter
     room_jitter: float = 0.06  # relative, uniform
-    chairs: int = 6  # identical ones: 4 at the table, 2 at the desk
-    monitors: int = 2
-    cups: int = 4
-    bottles: int = 3
-    books: int = 5
-    plants: int = 2
-    couch: bool = True
-    extras: bool = True  # laptop, keyboard, mouse, vase, clock, teddy bear, ball, suitcase, bowl
     path: str = "revisit"  # one of PATHS
     plan: str = "home"  # one of PLANS
     eye_m: float = 1.5  # camera height
@@ -78,17 +73,3 @@ class RoomConfig:
     noise: float = 0.9  # sensor noise, grey levels at mid grey
     exposure: float = 0.08  # relative slow drift of the exposure
     light_rays: int = 10  # shadow rays per lamp and light texel
-
-
-@dataclass(frozen=True, slots=True)
-class DetectorConfig:
-    """How the simulated detector errs."""
-
-    box_sigma: float = 0.012  # of the box side, each edge
-    miss_rate: float = 0.03  # of clearly visible objects
-    min_visibility: float = 0.25  # half of the objects this visible are found
-    min_side_px: float = 10.0  # half of the objects this small are found
-    false_positives: float = 0.04  # per frame
-    class_confusion: float = 0.0  # probability of a wrong class
-    mask_erosion_px: float = 0.6  # mean shift of the mask's outline, inwards
-    score_sigma: float = 0.05

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import find_objects
 
 from rendering.config import NEAR_M, Array
 from rendering.models import SPHERE
@@ -95,9 +96,10 @@ def visible_boxes(
     """Pixel counts (O,) and tight boxes (O, 4) of the labels 0 .. count - 1."""
     pixels = np.bincount(instance.ravel() + 1, minlength=count + 1)[1:]
     boxes = np.full((count, 4), np.nan)
-    for index in np.nonzero(pixels)[0]:
-        rows, cols = np.nonzero(instance == index)
-        boxes[index] = cols.min(), rows.min(), cols.max() + 1, rows.max() + 1
+    for index, found in enumerate(find_objects(instance + 1, count)):
+        if found:
+            rows, cols = found
+            boxes[index] = cols.start, rows.start, cols.stop, rows.stop
     return pixels, boxes
 
 

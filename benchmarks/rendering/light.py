@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rendering.config import Array, Color, Rng
+from rendering.config import Array, Color, Rng, Size
 from rendering.models import rotation_z
-from rendering.surfaces import Surfaces, apply, surface_points
+from rendering.surfaces import LIGHT_WIDTH, Surfaces, apply, surface_points
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,13 +21,15 @@ class Lighting:
 
     lamp: Color = (5.2, 6.0, 6.6)  # radiance of the ceiling panels
     window: Color = (4.6, 4.2, 3.8)  # radiance of the window
-    panel_gains: tuple[float, ...] = ()  # relative, of the first panels; 1 for those without
+    panel_gains: Sequence[float] = (1.0, 1.0)  # relative
     ambient: float = 1.0  # relative
     window_turn_rad: float = 0.0  # about z: direction of most daylight against the window's normal
     window_focus: float = 1.0  # exponent of the cosine to that direction; 1: a diffuse sky
 
 
 DEFAULT_LIGHTING = Lighting()
+SHELL = 6  # the first patches, walls, floor and ceiling, cast no shadow
+VOXEL_M = 0.04
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,52 +38,28 @@ class Voxels:
 
     filled: npt.NDArray[np.bool_]  # (X, Y, Z), one cell of margin
     origin: Array  # (3,) m
-    step_m: float
+
+    def index(self, points: Array) -> tuple[Any, ...]:
+        """Cells (x, y, z) of (..., 3) world points, for those outside the nearest ones."""
+        cells = ((points - self.origin) / VOXEL_M).astype(np.int32)
+        cells = np.clip(cells, 0, np.array(self.filled.shape) - 1)
+        return cells[..., 0], cells[..., 1], cells[..., 2]
 
     def at(self, points: Array) -> npt.NDArray[np.bool_]:
         """Are (..., 3) world points inside furniture?"""
-        index = ((points - self.origin) / self.step_m).astype(np.int32)
-        index = np.clip(index, 0, np.array(self.filled.shape) - 1)
-        return np.asarray(self.filled[index[..., 0], index[..., 1], index[..., 2]])
+        return np.asarray(self.filled[self.index(points)])
 
 
-def voxelize(
-    surfaces: Surfaces, size: tuple[float, float, float], first: int = 6, step_m: float = 0.04
-) -> Voxels:
-    """Mark the cells that surfaces pass through, all but the first patches (the room's shell)."""
-    origin = np.array([-size[0] / 2, -size[1] / 2, 0.0]) - step_m
-    shape = np.ceil((np.array(size) + 2 * step_m) / step_m).astype(int)
-    filled = np.zeros(shape, bool)
-    for i in range(first, len(surfaces.kind)):
-        if surfaces.emission[i] > 0:
-            continue
-        lengths = np.maximum(surfaces.light_rect[i, 2:] * 0.08 / (0.7 * step_m), 3).astype(int)
-        s, t = (v.ravel() for v in np.meshgrid(*((np.arange(n) + 0.5) / n for n in lengths)))
-        points, _ = surface_points(
-            int(surfaces.kind[i]), surfaces.world_from_patch[i], surfaces.radii[i], s, t
-        )
-        index = np.clip(((points - origin) / step_m).astype(int), 0, shape - 1)
-        filled[index[:, 0], index[:, 1], index[:, 2]] = True
-    return Voxels(filled, origin, step_m)
-
-
-def light_samples(surfaces: Surfaces) -> tuple[Array, Array, list[slice]]:
-    """Points and normals of all light-map texels, patch after patch (N = sum of w h)."""
-    points = []
-    normals = []
-    slices = []
-    start = 0
-    for i in range(len(surfaces.kind)):
-        w, h = surfaces.light_rect[i, 2:].astype(int)
-        s, t = (v.ravel() for v in np.meshgrid((np.arange(w) + 0.5) / w, (np.arange(h) + 0.5) / h))
-        p, n = surface_points(
-            int(surfaces.kind[i]), surfaces.world_from_patch[i], surfaces.radii[i], s, t
-        )
-        points.append(p)
-        normals.append(n)
-        slices.append(slice(start, start + w * h))
-        start += w * h
-    return np.concatenate(points), np.concatenate(normals), slices
+def voxelize(surfaces: Surfaces, size: Size) -> Voxels:
+    """Mark the cells that the furniture's surfaces pass through."""
+    origin = np.array([-size[0] / 2, -size[1] / 2, 0.0]) - VOXEL_M
+    shape = np.ceil((np.array(size) + 2 * VOXEL_M) / VOXEL_M).astype(int)
+    voxels = Voxels(np.zeros(shape, bool), origin)
+    for i in range(SHELL, len(surfaces.kind)):
+        if surfaces.emission[i] <= 0:
+            w, h = np.maximum(surfaces.light_rect[i, 2:] * 0.08 / (0.7 * VOXEL_M), 3).astype(int)
+            voxels.filled[voxels.index(surface_points(surfaces, i, (w, h))[0])] = True
+    return voxels
 
 
 def lamp_light(
@@ -98,16 +78,11 @@ def lamp_light(
     """
     frame, direction, focus = lamp
     total = np.zeros(len(points))
-    steps = (
-        np.arange(1, 44) * 0.06
-    )  # m from the point; above 2.6 m of way nothing stands in this room
+    steps = np.arange(1, 44) * 0.06  # m from the point; nothing stands further away in this room
     area = float(np.linalg.norm(np.cross(frame[:, 0], frame[:, 1])))
     for _ in range(rays):
-        spot = apply(
-            frame,
-            np.concatenate([rng.uniform(0, 1, (len(points), 2)), np.zeros((len(points), 1))], 1),
-        )
-        ray = spot - points
+        spot = np.pad(rng.uniform(0, 1, (len(points), 2)), ((0, 0), (0, 1)))
+        ray = apply(frame, spot) - points
         distance = np.linalg.norm(ray, axis=1)  # (N,)
         ray /= distance[:, None]
         value = (
@@ -125,13 +100,11 @@ def lamp_light(
     return total / rays
 
 
-def ambient_open(
-    points: Array, normals: Array, voxels: Voxels, size: tuple[float, float, float], rng: Rng
-) -> Array:
+def ambient_open(points: Array, normals: Array, voxels: Voxels, size: Size, rng: Rng) -> Array:
     """(N,) fraction of the near half-space (0.6 m) that is open: contact shadows, dark corners."""
     opened = np.zeros(len(points))
     rays = 14
-    half = np.array([size[0] / 2, size[1] / 2])
+    half = np.array(size[:2]) / 2
     for _ in range(rays):
         ray = rng.standard_normal(points.shape)
         ray = ray / np.linalg.norm(ray, axis=1, keepdims=True) + normals
@@ -147,46 +120,37 @@ def ambient_open(
 
 
 def bake_light(
-    surfaces: Surfaces,
-    size: tuple[float, float, float],
-    height: int,
-    rays: int,
-    rng: Rng,
-    shell: int = 6,
-    lighting: Lighting = DEFAULT_LIGHTING,
+    surfaces: Surfaces, size: Size, height: int, rays: int, rng: Rng, lighting: Lighting
 ) -> npt.NDArray[np.float32]:
-    """Irradiance of every patch: ceiling panels (warm), window (cool), ambient; the first `shell`
-    patches (walls, floor, ceiling) cast no shadow.
-    """
-    points, normals, slices = light_samples(surfaces)
-    voxels = voxelize(surfaces, size, shell)
+    """Irradiance of every patch: ceiling panels (warm), window (cool), ambient."""
+    rects = surfaces.light_rect.astype(int)
+    samples = [surface_points(surfaces, i, (w, h)) for i, (_, _, w, h) in enumerate(rects)]
+    points, normals = (np.concatenate(column) for column in zip(*samples, strict=True))  # (N, 3)
+    voxels = voxelize(surfaces, size)
     opened = ambient_open(points, normals, voxels, size, rng)
     up = 0.5 + 0.5 * normals[:, 2:]  # (N, 1)
-    total = (
-        lighting.ambient
-        * opened[:, None]
-        * (up * [0.22, 0.205, 0.19] + (1 - up) * [0.12, 0.15, 0.19])
-    )  # (N, 3) BGR
+    sky = up * [0.22, 0.205, 0.19] + (1 - up) * [0.12, 0.15, 0.19]
+    total = lighting.ambient * opened[:, None] * sky  # (N, 3) BGR
     gains = np.ones(len(surfaces.kind))  # relative, of the emitting patches
     panel_gains = iter(lighting.panel_gains)
     for lamp in np.nonzero(surfaces.emission >= 1)[0]:
         frame = surfaces.world_from_patch[lamp]
         is_window = abs(frame[2, 2]) < 0.5
-        color = np.array(lighting.window if is_window else lighting.lamp)
-        usual = DEFAULT_LIGHTING.window if is_window else DEFAULT_LIGHTING.lamp
-        gain = 1.0 if is_window else next(panel_gains, 1.0)
-        gains[lamp] = gain * color.mean() / np.mean(usual)
+        source = "window" if is_window else "lamp"
+        color = getattr(lighting, source)
+        gain = 1.0 if is_window else next(panel_gains)
         direction = -frame[:, 2]
         focus = 1.0
         if is_window:
             direction = rotation_z(lighting.window_turn_rad) @ direction
             focus = lighting.window_focus
+        gains[lamp] = gain * np.mean(color) / np.mean(getattr(DEFAULT_LIGHTING, source))
         arrived = lamp_light(points, normals, (frame, direction, focus), voxels, rays, rng)
-        total += gain * arrived[:, None] * color
-    light = np.zeros((height, 512, 3), np.float32)
-    for i, part in enumerate(slices):
-        x, y, w, h = surfaces.light_rect[i].astype(int)
-        block = total[part].reshape(h, w, 3).astype(np.float32)
+        total += gain * arrived[:, None] * np.array(color)
+    light = np.zeros((height, LIGHT_WIDTH, 3), np.float32)
+    blocks = np.split(total, np.cumsum(rects[:, 2] * rects[:, 3])[:-1])
+    for i, ((x, y, w, h), values) in enumerate(zip(rects, blocks, strict=True)):
+        block = values.reshape(h, w, 3).astype(np.float32)
         if surfaces.emission[i] > 0:
             block[:] = surfaces.emission[i] * gains[i]
         light[y : y + h, x : x + w] = cv2.GaussianBlur(

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from rendering.config import Array, Rng
+from rendering.config import Array, Rng, Size
 
 QUAD, DISC, SPHERE, FRUSTUM = range(4)
 
@@ -38,7 +38,7 @@ class Model:
 
     class_name: str
     support: str  # the solid that describes it: box | cylinder | ellipsoid
-    parts: tuple[Part, ...]
+    parts: Sequence[Part]
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +64,19 @@ def rotation_x(angle_rad: float) -> Array:
     return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
 
 
+def placed(parts: Iterable[Part], rotation: Array, offset: npt.ArrayLike = 0.0) -> list[Part]:
+    """Parts that are turned, then shifted."""
+    result = []
+    for part in parts:
+        frame = rotation @ part.obj_from_patch  # (3, 4)
+        frame[:, 3] += np.asarray(offset, float)
+        result.append(replace(part, obj_from_patch=frame))
+    return result
+
+
+# ---- Shapes ------------------------------------------------------------------------------------
+
+
 def quad(
     origin: npt.ArrayLike, right: npt.ArrayLike, down: npt.ArrayLike, texture: str, **options: Any
 ) -> Part:
@@ -71,55 +84,49 @@ def quad(
     a = np.asarray(right, float)
     b = np.asarray(down, float)
     into = np.cross(a, b)
-    frame = np.stack(
-        [a, b, into / np.linalg.norm(into), np.asarray(origin, float)], axis=1
-    )  # (3, 4)
+    frame = np.column_stack([a, b, into / np.linalg.norm(into), origin])  # (3, 4)
     return Part(options.pop("kind", QUAD), frame, texture, **options)
 
 
 def box(
-    center: Sequence[float],
+    center: npt.ArrayLike,
     size: Sequence[float],
     texture: str,
-    faces: dict[str, str] | None = None,
+    fitted: str = "",
+    picture: str = "",
     rotation: Array | None = None,
 ) -> list[Part]:
-    """Six quads; `faces`: textures fitted to front (-y), back, left (-x), right, top, bottom."""
-    hx, hy, hz = (0.5 * float(v) for v in size)
-    layout: dict[str, tuple[npt.ArrayLike, npt.ArrayLike, npt.ArrayLike]] = {
-        "front": ((-hx, -hy, hz), (2 * hx, 0, 0), (0, 0, -2 * hz)),
-        "back": ((hx, hy, hz), (-2 * hx, 0, 0), (0, 0, -2 * hz)),
-        "left": ((-hx, hy, hz), (0, -2 * hy, 0), (0, 0, -2 * hz)),
-        "right": ((hx, -hy, hz), (0, 2 * hy, 0), (0, 0, -2 * hz)),
-        "top": ((-hx, hy, hz), (2 * hx, 0, 0), (0, -2 * hy, 0)),
-        "bottom": ((-hx, -hy, -hz), (2 * hx, 0, 0), (0, 2 * hy, 0)),
+    """Six quads with pieces of a texture.
+
+    Args:
+        fitted: faces that show a whole texture, of front (-y), back, left (-x), right, top, bottom.
+        picture: that texture, `texture` by default.
+    """
+    x, y, z = (0.5 * float(v) for v in size)
+    layout: dict[str, tuple[Sequence[float], Sequence[float], Sequence[float]]] = {
+        "front": ((-x, -y, z), (2 * x, 0, 0), (0, 0, -2 * z)),
+        "back": ((x, y, z), (-2 * x, 0, 0), (0, 0, -2 * z)),
+        "left": ((-x, y, z), (0, -2 * y, 0), (0, 0, -2 * z)),
+        "right": ((x, -y, z), (0, 2 * y, 0), (0, 0, -2 * z)),
+        "top": ((-x, y, z), (2 * x, 0, 0), (0, -2 * y, 0)),
+        "bottom": ((-x, -y, -z), (2 * x, 0, 0), (0, 2 * y, 0)),
     }
-    own = faces or {}
     parts = []
     for face, (origin, right, down) in layout.items():
-        if face not in own and np.linalg.norm(down) > 1.5 * np.linalg.norm(
-            right
-        ):  # grain lengthwise
-            origin, right, down = np.add(origin, right), np.asarray(down), -np.asarray(right)
-        parts.append(quad(origin, right, down, own.get(face, texture), fit=face in own))
-    turn = np.eye(3) if rotation is None else rotation
-    return [moved(part, turn, np.asarray(center, float)) for part in parts]
+        if face in fitted:
+            parts.append(quad(origin, right, down, picture or texture))
+        elif np.linalg.norm(down) > 1.5 * np.linalg.norm(right):  # the grain runs lengthwise
+            turned = -np.array(right)
+            parts.append(quad(np.add(origin, right), down, turned, texture, fit=False))
+        else:
+            parts.append(quad(origin, right, down, texture, fit=False))
+    return placed(parts, np.eye(3) if rotation is None else rotation, center)
 
 
-def moved(part: Part, rotation: Array, offset: Array) -> Part:
-    """Turn, then shift a part."""
-    frame = rotation @ part.obj_from_patch  # (3, 4)
-    frame[:, 3] += offset
-    return Part(part.kind, frame, part.texture, part.fit, part.radii, part.two_sided, part.emission)
-
-
-def frustum(
-    base: Sequence[float], height: float, radii: tuple[float, float], texture: str, **options: Any
-) -> Part:
+def frustum(base: Sequence[float], height: float, radii: tuple[float, float], texture: str) -> Part:
     """Lateral surface of a cone piece that stands on `base` (m)."""
-    frame = np.concatenate([np.eye(3), np.asarray(base, float)[:, None]], axis=1)  # (3, 4)
-    frame[:, 2] *= height
-    return Part(FRUSTUM, frame, texture, radii=radii, **options)
+    frame = np.column_stack([np.diag([1.0, 1.0, height]), base])  # (3, 4)
+    return Part(FRUSTUM, frame, texture, radii=radii)
 
 
 def disc(
@@ -138,68 +145,19 @@ def upright(
 ) -> list[Part]:
     """A closed cylinder or cone piece."""
     x, y, z = base
-    lids = [
+    return [
+        frustum(base, height, radii, side),
         disc((x, y, z + height), radii[1], cap, fit=False),
         disc((x, y, z), radii[0], cap, up=False, fit=False),
     ]
-    return [frustum(base, height, radii, side), *lids]
 
 
 def ball(
     center: Sequence[float], half_axes: Sequence[float], texture: str, rotation: Array | None = None
 ) -> Part:
     """An ellipsoid."""
-    axes = (
-        np.diag(np.asarray(half_axes, float))
-        if rotation is None
-        else rotation * np.asarray(half_axes, float)
-    )
-    return Part(SPHERE, np.concatenate([axes, np.asarray(center, float)[:, None]], axis=1), texture)
-
-
-def chair_model() -> Model:
-    """Wooden chair: seat, cushion, four legs, back rest with slats."""
-    parts = box((0, 0, 0.44), (0.43, 0.43, 0.035), "chair_wood")
-    parts += box(
-        (0, -0.005, 0.478),
-        (0.40, 0.39, 0.045),
-        "chair_cloth",
-        {"top": "chair_cloth", "front": "chair_cloth"},
-    )
-    for x in (-0.195, 0.195):
-        parts += box((x, -0.195, 0.212), (0.04, 0.04, 0.424), "chair_wood")
-        parts += box((x, 0.205, 0.45), (0.04, 0.04, 0.90), "chair_wood")
-    for z, height in ((0.84, 0.11), (0.69, 0.06), (0.58, 0.05)):
-        parts += box((0, 0.205, z), (0.35, 0.024, height), "chair_wood")
-    for y in (-0.195, 0.205):
-        parts += box((0, y, 0.2), (0.35, 0.02, 0.03), "chair_wood")
-    return Model("chair", "box", tuple(parts))
-
-
-def office_chair_model() -> Model:
-    """Swivel chair: five-armed foot, gas lift, padded seat and back."""
-    parts = [frustum((0, 0, 0.1), 0.34, (0.03, 0.025), "plastic")]
-    for turn in np.arange(5) * 2 * np.pi / 5:
-        tip = (0.15 * float(np.sin(turn)), -0.15 * float(np.cos(turn)), 0.08)
-        parts += box(tip, (0.05, 0.3, 0.04), "plastic", None, rotation_z(float(turn)))
-    cloth = {side: "chair_cloth" for side in ("top", "front", "back")}
-    parts += box((0, -0.02, 0.47), (0.48, 0.46, 0.08), "chair_cloth", cloth)
-    parts += box((0, 0.24, 0.56), (0.07, 0.04, 0.3), "plastic")
-    parts += box((0, 0.22, 0.84), (0.44, 0.07, 0.46), "chair_cloth", cloth, rotation_x(-0.12))
-    for x in (-0.27, 0.27):
-        parts += box((x, 0.02, 0.66), (0.05, 0.26, 0.03), "plastic")
-        parts += box((x, 0.1, 0.57), (0.03, 0.04, 0.18), "plastic")
-    return Model("chair", "box", tuple(parts))
-
-
-def tub_chair_model() -> Model:
-    """Low arm chair of one colour on a round plinth."""
-    parts = upright((0, 0, 0), 0.22, (0.2, 0.24), "plastic", "plastic")
-    parts += upright((0, 0, 0.22), 0.2, (0.3, 0.33), "chair_cloth", "chair_cloth")
-    for turn in np.linspace(-1.9, 1.9, 9):
-        spot = (0.3 * np.sin(turn), 0.3 * np.cos(turn), 0.55)
-        parts += box(spot, (0.16, 0.08, 0.3), "chair_cloth", None, rotation_z(-float(turn)))
-    return Model("chair", "box", tuple(parts))
+    turn = np.eye(3) if rotation is None else rotation
+    return Part(SPHERE, np.column_stack([turn * np.array(half_axes), center]), texture)
 
 
 def stretched(model: Model, factors: npt.ArrayLike) -> Model:
@@ -211,13 +169,57 @@ def stretched(model: Model, factors: npt.ArrayLike) -> Model:
             into = np.cross(frame[:, 0], frame[:, 1])
             frame[:, 2] = into / np.linalg.norm(into)
         parts.append(replace(part, obj_from_patch=frame))
-    return Model(model.class_name, model.support, tuple(parts))
+    return replace(model, parts=parts)
 
 
-def table_model(size: tuple[float, float, float], wood_name: str) -> Model:
+# ---- Models ------------------------------------------------------------------------------------
+
+
+def chair_model() -> Model:
+    """Wooden chair: seat, cushion, four legs, back rest with slats."""
+    parts = box((0, 0, 0.44), (0.43, 0.43, 0.035), "chair_wood")
+    parts += box((0, -0.005, 0.478), (0.40, 0.39, 0.045), "chair_cloth", "top front")
+    for x in (-0.195, 0.195):
+        parts += box((x, -0.195, 0.212), (0.04, 0.04, 0.424), "chair_wood")
+        parts += box((x, 0.205, 0.45), (0.04, 0.04, 0.90), "chair_wood")
+    for z, height in ((0.84, 0.11), (0.69, 0.06), (0.58, 0.05)):
+        parts += box((0, 0.205, z), (0.35, 0.024, height), "chair_wood")
+    for y in (-0.195, 0.205):
+        parts += box((0, y, 0.2), (0.35, 0.02, 0.03), "chair_wood")
+    return Model("chair", "box", parts)
+
+
+def office_chair_model() -> Model:
+    """Swivel chair: five-armed foot, gas lift, padded seat and back."""
+    parts = [frustum((0, 0, 0.1), 0.34, (0.03, 0.025), "plastic")]
+    for turn in np.arange(5) * 2 * np.pi / 5:
+        tip = (0.15 * np.sin(turn), -0.15 * np.cos(turn), 0.08)
+        parts += box(tip, (0.05, 0.3, 0.04), "plastic", rotation=rotation_z(turn))
+    faces = "top front back"
+    parts += box((0, -0.02, 0.47), (0.48, 0.46, 0.08), "chair_cloth", faces)
+    parts += box((0, 0.24, 0.56), (0.07, 0.04, 0.3), "plastic")
+    back = rotation_x(-0.12)
+    parts += box((0, 0.22, 0.84), (0.44, 0.07, 0.46), "chair_cloth", faces, rotation=back)
+    for x in (-0.27, 0.27):
+        parts += box((x, 0.02, 0.66), (0.05, 0.26, 0.03), "plastic")
+        parts += box((x, 0.1, 0.57), (0.03, 0.04, 0.18), "plastic")
+    return Model("chair", "box", parts)
+
+
+def tub_chair_model() -> Model:
+    """Low arm chair of one colour on a round plinth."""
+    parts = upright((0, 0, 0), 0.22, (0.2, 0.24), "plastic", "plastic")
+    parts += upright((0, 0, 0.22), 0.2, (0.3, 0.33), "chair_cloth", "chair_cloth")
+    for turn in np.linspace(-1.9, 1.9, 9):
+        spot = (0.3 * np.sin(turn), 0.3 * np.cos(turn), 0.55)
+        parts += box(spot, (0.16, 0.08, 0.3), "chair_cloth", rotation=rotation_z(-turn))
+    return Model("chair", "box", parts)
+
+
+def table_model(size: Size, wood_name: str) -> Model:
     """Four-legged table with aprons."""
     w, d, h = size
-    parts = box((0, 0, h - 0.02), (w, d, 0.04), wood_name, {"top": wood_name})
+    parts = box((0, 0, h - 0.02), (w, d, 0.04), wood_name, "top")
     for x in (-w / 2 + 0.06, w / 2 - 0.06):
         for y in (-d / 2 + 0.06, d / 2 - 0.06):
             parts += box((x, y, (h - 0.04) / 2), (0.07, 0.07, h - 0.04), wood_name)
@@ -225,7 +227,7 @@ def table_model(size: tuple[float, float, float], wood_name: str) -> Model:
         parts += box((0, y, h - 0.08), (w - 0.2, 0.02, 0.08), wood_name)
     for x in (-w / 2 + 0.07, w / 2 - 0.07):
         parts += box((x, 0, h - 0.08), (0.02, d - 0.2, 0.08), wood_name)
-    return Model("dining table", "box", tuple(parts))
+    return Model("dining table", "box", parts)
 
 
 def monitor_model() -> Model:
@@ -234,7 +236,7 @@ def monitor_model() -> Model:
     parts += box((0, 0.05, 0.13), (0.06, 0.03, 0.23), "plastic")
     parts += box((0, 0, 0.28), (0.56, 0.04, 0.34), "plastic")
     face = quad((-0.28, -0.021, 0.45), (0.56, 0, 0), (0, 0, -0.34), "screen", emission=0.55)
-    return Model("tv", "box", (*parts, face))
+    return Model("tv", "box", [*parts, face])
 
 
 def couch_model() -> Model:
@@ -243,23 +245,16 @@ def couch_model() -> Model:
     parts += box((0, 0.33, 0.47), (1.74, 0.20, 0.62), "couch")
     for x in (-0.79, 0.79):
         parts += box((x, -0.02, 0.36), (0.18, 0.84, 0.42), "couch")
+    back = rotation_x(-0.15)
     for x in (-0.35, 0.35):
-        cloth = {"top": "couch_cushion", "front": "couch_cushion"}
-        parts += box((x, -0.08, 0.35), (0.68, 0.68, 0.17), "couch_cushion", cloth)
-        parts += box(
-            (x, 0.19, 0.60),
-            (0.66, 0.15, 0.36),
-            "couch_cushion",
-            {"front": "couch_cushion"},
-            rotation_x(-0.15),
-        )
-    parts += box(
-        (-0.48, 0.06, 0.60), (0.40, 0.12, 0.36), "pillow", {"front": "pillow"}, rotation_x(-0.35)
-    )
+        parts += box((x, -0.08, 0.35), (0.68, 0.68, 0.17), "couch_cushion", "top front")
+        parts += box((x, 0.19, 0.60), (0.66, 0.15, 0.36), "couch_cushion", "front", rotation=back)
+    pillow = rotation_x(-0.35)
+    parts += box((-0.48, 0.06, 0.60), (0.40, 0.12, 0.36), "pillow", "front", rotation=pillow)
     for x in (-0.78, 0.78):
         for y in (-0.36, 0.36):
             parts += box((x, y, 0.025), (0.06, 0.06, 0.05), "chair_wood")
-    return Model("couch", "box", tuple(parts))
+    return Model("couch", "box", parts)
 
 
 def plant_model(rng: Rng, height: float) -> Model:
@@ -269,35 +264,22 @@ def plant_model(rng: Rng, height: float) -> Model:
         turn = rng.uniform(0, 2 * np.pi)
         lift = rng.uniform(0, 1)
         reach = 0.05 + 0.27 * np.sin(np.pi * (0.15 + 0.75 * lift)) * rng.uniform(0.6, 1.0)
-        center = np.array(
-            [reach * np.cos(turn), reach * np.sin(turn), 0.36 + (height - 0.45) * lift]
-        )
+        heading = np.array([np.cos(turn), np.sin(turn)])
+        center = np.append(reach * heading, 0.36 + (height - 0.45) * lift)
         droop = rng.uniform(-0.5, 0.9)
-        along = np.array(
-            [np.cos(turn) * np.cos(droop), np.sin(turn) * np.cos(droop), np.sin(droop)]
-        )
+        along = np.append(heading * np.cos(droop), np.sin(droop))
         across = np.cross(along, rng.normal(0, 0.35, 3) + np.array([0.0, 0, 1]))
-        along, across = (
-            along * rng.uniform(0.2, 0.32),
-            across / np.linalg.norm(across) * rng.uniform(0.08, 0.12),
-        )
+        along = along * rng.uniform(0.2, 0.32)
+        across = across / np.linalg.norm(across) * rng.uniform(0.08, 0.12)
         texture = f"leaf{int(rng.integers(3))}"
-        parts.append(
-            quad(center - along / 2 - across / 2, along, across, texture, kind=DISC, two_sided=True)
-        )
+        corner = center - along / 2 - across / 2
+        parts.append(quad(corner, along, across, texture, kind=DISC, two_sided=True))
     for _ in range(6):
         turn = rng.uniform(0, 2 * np.pi)
-        tip = np.array([0.06 * np.cos(turn), 0.06 * np.sin(turn), height - 0.5])
-        parts.append(
-            quad(
-                (0, 0, 0.3),
-                tip,
-                (0.012 * np.sin(turn), -0.012 * np.cos(turn), 0),
-                "leaf0",
-                two_sided=True,
-            )
-        )
-    return Model("potted plant", "cylinder", tuple(parts))
+        tip = (0.06 * np.cos(turn), 0.06 * np.sin(turn), height - 0.5)
+        width = (0.012 * np.sin(turn), -0.012 * np.cos(turn), 0)
+        parts.append(quad((0, 0, 0.3), tip, width, "leaf0", two_sided=True))
+    return Model("potted plant", "cylinder", parts)
 
 
 def bottle_model(texture: str) -> Model:
@@ -306,7 +288,7 @@ def bottle_model(texture: str) -> Model:
     parts.append(frustum((0, 0, 0.19), 0.05, (0.038, 0.015), "glass"))
     parts.append(frustum((0, 0, 0.24), 0.045, (0.015, 0.014), "glass"))
     parts += upright((0, 0, 0.285), 0.02, (0.017, 0.017), "cap", "cap")
-    return Model("bottle", "cylinder", tuple(parts))
+    return Model("bottle", "cylinder", parts)
 
 
 def cup_model() -> Model:
@@ -314,10 +296,10 @@ def cup_model() -> Model:
     parts = upright((0, 0, 0), 0.10, (0.038, 0.043), "cup", "china")[::2]
     parts.append(frustum((0, 0, 0.0), 0.1, (0.037, 0.042), "china"))
     parts.append(disc((0, 0, 0.085), 0.041, "soil", fit=False))
-    for x, z, size in ((0.052, 0.075, (0.026, 0.012, 0.012)), (0.052, 0.03, (0.026, 0.012, 0.012))):
-        parts += box((x, 0, z), size, "china")
+    for z in (0.075, 0.03):
+        parts += box((0.052, 0, z), (0.026, 0.012, 0.012), "china")
     parts += box((0.066, 0, 0.0525), (0.012, 0.012, 0.057), "china")
-    return Model("cup", "cylinder", tuple(parts))
+    return Model("cup", "cylinder", parts)
 
 
 def bowl_model(rng: Rng) -> Model:
@@ -327,24 +309,20 @@ def bowl_model(rng: Rng) -> Model:
         disc((0, 0, 0.055), 0.125, "soil", fit=False),
     ]
     for turn in np.arange(5) * 2 * np.pi / 5:
-        parts.append(
-            ball((0.07 * np.cos(turn), 0.07 * np.sin(turn), 0.085), (0.037,) * 3, "orange")
-        )
-    parts.append(
-        ball((0.0, 0.0, 0.125), (0.037,) * 3, "orange", rotation_z(float(rng.uniform(0, 6))))
-    )
-    return Model("bowl", "cylinder", tuple(parts))
+        spot = (0.07 * np.cos(turn), 0.07 * np.sin(turn), 0.085)
+        parts.append(ball(spot, (0.037,) * 3, "orange"))
+    parts.append(ball((0, 0, 0.125), (0.037,) * 3, "orange", rotation_z(rng.uniform(0, 6))))
+    return Model("bowl", "cylinder", parts)
 
 
 def book_model(index: int, upright_book: bool) -> Model:
     """A book lying flat, or standing with its cover to the front."""
-    faces = {"top": f"book{index}", "bottom": f"book{index}"}
-    parts = box((0, 0, 0.0175), (0.17, 0.24, 0.035), "paper", faces)
-    parts += box((-0.087, 0, 0.0175), (0.004, 0.24, 0.036), f"book{index}")
+    cover = f"book{index}"
+    parts = box((0, 0, 0.0175), (0.17, 0.24, 0.035), "paper", "top bottom", cover)
+    parts += box((-0.087, 0, 0.0175), (0.004, 0.24, 0.036), cover)
     if upright_book:
-        stand = rotation_x(np.pi / 2 - 0.18)
-        parts = [moved(part, stand, np.array([0, 0, 0.118])) for part in parts]
-    return Model("book", "box", tuple(parts))
+        parts = placed(parts, rotation_x(np.pi / 2 - 0.18), (0, 0, 0.118))
+    return Model("book", "box", parts)
 
 
 def bear_model() -> Model:
@@ -361,49 +339,35 @@ def bear_model() -> Model:
         ball((0, -0.122, 0.3), (0.012, 0.01, 0.008), "plastic"),
     ]
     bear += [ball((x, -0.088, 0.335), (0.009, 0.008, 0.009), "plastic") for x in (-0.035, 0.035)]
-    return Model("teddy bear", "ellipsoid", tuple(bear))
+    return Model("teddy bear", "ellipsoid", bear)
 
 
 def small_models(rng: Rng) -> dict[str, Model]:
     """Objects for desks, shelves and corners."""
-    laptop = box((0, 0, 0.01), (0.34, 0.24, 0.02), "alu", {"top": "keys"})
-    laptop += box(
-        (0, 0.16, 0.12), (0.34, 0.01, 0.23), "alu", {"front": "screen2"}, rotation_x(-0.3)
-    )
+    laptop = box((0, 0, 0.01), (0.34, 0.24, 0.02), "alu", "top", "keys")
+    lid = rotation_x(-0.3)
+    laptop += box((0, 0.16, 0.12), (0.34, 0.01, 0.23), "alu", "front", "screen2", lid)
     vase = upright((0, 0, 0), 0.12, (0.05, 0.09), "vase", "soil")
     vase.append(frustum((0, 0, 0.12), 0.14, (0.09, 0.035), "vase"))
     vase.append(frustum((0, 0, 0.26), 0.04, (0.035, 0.05), "vase"))
     clock = [disc((0, 0, 0.04), 0.16, "clock"), frustum((0, 0, 0), 0.04, (0.16, 0.16), "plastic")]
-    hang = rotation_x(np.pi / 2)
-    case = box(
-        (0, 0, 0.35), (0.42, 0.25, 0.56), "suitcase", {"front": "suitcase", "back": "suitcase"}
-    )
-    case += [
-        p
-        for x in (-0.17, 0.17)
-        for p in upright((x, 0, 0), 0.07, (0.03, 0.03), "plastic", "plastic")
-    ]
+    case = box((0, 0, 0.35), (0.42, 0.25, 0.56), "suitcase", "front back")
+    for x in (-0.17, 0.17):
+        case += upright((x, 0, 0), 0.07, (0.03, 0.03), "plastic", "plastic")
     case += box((0, 0.1, 0.68), (0.2, 0.02, 0.02), "plastic")
-    case += [p for x in (-0.1, 0.1) for p in box((x, 0.1, 0.655), (0.02, 0.02, 0.05), "plastic")]
+    for x in (-0.1, 0.1):
+        case += box((x, 0.1, 0.655), (0.02, 0.02, 0.05), "plastic")
+    keyboard = box((0, 0, 0.013), (0.44, 0.15, 0.026), "plastic", "top", "keys")
+    football = ball((0, 0, 0.12), (0.12,) * 3, "ball", rotation_x(rng.uniform(0.4, 1.2)))
     return {
-        "laptop": Model("laptop", "box", tuple(laptop)),
-        "keyboard": Model(
-            "keyboard",
-            "box",
-            tuple(box((0, 0, 0.013), (0.44, 0.15, 0.026), "plastic", {"top": "keys"})),
-        ),
-        "mouse": Model("mouse", "ellipsoid", (ball((0, 0, 0.018), (0.033, 0.055, 0.018), "alu"),)),
-        "vase": Model("vase", "cylinder", tuple(vase)),
-        "clock": Model(
-            "clock", "box", tuple(moved(p, hang, np.array([0.0, 0.0, 0.16])) for p in clock)
-        ),
+        "laptop": Model("laptop", "box", laptop),
+        "keyboard": Model("keyboard", "box", keyboard),
+        "mouse": Model("mouse", "ellipsoid", [ball((0, 0, 0.018), (0.033, 0.055, 0.018), "alu")]),
+        "vase": Model("vase", "cylinder", vase),
+        "clock": Model("clock", "box", placed(clock, rotation_x(np.pi / 2), (0, 0, 0.16))),
         "bear": bear_model(),
-        "ball": Model(
-            "sports ball",
-            "ellipsoid",
-            (ball((0, 0, 0.12), (0.12,) * 3, "ball", rotation_x(float(rng.uniform(0.4, 1.2)))),),
-        ),
-        "suitcase": Model("suitcase", "box", tuple(case)),
+        "ball": Model("sports ball", "ellipsoid", [football]),
+        "suitcase": Model("suitcase", "box", case),
         "bowl": bowl_model(rng),
     }
 

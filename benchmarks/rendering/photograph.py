@@ -13,7 +13,7 @@ import numpy.typing as npt
 from rendering.camera import camera_matrix, camera_path
 from rendering.config import NEAR_M, Array, Image, Rng, RoomConfig
 from rendering.ground_truth import FrameTruth, ground_truth
-from rendering.raster import render
+from rendering.raster import pixel_rays, render
 from rendering.surfaces import Room, apply
 from rendering.textures import to_image
 
@@ -21,11 +21,10 @@ from rendering.textures import to_image
 def image_flow(depth: Array, K: Array, next_from_cam: Array) -> Array:
     """(H, W, 2) where each pixel's point goes in the next view, minus where it is, in pixels."""
     height, width = depth.shape
-    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], -1)
-    moved_points = apply(next_from_cam, rays * depth[..., None])
-    pixels = moved_points @ K.T
-    return np.asarray(pixels[..., :2] / np.maximum(pixels[..., 2:], NEAR_M) - np.stack([u, v], -1))
+    rays = pixel_rays(K, (0, 0, width, height))
+    pixels = apply(next_from_cam, rays * depth[..., None]) @ K.T
+    middles = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1)
+    return np.asarray(pixels[..., :2] / np.maximum(pixels[..., 2:], NEAR_M) - middles)
 
 
 def blur_motion(
@@ -36,10 +35,8 @@ def blur_motion(
     u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     total = np.zeros(image.shape, np.float32)
     for fraction in (np.arange(taps) / (taps - 1) - 0.5) * shutter:
-        map_u, map_v = (
-            u - (fraction * flow[..., 0]).astype(np.float32),
-            v - (fraction * flow[..., 1]).astype(np.float32),
-        )
+        map_u = u - (fraction * flow[..., 0]).astype(np.float32)
+        map_v = v - (fraction * flow[..., 1]).astype(np.float32)
         total += cv2.remap(image, map_u, map_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(total / taps, np.float32)
 
@@ -79,26 +76,18 @@ class Frame:
     truth: FrameTruth
 
 
-def render_frame(
-    room: Room, config: RoomConfig, index: int, poses: Array, drawn: Room | None = None
-) -> Frame:
+def render_frame(room: Room, config: RoomConfig, index: int, poses: Array) -> Frame:
     """One frame of a clip; it has its own random stream, so it does not depend on the others.
 
     Args:
         poses: cam_from_world (F, 3, 4) of the whole clip.
-        drawn: the room without patches that this view cannot show; all of it by default.
     """
     K = camera_matrix(config)
     pose = poses[index]
     rng = np.random.default_rng([config.seed, 4, index])
-    clean, instance, depth = render(
-        room if drawn is None else drawn,
-        K,
-        pose,
-        (config.width, config.height),
-        config.supersample,
-        exposure_at(index, config),
-    )
+    size = (config.width, config.height)
+    exposure = exposure_at(index, config)
+    clean, instance, depth = render(room, K, pose, size, config.supersample, exposure)
     moves = index + 1 < len(poses) and config.path != "table"  # photos: nothing is blurred
     after = poses[index + 1] if moves else pose
     rotation = after[:, :3] @ pose[:, :3].T

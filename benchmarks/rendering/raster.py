@@ -25,6 +25,14 @@ class Layers:
     s: npt.NDArray[np.float32]
     t: npt.NDArray[np.float32]
 
+    def store(self, index: int, window: Any, at: tuple[Any, ...], w: Any, s: Any, t: Any) -> None:
+        """Write 1/z, s, t of the samples that passed, at rows and columns of a window."""
+        where = (at[0] + window[1], at[1] + window[0])
+        self.inverse_depth[where] = w
+        self.s[where] = s
+        self.t[where] = t
+        self.patch[where] = index
+
 
 def patch_windows(
     surfaces: Surfaces, img_from_world: Array, size: tuple[int, int]
@@ -60,30 +68,22 @@ def draw_flat(
     x0, y0, x1, y1 = window
     u = np.arange(x0, x1, dtype=np.float32)[None, :] + np.float32(0.5)
     v = np.arange(y0, y1, dtype=np.float32)[:, None] + np.float32(0.5)
-    m = patch_from_img.astype(np.float32)
-    w = m[2, 0] * u + (m[2, 1] * v + m[2, 2])  # (h, w) 1/z
+    s, t, w = (a * u + (b * v + c) for a, b, c in patch_from_img.astype(np.float32))  # (h, w)
     nearer = w > layers.inverse_depth[y0:y1, x0:x1]
-    s = m[0, 0] * u + (m[0, 1] * v + m[0, 2])
-    t = m[1, 0] * u + (m[1, 1] * v + m[1, 2])
     edge = np.float32(1e-5) * w
     if kind == DISC:
         inside = (s - 0.5 * w) ** 2 + (t - 0.5 * w) ** 2 <= np.float32(0.25) * w * w
     else:
         inside = (s >= -edge) & (t >= -edge) & (s <= w + edge) & (t <= w + edge)
-    rows, cols = np.nonzero(inside & nearer & (w < 1 / NEAR_M))
-    depth_inv = w[rows, cols]
-    store(
-        layers,
-        index,
-        (rows + y0, cols + x0),
-        (depth_inv, s[rows, cols] / depth_inv, t[rows, cols] / depth_inv),
-    )
+    at = np.nonzero(inside & nearer & (w < 1 / NEAR_M))
+    layers.store(index, window, at, w[at], s[at] / w[at], t[at] / w[at])
 
 
-def store(layers: Layers, index: int, at: tuple[Any, Any], values: tuple[Any, Any, Any]) -> None:
-    """Write 1/z, s, t of the samples that passed."""
-    layers.inverse_depth[at], layers.s[at], layers.t[at] = values
-    layers.patch[at] = index
+def pixel_rays(K: Array, window: Any) -> Array:
+    """(h, w, 3) rays with z = 1 through the middles of the pixels in x0, y0, x1, y1."""
+    x0, y0, x1, y1 = window
+    u, v = np.meshgrid(np.arange(x0, x1) + 0.5, np.arange(y0, y1) + 0.5)
+    return np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], -1)
 
 
 def draw_round(
@@ -96,12 +96,7 @@ def draw_round(
 ) -> None:
     """Z-test a sphere or frustum: nearest root of the ray within the patch's z limits."""
     a, b, c, z_low, z_high = quadric
-    x0, y0, x1, y1 = window
-    u, v = np.meshgrid(np.arange(x0, x1) + 0.5, np.arange(y0, y1) + 0.5)
-    rays = np.stack(
-        [(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], -1
-    )  # (h, w, 3), z = 1
-    d = rays @ patch_from_cam[:, :3].T
+    d = pixel_rays(K, window) @ patch_from_cam[:, :3].T
     o = patch_from_cam[:, 3]
     # (dx^2 + dy^2 + a dz^2) k^2 + (2 (o.d)_a + b dz) k + (ox^2 + oy^2 + a oz^2 + b oz + c) = 0
     qa = d[..., 0] ** 2 + d[..., 1] ** 2 + a * d[..., 2] ** 2
@@ -109,57 +104,56 @@ def draw_round(
     qc = o[0] ** 2 + o[1] ** 2 + a * o[2] ** 2 + b * o[2] + c
     root = np.sqrt(np.maximum(qb**2 - qa * qc, 0))
     safe = np.where(np.abs(qa) < 1e-12, 1e-12, qa)
-    depth = np.full(u.shape, np.inf)
+    depth = np.full(qa.shape, np.inf)
     for k in ((-qb - root) / safe, (-qb + root) / safe):
         z = o[2] + k * d[..., 2]
         good = (qb**2 >= qa * qc) & (k > NEAR_M) & (z >= z_low) & (z <= z_high) & (k < depth)
         depth = np.where(good, k, depth)
-    rows, cols = np.nonzero(1 / depth > layers.inverse_depth[y0:y1, x0:x1])
-    k = depth[rows, cols]
-    x, y, z = (o[i] + k * d[rows, cols, i] for i in range(3))
+    x0, y0, x1, y1 = window
+    at = np.nonzero(1 / depth > layers.inverse_depth[y0:y1, x0:x1])
+    k = depth[at]
+    x, y, z = o[:, None] + k * d[at].T
     s = np.arctan2(y, x) / (2 * np.pi) + 0.5
-    t = (z_high - z) / (z_high - z_low)
-    store(layers, index, (rows + y0, cols + x0), (1 / k, s, t))
+    layers.store(index, window, at, 1 / k, s, (z_high - z) / (z_high - z_low))
+
+
+def cam_from_patch(surfaces: Surfaces, cam_from_world: Array) -> Array:
+    """(S, 3, 4) patches in the camera's frame."""
+    frames = cam_from_world[:, :3] @ surfaces.world_from_patch
+    frames[:, :, 3] += cam_from_world[:, 3]
+    return np.asarray(frames)
 
 
 def rasterize(surfaces: Surfaces, K: Array, cam_from_world: Array, size: tuple[int, int]) -> Layers:
     """Fill the layers of one view, patch by patch."""
-    width, height = size
-    shape = (height, width)
-    zero = np.zeros(shape, np.float32)
-    layers = Layers(zero.copy(), np.full(shape, -1, np.int32), zero.copy(), zero.copy())
+    zero = np.zeros(size[::-1], np.float32)
+    layers = Layers(zero.copy(), np.full(zero.shape, -1, np.int32), zero.copy(), zero.copy())
     windows = patch_windows(surfaces, K @ cam_from_world, size)
     center = -cam_from_world[:, :3].T @ cam_from_world[:, 3]
-    drawn = (
-        faces_camera(surfaces, center)
-        & (windows[:, 2] > windows[:, 0])
-        & (windows[:, 3] > windows[:, 1])
-    )
-    for i in np.nonzero(drawn)[0]:
-        cam_from_patch = cam_from_world[:, :3] @ surfaces.world_from_patch[i]  # (3, 4)
-        cam_from_patch[:, 3] += cam_from_world[:, 3]
+    drawn = faces_camera(surfaces, center) & (windows[:, 2:] > windows[:, :2]).all(1)
+    frames = cam_from_patch(surfaces, cam_from_world)
+    for i in np.nonzero(drawn)[0].tolist():
         if surfaces.kind[i] in (QUAD, DISC):
-            img_from_patch = K @ cam_from_patch[:, [0, 1, 3]]  # (3, 3) of (s, t, 1)
+            img_from_patch = K @ frames[i][:, [0, 1, 3]]  # (3, 3) of (s, t, 1)
             if abs(np.linalg.det(img_from_patch)) > 1e-9:
-                draw_flat(
-                    layers, int(i), int(surfaces.kind[i]), np.linalg.inv(img_from_patch), windows[i]
-                )
+                patch_from_img = np.linalg.inv(img_from_patch)
+                draw_flat(layers, i, surfaces.kind[i], patch_from_img, windows[i])
         else:
-            linear = np.linalg.inv(cam_from_patch[:, :3])
-            patch_from_cam = np.concatenate([linear, -linear @ cam_from_patch[:, 3:]], 1)
-            draw_round(layers, int(i), surfaces.quadric[i], patch_from_cam, K, windows[i])
+            linear = np.linalg.inv(frames[i][:, :3])
+            patch_from_cam = np.concatenate([linear, -linear @ frames[i][:, 3:]], 1)
+            draw_round(layers, i, surfaces.quadric[i], patch_from_cam, K, windows[i])
     return layers
 
 
 def texel_rates(surfaces: Surfaces, K: Array, cam_from_world: Array) -> tuple[Array, Array]:
     """(S,) factor and power: texels per pixel = factor * depth**power (mean over the area)."""
-    frames = cam_from_world[:, :3] @ surfaces.world_from_patch  # (S, 3, 4)
-    frames[:, :, 3] += cam_from_world[:, 3]
+    frames = cam_from_patch(surfaces, cam_from_world)
     flat = np.abs(np.linalg.det(K @ frames[:, :, [0, 1, 3]]))  # (S,) |det of img_from_patch|
     texels = surfaces.texture_rect[:, 2] * surfaces.texture_rect[:, 3]
     lengths = np.linalg.norm(surfaces.world_from_patch[:, :, :3], axis=1)  # (S, 3)
-    around = 2 * np.pi * np.where(surfaces.kind == SPHERE, lengths[:, 0], surfaces.radii.max(1))
-    tall = np.where(surfaces.kind == SPHERE, np.pi, 1.0) * lengths[:, 2]
+    is_sphere = surfaces.kind == SPHERE
+    around = 2 * np.pi * np.where(is_sphere, lengths[:, 0], surfaces.radii.max(1))
+    tall = np.where(is_sphere, np.pi, 1.0) * lengths[:, 2]
     is_flat = surfaces.kind < SPHERE
     factor = np.where(
         is_flat,
@@ -174,17 +168,15 @@ def sample_atlas(
 ) -> npt.NDArray[np.uint8]:
     """Texture colours (N, 3) at atlas positions u, v (N,), each from its own mip level."""
     colors = np.zeros((len(u), 3), np.uint8)
+    columns = 1024  # remap wants an image: fold the list
     for number, image in enumerate(atlas):
-        chosen = np.nonzero(level == number)[0]
-        if not len(chosen):
-            continue
-        columns = 1024  # remap wants an image: fold the list
-        maps = np.zeros((2, -(-len(chosen) // columns) * columns), np.float32)
-        maps[0, : len(chosen)] = u[chosen] / 2**number - 0.5
-        maps[1, : len(chosen)] = v[chosen] / 2**number - 0.5
-        folded = maps.reshape(2, -1, columns)
-        picked = cv2.remap(image, folded[0], folded[1], cv2.INTER_LINEAR)
-        colors[chosen] = picked.reshape(-1, 3)[: len(chosen)]
+        rows = np.nonzero(level == number)[0]
+        maps = np.zeros((2, -(-len(rows) // columns) * columns), np.float32)
+        maps[:, : len(rows)] = np.stack([u[rows], v[rows]]) / 2**number - 0.5
+        if len(rows):
+            map_u, map_v = maps.reshape(2, -1, columns)
+            picked = cv2.remap(image, map_u, map_v, cv2.INTER_LINEAR)
+            colors[rows] = picked.reshape(-1, 3)[: len(rows)]
     return colors
 
 
@@ -195,29 +187,22 @@ def shade_layers(
     surfaces = room.surfaces
     shape = layers.patch.shape
     patch = np.maximum(layers.patch, 0).ravel()
-    s = layers.s.ravel()
-    t = layers.t.ravel()
-    rect = surfaces.texture_rect.astype(np.float32)[patch]  # (N, 4)
+    st = np.stack([layers.s.ravel(), layers.t.ravel()], 1)  # (N, 2)
     factor, power = texel_rates(surfaces, K, cam_from_world)
     depth_log = -np.log2(np.maximum(layers.inverse_depth.ravel(), 1e-3))
-    level = (
-        np.log2(factor + 1e-12).astype(np.float32)[patch]
-        + power.astype(np.float32)[patch] * depth_log
-    )
-    dither = np.tile(
-        np.array([[0.1, 0.6], [0.85, 0.35]], np.float32), (-(-shape[0] // 2), -(-shape[1] // 2))
-    )
-    level = np.floor(
-        level + dither[: shape[0], : shape[1]].ravel()
-    )  # the mean over 2x2 samples blends two levels
+    level = np.log2(factor + 1e-12).astype(np.float32)[patch]
+    level = level + power.astype(np.float32)[patch] * depth_log
+    dither = np.array([[0.1, 0.6], [0.85, 0.35]], np.float32)
+    tiles = np.tile(dither, (-(-shape[0] // 2), -(-shape[1] // 2)))[: shape[0], : shape[1]]
+    level = np.floor(level + tiles.ravel())  # the mean over 2x2 samples blends two levels
     level = np.clip(level, 0, MIP_LEVELS - 1).astype(np.int64)
-    albedo = sample_atlas(
-        room.atlas, rect[:, 0] + s * rect[:, 2], rect[:, 1] + t * rect[:, 3], level
-    )
+    rect = surfaces.texture_rect.astype(np.float32)[patch]  # (N, 4)
+    u, v = (rect[:, :2] + st * rect[:, 2:]).T
+    albedo = sample_atlas(room.atlas, u, v, level)
     spot = surfaces.light_rect.astype(np.float32)[patch]
-    light_u = spot[:, 0] + np.clip(s * spot[:, 2], 0.5, spot[:, 2] - 0.5) - 0.5
-    light_v = spot[:, 1] + np.clip(t * spot[:, 3], 0.5, spot[:, 3] - 0.5) - 0.5
-    light = cv2.remap(room.light, light_u.reshape(shape), light_v.reshape(shape), cv2.INTER_LINEAR)
+    at = spot[:, :2] + np.clip(st * spot[:, 2:], 0.5, spot[:, 2:] - 0.5) - 0.5
+    u, v = (np.ascontiguousarray(column).reshape(shape) for column in at.T)
+    light = cv2.remap(room.light, u, v, cv2.INTER_LINEAR)
     to_linear = ((np.arange(256) / 255.0) ** 2.2).astype(np.float32)
     return np.asarray(to_linear[albedo].reshape(*shape, 3) * light, np.float32)
 
@@ -246,22 +231,22 @@ def render(
     """
     width, height = size
     n = supersample
-    K_fine = (
-        np.diag([n, n, 1.0]) @ K
-    )  # corner convention: scaling pixels scales K, nothing to shift
+    K_fine = np.diag([n, n, 1.0]) @ K  # corner convention: nothing to shift
     layers = rasterize(room.surfaces, K_fine, cam_from_world, (n * width, n * height))
     fine = shade_layers(room, layers, K_fine, cam_from_world) * np.float32(exposure)
     linear = cv2.resize(fine, (width, height), interpolation=cv2.INTER_AREA) if n > 1 else fine
+
+    def samples(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """(H, W, n * n) of each pixel."""
+        blocks = values.reshape(height, n, width, n).transpose(0, 2, 1, 3)
+        return blocks.reshape(height, width, n * n)
+
     owner = np.where(layers.patch < 0, -1, room.surfaces.owner[layers.patch]).astype(np.int32)
-    samples = owner.reshape(height, n, width, n).transpose(0, 2, 1, 3).reshape(height, width, n * n)
-    instance = majority(samples)
-    inverse = (
-        layers.inverse_depth.reshape(height, n, width, n)
-        .transpose(0, 2, 1, 3)
-        .reshape(height, width, n * n)
-    )
-    same = samples == instance[..., None]
-    depth = same.sum(-1) / np.maximum((inverse * same).sum(-1), 1e-6)
+    owners = samples(owner)
+    instance = majority(owners)
+    same = owners == instance[..., None]
+    inverse = samples(layers.inverse_depth) * same
+    depth = same.sum(-1) / np.maximum(inverse.sum(-1), 1e-6)
     return tone_map(linear), instance, depth.astype(np.float32)
 
 

@@ -7,17 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from rendering.config import PLANS, Rng, RoomConfig
-from rendering.light import bake_light
-from rendering.models import Part, Placement, furniture_models
+from rendering.config import PLANS, Array, Image, Rect, Rng, RoomConfig, Size
+from rendering.light import DEFAULT_LIGHTING, Lighting, bake_light
+from rendering.models import Model, Part, Placement, furniture_models, placed, rotation_z
 from rendering.plans import (
-    desk_placements,
-    dining_placements,
     fixed_furniture,
-    limit_placements,
-    lounge_placements,
+    home_plan,
+    later_plan,
     room_shell,
-    shelf_placements,
     skirting,
     varied_models,
     varied_plan,
@@ -25,6 +22,7 @@ from rendering.plans import (
 )
 from rendering.surfaces import (
     Room,
+    RoomObject,
     Surfaces,
     build_atlas,
     build_surfaces,
@@ -32,6 +30,55 @@ from rendering.surfaces import (
     texture_window,
 )
 from rendering.texture_set import make_textures, varied_textures
+
+Windows = Sequence[Sequence[float]]  # texture piece (x, y, w, h) in the atlas of every part
+
+
+def texture_windows(
+    parts: Sequence[Part], rects: dict[str, Rect], config: RoomConfig, rng: Rng
+) -> Windows:
+    """The texture pieces of parts."""
+    return [texture_window(p, rects[p.texture], config.texels_per_m, rng) for p in parts]
+
+
+def build_room(
+    size: Size,
+    background: tuple[Sequence[Part], Windows],
+    placements: dict[int, Placement],
+    models: dict[str, tuple[Model, Windows]],
+    atlas: tuple[Image, ...],
+    rng: Rng,
+    rays: int,
+    lighting: Lighting = DEFAULT_LIGHTING,
+    margin_m: float = 0.0,
+) -> Room:
+    """Furnish and light a room.
+
+    Args:
+        background: parts without objects, the walls, floor and ceiling first.
+        placements: by identity.
+        models: by name; objects of one model look the same.
+        margin_m: by which the lit space is wider than the room.
+    """
+    parts = list(background[0])
+    windows = list(background[1])
+    owners = [-1] * len(parts)
+    objects: list[RoomObject] = []
+    outlines: list[Array] = []
+    names = list(models)
+    for identity, placement in sorted(placements.items()):
+        model, pieces = models[placement.model]
+        group = names.index(placement.model)
+        truth, own, outline = place_object(len(objects), identity, placement, model, group)
+        owners += [len(objects)] * len(own)
+        parts += own
+        windows += pieces
+        objects.append(truth)
+        outlines.append(outline)
+    surfaces, height = build_surfaces(parts, owners, windows)
+    lit = (size[0] + margin_m, *size[1:])
+    light = bake_light(surfaces, lit, height, rays, rng, lighting)
+    return Room(size, tuple(objects), surfaces, atlas, light, tuple(outlines))
 
 
 def make_room(config: RoomConfig) -> Room:
@@ -49,74 +96,39 @@ def make_room(config: RoomConfig) -> Room:
     w, d, h = (side * (1 + float(rng.uniform(-1, 1)) * config.room_jitter) for side in sides)
     size = (w, d, h)
     models = furniture_models(rng)
-    gone: tuple[int, ...] = ()
+    gone = -1
     if varied:
         models = varied_models(rng, models)
-        plan, fixed = varied_plan(config, rng, size)
+        plan, fixed = varied_plan(rng, size)
     else:
-        plan = limit_placements(home_plan(config, rng, size), config)
+        plan = home_plan(rng, size)
         if config.plan == "later":
             plan, gone = later_plan(plan)
         fixed = wall_pictures(size, rng) + fixed_furniture(size)
-    placed = [
-        place_object(i, placement, models[placement.model], list(models).index(placement.model))
-        for i, placement in enumerate(plan)
-    ]
-    parts = room_shell(size) + skirting(size) + fixed
-    owners = [-1] * len(parts) + [truth.index for truth, own, _ in placed for _ in own]
-    parts += [part for _, own, _ in placed for part in own]
+    background = room_shell(size) + skirting(size) + fixed
     textures = make_textures(rng, config, size)
     if varied:
-        texels = (int(w * config.texels_per_m), int(d * config.texels_per_m))
-        textures |= varied_textures(rng, config, (*texels, int(h * config.texels_per_m)))
+        w, d, h = (int(side * config.texels_per_m) for side in size)
+        textures |= varied_textures(rng, (w, d, h))
     atlas, rects = build_atlas(textures)
-    windows = object_windows(
-        parts, owners, rects, config, rng, [truth.twin_group for truth, _, _ in placed]
-    )
-    shown = [part for part, owner in enumerate(owners) if owner not in gone]
-    placed = [found for found in placed if found[0].index not in gone]
-    parts = [parts[part] for part in shown]
-    windows = [windows[part] for part in shown]
-    new_index = {truth.index: index for index, (truth, _, _) in enumerate(placed)}
-    owners = [new_index.get(owners[part], -1) for part in shown]
-    placed = [(replace(t, index=k), own, origin) for k, (t, own, origin) in enumerate(placed)]
-    surfaces, light_height = build_surfaces(parts, owners, windows)
-    light = bake_light(surfaces, size, light_height, config.light_rays, rng)
-    return Room(
-        size, tuple(t for t, _, _ in placed), surfaces, atlas, light, tuple(o for _, _, o in placed)
-    )
-
-
-def home_plan(config: RoomConfig, rng: Rng, size: tuple[float, float, float]) -> list[Placement]:
-    """Dining table, desk, lounge and shelves, each at its own position."""
-    center = (
-        -size[0] / 2 + 1.65 + float(rng.uniform(-0.1, 0.1)),
-        -0.95 + float(rng.uniform(-0.1, 0.1)),
-    )
-    return (
-        dining_placements(config, rng, center)
-        + desk_placements(rng, size)
-        + lounge_placements(rng, size)
-        + shelf_placements(size)
+    windows = texture_windows(background, rects, config, rng)
+    pieces: dict[str, Windows] = dict.fromkeys(models, ())
+    for p in plan:
+        if not pieces[p.model]:
+            parts = placed(models[p.model].parts, rotation_z(p.yaw_rad), p.position)
+            pieces[p.model] = texture_windows(parts, rects, config, rng)
+    return build_room(
+        size,
+        (background, windows),
+        {k + 1: placement for k, placement in enumerate(plan) if k != gone},
+        {name: (model, pieces[name]) for name, model in models.items()},
+        atlas,
+        rng,
+        config.light_rays,
     )
 
 
-def later_plan(plan: list[Placement]) -> tuple[list[Placement], tuple[int, ...]]:
-    """The home plan on another day: a chair and the bowl moved, a bottle is gone, a ball is new.
-
-    Returns: the placements, in their order, new ones last; indices of those that are gone.
-    """
-    chair = 4
-    bowl = 5
-    bottle = 8
-    later = list(plan)
-    later[chair] = replace(plan[chair], position=(-2.75, -0.05, 0.0), yaw_rad=0.9)
-    x, y, z = plan[bowl].position
-    later[bowl] = replace(plan[bowl], position=(x - 0.29, y - 0.13, z))
-    return [*later, Placement("ball", (-0.75, -1.5, 0.0))], (bottle,)
-
-
-CORRIDOR_ROOMS = 3  # chosen: two wrong positions for every view
+CORRIDOR_ROOMS = 3  # so that every view has two wrong positions
 JOIN_M = 0.2  # what is so close to a wall that is left out goes with it: pictures, curtains
 
 
@@ -133,48 +145,21 @@ def rooms_in_a_row(room: Room, count: int) -> Room:
         shift = np.array([(copy - (count - 1) / 2) * w, 0.0, 0.0])
         first = copy * len(room.objects)
         part = {name: getattr(room.surfaces, name)[keep] for name in Surfaces.__slots__}
-        part["world_from_patch"] = part["world_from_patch"] + np.pad(
-            shift[:, None], ((0, 0), (3, 0))
-        )
+        offset = np.pad(shift[:, None], ((0, 0), (3, 0)))
+        part["world_from_patch"] = part["world_from_patch"] + offset
         part["corners_in_world"] = part["corners_in_world"] + shift
         part["owner"] = np.where(part["owner"] < 0, -1, part["owner"] + first)
         surfaces.append(part)
-        objects += [
-            replace(
-                o,
-                index=o.index + first,
-                identity=o.index + first + 1,
-                center_in_world=o.center_in_world + shift,
-            )
-            for o in room.objects
-        ]
+        for o in room.objects:
+            number = o.index + first
+            center = o.center_in_world + shift
+            objects.append(replace(o, index=number, identity=number + 1, center_in_world=center))
         outlines += [outline + shift for outline in room.outline_in_world]
     joined = {name: np.concatenate([s[name] for s in surfaces]) for name in Surfaces.__slots__}
-    return Room(
-        (count * w, d, h), tuple(objects), Surfaces(**joined), room.atlas, room.light,
-        tuple(outlines),
-    )  # fmt: skip
-
-
-def object_windows(
-    parts: Sequence[Part],
-    owners: Sequence[int],
-    rects: dict[str, tuple[int, int, int, int]],
-    config: RoomConfig,
-    rng: Rng,
-    twin_groups: Sequence[int],
-) -> list[list[float]]:
-    """Texture pieces of all parts; identical instances share them and differ by position only."""
-    windows: list[list[float]] = []
-    known: dict[tuple[int, int], list[float]] = {}
-    seen = 0
-    for index, (part, owner) in enumerate(zip(parts, owners, strict=True)):
-        seen = seen + 1 if index and owners[index - 1] == owner else 0
-        if owner < 0:
-            windows.append(texture_window(part, rects[part.texture], config.texels_per_m, rng))
-            continue
-        key = (twin_groups[owner], seen)
-        if key not in known:
-            known[key] = texture_window(part, rects[part.texture], config.texels_per_m, rng)
-        windows.append(known[key])
-    return windows
+    return replace(
+        room,
+        size_m=(count * w, d, h),
+        objects=tuple(objects),
+        surfaces=Surfaces(**joined),
+        outline_in_world=tuple(outlines),
+    )

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -13,10 +12,11 @@ from typing import Any
 import av
 import cv2
 import numpy as np
-import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+from tqdm import tqdm
 
 from rendering.camera import camera_matrix
-from rendering.config import COCO_NAMES, Array, DetectorConfig, Image, RoomConfig
+from rendering.config import COCO_NAMES, Array, Image, RoomConfig
 from rendering.detector import FrameDetections, simulate_detections
 from rendering.ground_truth import FrameTruth
 from rendering.models import rotation_z
@@ -25,50 +25,27 @@ from rendering.room import make_room
 from rendering.surfaces import Room
 
 
-def run_lengths(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.uint32]:
-    """COCO-style run lengths, column-major, zeros first; none for an empty array."""
-    flat = mask.ravel(order="F")
-    if not flat.size:
-        return np.zeros(0, np.uint32)
-    turns = np.nonzero(flat[1:] != flat[:-1])[0] + 1
-    edges = np.concatenate([[0] if not flat[0] else [0, 0], turns, [flat.size]])
-    return np.diff(edges).astype(np.uint32)
-
-
-@dataclass(frozen=True, slots=True)
-class PackedDetections:
-    """Detections of one frame with their masks as run lengths."""
-
-    xyxy: Array  # (D, 4) px, corner convention
-    score: Array  # (D,)
-    class_id: npt.NDArray[np.int64]  # (D,)
-    runs: tuple[npt.NDArray[np.uint32], ...]  # D times; an empty array where there is no mask
-
-
-def pack_detections(found: FrameDetections) -> PackedDetections:
-    """Replace the masks of a frame by their run lengths, which take far less memory."""
-    runs = tuple(run_lengths(mask) for mask in found.masks)
-    return PackedDetections(found.xyxy, found.score, found.class_id, runs)
-
-
-def save_detections(path: Path, frames: Sequence[PackedDetections], size: tuple[int, int]) -> None:
+def save_detections(path: Path, frames: Sequence[FrameDetections], size: tuple[int, int]) -> None:
     """Write `detections.npz`: arrays over all frames, masks as concatenated run lengths."""
-    runs = [run for frame in frames for run in frame.runs]
-    lengths = np.array([len(run) for run in runs], np.int64)
+    runs = [np.zeros(0, np.uint32), *(run for frame in frames for run in frame["runs"])]
+    table = {
+        key: np.concatenate([frame[key] for frame in frames])
+        for key in ("xyxy", "score", "class_id")
+    }
     np.savez_compressed(
         path,
-        frame=np.repeat(np.arange(len(frames), dtype=np.int64), [len(f.score) for f in frames]),
-        xyxy=np.concatenate([f.xyxy for f in frames]).round(2),
-        score=np.concatenate([f.score for f in frames]).round(4),
-        class_id=np.concatenate([f.class_id for f in frames]).astype(np.int64),
+        frame=np.repeat(np.arange(len(frames), dtype=np.int64), [len(f["score"]) for f in frames]),
+        xyxy=table["xyxy"].round(2),
+        score=table["score"].round(4),
+        class_id=table["class_id"],
         class_names=np.array(COCO_NAMES),
         image_size=np.array(size, np.int64),
-        mask_counts=np.concatenate(runs) if runs else np.zeros(0, np.uint32),
-        mask_offsets=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
+        mask_counts=np.concatenate(runs),
+        mask_offsets=np.cumsum([len(run) for run in runs], dtype=np.int64),
     )
 
 
-def mot_lines(frame: int, truth: FrameTruth, room: Room, size: tuple[int, int]) -> list[str]:
+def mot_lines(frame: int, truth: FrameTruth, room: Room) -> list[str]:
     """MOTChallenge ground truth of one frame: visible boxes of objects seen well enough."""
     lines = []
     for item in room.objects:
@@ -80,33 +57,19 @@ def mot_lines(frame: int, truth: FrameTruth, room: Room, size: tuple[int, int]) 
     return lines
 
 
-def quaternion_xyzw(rotation: Array) -> Array:
-    """Unit quaternion of a (3, 3) rotation: the eigenvector of its 4x4 form, w >= 0.
-
-    Ref: Bar-Itzhack, New method for extracting the quaternion from a rotation matrix, 2000.
-    """
-    r = rotation
-    form = np.zeros((4, 4))
-    form[:3, :3] = r + r.T - np.trace(r) * np.eye(3)
-    form[:3, 3] = form[3, :3] = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
-    form[3, 3] = np.trace(r)
-    quaternion = np.linalg.eigh(form)[1][:, -1]
-    return np.asarray(quaternion * (1 if quaternion[3] >= 0 else -1))
-
-
 def tum_line(seconds: float, cam_from_world: Array) -> str:
     """`t tx ty tz qx qy qz qw`, world_from_cam."""
     rotation = cam_from_world[:, :3].T
     center = -rotation @ cam_from_world[:, 3]
-    return f"{seconds:.6f} " + " ".join(f"{v:.9f}" for v in (*center, *quaternion_xyzw(rotation)))
+    xyzw = Rotation.from_matrix(rotation).as_quat(canonical=True)
+    return f"{seconds:.6f} " + " ".join(f"{v:.9f}" for v in (*center, *xyzw))
 
 
 def world_of_camera(cam_from_world: Array) -> Array:
     """room_from_world (4, 4) of a world at a camera (3, 4): x is its heading, z is up."""
     forward = cam_from_world[2, :3]
-    heading = np.arctan2(forward[1], forward[0])
     world = np.eye(4)
-    world[:3, :3] = rotation_z(float(heading))
+    world[:3, :3] = rotation_z(np.arctan2(forward[1], forward[0]))
     world[:3, 3] = -cam_from_world[:, :3].T @ cam_from_world[:, 3]
     return world
 
@@ -133,21 +96,17 @@ def objects_json(room: Room, config: RoomConfig) -> dict[str, Any]:
         "camera_axes": "x right, y down, z forward",
         "pixels": "corner (COLMAP)",
     }
-    settings = {name: getattr(config, name) for name in config.__slots__}
-    if config.plan == "home":
-        del settings["plan"]
-    head: dict[str, Any] = {
+    return {
         "format": "reobj-room-truth",
         "version": 1,
         "units": "m",
         "up_axis": "+z",
-    }
-    head |= {
         "conventions": conventions,
-        "config": settings,
+        "config": asdict(config),
         "room_m": [round(v, 6) for v in room.size_m],
+        "K": camera_matrix(config).tolist(),
+        "objects": objects,
     }
-    return {**head, "K": camera_matrix(config).tolist(), "objects": objects}
 
 
 def camera_line(config: RoomConfig) -> str:
@@ -185,78 +144,58 @@ class VideoSink:
         """Append a frame."""
         if self._stream is None:
             self._file.write(image)
-            return
-        frame = av.VideoFrame.from_ndarray(image, format="bgr24")
-        self._file.mux(self._stream.encode(frame))
+        else:
+            frame = av.VideoFrame.from_ndarray(image, format="bgr24")
+            self._file.mux(self._stream.encode(frame))
 
     def close(self) -> None:
         """Finish the file."""
         if self._stream is None:
             self._file.release()
-            return
-        self._file.mux(self._stream.encode())
-        self._file.close()
+        else:
+            self._file.mux(self._stream.encode())
+            self._file.close()
 
 
 def write_clip(
     out: Path,
     config: RoomConfig,
-    detector: DetectorConfig,
     png: bool = False,
     crf: int | None = None,
     own_world: bool = False,
+    room: Room | None = None,
+    cameras: Array | None = None,
+    watch: Callable[[Frame], None] | None = None,
 ) -> dict[str, int]:
     """Render a clip into a folder, with all truth files.
 
     Args:
         own_world: write poses in a world with its origin at the first camera, which looks along x.
-    """
-    room = make_room(config)
-    return write_room(out, room, config, detector, png=png, crf=crf, own_world=own_world)
-
-
-def write_room(
-    out: Path,
-    room: Room,
-    config: RoomConfig,
-    detector: DetectorConfig,
-    cameras: Array | None = None,
-    watch: Callable[[Frame], None] | None = None,
-    png: bool = False,
-    crf: int | None = None,
-    own_world: bool = False,
-) -> dict[str, int]:
-    """Render a clip of a room that exists into a folder, with all truth files.
-
-    Args:
-        cameras: cam_from_world (F, 3, 4); the path of the config by default.
+        room, cameras: with the path cam_from_world (F, 3, 4); those of the config by default.
         watch: called with every frame.
-        own_world: write poses in a world with its origin at the first camera, which looks along x.
     """
+    room = room or make_room(config)
     world = np.eye(4)  # room_from_world
     out.mkdir(parents=True, exist_ok=True)
-    size = (config.width, config.height)
     mot: list[str] = []
     tum: list[str] = []
-    found: list[PackedDetections] = []
+    found: list[FrameDetections] = []
     writer = VideoSink(out / "room.mp4", config, crf)
-    for frame in render_clip(room, config, cameras):
+    clip = render_clip(room, config, cameras)
+    for frame in tqdm(clip, "render", config.frames, disable=None):
         if watch:
             watch(frame)
         writer.write(frame.image)
         if png:
             cv2.imwrite(str(out / f"frame_{frame.index:05d}.png"), frame.image)
         rng = np.random.default_rng([config.seed, 5, frame.index])
-        found.append(
-            pack_detections(simulate_detections(room, frame.truth, frame.instance, detector, rng))
-        )
-        mot += mot_lines(frame.index, frame.truth, room, size)
+        found.append(simulate_detections(room, frame.truth, frame.instance, rng))
+        mot += mot_lines(frame.index, frame.truth, room)
         if own_world and not tum:
             world = world_of_camera(frame.cam_from_world)
         tum.append(tum_line(frame.index / config.fps, frame.cam_from_world @ world))
-        show_progress(frame.index + 1, config.frames)
     writer.close()
-    save_detections(out / "detections.npz", found, size)
+    save_detections(out / "detections.npz", found, (config.width, config.height))
     (out / "gt_mot.txt").write_text("\n".join(mot) + "\n")
     (out / "poses.txt").write_text("\n".join(tum) + "\n")
     (out / "camera.txt").write_text(camera_line(config) + "\n")
@@ -265,12 +204,5 @@ def write_room(
         "frames": config.frames,
         "objects": len(room.objects),
         "boxes": len(mot),
-        "detections": sum(len(f.score) for f in found),
+        "detections": sum(len(f["score"]) for f in found),
     }
-
-
-def show_progress(done: int, total: int) -> None:
-    """A counter on stderr, only on a terminal."""
-    if sys.stderr.isatty():
-        sys.stderr.write(f"\rrender {done}/{total}" + ("\n" if done == total else ""))
-        sys.stderr.flush()
