@@ -114,6 +114,16 @@ GONE = {
 
 LAYERS = frozenset({"solids", "ellipses", "trails", "boxes"})  # of the overlay video of 0.2.0
 
+# What the value of a flag is, in --help; the flags of other options of type str take a NAME
+VALUES = {
+    "input.max_size": "PIXELS", "detect.model": "MODEL", "detect.words": "WORDS",
+    "detect.classes": "NAMES", "detect.format": "FORMAT", "detect.layout": "LAYOUT",
+    "embed.model": "MODEL", "tracker.high_score": "SCORE", "poses.mode": "FILE",
+    "poses.fmt": "FORMAT", "poses.camera": "CAMERA", "poses.camera_format": "FORMAT",
+    "poses.depth": "FOLDER", "objects.priors": "FILE", "objects.prior": "WORD=SIZE",
+    "objects.known_size": "NAME=HEIGHT", "objects.support": "SHAPE", "map.path": "FILE",
+}  # fmt: skip
+
 EXPECTED = {
     bool: "true or false", int: "a whole number, 0 or more", float: "a number, 0 or more",
     str: "a text",
@@ -280,7 +290,7 @@ def add_flags(parser: argparse.ArgumentParser, config: Any, sections: Iterable[s
         flags = f.metadata["flags"]
         if flags and name.rpartition(".")[0] in sections:
             kind = type(f.default)
-            named = flags[0][2:].upper()
+            named = VALUES.get(name, "NAME" if kind is str else "N")
             action = "append" if f.metadata["repeated"] else "store"
             settings: dict[str, Any] = {"type": kind, "metavar": named, "action": action}
             if kind is bool:
