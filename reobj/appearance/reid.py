@@ -167,7 +167,7 @@ class SimilarityCalibration:
             background (last axis), of different and of same objects (first axis).
     """
 
-    # fitted by `benchmarks/rank_k.py --calibrate` to 12 rendered rooms, with and without masks; the
+    # fitted to 12 rendered rooms, with and without masks; the
     # weights lie between the fits of several embeddings (benchmarks/RESULTS.md)
     WEIGHTS = (0.55, 0.5)  # of foreground and background
     # mean log similarity of foreground and background: of different, of same objects
