@@ -11,7 +11,7 @@ import dataclasses
 import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -548,27 +548,17 @@ def join_fits(
         fits: of the objects of each component, in their order; None for one without objects.
         component_of_object: (O,).
     """
-    if len(fits) == 1:
+    if len(fits) == 1 or not any(fits):
         return fits[0]
-    made = [(k, fit) for k, fit in enumerate(fits) if fit is not None]
-    if not made:
-        return None
-    order = np.argsort(np.argsort(component_of_object, kind="stable"))  # (O,) row in `made`
-    inlier = np.zeros((int(poses.known.sum()), len(order)), bool)
-    for k, fit in made:
-        inlier[np.ix_(poses.part[poses.known] == k, component_of_object == k)] = fit.inlier
-    reasons = [reason for _, fit in made for reason in fit.reason]
-    per_object = ("size", "cov", "support", "rms_px", "status", "parallax_deg", "prior_share")
-    columns: dict[str, Any] = {
-        name: np.concatenate([getattr(fit, name) for _, fit in made])[order] for name in per_object
-    }
-    return dataclasses.replace(
-        quadrics.ObjectFits.unfitted(inlier.shape, "") if fits[0] is None else fits[0],
-        ellipsoids=quadrics.Ellipsoids.concatenate([fit.ellipsoids for _, fit in made])[order],
-        inlier=inlier,
-        reason=[reasons[i] for i in order],
-        **columns,
-    )
+    shape = (int(poses.known.sum()), len(component_of_object))
+    joined = quadrics.ObjectFits.unfitted(shape, "")
+    for k, fit in enumerate(fits):
+        if fit is not None:
+            objects = np.flatnonzero(component_of_object == k)
+            joined.put(objects, fit)
+            joined.inlier[np.ix_(poses.part[poses.known] == k, objects)] = fit.inlier
+    first = fits[0] or joined
+    return dataclasses.replace(joined, scale=first.scale, up=first.up, up_source=first.up_source)
 
 
 # ---- Interpolation -----------------------------------------------------------------------------
