@@ -17,7 +17,7 @@ PAGE = Path(__file__).parent / "api.md"
 DEFAULT = 24  # characters of a default value that is shown
 INTERNAL = set(
     "cached cameras_text cells clip_segments cut fault flush frozen keep_embeddings selects "
-    "look maps masked run_conv_block span_text to_json trained updated".split()
+    "look maps masked of put run_conv_block span_text to_json trained updated".split()
 )  # methods for the tool itself
 
 HEAD = """# Python reference

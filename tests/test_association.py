@@ -270,15 +270,6 @@ def test_detections_are_assigned_to_their_objects_one_to_one() -> None:
     assert (found.gains(detected_in(table_of(walk(30)), walk(30))) > 50).all()
 
 
-def test_a_duplicate_object_is_pruned_and_its_detections_reassigned() -> None:
-    three = chairs()
-    four = Shapes.concatenate([three, three[[0]]])
-    made, found = association_of(four, walk(30))
-    for _ in range(3):
-        found = made._prune(found)
-    assert len(found.shapes) == 3 and (found.label >= 0).all()
-
-
 def test_ambiguous_detections_are_excluded_from_refits() -> None:
     _, found = association_of(chairs(), walk(30))
     assert found.unambiguous().all()

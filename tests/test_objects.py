@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -144,8 +142,7 @@ def test_an_object_lists_its_two_most_probable_classes() -> None:
     assert list(once) == ["chair"] and 0.1 < once["chair"] < 0.3  # one box is weak evidence
 
 
-def test_priors_support_and_up_reach_the_fit(tmp_path: Path) -> None:
-    """The fit uses the configured priors, shape and up direction."""
+def test_support_and_up_reach_the_fit() -> None:
     poses = dataclasses.replace(walk(20), up_in_world=None)
     tracks = tracks_of(poses)
     tilted = np.array([0, 0.1, 1]) / np.hypot(0.1, 1)
@@ -154,14 +151,6 @@ def test_priors_support_and_up_reach_the_fit(tmp_path: Path) -> None:
     assert {o.support for o in result.objects} == {"cylinder"}
     assert result.world.up_source == "given"
     np.testing.assert_allclose(result.world.up_in_world, tilted, atol=1e-5)
-
-    own = Path(quadrics.__file__).with_name("priors.json")
-    small = json.loads(own.read_text().replace('"chair"', '"armchair of a doll"'))
-    (tmp_path / "priors.json").write_text(json.dumps(small))
-    few = tracks[tracks.frame < 3]  # hardly any parallax: the prior decides the depth
-    sizes = [fitted(few, poses, options(priors=p, support="box")).objects[0].size_rel_sigma.max()
-             for p in ("", str(tmp_path / "priors.json"))]  # fmt: skip
-    assert sizes[1] > 1.2 * sizes[0]  # an unknown category constrains the size less
 
 
 @pytest.mark.parametrize("text", ["north", "0,0,0", "1,2,nan"])

@@ -238,21 +238,19 @@ def describe_world(
     if poses is None:
         return World(links=tuple(events))
     components = tuple(_describe_component(poses, k, fit) for k, fit in enumerate(fits))
-    largest = components[0]
+    of_largest = (
+        "registered_frames", "interpolated_frames", "up_in_world", "up_source", "scale", "floor",
+        "floor_reason",
+    )  # fmt: skip
+    largest: dict[str, Any] = {name: getattr(components[0], name) for name in of_largest}
     return World(
         units="m" if poses.metric else "arbitrary",
         source=poses.source,
-        registered_frames=largest.registered_frames,
-        interpolated_frames=largest.interpolated_frames,
         frames=len(poses.frame),
-        up_in_world=largest.up_in_world,
-        up_source=largest.up_source,
-        scale=largest.scale,
         links=tuple(events),
         parts=components,
-        floor=largest.floor,
-        floor_reason=largest.floor_reason,
         reading=poses.reading,
+        **largest,
     )
 
 
