@@ -301,7 +301,7 @@ def components_message(poses: Poses) -> list[str]:
 # ---- Confidence ----
 
 # Logistic regression of existence: intercept, log odds of the best scores, hit rate over the frames
-# where the object should be visible, see-through ratio (`occlusion.see_through_ratio`). Fitted to
+# where the object should be visible, see-through ratio (`see_through_ratio`). Fitted to
 # 1,202 objects of 48 runs of 10 rooms (benchmarks/RESULTS.md)
 CONFIDENCE = (-1.0, 1.5, 1.8, -1.5)
 FITTED_TO = "YOLOv8s, deimv2-femto, rendered rooms"
@@ -320,7 +320,7 @@ def existence_probability(score: Array, hit_rate: Array, see_through: Array | fl
     """Return the probability that objects exist.
 
     Args:
-        score: `log_best_odds` of the detections. see_through: `occlusion.see_through_ratio`.
+        score: `log_best_odds` of the detections. see_through: `see_through_ratio`.
         hit_rate: over the frames where the object should be visible; NaN: it has no shape.
     """
     intercept, of_score, of_hit_rate, of_see_through = CONFIDENCE

@@ -281,25 +281,21 @@ def _link_component(
 
 def _joined(components: Iterable[Links]) -> Links:
     """Join the linked components; identities are numbered after those of the components before."""
-    joined = list[Tracks]()
-    sources = list[IntArray]()
-    events = list[LinkEvent]()
-    shapes = list[ComponentShapes | None]()
-    certainty: dict[int, float] = {}
-    label_of: dict[int, int] = {}
-    offset = 0
-    for linked in components:
-        joined.append(dataclasses.replace(linked.tracks, track_id=linked.tracks.track_id + offset))
-        sources.append(linked.source)
-        events += linked.events
-        shapes += linked.shapes
-        certainty |= {identity + offset: value for identity, value in linked.confidence.items()}
-        label_of |= {identity + offset: label for identity, label in linked.label_of.items()}
-        offset = int(joined[-1].track_id.max(initial=offset))
+    linked = list(components)
+    highest = [int(c.tracks.track_id.max(initial=0)) for c in linked]
+    pairs = list(zip(linked, itertools.accumulate([0, *highest[:-1]]), strict=True))
+    joined = [dataclasses.replace(c.tracks, track_id=c.tracks.track_id + o) for c, o in pairs]
     order = np.argsort(np.concatenate([tracks.frame for tracks in joined]), kind="stable")
     tracks = Tracks.joined(joined)
-    source = np.concatenate(sources)[order]
-    return Links(tracks, source, tracks.class_id, events, certainty, shapes, label_of)
+    return Links(
+        tracks,
+        np.concatenate([c.source for c in linked])[order],
+        tracks.class_id,
+        [event for c in linked for event in c.events],
+        {identity + o: value for c, o in pairs for identity, value in c.confidence.items()},
+        [shapes for c in linked for shapes in c.shapes],
+        {identity + o: label for c, o in pairs for identity, label in c.label_of.items()},
+    )
 
 
 def _with_untracked(tracks: Tracks, untracked: Tracks) -> tuple[Tracks, IntArray]:
