@@ -1036,7 +1036,7 @@ def _problems(spec: _Spec, hyp: IntArray, code: IntArray, axis: IntArray) -> _Pr
     tilt = (1.0 - vertical) / spec.tilt_rad**2 * bool(np.any(spec.up))
     round_ = spec.round_[hyp] | ((code == Shape.CYLINDER) & (spec.natural[hyp] != Shape.CYLINDER))
     tie = np.array([[1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, 0.0]]) / ROUND_LOG**2
-    own_info = np.linalg.inv(spec.size_cov)[hyp]
+    own_info: Array = np.linalg.inv(spec.size_cov)[hyp]
     level = 0.5 * (mean[:, [0, 0, 2]] + mean[:, [1, 1, 2]])
     mean = np.where(round_[:, None], level, mean)
     kind = spec.kind[hyp]
@@ -1214,7 +1214,7 @@ def _best_starts(few: _Data, spec: _Spec, cfg: FitConfig) -> _Fit:
     noise, common, evidence = np.ones((3, len(keep)))
     return _Fit(
         spec.obj[hyp[keep]], hyp[keep], code[keep], axis[keep], prob[keep], state[keep],
-        solved.hessian[keep], inlier, noise, common, evidence, inlier.any(-1),
+        solved.hessian[keep], inlier, noise, common, evidence, np.asarray(inlier.any(-1)),
         total / mass[:, None, None],
     )  # fmt: skip
 

@@ -247,7 +247,8 @@ class Categories:
 
     def usual_size(self, classes: IntArray) -> Array:
         """Return width, depth and height (G, 3)."""
-        return np.exp(self.priors.of("log_mean", self.rows(classes))) / self.scale.value
+        log_size = self.priors.of("log_mean", self.rows(classes))
+        return np.asarray(np.exp(log_size) / self.scale.value)
 
     def on_floor(self, classes: IntArray) -> BoolArray:
         """Mark the classes (G,) that stand on the floor."""
