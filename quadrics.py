@@ -1036,7 +1036,7 @@ def _problems(spec: _Spec, hyp: IntArray, code: IntArray, axis: IntArray) -> _Pr
     tilt = (1.0 - vertical) / spec.tilt_rad**2 * bool(np.any(spec.up))
     round_ = spec.round_[hyp] | ((code == Shape.CYLINDER) & (spec.natural[hyp] != Shape.CYLINDER))
     tie = np.array([[1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, 0.0]]) / ROUND_LOG**2
-    own_info: Array = np.linalg.inv(spec.size_cov)[hyp]
+    own_info = np.asarray(np.linalg.inv(spec.size_cov)[hyp], np.float64)
     level = 0.5 * (mean[:, [0, 0, 2]] + mean[:, [1, 1, 2]])
     mean = np.where(round_[:, None], level, mean)
     kind = spec.kind[hyp]

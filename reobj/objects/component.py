@@ -411,7 +411,7 @@ def _along_rays(
 
     def from_top(height: Array) -> Array:
         """Return centres (g, D, 3) of shapes of this height (g, D) below the top of the box."""
-        return point + ((top_height - height / 2) - point @ up)[..., None] * up
+        return np.asarray(point + ((top_height - height / 2) - point @ up)[..., None] * up)
 
     if floor is None:
         shorter = size[..., 1] < usual[..., 1]

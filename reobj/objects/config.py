@@ -335,7 +335,8 @@ def _as_fits(
         reason: why the others have no ellipsoid.
     """
     none = quadrics.ObjectFits.unfitted(views.boxes.shape[:2], reason)
-    good = np.isfinite(ellipsoids.dual_quadrics()).all((1, 2)) & (ellipsoids.half_axes > 0).all(1)
+    finite = np.isfinite(ellipsoids.dual_quadrics()).all((1, 2))
+    good = np.asarray(finite & (ellipsoids.half_axes > 0).all(1))  # (O,)
     return dataclasses.replace(
         none,
         ellipsoids=ellipsoids,
