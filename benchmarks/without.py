@@ -31,9 +31,9 @@ COMPONENT = "reobj.objects.component"
 WITHOUT: dict[str, dict[str, Any]] = {
     "occluded edges": {f"{LIKELIHOOD}.OCCLUDED_EDGES": 0.0},
     "occluded edges in the fit": {
-        "quadrics.CAUCHY_HIDDEN": quadrics.CAUCHY,
-        "quadrics.HUBER_HIDDEN": quadrics.HUBER,
-        "quadrics.HIDDEN_CAP": quadrics.OUTLIER_CAP,
+        "quadrics.CAUCHY_OCCLUDED": quadrics.CAUCHY,
+        "quadrics.HUBER_OCCLUDED": quadrics.HUBER,
+        "quadrics.OCCLUDED_CAP": quadrics.OUTLIER_CAP,
     },
     "edges above the floor": {"reobj.objects.observations.ABOVE_FLOOR": np.inf},
     "widening": {f"{ASSOCIATION}.WIDENING_ROUNDS": 0},

@@ -18,7 +18,7 @@ DEFAULT = 24  # characters of a default value that is shown
 FIELDS = 14  # an options class with more has its fields in its docstring only
 INTERNAL = set(
     "cached cameras_text cells cut fault flush frozen keep_embeddings selects "
-    "look maps masked run_conv_block span_text to_json trained updated".split()
+    "look maps masked of put run_conv_block span_text to_json trained updated".split()
 )  # methods for the tool itself
 
 HEAD = """# Python reference

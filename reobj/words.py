@@ -193,13 +193,13 @@ def priors_used(path: str, given: str, names: Sequence[str]) -> list[str]:
 # ---- Known sizes: --known-size ----
 
 
-def parse_known_size(text: str) -> dict[str | int, tuple[str | int, float]]:
+def parse_known_size(text: str) -> dict[str | int, tuple[str, float]]:
     """Parse 'chair=0.82m,door=2.0m' into heights in metres by category.
 
     >>> parse_known_size("door=2.0m, chair=82cm")
     {'door': ('h', 2.0), 'chair': ('h', 0.82)}
     """
-    sizes: dict[str | int, tuple[str | int, float]] = {}
+    sizes: dict[str | int, tuple[str, float]] = {}
     for item in filter(None, (entry.strip() for entry in text.split(","))):
         category, _, value = (part.strip() for part in item.rpartition("="))
         height_m = _lengths_m(NUMBER + UNIT, value)

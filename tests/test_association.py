@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ import quadrics
 import reobj_track as rt
 from reobj.cameras import distort_boxes
 from reobj.objects import association, likelihood
-from reobj.objects.association import MAX_BOX_GAIN, MISSED, Association, Associator
+from reobj.objects.association import Association, Associator
 from reobj.objects.component import associate_component, propose
 from reobj.objects.config import make_fit
 from reobj.objects.description import (
@@ -98,27 +97,6 @@ def test_a_box_may_be_half_occluded_but_not_exceed_the_projection(
     table = table_of(poses)
     occluded, larger = (odds_of(shifted(table, np.array(by)), poses) for by in (inside, outside))
     assert odds_of(table, poses) >= occluded > larger + 1
-
-
-@pytest.mark.parametrize("shown", [0.5, 0.3, 0.15])
-def test_the_occluded_fraction_of_the_height_is_uniform(shown: float) -> None:
-    """Only the upper end is visible: each occluded fraction of the height is equally likely."""
-    projected, size = np.array([[100.0, 100, 180, 300]]), (640, 480)
-    part = projected.copy()
-    part[0, 3] = 100 + shown * 200
-    whole, half, some = (
-        likelihood._box_log_odds(projected, box, size)[0]
-        for box in (projected, projected - [[0, 0, 0, 100]], part)
-    )
-    assert whole > half > 2
-    # The occluded edge is uniform over the projection, a clutter box has a density prop. to 1 / h;
-    # the sigma of the upper edge is a fraction of the mean height.
-    expected = np.log(shown / 0.5) - np.log((1 + shown) / 1.5)
-    assert some - half == pytest.approx(expected, abs=0.02)
-    beyond = projected.copy()
-    beyond[0, 3] = 100 - 30  # above its upper edge
-    beyond[0, 1] = 50
-    assert likelihood._box_log_odds(projected, beyond, size)[0] < 0
 
 
 def test_scores_and_classes_change_the_odds() -> None:
@@ -220,15 +198,6 @@ def test_strong_detections_that_do_not_agree_are_clutter() -> None:
     assert (found[~wild] >= 0).all() and len(np.unique(found[~wild])) == 2
 
 
-def test_random_boxes_give_no_objects() -> None:
-    poses = walk(30)
-    table = table_of(poses)
-    corner = np.random.default_rng(1).uniform(0, 300, (len(table), 2))
-    side = np.random.default_rng(2).uniform(20, 300, corner.shape)
-    wild = dataclasses.replace(table, xyxy=np.concatenate([corner, corner + side], 1))
-    assert (located(wild, poses) < 0).mean() > 0.7
-
-
 @pytest.mark.parametrize(("off_px", "name"), [(3.0, "chair"), (0.0, "couch")])
 def test_duplicate_detections_give_one_object(off_px: float, name: str) -> None:
     """A second tracklet shows the first chair in every frame: slightly off, or of another class."""
@@ -301,38 +270,12 @@ def test_detections_are_assigned_to_their_objects_one_to_one() -> None:
     assert (found.gains(detected_in(table_of(walk(30)), walk(30))) > 50).all()
 
 
-def test_a_duplicate_object_is_pruned_and_its_detections_reassigned() -> None:
-    three = chairs()
-    four = Shapes.concatenate([three, three[[0]]])
-    made, found = association_of(four, walk(30))
-    for _ in range(3):
-        found = made._prune(found)
-    assert len(found.shapes) == 3 and (found.label >= 0).all()
-
-
 def test_ambiguous_detections_are_excluded_from_refits() -> None:
-    made, found = association_of(chairs(), walk(30))
+    _, found = association_of(chairs(), walk(30))
     assert found.unambiguous().all()
     slipped = np.flatnonzero(found.label == 0)[:4]
     found.label[slipped] = 1  # four boxes of a chair are given to the next one
     np.testing.assert_array_equal(np.flatnonzero(~found.unambiguous()), slipped)
-    score = np.random.default_rng(0).random(len(found.label))
-    kind = np.random.default_rng(1).integers(-1, 4, len(found.label))
-    made.detections = dataclasses.replace(made.detections, score=score, class_id=kind)
-    found.label[found.label == 2] = -1
-    made.fit_shapes = Mock(return_value=found.shapes)
-    made._refit(found)
-    rows, _, classes, _ = made.fit_shapes.call_args.args
-    np.testing.assert_array_equal(rows, np.flatnonzero(found.unambiguous()))
-    own = [(found.label == obj)[:, None] & (kind.clip(0)[:, None] == range(4)) for obj in (0, 1)]
-    assert classes.tolist() == [*((score @ w).argmax() for w in own), CHAIR]  # none: unchanged
-
-
-def test_a_duplicate_without_unambiguous_detections_is_fitted_to_all() -> None:
-    four = Shapes.concatenate([chairs(), chairs()[[0]]])
-    _, found = association_of(four, walk(30))
-    assert found.unambiguous().all() and len(np.unique(found.label)) >= 3
-    assert not association_of(chairs()[[]], walk(30))[1].unambiguous().any()
 
 
 def test_of_two_duplicates_the_better_fitting_one_stays() -> None:
@@ -377,63 +320,6 @@ def test_a_part_of_an_object_is_no_separate_object(
     for pair in ([solid, other], [other, solid]):
         found = association._coincide(Shapes.concatenate(pair))
         assert found[0, 1] == found[1, 0] == one
-
-
-def test_greedy_selection_adds_the_largest_marginal_gain() -> None:
-    """Equals re-evaluating every object in every round; ties go to the first."""
-    three = chairs()
-    rng = np.random.default_rng(0)
-    near = three[np.tile(np.arange(3), 8)]
-    off = rng.normal(0, 0.15, near.ellipsoids.center_in_world.shape)
-    moved = dataclasses.replace(
-        near.ellipsoids, center_in_world=near.ellipsoids.center_in_world + off
-    )
-    many = Shapes.concatenate([dataclasses.replace(near, ellipsoids=moved), three[[0]], three[[0]]])
-    made, _ = association_of(three, walk(30))
-    made.size_log_odds = lambda s: 1.25 + np.arange(len(s))
-    of = made._unassigned(many)
-    seen, cost, view = of.evidence, of.costs(), made.detections.view
-    value = np.minimum(seen.assignment, seen.existence + MAX_BOX_GAIN)
-    explained, expected = np.zeros(len(view)), list[int]()
-    while True:
-        gain, tops = -cost, np.zeros((len(many), len(seen.expected)))
-        np.maximum.at(tops, (seen.obj, view[seen.row]), value - explained[seen.row])
-        gain += (tops + MISSED * (seen.expected.T & (tops > 0))).sum(1)
-        gain[expected] = -np.inf
-        if gain.max() <= 0:
-            break
-        expected.append(int(gain.argmax()))
-        own = (seen.obj == expected[-1]) & (value > 0)
-        np.maximum.at(explained, seen.row[own], value[own])
-    assert len(expected) > 1 and made._select_greedily(of).tolist() == expected
-
-
-def test_the_gain_of_a_merge_uses_all_rows_of_both() -> None:
-    """Computed by loops: each object's summed log odds, with one hit per frame at its best row."""
-    three = chairs()
-    made, found = association_of(three, walk(12))
-    rng = np.random.default_rng(1)
-    label = found.label.copy()
-    label[rng.random(len(label)) < 0.3] = 0  # several rows of an object in one frame
-    strong = np.array([0, 1])
-    weak = np.array([2, 0])
-    fitted = three[[0, 1]]
-    seen = made._unassigned(fitted).evidence
-    view = made.detections.view
-    expected = -made._unassigned(fitted).costs()
-    for k in range(2):
-        best: dict[int, tuple[float, int]] = {}
-        rows = [n for n in range(len(seen.row)) if seen.obj[n] == k]
-        rows = [n for n in rows if label[seen.row[n]] in (strong[k], weak[k])]
-        for n in rows:
-            frame = int(view[seen.row[n]])
-            best[frame] = max(best.get(frame, (-np.inf, -n)), (float(seen.existence[n]), -n))
-        for n in rows:
-            frame = int(view[seen.row[n]])
-            hit = MISSED * seen.expected[frame, k] * (best[frame][1] == -n)
-            expected[k] += max(seen.existence[n] + hit, 0.0)
-    assert any(np.bincount(view[label == 0]) > 1)
-    np.testing.assert_allclose(made._joint_gains(label, strong, weak, fitted), expected)
 
 
 def test_a_size_is_compared_with_the_prior_per_axis() -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -144,23 +142,7 @@ def test_an_object_lists_its_two_most_probable_classes() -> None:
     assert list(once) == ["chair"] and 0.1 < once["chair"] < 0.3  # one box is weak evidence
 
 
-def test_known_size_sets_the_scale() -> None:
-    """A world of half the size and without metric poses: scaled by the chairs' .82 m."""
-    poses = walk()
-    tracks = tracks_of(poses)
-    poses = dataclasses.replace(poses, metric=False)
-    poses.cam_from_world[:, :, 3] *= 0.5
-    result = fitted(tracks, poses, options(known_size="chair=82cm"))
-    assert result.world.units == "arbitrary" and result.world.scale is not None
-    assert result.world.scale.source == "known_size"
-    assert result.world.scale.value == pytest.approx(2, rel=0.05)
-    for found in result.objects:
-        np.testing.assert_allclose(found.size_m, 2 * found.size, rtol=0.05)
-        np.testing.assert_allclose(np.sort(found.size_m), [0.56, 0.6, 0.82], rtol=0.1)
-
-
-def test_priors_support_and_up_reach_the_fit(tmp_path: Path) -> None:
-    """The fit uses the configured priors, shape and up direction."""
+def test_support_and_up_reach_the_fit() -> None:
     poses = dataclasses.replace(walk(20), up_in_world=None)
     tracks = tracks_of(poses)
     tilted = np.array([0, 0.1, 1]) / np.hypot(0.1, 1)
@@ -170,32 +152,11 @@ def test_priors_support_and_up_reach_the_fit(tmp_path: Path) -> None:
     assert result.world.up_source == "given"
     np.testing.assert_allclose(result.world.up_in_world, tilted, atol=1e-5)
 
-    own = Path(quadrics.__file__).with_name("priors.json")
-    small = json.loads(own.read_text().replace('"chair"', '"armchair of a doll"'))
-    (tmp_path / "priors.json").write_text(json.dumps(small))
-    few = tracks[tracks.frame < 3]  # hardly any parallax: the prior decides the depth
-    sizes = [fitted(few, poses, options(priors=p, support="box")).objects[0].size_rel_sigma.max()
-             for p in ("", str(tmp_path / "priors.json"))]  # fmt: skip
-    assert sizes[1] > 1.2 * sizes[0]  # an unknown category constrains the size less
-
 
 @pytest.mark.parametrize("text", ["north", "0,0,0", "1,2,nan"])
 def test_up_that_is_no_direction(text: str) -> None:
     with pytest.raises(rt.ReobjError, match="expected a direction"):
         parse_up(text)
-
-
-@pytest.mark.parametrize(
-    ("text", "sizes"),
-    [
-        ("", {}),
-        ("chair=0.82m,door=2m", {"chair": ("h", 0.82), "door": ("h", 2.0)}),
-        (" dining table = 75 cm ,", {"dining table": ("h", 0.75)}),  # names with blanks
-        ("cup=95mm", {"cup": ("h", 0.095)}),
-    ],
-)
-def test_known_sizes(text: str, sizes: dict[str, tuple[str, float]]) -> None:
-    assert parse_known_size(text) == sizes
 
 
 @pytest.mark.parametrize("text", ["door", "door=2furlongs", "=2m", "door=1.2.3m", "door=0m"])
@@ -298,15 +259,6 @@ def test_evidence_of_a_fit() -> None:
     assert found.score == 0.6 and found.class_name == "lamp" and found.reason == ""
 
 
-@pytest.mark.parametrize("status", ["ok", "prior_dominated", "rejected"])
-def test_only_rejected_objects_have_no_shape(status: str) -> None:
-    found = described(status=np.array([status]), reason=["so it is"])
-    assert (found.status, found.reason) == (status, "so it is")
-    assert found.located == (status != "rejected") == (found.center is not None)
-    assert (found.cov is None) == (found.half_axes is None) == (not found.located)
-    assert found.support == "box"
-
-
 def test_unseen_frames_do_not_count_as_views() -> None:
     """In five of eight frames the object has no box: no view, no outlier, no overlap of 0."""
     fits, views = a_fit(8, inlier=np.arange(8)[:, None] < 3)
@@ -330,23 +282,6 @@ def test_world_of_a_fit() -> None:
     assert (world.registered_frames, world.interpolated_frames, world.frames) == (5, 1, 6)
     assert world.scale == (2.123457, 0.1235, "priors") and world.links == (event,)
     assert world.up_source == "objects" and world.up_in_world.tolist() == [0, 0, 1]
-
-
-@pytest.mark.parametrize(
-    ("fit_knows", "poses_know", "up", "source"),
-    [(True, True, [0, 0, 1], "objects"), (False, True, [1, 0, 0], "poses"),
-     (False, False, None, "none")],
-)  # fmt: skip
-def test_up_comes_from_the_fit_or_the_poses(
-    fit_knows: bool, poses_know: bool, up: list[float] | None, source: str
-) -> None:
-    poses = dataclasses.replace(walk(3), up_in_world=np.array([1.0, 0, 0]) if poses_know else None)
-    changes = {} if fit_knows else {"up": np.zeros(3), "up_source": "none"}
-    world = describe_world(poses, [a_fit(**changes)[0]], [])
-    assert (None if world.up_in_world is None else world.up_in_world.tolist()) == up
-    assert world.up_source == source
-    flat = describe_world(poses, [None], [])
-    assert flat.scale is None and flat.up_source == ("poses" if poses_know else "none")
 
 
 def test_a_size_of_four_sigma_is_reported_and_not_set_aside() -> None:
@@ -437,20 +372,3 @@ def test_the_mean_box_ignores_outliers_and_the_order_of_axes() -> None:
     degrees = np.degrees(np.arctan2(turn[1, order[0]], turn[0, order[0]])) % 180
     assert degrees == pytest.approx(20, abs=1)
     assert (np.sqrt(np.diag(cov)) >= 0.05 * 0.2).all() and (np.linalg.eigvalsh(cov) > 0).all()
-
-
-def test_the_covariance_of_the_mean_box_follows_scatter_and_score() -> None:
-    rng = np.random.default_rng(1)
-    up = np.array([0, 0, 1.0])
-
-    def sigma(spread: float, score: float, count: int = 40) -> float:
-        size = np.exp(spread * rng.normal(size=(count, 3)))
-        cov = mean_box(boxes_of(0.0, size, 0.0, count), np.full(count, score), up)[3]
-        return float(np.sqrt(np.diag(cov)[3:6]).mean())
-
-    assert sigma(0.0, 0.9) == pytest.approx(0.05, rel=0.01)  # the error common to all boxes
-    assert sigma(0.3, 0.9) > 1.5 * sigma(0.05, 0.9)
-    assert sigma(0.3, 0.3) > sigma(0.3, 0.9)
-    lying = boxes_of(0.0, [1.0, 2.0, 3.0], 0.0, 1)
-    half = mean_box(lying, np.ones(1), np.array([1.0, 0, 0]))[1]
-    assert half[2] == pytest.approx(0.5)  # the axis along up is the last one

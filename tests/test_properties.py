@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from simulated import chair_solids, walk
 
 import quadrics
 import reobj_track as rt
@@ -27,7 +26,7 @@ from reobj.results.workspace import Workspace
 from reobj.sources.video import ImagelessVideo
 
 hypothesis = pytest.importorskip("hypothesis", reason="pip install hypothesis (dev extra)")
-from hypothesis import example, given, settings  # noqa: E402
+from hypothesis import example, given  # noqa: E402
 from hypothesis import strategies as st  # noqa: E402
 from hypothesis.extra import numpy as npst  # noqa: E402
 
@@ -245,9 +244,6 @@ def test_the_unmodified_files_are_valid(name: str, folder: Path, video: Any) -> 
     check(read(folder / name, video), video)
 
 
-# ---- Options ----
-
-
 # ---- Arrays ----
 
 
@@ -278,36 +274,3 @@ def test_frames_of_a_tracker_are_accepted_or_refused(rows: Any, value: float, at
                 np.isfinite(tracks.xyxy).all() and ((tracks.score >= 0) & (tracks.score <= 1)).all()
             )
             assert (tracks.xyxy[:, 2:] >= tracks.xyxy[:, :2]).all()
-
-
-@settings(max_examples=8)
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    value=st.sampled_from([np.nan, np.inf, 0.0, 1e300, -1e12, 1e-300]),
-    fraction=st.sampled_from([0.0, 0.05, 0.5, 1.0]),
-    cameras=st.booleans(),
-)
-@example(seed=5, value=1e300, fraction=0.05, cameras=False)
-@example(seed=5, value=np.inf, fraction=1.0, cameras=True)
-def test_fits_are_finite_or_none(seed: int, value: float, fraction: float, cameras: bool) -> None:
-    """Objects are located with finite numbers or not at all; the same for factorisations."""
-    rng, poses = np.random.default_rng(seed), walk(5)
-    img_from_world = poses.camera.K @ poses.cam_from_world
-    boxes = quadrics.solid_boxes(chair_solids(), "box", img_from_world)
-    boxes = np.concatenate([boxes, boxes + rng.normal(0, 2, boxes.shape)], 1)  # (5, 6, 4)
-    target = img_from_world if cameras else boxes
-    target[rng.random(target.shape) < fraction] = value
-    categories = ["chair"] * boxes.shape[1]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # squares of 1e300
-        try:
-            fits = quadrics.fit_objects(boxes, img_from_world, SIZE, categories)
-            for name in ("center_in_world", "half_axes"):
-                values = getattr(fits.ellipsoids, name)
-                assert (np.isfinite(values).all(1) | np.isnan(values).any(1)).all()
-            quadrics.fit_psfmo(boxes, quadrics.load_priors(), categories)
-        except REFUSED as error:
-            assert str(error).isprintable() and str(error)
-
-
-# ---- Caches ----

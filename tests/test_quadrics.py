@@ -1,24 +1,20 @@
 """quadrics.py against reference implementations, ground truth, symmetries and degenerate input.
 
-References: pycolmap (projection), sampled surface points (outlines), the lens formula and Monte
-Carlo (volumes), the cost of `fit_objects` written out edge by edge with finite differences, plain
-per-object versions of LfD and PSfMO written from the papers' equations, simulated truth, and the
-LfD authors' published demo (../shared/data/lfd_aldoma).
+References: pycolmap (projection), sampled surface points (outlines), Monte Carlo
+(volumes), the cost of `fit_objects` written out edge by edge with finite differences, simulated
+truth, and the LfD authors' published demo (../shared/data/lfd_aldoma).
 """
 
 from __future__ import annotations
 
-import itertools
 import json
-import re
 from pathlib import Path
 
 import numpy as np
 import own_priors
 import pytest
 import synthetic_quadrics as syn
-from scipy.stats import chi2
-from simulated import chair_solids, walk
+from simulated import walk
 
 import quadrics as q
 from reobj_track import COCO_NAMES
@@ -125,46 +121,10 @@ def test_rotation_vectors_invert_rotations() -> None:
 # ---- Independent implementations and bad input -----------------------------------------------
 
 
-def plain_lfd(boxes: np.ndarray, cams: np.ndarray, passes: int = 2) -> np.ndarray:
-    """LfD as published, one object at a time: the stand-in for the official code.
-
-    boxes (V, 4), cams (V, 3, 4) -> dual quadric (4, 4). For each view beta C* = P Q* P' with P and
-    C* in the frame where the ellipse is centred and of unit size; null vector by SVD; each further
-    pass has its origin at the centre found before. Ref: Rubino et al., PAMI 2018.
-    """
-    i, j = np.triu_indices(4)
-    r, s = np.triu_indices(3)
-    expand = np.zeros((16, 10))  # vec Q = expand @ vech Q
-    for k, (a, b) in enumerate(zip(i, j, strict=True)):
-        expand[4 * a + b, k] = expand[4 * b + a, k] = 1.0
-    origin = np.zeros(3)
-    dual_q = np.zeros((4, 4))
-    for _ in range(passes):
-        shift = np.eye(4)
-        shift[:3, 3] = origin
-        rows = np.zeros((6 * len(boxes), 10 + len(boxes)))
-        for v, (x1, y1, x2, y2) in enumerate(boxes):
-            half = 0.5 * np.array([x2 - x1, y2 - y1])
-            scale = np.linalg.norm(half)
-            frame = np.array([[scale, 0, (x1 + x2) / 2], [0, scale, (y1 + y2) / 2], [0, 0, 1]])
-            cam = np.linalg.inv(frame) @ cams[v] @ shift
-            kron = (np.kron(cam, cam) @ expand).reshape(3, 3, 10)
-            rows[6 * v : 6 * v + 6, :10] = kron[r, s]
-            conic = np.diag([*(half / scale) ** 2, -1.0])
-            rows[6 * v : 6 * v + 6, 10 + v] = -conic[r, s]
-        null = np.linalg.svd(rows)[2][-1, :10]
-        local = (expand @ null).reshape(4, 4)
-        local = -local / local[3, 3]
-        dual_q = shift @ local @ shift.T
-        origin = -dual_q[:3, 3]
-    return dual_q
-
-
 def spoil(boxes: np.ndarray, kind: str, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Replace one box in five of each scene; boxes (T, V, 1, 4) -> changed boxes, mask (T, V).
 
-    far: anywhere in the image; near: a neighbour half a box to a box away, of another size;
-    hidden: an occluder covers 30 to 60 % from one side.
+    far: anywhere in the image; near: a neighbour half a box to a box away, of another size.
     """
     out, trials, views = boxes.copy(), *boxes.shape[:2]
     wrong = np.zeros((trials, views), bool)
@@ -172,14 +132,9 @@ def spoil(boxes: np.ndarray, kind: str, rng: np.random.Generator) -> tuple[np.nd
         for v in rng.choice(views, max(1, views // 5), replace=False):
             wrong[t, v] = True
             size = boxes[t, v, 0, 2:] - boxes[t, v, 0, :2]
-            middle = boxes[t, v, 0, :2] + 0.5 * size
-            if kind == "hidden":
-                side = rng.integers(4)
-                sign = 1.0 if side < 2 else -1.0
-                out[t, v, 0, side] += sign * rng.uniform(0.3, 0.6) * size[side % 2]
-                continue
             turn = rng.uniform(0, 2 * np.pi)
-            near = middle + np.array([np.cos(turn), np.sin(turn)]) * size * rng.uniform(0.5, 1.2)
+            off = np.array([np.cos(turn), np.sin(turn)]) * size * rng.uniform(0.5, 1.2)
+            near = boxes[t, v, 0, :2] + 0.5 * size + off
             middle = near if kind == "near" else rng.uniform([0, 0], syn.IMAGE)
             size = size * np.exp(rng.normal(0, 0.3, 2))
             out[t, v, 0] = [*(middle - 0.5 * size), *(middle + 0.5 * size)]
@@ -250,6 +205,7 @@ def fuzz(n: int, rng: np.random.Generator) -> dict[str, int]:
             metric=bool(rng.integers(2)),
         )
         q.fit_lfd(boxes, cams)
+        q.fit_psfmo(boxes, priors, names or [None] * o, cams)
         q.reprojection_iou(fits, boxes, cams, (640, 480))
         counts["objects"] += o
         counts["bad"] += int((~is_honest(fits)).sum())
@@ -259,35 +215,6 @@ def fuzz(n: int, rng: np.random.Generator) -> dict[str, int]:
 
 
 # ---- LfD -----------------------------------------------------------------------------------
-
-
-def test_plain_lfd_agrees_with_the_batched_one() -> None:
-    """Independent per-object version (`plain_lfd`), same equations, world at the object."""
-    rng = np.random.default_rng(7)
-    solids = random_solids(6, rng)
-    solids = q.Ellipsoids(0.1 * solids.center_in_world, solids.half_axes, solids.world_from_obj)
-    cams = syn.arc_cameras(12, 170, rng)
-    boxes = syn.noisy(q.solid_boxes(solids, "ellipsoid", cams), 0.01, rng)
-    ours, real = q.fit_lfd(boxes, cams)
-    plain = np.array([plain_lfd(boxes[:, k], cams) for k in range(6)])
-    assert real.all()
-    overlap = q.volume_overlap(*(q.Ellipsoids.from_dual_quadrics(x)[0] for x in (ours, plain)))
-    assert overlap.min() > 0.99
-
-
-@pytest.mark.parametrize("shift", [(3.0, 2.0, 1.0), (-1000.0, 700.0, 20.0)])
-def test_lfd_does_not_depend_on_the_world_origin_or_unit(shift: tuple[float, ...]) -> None:
-    rng = np.random.default_rng(8)
-    solids, cams = random_solids(5, rng), syn.arc_cameras(6, 60, rng)
-    boxes = syn.noisy(q.solid_boxes(solids, "ellipsoid", cams), 0.01, rng)
-    boxes[4, 2] = np.nan
-    old_from_new = np.diag([0.01, 0.01, 0.01, 1.0])  # centimetres, shifted
-    old_from_new[:3, 3] = -np.array(shift)
-    base, real = q.fit_lfd(boxes, cams)
-    moved, same = q.fit_lfd(boxes, cams @ old_from_new)
-    back = old_from_new @ moved @ old_from_new.T
-    assert (real == same).all()
-    assert np.allclose(back / -back[:, 3:, 3:], base, rtol=1e-5, atol=1e-6)
 
 
 def test_lfd_needs_three_views() -> None:
@@ -331,16 +258,6 @@ def test_published_lfd_demo(demo) -> None:
         for k in range(6)
     ]
     assert np.mean(three) >= 0.62
-
-
-def test_evidence_distinguishes_cartons_from_bottles(demo) -> None:
-    boxes, cams, _ = demo
-    fits = q.fit_objects(boxes, cams, (640, 480), up=UP, support="evidence")
-    assert fits.support.tolist()[:4] == ["box"] * 4
-    assert set(fits.support.tolist()[4:]) <= {"ellipsoid", "cylinder"}
-    eye = -np.linalg.solve(cams[0, :, :3], cams[0, :, 3])
-    depth = np.linalg.norm(fits.ellipsoids.center_in_world - eye, axis=1)
-    assert (fits.rms_px * depth / 528.0 <= 0.002).all()  # metres
 
 
 # ---- fit_objects: accuracy -----------------------------------------------------------------
@@ -604,41 +521,6 @@ def test_points_improve_the_depth_despite_background_points() -> None:
     np.testing.assert_array_equal(depth_errors(far), depth_errors(None))  # NaN: no points
 
 
-def test_points_do_not_make_a_size_more_certain() -> None:
-    """They are a one-sided bound; but they do reduce the uncertainty of the prior."""
-    boxes, cams, truth, priors, names = syn.scenes(40, 6, 12, 0.02, "box", np.random.default_rng(5))
-    side = np.sign(np.random.default_rng(6).normal(0, 1, (40, 40, 3)))
-    points = truth.center_in_world[:, None] + np.einsum(
-        "oij,opj->opi", truth.world_from_obj, side * truth.half_axes[:, None]
-    )
-    given = (*syn.as_one(boxes, cams), syn.IMAGE, names, priors)
-    plain, found = (q.fit_objects(*given, up=UP, points=p) for p in (None, points))
-    sigma = [np.sqrt(np.einsum("oii->oi", fits.cov))[:, 3:6] for fits in (plain, found)]
-    assert np.median(sigma[1] / sigma[0]) > 0.9
-    rests = (found.prior_share == 1).all(1)  # no side is better constrained than by the prior
-    assert 0.1 < rests.mean() < 0.7 and (found.status[rests] == "prior_dominated").all()
-
-
-def test_initial_fits_weight_possibly_occluded_edges_less() -> None:
-    """One edge of each object moved by 4.5 sigma: inwards, as an occluder does, or outwards.
-
-    Without refinement after the initial fits the weights are those of Cauchy's loss.
-    """
-    config = q.FitConfig(correlation_deg=0, iterations=0, start_iterations=60, start_views=48)
-    rng = np.random.default_rng(32)
-    boxes, cams, truth, priors, names = syn.scenes(100, 10, 120, 0.02, "ellipsoid", rng)
-    exact = np.stack([q.solid_boxes(truth[k], "ellipsoid", cams[k]) for k in range(100)])
-    edge = exact[:, 4, 0, 2]
-    sigma = np.hypot(1.0, 0.02 * (edge - exact[:, 4, 0, 0]))
-    centers = []
-    for shift in (0.0, -4.5, 4.5):
-        boxes[:, 4, 0, 2] = edge + shift * sigma
-        centers.append(syn.solve(boxes, cams, priors, names, config).ellipsoids.center_in_world)
-    inward, outward = (np.linalg.norm(c - centers[0], axis=1).sum() for c in centers[1:])
-    expected = (1 + 4.5**2 / 3**2) / (1 + 4.5**2 / 2**2)
-    assert inward / outward == pytest.approx(expected, abs=0.1)
-
-
 def test_evidence_is_robust_to_occluded_edges() -> None:
     """An occluder covers a fifth of every box from one side."""
     right = []
@@ -839,18 +721,13 @@ def corridor(rng: np.random.Generator, noise: float):
     return q.clip_boxes(boxes, syn.IMAGE), cams, truth
 
 
-@pytest.mark.parametrize("way", ["flies off", "elsewhere"])
-def test_wrong_cameras_affect_only_the_objects_they_observe(way: str) -> None:
+def test_wrong_cameras_affect_only_the_objects_they_observe() -> None:
     """50 of 240 cameras are wrong: others and those with enough good views are kept."""
-    rng = np.random.default_rng(51)
-    boxes, cams, truth = corridor(rng, 0.08)  # as far off as a small detector's on hololens_kitchen
+    boxes, cams, truth = corridor(np.random.default_rng(51), 0.08)
+    step = np.eye(4)
+    step[:3, :3] = q.rotations(np.array([[0.2, 0.3, 0.9]]))[0]
+    step[:3, 3] = [2.0, 1.0, -1.0]
     bad = np.arange(90, 140)
-    step = np.eye(4)[None].repeat(len(bad), 0)
-    if way == "flies off":  # and returns
-        step[:, 0, 3] = 500.0 * np.sin(np.linspace(0, np.pi, len(bad) + 2)[1:-1])
-    else:
-        step[:, :3, :3] = q.rotations(np.array([[0.2, 0.3, 0.9]]))
-        step[:, :3, 3] = [2.0, 1.0, -1.0]
     broken = cams.copy()
     broken[bad] = cams[bad] @ step
     priors, name = syn.individual_priors(np.full((1, 3), np.log(0.4)), 0.25, "box")
@@ -862,10 +739,8 @@ def test_wrong_cameras_affect_only_the_objects_they_observe(way: str) -> None:
     wrong = seen[bad].sum(0) / seen.sum(0)  # (O,) fraction of views with wrong cameras
     apart = wrong == 0
     both = (wrong > 0) & (wrong < 0.4)
-    assert apart.sum() > 20 and both.sum() > 3 and (wrong > 0.6).sum() > 8
+    assert apart.sum() > 20 and both.sum() > 3
     assert (good.status != "rejected").all() and (spoilt.status[apart | both] != "rejected").all()
-    listed = [np.isin(f.status, ("ok", "prior_dominated"))[apart] for f in (good, spoilt)]
-    assert (listed[0] == listed[1]).all()
     same = q.volume_overlap(good.ellipsoids, spoilt.ellipsoids)
     assert np.quantile(same[apart], 0.1) > 0.95 and same[apart].min() > 0.85
     before, after = (q.volume_overlap(f.ellipsoids, truth)[both] for f in (good, spoilt))
@@ -930,28 +805,6 @@ def test_gravity_is_given_or_from_level_cameras(room) -> None:
         assert off_deg < (10.0 if up is None else 1e-3)
 
 
-def test_moving_the_world_moves_the_result(room) -> None:
-    boxes, cams, _, names = room
-    priors = q.load_priors()
-    old_from_new = np.eye(4)
-    old_from_new[:3, :3] = q.rotations(np.array([[0.2, 0.5, -2.0]]))[0]
-    old_from_new[:3, 3] = [30.0, -200.0, 5.0]
-    new_up = old_from_new[:3, :3].T @ np.array(UP)
-    a = q.fit_objects(boxes, cams, syn.IMAGE, names, priors, up=UP)
-    b = q.fit_objects(boxes, cams @ old_from_new, syn.IMAGE, names, priors, up=new_up)
-    center = b.ellipsoids.center_in_world @ old_from_new[:3, :3].T + old_from_new[:3, 3]
-    close = np.abs(center - a.ellipsoids.center_in_world).max(1) < 2e-3
-    assert close.mean() > 0.9  # initial yaws differ: an ambiguous object may change its mode
-    assert np.allclose(np.sort(a.size, 1)[close], np.sort(b.size, 1)[close], rtol=0.02)
-
-
-def test_same_input_same_bytes(room) -> None:
-    boxes, cams, _, names = room
-    runs = [q.fit_objects(boxes, cams, syn.IMAGE, names, q.load_priors()) for _ in range(2)]
-    for name in ("size", "cov", "rms_px", "inlier"):
-        assert getattr(runs[0], name).tobytes() == getattr(runs[1], name).tobytes()
-
-
 def test_support_may_differ_by_object(room) -> None:
     boxes, cams, _, names = room
     wanted = [None, "ellipsoid", "evidence"] + [None] * (len(names) - 3)
@@ -992,17 +845,12 @@ def test_covariance_follows_the_axes_of_a_lying_object() -> None:
     ],
 )
 def test_empty_input(shape: tuple[int, int], reason: str | None) -> None:
-    fits = q.fit_objects(
-        np.full((*shape, 4), np.nan), np.full((shape[0], 3, 4), np.nan), (640, 480)
-    )
+    boxes, cams = np.full((*shape, 4), np.nan), np.full((shape[0], 3, 4), np.nan)
+    fits = q.fit_objects(boxes, cams, (640, 480))
     assert len(fits) == shape[1] and (fits.status == "rejected").all()
     assert fits.inlier.shape == shape and fits.cov.shape == (shape[1], 9, 9)
     assert all(reason in r for r in fits.reason if reason)
-    assert q.fit_lfd(np.full((*shape, 4), np.nan), np.full((shape[0], 3, 4), np.nan))[0].shape == (
-        shape[1],
-        4,
-        4,
-    )
+    assert q.fit_lfd(boxes, cams)[0].shape == (shape[1], 4, 4)
 
 
 @pytest.mark.parametrize(
@@ -1010,11 +858,11 @@ def test_empty_input(shape: tuple[int, int], reason: str | None) -> None:
     [
         ({"boxes_xyxy": np.zeros((3, 4))}, "boxes_xyxy has shape"),
         ({"img_from_world": np.zeros((2, 3, 4))}, "img_from_world has shape"),
-        ({"categories": ["chair"]}, "1 categories"),
+        ({"categories": ["chair"]}, "categories has shape"),
         ({"points": np.zeros((3, 4, 3))}, "points has shape"),
         ({"points": np.zeros((2, 3))}, "points has shape"),
-        ({"support": "cone"}, "unknown shape"),
-        ({"support": ["box"]}, "1 shapes for 2 objects"),
+        ({"support": "cone"}, "cone"),
+        ({"support": ["box"]}, "1 for 2 objects"),
         ({"known_size": {"chair": ("x", 1.0)}}, "known_size"),
     ],
 )
@@ -1032,28 +880,6 @@ def test_random_input_gives_no_exceptions_and_no_false_claims() -> None:
 
 
 # ---- Volumes -------------------------------------------------------------------------------
-
-
-def spheres(center: np.ndarray, radius: np.ndarray) -> q.Ellipsoids:
-    return q.Ellipsoids(
-        center, np.repeat(radius[:, None], 3, 1), np.tile(np.eye(3), (len(radius), 1, 1))
-    )
-
-
-def test_volume_overlap_of_spheres_is_the_lens() -> None:
-    rng = np.random.default_rng(20)
-    r1, r2, d = rng.uniform(0.2, 1, 200), rng.uniform(0.2, 1, 200), rng.uniform(0, 2.2, 200)
-    direction = rng.normal(0, 1, (200, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    lens = np.pi * (r1 + r2 - d) ** 2 * (d**2 + 2 * d * (r1 + r2) - 3 * (r1 - r2) ** 2) / (12 * d)
-    lens = np.where(
-        d >= r1 + r2, 0, np.where(d <= abs(r1 - r2), 4 / 3 * np.pi * np.minimum(r1, r2) ** 3, lens)
-    )
-    expected = lens / (4 / 3 * np.pi * (r1**3 + r2**3) - lens)
-    measured = q.volume_overlap(
-        spheres(np.zeros((200, 3)), r1), spheres(direction * d[:, None], r2)
-    )
-    assert np.abs(measured - expected).max() < 1e-3
 
 
 def test_overlap_matches_monte_carlo_and_symmetry() -> None:
@@ -1101,49 +927,6 @@ def test_sfmo_reports_insufficient_input(shape: tuple[int, int]) -> None:
     assert not result.ok and "needs" in result.note and len(result.ellipsoids) == shape[1]
 
 
-def plain_psfmo(
-    rows: np.ndarray, cams: np.ndarray, center: np.ndarray, rot: np.ndarray,
-    mean_log: np.ndarray, cov_log: np.ndarray,
-) -> tuple[float, np.ndarray, float]:  # fmt: skip
-    """PSfMO of one object by loops, as the paper states it: log likelihood, half axes, noise.
-
-    rows (F, 3): entries 11, 12, 22 of the centred ellipses; rot: the ellipsoid's axes; the prior is
-    on log(w/h), log(d/h) of these axes. EM in the gain form of the Gaussian posterior.
-    """
-    columns = []
-    for axis in range(3):  # what a squared half axis of 1 adds to each row
-        column = []
-        for cam in cams:
-            jacobian = np.zeros((2, 3))  # of the projection at the centre
-            for i, d in enumerate(1e-5 * np.eye(3)):
-                jacobian[:, i] = (pixels(center[None] + d, cam) - pixels(center[None] - d, cam))[0]
-            image = jacobian @ rot[:, axis] / 2e-5
-            column += [image[0] ** 2, image[0] * image[1], image[1] ** 2]
-        columns.append(column)
-    unit = np.abs(rows).mean()
-    system, target = np.array(columns).T / unit, rows.ravel() / unit
-    node, weight = np.polynomial.hermite.hermgauss(20)
-    spread = np.sqrt(2) * np.linalg.cholesky(cov_log)
-    draws = [mean_log + spread @ [x, y] for x in node for y in node]
-    square = np.exp(2 * np.column_stack([draws, np.zeros(400)]))
-    u = square / square.sum(1, keepdims=True)  # squared half axes, their sum 1
-    mass = np.outer(weight, weight).ravel() / np.pi
-    mu = mass @ u
-    cov = (mass[:, None] * (u - mu)).T @ (u - mu)
-    x, noise2 = mu, 0.01
-    for _ in range(200):
-        scale = (system @ x) @ target / np.sum((system @ x) ** 2)
-        loading, rest = scale * system, target - scale * system @ mu
-        total = loading @ cov @ loading.T + noise2 * np.eye(len(target))
-        gain = cov @ loading.T @ np.linalg.inv(total)
-        likelihood = -0.5 * (rest @ np.linalg.solve(total, rest) + np.linalg.slogdet(total)[1])
-        x, left = mu + gain @ rest, cov - gain @ loading @ cov
-        noise2 = np.mean((target - loading @ x) ** 2)
-        noise2 += np.trace(loading @ left @ loading.T) / len(target)
-    likelihood -= 0.5 * len(target) * np.log(2 * np.pi)
-    return float(likelihood), np.sqrt(scale * x), float(np.sqrt(noise2))
-
-
 def ratio_scene(views: int, arc: float, size_error: float, seed: int):
     """Ten objects whose axis ratios are drawn from their categories, ellipses disturbed."""
     rng = np.random.default_rng(seed)
@@ -1158,34 +941,23 @@ def ratio_scene(views: int, arc: float, size_error: float, seed: int):
     return truth, cams, dual_c, syn.ratio_priors(mean, cov)
 
 
-def test_psfmo_agrees_with_the_plain_one() -> None:
-    """Prior of a^2, its axes' order, EM until it converges, noise with the posterior's trace."""
-    _, cams, dual_c, priors = ratio_scene(4, 40, 0.1, seed=0)
-    ours = q.fit_psfmo(None, priors, priors.names, cams, dual_c, iterations=200)
-    soon = q.fit_psfmo(None, priors, priors.names, cams, dual_c)
-    center = -dual_c[..., :2, 2] / -dual_c[..., 2:, 2]
-    conic = -dual_c / dual_c[..., 2:, 2:]
-    for k in range(10):
-        solid = ours.ellipsoids[k]
-        block = conic[:, k, :2, :2] + center[:, k, :, None] * center[:, k, None]
-        rows = block.reshape(4, 4)[:, [0, 1, 3]]
-        given = (rows, cams, solid.center_in_world[0], solid.world_from_obj[0])
-        size_cov = np.zeros((3, 3))
-        size_cov[:2, :2] = priors.ratio_cov[k]
-        found = {}
-        for order in itertools.permutations(range(3)):
-            difference = np.eye(3)[list(order[:2])] - np.eye(3)[order[2]]
-            size = np.append(priors.ratio_mean[k], 0.0)
-            prior = (difference @ size, difference @ size_cov @ difference.T)
-            found[order] = plain_psfmo(*given, *prior)
-        order = max(found, key=lambda x: found[x][0])
-        likelihood, half, noise = found[order]
-        assert tuple(ours.permutation[k]) == order
-        assert np.allclose(solid.half_axes[0], half, rtol=2e-3), k
-        assert ours.noise[k] == pytest.approx(noise, rel=2e-3)
-        assert ours.log_likelihood[k] == pytest.approx(likelihood, abs=0.02)
-    change = np.abs(np.log(soon.ellipsoids.half_axes / ours.ellipsoids.half_axes))
-    assert np.mean(change.max(1) < 1e-3) >= 0.8  # the default number of steps converges
+def test_psfmo_finds_the_axes_with_a_prior_on_their_ratios() -> None:
+    """Better than with the ratios of other objects; exact ellipses give the exact axes."""
+    own, other = [], []
+    for seed in range(4):
+        truth, cams, dual_c, priors = ratio_scene(4, 40, 0.1, seed)
+        for names, errors in ((priors.names, own), (priors.names[::-1], other)):
+            found = q.fit_psfmo(None, priors, names, cams, dual_c)
+            half = np.sort(found.ellipsoids.half_axes, 1) / np.sort(truth.half_axes, 1)
+            errors.append(np.abs(np.log(half)).mean())
+    assert np.mean(own) < 0.2 and np.mean(own) < 0.9 * np.mean(other)
+    truth, cams, dual_c, priors = ratio_scene(12, 120, 0.0, 0)
+    exact = q.project(truth.dual_quadrics(), cams)[0]
+    found = q.fit_psfmo(None, priors, priors.names, cams, exact)
+    assert (found.noise < 0.1).all() and set(found.permutation[0]) == {0, 1, 2}
+    np.testing.assert_allclose(
+        np.sort(found.ellipsoids.half_axes, 1), np.sort(truth.half_axes, 1), rtol=0.05
+    )
 
 
 # ---- Priors --------------------------------------------------------------------------------
@@ -1200,18 +972,6 @@ def test_priors_cover_the_vocabularies() -> None:
     assert priors.index(["sofa"]) == priors.index(["couch"])
     assert (np.linalg.eigvalsh(priors.log_cov) > 0).all() and (priors.log_mean < np.log(60)).all()
     assert (np.linalg.eigvalsh(priors.ratio_cov) > 0).all()
-
-
-def test_no_prior_comes_from_an_evaluation_set() -> None:
-    """Recordings, who measured their objects, and rendered rooms."""
-    table = json.loads(Path(q.__file__).with_name("priors.json").read_text())
-    sources = [str(table.pop("about")["sources"])]
-    table.pop("aliases")
-    for entry in table.values():
-        sources += [entry["source"], entry["axis_ratio"]["source"]]
-    scored = r"7-?scenes|kitchen|hololens|\bTUM\b|MRHan|SO-?SLAM|fr[123]|\bTUW\b|aldoma|cubeslam"
-    scored = re.compile(scored + r"|\bADT\b|\baria\b|render|examples/", re.IGNORECASE)
-    assert len(sources) > 200 and not any(map(scored.search, sources))
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -1234,23 +994,3 @@ def test_user_priors_from_a_table(tmp_path: Path) -> None:
     table.write_text("category,w,d,h\n" + "".join(f"stool,{w},{d},{h}\n" for w, d, h in sizes))
     assert own_priors.main([str(table), "-o", str(out), "--support", "cylinder"]) == 0
     assert np.allclose(q.load_priors(out).log_mean[0], np.log(sizes).mean(0), atol=1e-3)
-
-
-# ---- Numbers at the limit --------------------------------------------------------------------
-
-
-def test_overflowing_cameras_give_no_quadric() -> None:
-    """Squares of 1e300 are infinite, of which the SVD does not converge: NaN, and no exception."""
-    poses = walk(6)
-    img_from_world = poses.camera.K @ poses.cam_from_world  # (6, 3, 4)
-    boxes = q.solid_boxes(chair_solids(), "box", img_from_world)
-    priors, categories = q.load_priors(), ["chair"] * boxes.shape[1]
-    good = q.fit_psfmo(boxes, priors, categories, img_from_world)
-    assert np.isfinite(good.ellipsoids.half_axes).all()
-    bad = q.fit_psfmo(boxes, priors, categories, 1e300 * img_from_world)
-    assert bad.ellipsoids.half_axes.shape == good.ellipsoids.half_axes.shape
-
-
-def test_the_median_of_chi2_is_near() -> None:
-    dof = np.array([1.0, 2, 3, 10, 50, 400])
-    np.testing.assert_allclose(q._median_chi2_per_dof(dof), chi2.median(dof) / dof, rtol=0.04)

@@ -407,31 +407,32 @@ def _along_rays(
     top = np.einsum("gij,gj->gi", inverse, np.column_stack([middle[:, 0], box[:, 1], focal**0]))
     point = centre[:, None] + ray[:, None] * center_depth[..., None]  # (g, D, 3)
     top_height = (centre[:, None] + top[:, None] * center_depth[..., None]) @ up  # (g, D)
-    narrow = np.broadcast_to(usual[:, None, 0], depth.shape)
+    usual = np.broadcast_to(usual[:, None], size.shape)
+
+    def from_top(height: Array) -> Array:
+        """Return centres (g, D, 3) of shapes of this height (g, D) below the top of the box."""
+        return np.asarray(point + ((top_height - height / 2) - point @ up)[..., None] * up)
+
     if floor is None:
-        whole = np.broadcast_to(usual[:, None, 1], depth.shape)
-        kinds = [(size[..., 0], size[..., 1], point), (narrow, whole, None)]
-        good = [np.ones(depth.shape, bool), size[..., 1] < whole]
+        shorter = size[..., 1] < usual[..., 1]
+        kinds = [
+            (size, point, np.ones_like(shorter)), (usual, from_top(usual[..., 1]), shorter)
+        ]  # fmt: skip
     else:
         # height of the point above the floor n x = d
         lift = (point @ floor.normal - floor.offset) / (floor.normal @ up)
         whole = top_height - (point @ up - lift)
-        low, high = (factor * usual[:, None, 1] for factor in STANDING_HEIGHTS)
+        low, high = (factor * usual[..., 1] for factor in STANDING_HEIGHTS)
         stands = (whole > low) & (whole < high)
-        kinds = [(size[..., 0], whole, None), (narrow, whole, None)]
-        good = [stands, stands]
-    axes = _upright_axes(up)
-    shapes = []
-    source = []
-    for (width, height, center), keep in zip(kinds, good, strict=True):
-        if center is None:  # from the top downwards
-            center = point + ((top_height - height / 2) - point @ up)[..., None] * up
-        half = np.stack([width, width, height], -1)[keep] / 2
-        shapes.append((center[keep], half))
-        source.append(np.nonzero(keep)[0])
-    centers, halves = (np.concatenate(column) for column in zip(*shapes, strict=True))
-    ellipsoids = quadrics.Ellipsoids(centers, halves, np.tile(axes, (len(centers), 1, 1)))
-    return ellipsoids, np.concatenate(source)
+        kinds = [
+            (np.stack([width[..., 0], whole], -1), from_top(whole), stands)
+            for width in (size, usual)
+        ]
+    center = np.concatenate([middles[keep] for _, middles, keep in kinds])
+    half = np.concatenate([extents[keep][:, [0, 0, 1]] / 2 for extents, _, keep in kinds])
+    source = np.concatenate([np.nonzero(keep)[0] for _, _, keep in kinds])
+    axes = np.tile(_upright_axes(up), (len(center), 1, 1))
+    return quadrics.Ellipsoids(center, half, axes), source
 
 
 def _upright_axes(up: Array) -> Array:

@@ -146,10 +146,8 @@ def with_given_boxes(
     given = np.flatnonzero(row >= 0)
     if boxes is None or not len(given):
         return fits
-    e = fits.ellipsoids
-    solids = quadrics.Ellipsoids(
-        e.center_in_world.copy(), e.half_axes.copy(), e.world_from_obj.copy()
-    )
+
+    solids = fits.ellipsoids[np.arange(len(fits))]  # a copy
     cov = fits.cov.copy()
     replaced = np.unique(group[given])
     for i, rows in zip(replaced, rows_by(group[given]), strict=True):
@@ -337,9 +335,8 @@ def _as_fits(
         reason: why the others have no ellipsoid.
     """
     none = quadrics.ObjectFits.unfitted(views.boxes.shape[:2], reason)
-    axes = ellipsoids.world_from_obj.reshape(-1, 9)
-    values = np.hstack([ellipsoids.center_in_world, ellipsoids.half_axes, axes])  # (O, 15)
-    good = np.all(np.isfinite(values), 1) & np.all(ellipsoids.half_axes > 0, 1)  # (O,)
+    finite = np.isfinite(ellipsoids.dual_quadrics()).all((1, 2))
+    good = np.asarray(finite & (ellipsoids.half_axes > 0).all(1))  # (O,)
     return dataclasses.replace(
         none,
         ellipsoids=ellipsoids,

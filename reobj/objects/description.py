@@ -238,21 +238,19 @@ def describe_world(
     if poses is None:
         return World(links=tuple(events))
     components = tuple(_describe_component(poses, k, fit) for k, fit in enumerate(fits))
-    largest = components[0]
+    of_largest = (
+        "registered_frames", "interpolated_frames", "up_in_world", "up_source", "scale", "floor",
+        "floor_reason",
+    )  # fmt: skip
+    largest: dict[str, Any] = {name: getattr(components[0], name) for name in of_largest}
     return World(
         units="m" if poses.metric else "arbitrary",
         source=poses.source,
-        registered_frames=largest.registered_frames,
-        interpolated_frames=largest.interpolated_frames,
         frames=len(poses.frame),
-        up_in_world=largest.up_in_world,
-        up_source=largest.up_source,
-        scale=largest.scale,
         links=tuple(events),
         parts=components,
-        floor=largest.floor,
-        floor_reason=largest.floor_reason,
         reading=poses.reading,
+        **largest,
     )
 
 
@@ -303,7 +301,7 @@ def components_message(poses: Poses) -> list[str]:
 # ---- Confidence ----
 
 # Logistic regression of existence: intercept, log odds of the best scores, hit rate over the frames
-# where the object should be visible, see-through ratio (`occlusion.see_through_ratio`). Fitted to
+# where the object should be visible, see-through ratio (`see_through_ratio`). Fitted to
 # 1,202 objects of 48 runs of 10 rooms (benchmarks/RESULTS.md)
 CONFIDENCE = (-1.0, 1.5, 1.8, -1.5)
 FITTED_TO = "YOLOv8s, deimv2-femto, rendered rooms"
@@ -322,7 +320,7 @@ def existence_probability(score: Array, hit_rate: Array, see_through: Array | fl
     """Return the probability that objects exist.
 
     Args:
-        score: `log_best_odds` of the detections. see_through: `occlusion.see_through_ratio`.
+        score: `log_best_odds` of the detections. see_through: `see_through_ratio`.
         hit_rate: over the frames where the object should be visible; NaN: it has no shape.
     """
     intercept, of_score, of_hit_rate, of_see_through = CONFIDENCE

@@ -11,7 +11,7 @@ import dataclasses
 import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -280,25 +280,21 @@ def _link_component(
 
 def _joined(components: Iterable[Links]) -> Links:
     """Join the linked components; identities are numbered after those of the components before."""
-    joined = list[Tracks]()
-    sources = list[IntArray]()
-    events = list[LinkEvent]()
-    shapes = list[ComponentShapes | None]()
-    certainty: dict[int, float] = {}
-    label_of: dict[int, int] = {}
-    offset = 0
-    for linked in components:
-        joined.append(dataclasses.replace(linked.tracks, track_id=linked.tracks.track_id + offset))
-        sources.append(linked.source)
-        events += linked.events
-        shapes += linked.shapes
-        certainty |= {identity + offset: value for identity, value in linked.confidence.items()}
-        label_of |= {identity + offset: label for identity, label in linked.label_of.items()}
-        offset = int(joined[-1].track_id.max(initial=offset))
+    linked = list(components)
+    highest = [int(c.tracks.track_id.max(initial=0)) for c in linked]
+    pairs = list(zip(linked, itertools.accumulate([0, *highest[:-1]]), strict=True))
+    joined = [dataclasses.replace(c.tracks, track_id=c.tracks.track_id + o) for c, o in pairs]
     order = np.argsort(np.concatenate([tracks.frame for tracks in joined]), kind="stable")
     tracks = Tracks.joined(joined)
-    source = np.concatenate(sources)[order]
-    return Links(tracks, source, tracks.class_id, events, certainty, shapes, label_of)
+    return Links(
+        tracks,
+        np.concatenate([c.source for c in linked])[order],
+        tracks.class_id,
+        [event for c in linked for event in c.events],
+        {identity + o: value for c, o in pairs for identity, value in c.confidence.items()},
+        [shapes for c in linked for shapes in c.shapes],
+        {identity + o: label for c, o in pairs for identity, label in c.label_of.items()},
+    )
 
 
 def _with_untracked(tracks: Tracks, untracked: Tracks) -> tuple[Tracks, IntArray]:
@@ -547,27 +543,17 @@ def join_fits(
         fits: of the objects of each component, in their order; None for one without objects.
         component_of_object: (O,).
     """
-    if len(fits) == 1:
+    if len(fits) == 1 or not any(fits):
         return fits[0]
-    made = [(k, fit) for k, fit in enumerate(fits) if fit is not None]
-    if not made:
-        return None
-    order = np.argsort(np.argsort(component_of_object, kind="stable"))  # (O,) row in `made`
-    inlier = np.zeros((int(poses.known.sum()), len(order)), bool)
-    for k, fit in made:
-        inlier[np.ix_(poses.part[poses.known] == k, component_of_object == k)] = fit.inlier
-    reasons = [reason for _, fit in made for reason in fit.reason]
-    per_object = ("size", "cov", "support", "rms_px", "status", "parallax_deg", "prior_share")
-    columns: dict[str, Any] = {
-        name: np.concatenate([getattr(fit, name) for _, fit in made])[order] for name in per_object
-    }
-    return dataclasses.replace(
-        quadrics.ObjectFits.unfitted(inlier.shape, "") if fits[0] is None else fits[0],
-        ellipsoids=quadrics.Ellipsoids.concatenate([fit.ellipsoids for _, fit in made])[order],
-        inlier=inlier,
-        reason=[reasons[i] for i in order],
-        **columns,
-    )
+    shape = (int(poses.known.sum()), len(component_of_object))
+    joined = quadrics.ObjectFits.unfitted(shape, "")
+    for k, fit in enumerate(fits):
+        if fit is not None:
+            objects = np.flatnonzero(component_of_object == k)
+            joined.put(objects, fit)
+            joined.inlier[np.ix_(poses.part[poses.known] == k, objects)] = fit.inlier
+    first = fits[0] or joined
+    return dataclasses.replace(joined, scale=first.scale, up=first.up, up_source=first.up_source)
 
 
 # ---- Interpolation -----------------------------------------------------------------------------

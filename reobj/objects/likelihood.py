@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -72,7 +71,7 @@ class PosedDetections:
 
 
 @dataclass(frozen=True, slots=True)
-class Shapes:
+class Shapes(quadrics.Rows):
     """Shapes of O objects, each with a class.
 
     Attributes:
@@ -83,21 +82,6 @@ class Shapes:
     ellipsoids: quadrics.Ellipsoids
     support: npt.NDArray[np.str_]
     class_id: IntArray
-
-    def __len__(self) -> int:
-        return len(self.class_id)
-
-    def __getitem__(self, keep: Any) -> Shapes:
-        return Shapes(self.ellipsoids[keep], self.support[keep], self.class_id[keep])
-
-    @staticmethod
-    def concatenate(sets: list[Shapes]) -> Shapes:
-        """Concatenate sets of shapes."""
-        return Shapes(
-            quadrics.Ellipsoids.concatenate([s.ellipsoids for s in sets]),
-            np.concatenate([s.support for s in sets]),
-            np.concatenate([s.class_id for s in sets]),
-        )
 
 
 NO_SHAPES = Shapes(quadrics.Ellipsoids.unknown(0), np.empty(0, str), np.empty(0, np.int64))
@@ -242,7 +226,7 @@ def name_of(class_names: Sequence[str], class_id: int) -> str:
 
 def on_floor(priors: quadrics.Priors, names: list[str]) -> BoolArray:
     """Mark the categories (G,) that stand on the floor."""
-    return np.asarray(_with_unknown(priors.on_floor, False)[priors.index(names)], bool)
+    return np.asarray(priors.of("on_floor", priors.index(names)), bool)
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,35 +243,26 @@ class Categories:
 
     def rows(self, classes: IntArray) -> IntArray:
         """Return the rows (G,) of classes in the priors, -1 unknown."""
-        return self.priors.index(self._names_of(classes))
+        return self.priors.index(self.names[classes.clip(-1, len(self.names) - 1)].tolist())
 
     def usual_size(self, classes: IntArray) -> Array:
         """Return width, depth and height (G, 3)."""
-        unknown = np.log(quadrics.UNKNOWN_SIZE.mean_m)
-        log_size = _with_unknown(self.priors.log_mean, unknown)[self.rows(classes)]
+        log_size = self.priors.of("log_mean", self.rows(classes))
         return np.asarray(np.exp(log_size) / self.scale.value)
 
     def on_floor(self, classes: IntArray) -> BoolArray:
         """Mark the classes (G,) that stand on the floor."""
-        return on_floor(self.priors, self._names_of(classes))
+        return np.asarray(self.priors.of("on_floor", self.rows(classes)), bool)
 
     def size_log_odds(self, shapes: Shapes) -> Array:
         """Return the log odds (O,) of the sizes, 0 at the usual size, rotated by 90 deg or not."""
         rows = self.rows(shapes.class_id)
         no_scale = quadrics.UNKNOWN_SCALE_LOG
         sigma = no_scale if self.scale.source == "none" else self.scale.rel_sigma
-        unknown = no_scale**2 * np.eye(3)
-        cov = _with_unknown(self.priors.log_cov, unknown)[rows] + sigma**2
+        cov = self.priors.of("log_cov", rows)
+        cov[rows < 0] = no_scale**2 * np.eye(3)
+        cov += sigma**2
         size = np.log(2 * shapes.ellipsoids.half_axes)
         off = size[:, [[0, 1, 2], [1, 0, 2]]] - np.log(self.usual_size(shapes.class_id))[:, None]
         square = np.einsum("ski,sij,skj->sk", off, np.linalg.inv(cov), off).min(1)  # (O,)
         return np.asarray(-0.5 * np.nan_to_num(square, nan=np.inf).clip(max=SIZE_SIGMAS**2))
-
-    def _names_of(self, classes: IntArray) -> list[str]:
-        names: list[str] = self.names[classes.clip(-1, len(self.names) - 1)].tolist()
-        return names
-
-
-def _with_unknown(column: npt.NDArray[Any], unknown: Any) -> npt.NDArray[Any]:
-    """Append the row of categories without priors (index -1) to a column of the priors."""
-    return np.concatenate([column, np.broadcast_to(unknown, (1, *column.shape[1:]))])

@@ -338,9 +338,11 @@ def _beside_edges(box: Array) -> Array:
     found = []
     for beyond in BESIDE_EDGE:
         off = beyond * (high - low)
-        first, last = (np.broadcast_to(edge, along.shape) for edge in (low - off, high + off))
-        sides = [(first, along), (along, first), (last, along), (along, last)]
-        found.append(np.stack([np.stack([x[..., 0], y[..., 1]], -1) for x, y in sides], 1))
+        sides = np.tile(along[:, None], (1, 4, 1, 1))  # (D, 4, P, 2)
+        for k in (0, 1):
+            sides[:, k, :, k] = (low - off)[..., k]
+            sides[:, k + 2, :, k] = (high + off)[..., k]
+        found.append(sides)
     return np.stack(found)
 
 
