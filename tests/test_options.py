@@ -72,7 +72,7 @@ def test_every_option_can_be_set_and_every_flag_sets_its_own(tmp_path: Path) -> 
     ("text", "value"), [("true", True), ("On", True), ("1", True), ("no", False), ("OFF", False)]
 )
 def test_switches_accept_words(text: str, value: bool) -> None:
-    assert with_option(rt.Config(), "output.cloud", text).output.cloud is value
+    assert with_option(rt.Config(), "output.doubtful", text).output.doubtful is value
 
 
 WRONG = [
