@@ -263,8 +263,8 @@ def _identity_pairs(
 
 def identity_map(truth: LabelledBoxes, predicted: LabelledBoxes) -> dict[int, int | None]:
     """Map every true identity to one of the result, one to one by common frames, or to None."""
-    gt_ids, ids, *rest = _numbered(truth, predicted)
-    a, b, _ = _identity_pairs(*rest)
+    gt_ids, ids, steps, gt, pr = _numbered(truth, predicted)
+    a, b, _ = _identity_pairs(steps, gt, pr)
     pairs: dict[int, int | None] = dict.fromkeys(gt_ids.tolist())
     return pairs | dict(zip(gt_ids[a].tolist(), ids[b].tolist(), strict=True))
 

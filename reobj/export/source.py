@@ -20,8 +20,8 @@ import numpy as np
 import quadrics
 from reobj.cameras import Camera, Poses, camera_parameters, invert_rigid, quat_wxyz_from_matrix
 from reobj.files import Progress, spans
+from reobj.results.entries import rotation_to_up
 from reobj.results.result import Object, Result
-from reobj.results.upright import rotation_to_up
 from reobj.results.workspace import Workspace
 from reobj.sources.image_files import IMAGE_SUFFIXES
 from reobj.sources.video import Video

@@ -115,9 +115,10 @@ class Pictures:
             return image
         if self.grid is None:  # OpenCV's pixels: the centre of the first one is (0, 0)
             size = image.shape[1::-1]
-            xy = np.stack(np.meshgrid(*map(np.arange, size)), -1) + 0.5
+            xy = np.stack(np.meshgrid(*map(np.arange, size)), -1).astype(np.float64) + 0.5
             self.grid = (_distorted(self.camera.resized(size), xy) - 0.5).astype(np.float32)
-        return np.asarray(cv2.remap(image, self.grid, None, cv2.INTER_LINEAR), np.uint8)
+        x, y = np.moveaxis(self.grid, -1, 0)
+        return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR), np.uint8)
 
 
 def _distorted(camera: Camera, xy: Array) -> Array:
