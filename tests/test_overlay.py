@@ -321,14 +321,14 @@ def test_changed_objects_have_a_second_outline() -> None:
     """Around the box, in the colour of the change; the label has this colour too."""
     image = grey(300, 200)
     row = one_row((60, 60, 160, 150))
-    draw_tracks(image, row, {3: "3 chair"}, 1.0, marks={3: MOVED})
+    draw_tracks(image, row, {3: "3 chair"}, 1.0, {}, marks={3: MOVED})
     columns = np.flatnonzero(near(image[100], MOVED, 90))
     np.testing.assert_allclose(columns[[0, -1]], [56, 164], atol=1.5)
     columns = np.flatnonzero(near(image[100], object_color(3), 60))
     np.testing.assert_allclose(columns[[0, -1]], [60, 160], atol=1.5)
     assert near(image[40:60, 60:110], MOVED, 5).mean() > 0.4
     plain = grey(300, 200)
-    draw_tracks(plain, row, {3: "3 chair"}, 1.0, marks={4: MOVED})
+    draw_tracks(plain, row, {3: "3 chair"}, 1.0, {}, marks={4: MOVED})
     assert not near(plain, MOVED, 5).any()
 
 

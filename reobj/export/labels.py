@@ -42,11 +42,10 @@ def export_coco_vid(result: Result, path: Path) -> None:
         for f in frames
     ]  # fmt: skip
     warn_of_components(result, path)
-    part_of: dict[int, dict[str, int]] = {}
-    if len(result.world.parts) > 1:
-        part_of = {o.id: {"part": o.part} for o in result.objects}
-    corners = tracks.xyxy.round(2)
-    boxes = np.hstack([corners[:, :2], corners[:, 2:] - corners[:, :2]]).round(2).tolist()
+    several = len(result.world.parts) > 1
+    part_of = {o.id: {"part": o.part} for o in result.objects if several}
+    low, high = np.hsplit(tracks.xyxy.round(2), 2)  # (N, 2) each
+    boxes = np.hstack([low, high - low]).round(2).tolist()
     columns = (tracks.frame, tracks.track_id, tracks.class_id, tracks.score)
     rows = zip(boxes, *(column.tolist() for column in columns), strict=True)
     annotations = [

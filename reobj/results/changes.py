@@ -1,4 +1,4 @@
-"""Changes of a room between a map and a recording: what stayed, moved, went, came; changes.json."""
+"""Changes between a map and a recording: objects that stayed, moved, left, arrived; changes.json"""
 
 from __future__ import annotations
 
@@ -78,6 +78,11 @@ class Change:
     def name(self) -> str:
         """Class and number: "chair 6"."""
         return f"{self.class_name} {self.id}"
+
+    @property
+    def text(self) -> str:
+        """Its name, of a moved object with the distance: "chair 6 by 0.56 m"."""
+        return self.name if self.distance_m is None else f"{self.name} by {self.distance_m:.2f} m"
 
     def to_json(self) -> dict[str, Any]:
         """Return the entry of changes.json."""
@@ -181,10 +186,8 @@ class Changes:
             if not changes and kind != "stayed":
                 continue
             text = f"{len(changes)} {kind.replace('_', ' ')}"
-            if kind == "moved":
-                text += f" ({', '.join(map(_moved_text, changes))})"
-            elif kind in ("gone", "new"):
-                text += f" ({', '.join(c.name for c in changes)})"
+            if kind in ("moved", "gone", "new"):
+                text += f" ({', '.join(c.text for c in changes)})"
             counts.append(text)
         if self.ambiguous:
             counts.append(f"{len(self.ambiguous)} ambiguous among identical objects")
@@ -239,13 +242,6 @@ def read_earlier(path: Path) -> tuple[EarlierSession, ...]:
         ReobjError: damaged, or another kind of file.
     """
     return read_json(_EarlierFile, path, own=True).sessions
-
-
-def _moved_text(change: Change) -> str:
-    """Format a moved object: "chair 6 by 0.56 m"."""
-    if change.distance_m is None:
-        return change.name
-    return f"{change.name} by {change.distance_m:.2f} m"
 
 
 def write_changes(path: Path, changes: Changes) -> None:

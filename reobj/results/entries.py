@@ -199,7 +199,7 @@ def _classes_text(objects: Sequence[Object]) -> str:
 
 
 VISIT_GAP_S = 2.0  # between two visits of an object; a detector misses objects for shorter times
-VISIT_GAP_SHARE = 1 / 3  # of the recording, at most: 2 s are 60 photos without times (chosen)
+VISIT_GAP_SHARE = 1 / 3  # of the recording, at most: 2 s are 60 photos without times
 
 
 def visit_gap(frame: IntArray, fps: float) -> float:

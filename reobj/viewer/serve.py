@@ -77,18 +77,19 @@ class LocalHandler(BaseHTTPRequestHandler):
 
     def _may_read(self) -> bool:
         """Check the address, the host, which a page of another server cannot give, the token."""
+        token = self.server.token.encode()
+        fault = None
         try:
-            urlsplit(self.path)
-        except ValueError:  # such as http://[
-            self._refuse(HTTPStatus.BAD_REQUEST, "no address")
-            return False
-        if self.headers.get("Host", "").lower() not in self.server.hosts:
-            self._refuse(HTTPStatus.FORBIDDEN, "unknown host")
-            return False
-        if not any(hmac.compare_digest(t, self.server.token.encode()) for t in self._tokens()):
-            self._refuse(HTTPStatus.FORBIDDEN, "no token: open the address that was printed")
-            return False
-        return True
+            if self.headers.get("Host", "").lower() not in self.server.hosts:
+                fault = (HTTPStatus.FORBIDDEN, "unknown host")
+            elif not any(hmac.compare_digest(t, token) for t in self._tokens()):
+                why = "no token: open the address that was printed"
+                fault = (HTTPStatus.FORBIDDEN, why)
+        except ValueError:  # of the address, such as http://[
+            fault = (HTTPStatus.BAD_REQUEST, "no address")
+        if fault is not None:
+            self._refuse(*fault)
+        return fault is None
 
     def _tokens(self) -> list[bytes]:
         """Return the tokens of the address and of the cookie."""
@@ -317,29 +318,30 @@ class Corrections:
     def _run(
         self, edits: Path, done: Callable[[], None] | None, failed: Callable[[], None] | None
     ) -> None:
-        """Start the worker; `done` is called after its success, `failed` after an error."""
-        arguments = (edits, done, failed)
-        self._thread = threading.Thread(target=self._work, args=arguments, daemon=True)
+        """Apply a file of edits in a thread; then call `done`, or after an error `failed`."""
+
+        def work() -> None:
+            fault = self._applied(edits)
+            try:
+                if (after := failed if fault else done) is not None:
+                    after()
+            except (OSError, ReobjError) as error:
+                fault = fault or one_line(str(error))
+            finally:
+                edits.unlink(missing_ok=True)
+                self._end(fault)
+
+        self._thread = threading.Thread(target=work, daemon=True)
         self._thread.start()
 
-    def _work(
-        self, edits: Path, done: Callable[[], None] | None, failed: Callable[[], None] | None
-    ) -> None:
-        """Apply a file of edits in a child process, as the command line does."""
-        fault = self._applied(edits)
-        try:
-            if (after := failed if fault else done) is not None:
-                after()
-        except (OSError, ReobjError) as error:
-            fault = fault or one_line(str(error))
-        finally:
-            edits.unlink(missing_ok=True)
-            self._end(fault)
-
     def _applied(self, edits: Path) -> str:
-        """Run the child process; return its error, "" after a success."""
+        """Apply edits in a child process, as the command line does, and show its progress.
+
+        Returns:
+            its error, "" after a success.
+        """
         command = [*self._command, "objects", str(self.out), "--edits", str(edits)]
-        environment = os.environ | {"REOBJ_PROGRESS_S": str(PROGRESS_S)}
+        line = ""
         try:
             with subprocess.Popen(
                 command,
@@ -348,29 +350,22 @@ class Corrections:
                 stderr=subprocess.PIPE,
                 text=True,
                 errors="replace",
-                env=environment,
+                env=os.environ | {"REOBJ_PROGRESS_S": str(PROGRESS_S)},
                 start_new_session=True,  # Ctrl-C ends the server, which ends the worker
             ) as process:
                 with self._lock:
                     self._process = process
                     if self._is_ending:
                         process.kill()
-                return self._follow(process, edits)
+                for text in process.stderr or ():
+                    line = text.strip().replace(str(edits), OutputFile.EDITS) or line
+                    if not line.startswith(("warning:", "note:")):
+                        with self._lock:
+                            self._text = line
         except OSError as error:
             return f"the worker could not be started: {one_line(str(error))}"
-
-    def _follow(self, process: subprocess.Popen[str], edits: Path) -> str:
-        """Show the progress of the worker; return its error, "" after a success."""
-        assert process.stderr is not None
-        line = ""
-        for text in process.stderr:
-            line = text.strip().replace(str(edits), OutputFile.EDITS) or line
-            if not line.startswith(("warning:", "note:")):
-                with self._lock:
-                    self._text = line
-        if process.wait() == 0:
-            return ""
-        return line.removeprefix("error: ") or f"the worker ended with {process.returncode}"
+        ended = f"the worker ended with {process.returncode}"
+        return (line.removeprefix("error: ") or ended) if process.returncode else ""
 
 
 def _remove(entry: Path) -> None:
@@ -407,43 +402,39 @@ class _Handler(LocalHandler):
         self.close_connection = True  # an unread body is no next request
         if not self._may_read():
             return
-        if self.headers.get("Origin") not in self.server.origins:
-            self._refuse(HTTPStatus.FORBIDDEN, "from another page")
-            return
-        length = self.headers.get("Content-Length", "")
-        if not re.fullmatch(r"\d{1,9}", length) or int(length) > EDITS_MAX:
-            self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"at most {EDITS_MAX >> 20} MB")
-            return
         parts = urlsplit(self.path)
-        version = parse_qs(parts.query).get("version", [""])[0]
-        text = self.rfile.read(int(length))
+        length = self.headers.get("Content-Length", "")
         corrections = self.server.corrections
-        if parts.path not in ("/edits", "/undo"):
-            self._refuse(HTTPStatus.NOT_FOUND, "no such page")
-            return
-        if version != corrections.version:
-            self._refuse(HTTPStatus.CONFLICT, "the result has changed: reload this page")
-            return
+        fault = None
+        if self.headers.get("Origin") not in self.server.origins:
+            fault = (HTTPStatus.FORBIDDEN, "from another page")
+        elif not re.fullmatch(r"\d{1,9}", length) or int(length) > EDITS_MAX:
+            fault = (HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"at most {EDITS_MAX >> 20} MB")
+        elif parts.path not in ("/edits", "/undo"):
+            fault = (HTTPStatus.NOT_FOUND, "no such page")
+        elif parse_qs(parts.query).get("version", [""])[0] != corrections.version:
+            fault = (HTTPStatus.CONFLICT, "the result has changed: reload this page")
         try:
-            if parts.path == "/edits":
-                corrections.save(text)
-            else:
+            if fault is None and parts.path == "/edits":
+                corrections.save(self.rfile.read(int(length)))
+            elif fault is None:
                 corrections.undo()
         except ReobjError as error:
-            self._refuse(HTTPStatus.CONFLICT, str(error))
-            return
-        self._json(corrections.state())
+            fault = (HTTPStatus.CONFLICT, str(error))
+        if fault is None:
+            self._json(corrections.state())
+        else:
+            self._refuse(*fault)
 
     def _page(self) -> None:
         """Send the page; the token of the address moves to a cookie."""
-        if self._token_moved():
-            return
-        try:
-            page = self.server.page()
-        except ReobjError as error:
-            self._refuse(HTTPStatus.CONFLICT, str(error))
-            return
-        self._answer(HTTPStatus.OK, page.encode(), "text/html; charset=utf-8")
+        if not self._token_moved():
+            try:
+                page = self.server.page().encode()
+            except ReobjError as error:
+                self._refuse(HTTPStatus.CONFLICT, str(error))
+            else:
+                self._answer(HTTPStatus.OK, page, "text/html; charset=utf-8")
 
     def _recording(self, path: Path) -> None:
         """Send the video file, or the range of it that is requested."""
