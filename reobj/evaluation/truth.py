@@ -154,18 +154,11 @@ def read_result(out: Path, notes: list[str] | None = None) -> LabelledBoxes:
     return predicted
 
 
-class MotClass(enum.IntEnum):
-    """Classes of MOTChallenge: the one that counts, and those that do not count if matched.
-
-    The latter in TrackEval 1.3.0, mot_challenge_2d_box.py.
-    """
-
-    PEDESTRIAN = 1
-    PERSON_ON_VEHICLE = 2
-    NON_MOTORISED_VEHICLE = 6  # of MOT20 only
-    STATIC_PERSON = 7
-    DISTRACTOR = 8
-    REFLECTION = 12
+# Classes of MOTChallenge (TrackEval 1.3.0, mot_challenge_2d_box.py)
+PEDESTRIAN = 1
+# boxes on a person on a vehicle, a static person, a distractor or a reflection do not count
+DISTRACTORS = (2, 7, 8, 12)
+NON_MOTORISED_VEHICLE = 6  # a distractor of MOT20 only
 
 
 def _read_mot(source: Source, min_visibility: float) -> LabelledBoxes:
@@ -192,8 +185,8 @@ def _read_mot(source: Source, min_visibility: float) -> LabelledBoxes:
     number = rows[:, 7].clip(-CLASS_MAX, CLASS_MAX).astype(np.int64)
     names, role, note = _mot_classes(number, flagged, source, sequence)
     source.say(note)
-    hidden = (rows[:, 8] < min_visibility) & (role == Role.SCORED)
-    return labelled(rows, names, np.where(hidden, Role.IGNORED, role))
+    occluded = (rows[:, 8] < min_visibility) & (role == Role.SCORED)
+    return labelled(rows, names, np.where(occluded, Role.IGNORED, role))
 
 
 def _mot_classes(
@@ -219,13 +212,13 @@ def _mot_classes(
         return names, flagged * Role.IGNORED, f"classes are named by {stated.name}"
     benchmark, why = _benchmark(sequence.get("name", ""), source.path, number, flagged)
     if benchmark:
-        only_mot20 = {MotClass.NON_MOTORISED_VEHICLE} if benchmark != "MOT20" else set()
-        distractors = set(MotClass) - {MotClass.PEDESTRIAN} - only_mot20
-        role = (flagged | (number != MotClass.PEDESTRIAN)) * Role.ABSENT
-        role[np.isin(number, list(distractors))] = Role.IGNORED
+        role = (flagged | (number != PEDESTRIAN)) * Role.ABSENT
+        role[np.isin(number, DISTRACTORS)] = Role.IGNORED
+        if benchmark == "MOT20":
+            role[number == NON_MOTORISED_VEHICLE] = Role.IGNORED
         return "", role, (f"classes are {benchmark}'s, by {why}: pedestrians count, boxes on "
                           "distractors do not")  # fmt: skip
-    if (number < 0).all() or (sequence and (number == MotClass.PEDESTRIAN).all()):
+    if (number < 0).all() or (sequence and (number == PEDESTRIAN).all()):
         by = " (class 1, by seqinfo.ini)" if sequence else ""
         note = f"the truth has one class without a name{by}: classes do not count"
         return "", absent, note
@@ -297,7 +290,7 @@ def _benchmark(name: str, path: Path, number: IntArray, flagged: BoolArray) -> t
     for text, why in ((name, "seqinfo.ini"), (folder, f"the folder {folder}")):
         if match := re.match(r"(MOT16|MOT17|MOT20)-\d+", text):
             return match[1], why
-    other = number != MotClass.PEDESTRIAN
+    other = number != PEDESTRIAN
     known = ((number >= 1) & (number <= 13)).all()
     return ("MOT17" if known and other.any() and (flagged == other).all() else ""), "its rows"
 

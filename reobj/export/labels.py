@@ -21,6 +21,7 @@ from reobj.export.source import (
     warn_of_components,
 )
 from reobj.files import atomic, staged
+from reobj.results.entries import write_json
 from reobj.results.result import Object, Result, object_table
 from reobj.sources.image_files import IMAGE_FPS
 from reobj.types import Tracks, object_classes, rows_by, visible_name
@@ -62,8 +63,7 @@ def export_coco_vid(result: Result, path: Path) -> None:
         "images": images,
         "annotations": annotations,
     }
-    with atomic(path) as part:
-        part.write_text(json.dumps(data) + "\n", encoding="utf-8")
+    write_json(path, data, indent=None)
 
 
 def export_cvat(result: Result, path: Path) -> None:

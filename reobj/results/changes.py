@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,8 +9,8 @@ from typing import Annotated, Any
 
 import msgspec
 
-from reobj.files import atomic, numbers, rounded
-from reobj.results.entries import Object, check_shape, read_json
+from reobj.files import numbers, rounded
+from reobj.results.entries import Object, check_shape, read_json, write_json
 from reobj.types import (
     Array,
     FiniteFloat,
@@ -224,8 +223,7 @@ def write_earlier(path: Path, sessions: Sequence[EarlierSession]) -> None:
         }
         for session in sessions
     ]  # fmt: skip
-    with atomic(path) as part:
-        part.write_text(json.dumps({"sessions": data}) + "\n", encoding="utf-8")
+    write_json(path, {"sessions": data}, indent=None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,8 +244,7 @@ def read_earlier(path: Path) -> tuple[EarlierSession, ...]:
 
 def write_changes(path: Path, changes: Changes) -> None:
     """Write changes.json."""
-    with atomic(path) as part:
-        part.write_text(json.dumps(changes.to_json(), indent=1) + "\n", encoding="utf-8")
+    write_json(path, changes.to_json())
 
 
 def read_changes(path: Path) -> Changes:

@@ -7,7 +7,6 @@ the identities.
 from __future__ import annotations
 
 import dataclasses
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -15,8 +14,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 import numpy as np
 
-from reobj.files import atomic
-from reobj.results.entries import OutputFile, read_json
+from reobj.results.entries import OutputFile, read_json, write_json
 from reobj.types import (
     CLASS_NAME_MAX,
     COORDINATE_MAX,
@@ -147,8 +145,7 @@ def write_edits(folder: Path, edits: Edits | None) -> None:
     if edits is None or not edits.edits:
         return
     data = HEADER | {"map": edits.map_id, "edits": edits.to_json()}
-    with atomic(folder / OutputFile.EDITS) as part:
-        part.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+    write_json(folder / OutputFile.EDITS, data)
 
 
 def kept_edits(folder: Path) -> Edits | None:

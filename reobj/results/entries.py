@@ -426,6 +426,12 @@ def read_json(
     return content
 
 
+def write_json(path: Path, data: Any, indent: int | None = 1) -> None:
+    """Write a JSON file of ours; it appears only when it is complete."""
+    with atomic(path) as part:
+        part.write_text(json.dumps(data, indent=indent) + "\n", encoding="utf-8")
+
+
 RUN_AGAIN = f"damaged, or not written by reobj_track {__version__}: run the video again"
 
 

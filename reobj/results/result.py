@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -23,7 +22,6 @@ import quadrics
 from reobj import __version__
 from reobj.cameras import Poses, save_poses
 from reobj.files import (
-    atomic,
     columns_of,
     cut,
     from_columns,
@@ -57,6 +55,7 @@ from reobj.results.entries import (
     read_json,
     replaced,
     upright_pose,
+    write_json,
     write_mot,
     write_trajectories,
 )
@@ -357,8 +356,7 @@ def write_objects(result: Result, path: Path) -> None:
         ],
         "warnings": result.warnings,
     }
-    with atomic(path) as part:
-        part.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+    write_json(path, data)
 
 
 def _contradiction(entries: ObjectsFile, poses: Poses | None) -> str:

@@ -26,7 +26,6 @@ from reobj.files import (
     PART_RESULTS,
     LockedError,
     Progress,
-    atomic,
     load_cached,
     load_npz,
     locked,
@@ -40,6 +39,7 @@ from reobj.results.entries import (
     load_last_poses,
     read_json,
     remove_stale,
+    write_json,
 )
 from reobj.results.links import Links, load_links
 from reobj.results.result import Result, VideoInfo, load_tracked, save_tracked
@@ -166,8 +166,7 @@ class Workspace:
                 raise ReobjError(f"{self.out}: holds the results of {found}; {advice}")
             others = (OutputFile.TRACKS, OutputFile.OBJECTS, OutputFile.EDITS)
             remove_stale(self.out, (*STALE, *others, OutputFile.LAST_TRACKS))
-        with atomic(path) as part:
-            part.write_text(json.dumps(fingerprint), encoding="utf-8")
+        write_json(path, fingerprint, indent=None)
 
     def _has_results(self) -> bool:
         """Check for results of a run; cached stages are keyed by their video and do not count."""
