@@ -16,7 +16,7 @@ from reobj.export.source import (
     centred,
     distortion,
     image_files,
-    largest_part,
+    largest_component,
     upright_world,
     video_of,
 )
@@ -82,7 +82,7 @@ def export_ply(result: Result, path: Path) -> None:
 
     In the world and units of poses.txt: the fitted boxes, cylinders and ellipsoids.
     """
-    result = largest_part(result, path)
+    result = largest_component(result, path)
     if not result.located:
         raise ReobjError(f"{path}: nothing to export: the result has no solids, see `run`")
     located = result.located
@@ -217,7 +217,7 @@ def export_nerfstudio(result: Result, path: Path) -> None:
 
     Ref: docs.nerf.studio, "Data conventions": camera axes of OpenGL, world_from_cam.
     """
-    result, origin = centred(largest_part(result, path))
+    result, origin = centred(largest_component(result, path))
     poses = result.poses
     video = video_of(result)
     if poses is None or not poses.known.any():

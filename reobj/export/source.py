@@ -30,7 +30,7 @@ from reobj.types import Array, ReobjError, log
 # ---- Components and worlds ---------------------------------------------------------------------
 
 
-def largest_part(result: Result, path: Path) -> Result:
+def largest_component(result: Result, path: Path) -> Result:
     """Return the objects and cameras of component 0; warn if there are others."""
     if len(parts := result.world.parts) > 1:
         exported = f"component 0 of {len(parts)} ({parts[0].span_text})"
@@ -136,7 +136,7 @@ def upright_world(
     Raises:
         ReobjError: no objects with a shape and no cameras, unless the world `may_be_empty`.
     """
-    part = largest_part(result, path)
+    part = largest_component(result, path)
     origin = np.zeros(3)
     if float32:
         part, origin = centred(part)

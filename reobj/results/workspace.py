@@ -406,7 +406,7 @@ def collect_tracks(
     found: list[Tracks] = []  # also tentative ones
     embedded: list[tuple[IntArray, npt.NDArray[np.float16]]] = []
     detected: list[Detections] = []
-    looked: list[bool] = []
+    detector_ran: list[bool] = []
     try:
         with progress("track", video.expected) as line:
             for frame, _ in steps:
@@ -415,7 +415,7 @@ def collect_tracks(
                 found.append(tracker.latest)
                 embedded.append((index, rows.astype(np.float16)))
                 detected.append(dataclasses.replace(tracker.detections, masks=None))
-                looked.append(tracker.looked)
+                detector_ran.append(tracker.looked)
                 line.step()
     except KeyboardInterrupt:  # the way to end a live source
         if not video.is_live:
@@ -440,8 +440,9 @@ def collect_tracks(
         ]
     if not len(tracks):
         best = untracked.score.max(initial=0)
-        warnings.append(f"no object was tracked: {len(untracked)} detections in the {sum(looked)} "
-                        f"frames that the detector was run on, the best of score {best:.2f} "
+        warnings.append(f"no object was tracked: {len(untracked)} detections in the "
+                        f"{sum(detector_ran)} frames that the detector was run on, the best of "
+                        f"score {best:.2f} "
                         f"(tracker.new_score={tracker.config.new_score:g}, tracker.n_init)"
                         )  # fmt: skip
     return Result(
@@ -451,6 +452,6 @@ def collect_tracks(
         embeddings=embeddings,
         embedding_row=embedding_row,
         untracked=untracked,
-        looked=None if all(looked) else np.array(frames, np.int64)[looked],
+        looked=None if all(detector_ran) else np.array(frames, np.int64)[detector_ran],
         warnings=warnings,
     )

@@ -305,7 +305,7 @@ def write_scene(
         },
         **_scene_cameras(result, steps, np.array(origins)),
         "parts": [
-            _scene_part(k, part, thin) | {"origin": origin.tolist()}
+            _scene_component(k, part, thin) | {"origin": origin.tolist()}
             for k, (part, origin) in enumerate(zip(parts, origins, strict=True))
         ],
     }
@@ -375,7 +375,7 @@ def _scene_cameras(result: Result, steps: IntArray, origins: Array) -> dict[str,
     }
 
 
-def _scene_part(number: int, part: Result, thin: int) -> dict[str, Any]:
+def _scene_component(number: int, part: Result, thin: int) -> dict[str, Any]:
     """Collect name, scale, floor, up, every `thin`-th point and their sigma of a component."""
     poses = part.poses
     up = part.world.up_in_world
