@@ -88,7 +88,7 @@ def unit_mesh(shape: str | None, detail: int = 3) -> Mesh:
         detail: of the sphere: 8 x 4^detail triangles.
     """
     if shape == "box":
-        corners = np.indices((2, 2, 2)).reshape(3, 8).T * 2.0 - 1
+        corners = (2 * np.indices((2, 2, 2)).reshape(3, 8).T - 1).astype(np.float64)
         quads = np.array([(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4),
                           (1, 5, 7, 3)])  # fmt: skip
         return corners, quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
