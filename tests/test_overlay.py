@@ -175,7 +175,7 @@ def test_filled_gaps_are_dashed() -> None:
     edges = []
     for score in (0.9, 0.0):
         image = grey()
-        draw_tracks(image, dataclasses.replace(row, score=np.array([score])), {3: ""}, 1.0)
+        draw_tracks(image, dataclasses.replace(row, score=np.array([score])), {3: ""}, 1.0, {})
         edges.append((image[60:110, 39:42] != 127).any(2).any(1).mean())
     assert edges[0] == 1 and 0.3 < edges[1] < 0.9
 
@@ -337,7 +337,7 @@ def former_of(result: rt.Result, folder: Path) -> tuple[np.ndarray, dict[int, np
     overlay = Overlay(result, folder / "o.mp4", rt.Video(frames(folder / "f", 1, SIZE)))
     overlay.close(False)
     image = grey(*SIZE)
-    return image, overlay._draw_former(image, *overlay.cameras[0]), overlay
+    return image, overlay._draw_outlines(image, *overlay.cameras[0], set()), overlay
 
 
 def box_of(place: np.ndarray, shape: Shape) -> np.ndarray:

@@ -469,7 +469,7 @@ def summary(result: Result) -> str:
         lines += ["", *_table(result, shown), *_lines(_reasons(shown))]
     if any(o.size_rel_sigma is not None for o in shown):
         lines.append("sigma: standard deviation of the least certain side")
-    lines += ["", *_lines(_cameras(result))]
+    lines += ["", *_cameras(result)]
     lines.append("seconds: " + ", ".join(_stage_time(result, s) for s in result.seconds))
     return "\n".join(lines)
 
@@ -561,13 +561,13 @@ def _cameras(result: Result) -> list[str]:
         scale = [f"scale: {_scale_text(world.scale)}"] if world.scale else []
         return [result.poses.cameras_text, *scale]
     count = f"{len(world.parts)} components, each with its own frame and scale"
-    texts = [f"{result.poses.cameras_text} in {count}"]
+    texts = []
     for k, component in enumerate(world.parts):
         found = found_text(o for o in result.objects if o.part == k)
         frames = f"{component.registered_frames} of {component.frames} frames"
         text = f"component {k}: {component.span_text}; {frames}; {found}"
         texts.append(text + ((component.scale and f"; scale {_scale_text(component.scale)}") or ""))
-    return texts
+    return [f"{result.poses.cameras_text} in {count}", *_lines(texts)]
 
 
 def _scale_text(scale: quadrics.Scale) -> str:
