@@ -565,8 +565,8 @@ def _cameras(result: Result) -> list[str]:
     for k, component in enumerate(world.parts):
         found = found_text(o for o in result.objects if o.part == k)
         frames = f"{component.registered_frames} of {component.frames} frames"
-        text = f"component {k}: {component.span_text}; {frames}; {found}"
-        texts.append(text + ((component.scale and f"; scale {_scale_text(component.scale)}") or ""))
+        scale_text = f"; scale {_scale_text(component.scale)}" if component.scale else ""
+        texts.append(f"component {k}: {component.span_text}; {frames}; {found}{scale_text}")
     return [f"{result.poses.cameras_text} in {count}", *_lines(texts)]
 
 
