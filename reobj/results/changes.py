@@ -79,7 +79,7 @@ class Change:
         return f"{self.class_name} {self.id}"
 
     @property
-    def text(self) -> str:
+    def _text(self) -> str:
         """Its name, of a moved object with the distance: "chair 6 by 0.56 m"."""
         return self.name if self.distance_m is None else f"{self.name} by {self.distance_m:.2f} m"
 
@@ -186,7 +186,7 @@ class Changes:
                 continue
             text = f"{len(changes)} {kind.replace('_', ' ')}"
             if kind in ("moved", "gone", "new"):
-                text += f" ({', '.join(c.text for c in changes)})"
+                text += f" ({', '.join(c._text for c in changes)})"
             counts.append(text)
         if self.ambiguous:
             counts.append(f"{len(self.ambiguous)} ambiguous among identical objects")
