@@ -82,8 +82,7 @@ from reobj.poses.supplied.readers import read_poses
 from reobj.results.changes import Change, Changes
 from reobj.results.edits import read_edits
 from reobj.results.result import Object, Part, Result, World, load_tracked, save_tracked
-from reobj.results.stages import collect_tracks, detections_key
-from reobj.results.workspace import Workspace
+from reobj.results.workspace import Workspace, collect_tracks, detections_key
 from reobj.sources.detection_files import DetectConfig, read_detections, read_tracks
 from reobj.sources.detectors import DetectionSource, open_detections, with_detector
 from reobj.sources.onnx_layouts import OnnxDetector

@@ -32,8 +32,13 @@ from reobj.poses.stage import (
     supplied_poses,
     write_supplied_model,
 )
-from reobj.results.entries import OutputFile
-from reobj.results.saving import copy_models, replaced, validate_objects, write_trajectories
+from reobj.results.entries import (
+    OutputFile,
+    copy_models,
+    replaced,
+    validate_objects,
+    write_trajectories,
+)
 from reobj.results.workspace import Workspace
 from reobj.sources.video import Video
 from reobj.sources.weights import list_models, model_path

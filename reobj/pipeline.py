@@ -44,19 +44,17 @@ from reobj.poses.supplied.check import Supplied
 from reobj.poses.supplied.readers import open_video
 from reobj.results.changes import read_changes
 from reobj.results.edits import kept_edits
-from reobj.results.entries import OutputFile
+from reobj.results.entries import OutputFile, copy_models
 from reobj.results.links import Links
 from reobj.results.plausibility import implausible
 from reobj.results.result import Result, VideoInfo, write_objects
-from reobj.results.saving import copy_models
-from reobj.results.stages import detect_all, keep_detections
-from reobj.results.workspace import Workspace
+from reobj.results.workspace import Workspace, detect_all, keep_detections
 from reobj.sources.detection_files import read_tracks
 from reobj.sources.detectors import DetectionSource, open_detections
 from reobj.sources.video import InputConfig, Video
 from reobj.types import Image, ReobjError, Tracks, log, log_message, without_secrets
-from reobj.viewer.live import LivePage, open_viewer
 from reobj.viewer.scene import write_pictures
+from reobj.viewer.serve import LivePage, open_viewer
 from reobj.words import (
     among,
     check_known_size,
@@ -393,8 +391,6 @@ def _write(job: Job, result: Result) -> Result:
         output.doubtful,
         job.progress("write", job.video.expected),
         command=f"{program(absolute=True)} objects {shlex.quote(str(out.absolute()))}",
-        cloud=output.cloud,
-        depth=job.config.poses.depth,
     )
     if failures:
         result = dataclasses.replace(result, warnings=[*result.warnings, *failures])

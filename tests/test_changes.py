@@ -45,14 +45,6 @@ def assert_equal(a: Any, b: Any) -> None:
         np.testing.assert_array_equal(a, b)
 
 
-def test_written_changes_are_read_back(tmp_path: Path) -> None:
-    write_changes(tmp_path / "changes.json", room_changes())
-    assert_equal(read_changes(tmp_path / "changes.json"), room_changes())
-    refused = Changes("flat.map", "tuesday", "3 frames agree", 3, 40, ())
-    write_changes(tmp_path / "refused.json", refused)
-    assert_equal(read_changes(tmp_path / "refused.json"), refused)
-
-
 def test_entries_have_the_documented_keys(tmp_path: Path) -> None:
     write_changes(tmp_path / "changes.json", room_changes())
     data = json.loads((tmp_path / "changes.json").read_text())
@@ -108,15 +100,3 @@ def test_damaged_files_are_refused_in_one_line(
     text = str(caught.value)
     assert text.startswith(f"{path}: ") and text.endswith("run the video again")
     assert "\n" not in text
-
-
-def test_a_result_keeps_its_changes(chairs: rt.Result, parted: rt.Result, tmp_path: Path) -> None:
-    """In its folder, in its components, without doubtful objects; a run without a map has none."""
-    result = dataclasses.replace(chairs, changes=room_changes())
-    result.save(tmp_path)
-    assert_equal(rt.Result.load(tmp_path).changes, room_changes())
-    assert result.without_doubtful().changes is result.changes
-    assert dataclasses.replace(parted, changes=result.changes).of_part(1).changes is result.changes
-    dataclasses.replace(chairs).save(tmp_path)
-    assert not (tmp_path / "changes.json").exists()
-    assert rt.Result.load(tmp_path).changes is None

@@ -7,14 +7,11 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
-from simulated import SIZE, fitted, tracks_of, unlinked, walk, with_columns
 
 import reobj_track as rt
 from reobj.results.edits import apply_edits, read_edits
-from reobj.results.workspace import Workspace
 
 NAMES = ("chair", "cup")
 
@@ -126,32 +123,6 @@ def test_boxes_of_parts_are_joined(
     assert set(kept.score) == {0.9} and set(kept.detection_index) == {0}
 
 
-def test_a_cut_out_of_a_merged_object_has_one_box_a_frame(tmp_path: Path) -> None:
-    tracks = two_boxes([100, 50, 200, 150], [190, 55, 300, 150])
-    refs = [{"id": k + 1, "frame": 0, "box": tracks.xyxy[k].tolist()} for k in (0, 1)]
-    merge = {"do": "merge", "object": refs[0], "with": refs[1]}
-    cut = {"do": "split", "object": refs[1], "frames": [2, 3]}
-    made = applied(tmp_path, merge, cut, tracks=tracks)
-    kept = made.tracks[made.keep]
-    assert kept.track_id.tolist() == [1, 1, 3, 3, 1]  # 2 was merged: its number is not given again
-    assert (kept.xyxy[:, 2] - kept.xyxy[:, 0] == 200).all()
-
-
-def test_a_new_class_is_added_to_the_names(tmp_path: Path) -> None:
-    made = applied(tmp_path, RENAME, {"do": "rename", "object": ref(1, 3), "class": "cup"})
-    assert made.class_names == ("chair", "cup", "mug") and made.confirmed == {1, 2}
-    for obj, class_id in ((1, 1), (2, 2), (3, 0)):
-        assert set(made.tracks.class_id[made.tracks.track_id == obj]) == {class_id}
-
-
-def test_among_equal_boxes_the_id_decides(tmp_path: Path) -> None:
-    tracks = table()
-    tracks = with_columns(tracks, xyxy=np.tile([10.0, 10, 50, 50], (len(tracks), 1)))
-    for number in (1, 2, 3):
-        edit = {"do": "delete", "object": {"id": number, "frame": 4, "box": [10, 10, 50, 50]}}
-        assert set(members(applied(tmp_path, edit, tracks=tracks))) == {1, 2, 3} - {number}
-
-
 @pytest.mark.parametrize(
     ("edit", "said"),
     [
@@ -224,10 +195,6 @@ def listed(out: Path) -> list[tuple[int, str]]:
     return [(o.id, o.class_name) for o in rt.Result.load(out).objects]
 
 
-def state(out: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(out)): p.read_bytes() for p in out.rglob("*") if p.is_file()}
-
-
 def test_edits_are_stored_in_the_folder(folder: Path, tmp_path: Path, capsys: Any) -> None:
     """A merge over the break of the cameras, a new name, a deletion; later fits keep them."""
     before = rt.Result.load(folder)
@@ -255,85 +222,3 @@ def test_edits_are_stored_in_the_folder(folder: Path, tmp_path: Path, capsys: An
     assert refit(folder, "--edits", write(path)) == 0  # none any more
     assert [o.id for o in rt.Result.load(folder).objects] == [1, 2, 3, 4, 5, 6]
     assert not (folder / "edits.json").exists()
-
-
-@pytest.mark.slow
-def test_two_halves_that_are_merged_are_one_object(tmp_path: Path, capsys: Any) -> None:
-    """The detector gives the middle chair as two halves; the boxes of the merge can be named."""
-    poses = walk()
-    whole = tracks_of(poses)
-    middle = whole[whole.track_id == 2]
-    cut = middle.xyxy.copy()
-    cut[:, 0] = (cut[:, 0] + cut[:, 2]) / 2
-    right = with_columns(middle, xyxy=cut, track_id=4, tracklet_id=4, score=0.6, detection_index=3)
-    left = whole.xyxy.copy()
-    left[whole.track_id == 2, 2] = cut[:, 0]
-    (tmp_path / "frames").mkdir()
-    for i in poses.frame.tolist():
-        cv2.imwrite(
-            str(tmp_path / f"frames/{i:03d}.jpg"), np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
-        )
-    out = tmp_path / "out"
-    workspace = Workspace(out)
-    workspace.bind(rt.Video(tmp_path / "frames"))
-    tracks = rt.Tracks.joined([with_columns(whole, xyxy=left), right])
-    workspace.save_last(unlinked(poses, tracks), poses)
-    options = ("--set", "objects.link=false")
-    assert refit(out, *options) == 0
-    assert [o.id for o in rt.Result.load(out).objects] == [1, 2, 3, 4]
-    merge = {"do": "merge", "object": box_of(out, 2), "with": box_of(out, 4)}
-    path = write(tmp_path / "e.json", merge)
-    assert refit(out, "--edits", path, *options) == 0
-    result = rt.Result.load(out)
-    assert [o.id for o in result.objects] == [1, 2, 3]
-    rows = result.tracks[result.tracks.track_id == 2]
-    np.testing.assert_allclose(rows.xyxy, middle.xyxy, atol=0.01)
-    np.testing.assert_allclose(rows.score, 0.9)
-    expected = fitted(whole, poses).objects[1]
-    assert result.objects[1].center == pytest.approx(expected.center, abs=0.02)
-    assert result.objects[1].size_m == pytest.approx(expected.size_m, abs=0.03)
-    rename = {"do": "rename", "object": box_of(out, 2), "class": "stool"}
-    assert refit(out, "--edits", write(path, merge, rename), *options) == 0
-    assert listed(out) == [(1, "chair"), (2, "stool"), (3, "chair")]
-
-
-@pytest.mark.parametrize("bad", ["missing", "no json", "no box"])
-def test_bad_edits_write_nothing(folder: Path, tmp_path: Path, capsys: Any, bad: str) -> None:
-    path = tmp_path / "e.json"
-    if bad == "no json":
-        path.write_text("x")
-    if bad == "no box":
-        lost = {"do": "delete", "object": {"id": 1, "frame": 3, "box": [0, 0, 5, 5]}}
-        write(path, lost)
-    before = state(folder)
-    assert refit(folder, "--edits", path) == 2
-    said = capsys.readouterr().err.strip().splitlines()[-1]
-    assert said.startswith(f"error: {path}")
-    assert state(folder) == before
-
-
-def test_edits_that_no_longer_match_are_ignored_with_a_warning(folder: Path, capsys: Any) -> None:
-    lost = {"do": "delete", "object": {"id": 1, "frame": 3, "box": [0, 0, 5, 5]}}
-    write(folder / "edits.json", lost)
-    assert rt.main(["objects", str(folder)]) == 0
-    said = capsys.readouterr().err
-    assert "edit 1 (delete 1): no object has the box" in said
-    assert "no correction of this file was applied" in said
-    assert len(rt.Result.load(folder).objects) == 6 and (folder / "edits.json").exists()
-    assert '"edits":[]' in (folder / "scene.html").read_text()
-
-
-def test_given_identities_replace_edits(folder: Path, tmp_path: Path, capsys: Any) -> None:
-    path = write(tmp_path / "e.json", {"do": "delete", "object": box_of(folder, 6)})
-    both = ["objects", str(folder), "--tracks", str(folder / "tracks.txt"), "--edits", str(path)]
-    before = state(folder)
-    assert rt.main(both) == 2 and "one at a time" in capsys.readouterr().err
-    assert state(folder) == before
-    assert refit(folder, "--edits", path) == 0
-    shutil.copy(folder / "tracks.txt", tmp_path / "tracks.txt")
-    assert refit(folder, "--tracks", tmp_path / "tracks.txt") == 0
-    assert "edits.json removed" in capsys.readouterr().err
-    assert not (folder / "edits.json").exists() and len(rt.Result.load(folder).objects) == 5
-    last = write(tmp_path / "e.json", {"do": "delete", "object": box_of(folder, 5)})
-    assert refit(folder, "--edits", last) == 0  # upon given identities
-    assert len(rt.Result.load(folder).objects) == 4

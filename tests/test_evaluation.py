@@ -19,7 +19,6 @@ from reobj.evaluation.tracks import (
     return_ranks,
     score_report,
     score_tracks,
-    visits,
 )
 from reobj.evaluation.truth import LabelledBoxes, labelled
 from reobj.results.result import VideoInfo
@@ -209,13 +208,6 @@ def test_a_return_is_kept_if_any_earlier_visit_had_its_identity() -> None:
     assert mine["returns"] == 4 and mine["returns_kept"] == 0.5
 
 
-def test_a_visit_ends_after_thirty_frames() -> None:
-    frames = (0, 30, 60, 91, 92)
-    assert visits(boxes(*((f, 1, 0) for f in frames))).tolist() == [0, 0, 0, 1, 1]
-    unordered = boxes((91, 1, 0), (0, 2, 0), (0, 1, 0), (40, 2, 0))
-    assert visits(unordered).tolist() == [1, 0, 0, 1]
-
-
 def test_barely_visible_truth_and_that_of_other_classes_are_ignored(tmp_path: Path) -> None:
     """Two chairs, one of them occluded, and a cup, evaluated by a file without classes."""
     truth = (1, 0, 56, 0.9), (2, 50, 56, 0.1), (3, 90, 41, 0.9)  # id, x, class, visibility
@@ -324,14 +316,6 @@ def straight(tmp_path: Path, turned: np.ndarray) -> float:
     xyzw = Rotation.from_matrix(turn @ turned).as_quat()
     np.savetxt(path, np.c_[np.arange(12) / 10, centers, xyzw])
     return float(score_objects(result, solids, path, {4: 9})["center_error_median"])
-
-
-def test_a_short_path_is_aligned_by_viewing_directions(tmp_path: Path) -> None:
-    """Centres alone leave the roll about a straight path free; other camera axes are ignored."""
-    assert straight(tmp_path, np.eye(3)) < 0.01
-    for turned in ([np.pi, 0, 0], [0, np.pi / 2, 0]):  # OpenGL's axes; x ahead
-        axes = Rotation.from_rotvec(turned).as_matrix()
-        assert 0.05 < straight(tmp_path, axes) < 1
 
 
 def test_3d_needs_cameras(tmp_path: Path) -> None:

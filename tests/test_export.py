@@ -5,9 +5,6 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
-import shutil
-import sys
-import zipfile
 from collections import defaultdict
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -23,22 +20,11 @@ from reobj.cameras import invert_rigid
 from reobj.export.registry import EXPORTS, Viewer
 from reobj.results.result import VideoInfo
 
-NO_PICTURES = ("--set", "output.overlay=0", "--set", "output.scene=0")
 CORNERS = {"xtl", "ytl", "xbr", "ybr"}  # of a box in CVAT's XML
-
-
-def cli(*args: object) -> int:
-    return rt.main([str(a) for a in args])
 
 
 def mot(path: Path) -> np.ndarray:
     return np.loadtxt(path, delimiter=",", ndmin=2)
-
-
-def detected(out: Path) -> np.ndarray:
-    """Rows of tracks.txt that have a detection; filled gaps have score 0."""
-    rows = mot(out / "tracks.txt")
-    return rows[rows[:, 6] > 0]
 
 
 def objects(out: Path) -> list[dict[str, object]]:
@@ -72,48 +58,6 @@ def test_cvat_has_the_attributes_of_its_importer(room: Path, tmp_path: Path) -> 
     assert sorted(inside) == sorted((int(r[0]), int(r[1])) for r in rows if r[6] > 0)
 
 
-def edited(room: Path, path: Path) -> tuple[int, int]:
-    """Export, give object a all but the first four boxes of b, and save; returns a and b."""
-    rt.export(room, "cvat", path)
-    tree = ET.parse(path)
-    tracks = {int(t.attrib["id"]) + 1: t for t in tree.getroot().iter("track")}
-    frames = {i: {b.attrib["frame"] for b in t} for i, t in tracks.items()}
-    b = max(frames, key=lambda i: len(frames[i]))
-    late = [box for box in tracks[b] if box.attrib["outside"] == "0"][4:]
-    a = next(i for i in frames if not frames[i] & {box.attrib["frame"] for box in late})
-    for box in late:
-        tracks[b].remove(box)
-        tracks[a].append(box)
-    tracks[a][:] = sorted(tracks[a], key=lambda box: int(box.attrib["frame"]))
-    tree.write(path)
-    return a, b
-
-
-def test_corrected_identities_are_used(room: Path, tmp_path: Path) -> None:
-    """`objects OUT --tracks`: corrected identities override the linker."""
-    out, path = tmp_path / "out", tmp_path / "corrected.xml"
-    shutil.copytree(room, out)
-    a, b = edited(out, path)
-    with zipfile.ZipFile(tmp_path / "task.zip", "w") as archive:  # as downloaded from CVAT
-        archive.write(path, "annotations.xml")
-    video = rt.Video(ROOM / "room.mp4", rt.InputConfig(every=3, stop=120))
-    plain, zipped = (rt.read_tracks(p, video)[0] for p in (path, tmp_path / "task.zip"))
-    np.testing.assert_array_equal(plain.track_id, zipped.track_id)
-    np.testing.assert_array_equal(plain.xyxy, zipped.xyxy)
-    path = tmp_path / "task.zip"
-    rows = detected(out)
-    moved = np.flatnonzero(rows[:, 1] == b)[4:]
-    rows[moved, 1] = a
-    for _ in range(2):  # and they are kept when the objects are fitted again without --tracks
-        assert cli("objects", out, *(("--tracks", path) if path else ()), *NO_PICTURES) == 0
-        found = detected(out)
-        assert sorted(map(tuple, found[:, :2])) == sorted(map(tuple, rows[:, :2]))
-        path = None
-    data = json.loads((out / "objects.json").read_text())
-    assert data["world"]["links"] == []
-    assert {o["id"]: o["frames_seen"] for o in data["objects"]}[b] == 4
-
-
 # ---- CSV ----
 
 
@@ -142,33 +86,6 @@ def test_csv_runs_no_formula(tmp_path: Path, chairs: rt.Result, name: str, cell:
 
 
 # ---- What every export must do ----
-
-
-@pytest.mark.parametrize("to", EXPORTS)
-def test_same_folder_same_bytes(room: Path, tmp_path: Path, to: str) -> None:
-    if to in ("glb", "mcap", "rrd"):
-        package = {"glb": "trimesh", "mcap": "mcap_ros2", "rrd": "rerun"}[to]
-        pytest.importorskip(package, reason="pip install '.[viewer,mcap]'")
-    if to == "rrd":
-        pytest.skip("rerun numbers the chunks of a file at random")
-    paths = [tmp_path / "1", tmp_path / "2"]
-    assert [rt.export(room, to, path) for path in paths] == paths
-    assert paths[0].read_bytes() == paths[1].read_bytes() != b""
-
-
-def test_track_only_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Without cameras: the 2D formats work, the 3D ones report the missing cameras."""
-    args = ("--detections", ROOM / "detections.npz", "--stop", 20, "-o", tmp_path / "out")
-    assert cli("track", ROOM / "room.mp4", *args, *NO_PICTURES) == 0
-    for to in ("coco-vid", "cvat"):
-        assert cli("export", tmp_path / "out", "--to", to) == 0
-    assert len(json.loads((tmp_path / "out/coco_vid.json").read_text())["images"]) == 20
-    capsys.readouterr()
-    pytest.importorskip("trimesh", reason="pip install '.[viewer]'")
-    assert cli("export", tmp_path / "out", "--to", "glb") == 2
-    error = capsys.readouterr().err
-    assert "nothing to export" in error and len(error.splitlines()) == 1
-    assert not (tmp_path / "out/objects.glb").exists()
 
 
 # ---- GLB, rerun, COLMAP ----
@@ -220,23 +137,6 @@ def test_glb_has_the_frame_of_the_other_exports(
     np.testing.assert_allclose(in_file, in_world, rtol=0, atol=2e-3)
 
 
-@pytest.mark.parametrize(
-    ("to", "package"), [("glb", "trimesh"), ("rrd", "rerun"), ("usd", "usd-core")]
-)
-def test_a_missing_package_is_named(
-    room: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    to: str,
-    package: str,
-) -> None:
-    monkeypatch.setitem(sys.modules, "pxr" if to == "usd" else package, None)
-    assert cli("export", room, "--to", to) == 2
-    error = capsys.readouterr().err
-    assert "pip install" in error and package in error and len(error.splitlines()) == 1
-    assert not list(room.glob("*.glb")) and not list(room.glob("*.rrd"))
-
-
 def test_rrd_in_rerun(room: Path, tmp_path: Path) -> None:
     """Read back by rerun itself: every ellipsoid, camera and box."""
     pytest.importorskip("rerun", reason="pip install .[viewer]")
@@ -259,16 +159,6 @@ def test_rrd_in_rerun(room: Path, tmp_path: Path) -> None:
     assert image.shape == (480, 640, 3) and np.abs(image.astype(int) - fourth).mean() < 4
     (points,) = found["/world/points"] or [{"Points3D:positions": []}]
     assert isinstance(points["Points3D:positions"], list)
-
-
-def test_tracks_of_no_object_are_not_exported(chairs: rt.Result, tmp_path: Path) -> None:
-    """Rows added to tracks.txt by hand have no class."""
-    chairs.save(tmp_path)
-    with (tmp_path / "tracks.txt").open("a") as file:
-        file.write("1,9,10,10,20,20,0.9,-1,-1,-1\n")
-    with pytest.raises(rt.ReobjError, match=r"tracks\.txt: object 9 is not in objects\.json"):
-        rt.export(tmp_path, "cvat")
-    assert not (tmp_path / "cvat.xml").exists()
 
 
 def test_the_live_viewer_follows_the_tracking(tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from front_door.room import ROOM
@@ -18,7 +17,6 @@ import reobj_track as rt
 from reobj.cameras import invert_rigid
 from reobj.export.registry import EXPORTS
 from reobj.results.result import write_objects
-from reobj.results.workspace import Workspace
 from reobj.types import object_color
 
 TILT = Rotation.from_euler("xyz", [40, 70, -20], degrees=True).as_matrix()
@@ -304,44 +302,4 @@ def test_identities_are_read_back(room: Path, tmp_path: Path) -> None:
 # ---- YOLO ----
 
 
-def test_labels_of_images_in_folders(chairs: rt.Result, tmp_path: Path) -> None:
-    """Image names that are equal in two folders; images are referenced."""
-    image = cv2.imencode(".png", np.zeros((SIZE[1], SIZE[0], 3), np.uint8))[1]
-    for i in range(40):
-        (tmp_path / f"f/{i % 2}").mkdir(parents=True, exist_ok=True)
-        (tmp_path / f"f/{i % 2}/{i // 2}.png").write_bytes(image.tobytes())
-    video = rt.Video(str(tmp_path / "f/*/*.png"))
-    assert len(video.names) == 40
-    out = tmp_path / "out"
-    Workspace(out).bind(video)
-    chairs.save(out)
-    rt.export(out, "yolo")
-    frames = json.loads(rt.export(out, "nerfstudio").read_text())["frames"]
-    for frame, image in enumerate(video.files):
-        name = image.relative_to(tmp_path / "f")
-        assert (out / "nerfstudio" / frames[frame]["file_path"]).samefile(image)
-        rows = np.loadtxt((out / "yolo/labels" / name).with_suffix(".txt"))
-        shown = chairs.tracks.xyxy[chairs.tracks.frame == frame, 0]
-        np.testing.assert_allclose((rows[:, 1] - rows[:, 3] / 2) * 640, shown, atol=0.01)
-
-
 # ---- Message types of ROS ----
-
-
-@pytest.mark.parametrize("distribution", ["ROS2_HUMBLE", "LATEST"])
-def test_message_types_are_those_of_ros(
-    chairs: rt.Result, tmp_path: Path, distribution: str
-) -> None:
-    """By their hash (RIHS01), which ROS 2 compares; rosbags has no vision_msgs to compare."""
-    rosbags = pytest.importorskip("rosbags.highlevel", reason="pip install rosbags (extra `dev`)")
-    typesys = pytest.importorskip("rosbags.typesys")
-    ros = typesys.get_typestore(typesys.Stores[distribution])
-    with rosbags.AnyReader([written(chairs, "mcap", tmp_path / "a.mcap")]) as reader:
-        for connection, _, data in reader.messages():
-            reader.deserialize(data, connection.msgtype)
-        ours = reader.typestore
-        common = sorted(ours.fielddefs.keys() & ros.fielddefs.keys())
-        assert {"tf2_msgs/msg/TFMessage", "sensor_msgs/msg/CameraInfo",
-                "visualization_msgs/msg/MarkerArray"} < set(common)  # fmt: skip
-        hashes = {kind: (ours.hash_rihs01(kind), ros.hash_rihs01(kind)) for kind in common}
-    assert [kind for kind, (our, their) in hashes.items() if our != their] == []

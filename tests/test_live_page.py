@@ -74,34 +74,3 @@ def test_the_page_shows_frames_with_identities(
     drawn = np.abs(image.astype(int) - 127).max(2) > 60
     y, x = np.nonzero(drawn)
     np.testing.assert_allclose([x.min(), x.max(), y.max()], [60, 200, 180], atol=4)
-
-
-def test_the_page_ends_with_a_run_that_fails(
-    video: rt.Video, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Requests need the token; the port is closed, so that the browser waits for no pictures."""
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    urls: list[str] = []
-    opened = threading.Event()
-
-    def open_browser(url: str) -> None:
-        urls.append(url)
-        opened.set()
-
-    monkeypatch.setattr("webbrowser.open", open_browser)
-
-    def fails(image: np.ndarray) -> np.ndarray:
-        assert opened.wait(20) and browser().open(urls[0], timeout=20).status == 200
-        for path, status in (
-            ("", 403),
-            ("pictures", 403),
-            ("etc/passwd?" + urls[0].split("?")[1], 404),
-        ):
-            with pytest.raises(urllib.error.HTTPError, match=str(status)):
-                browser().open(urls[0].split("?")[0] + path, timeout=20)
-        raise rt.ReobjError("no detector")
-
-    with pytest.raises(rt.ReobjError, match="no detector"):
-        rt.run(video, tmp_path / "out", in_3d=False, detector=fails, show=True)
-    with pytest.raises(urllib.error.URLError, match="refused"):
-        browser().open(urls[0], timeout=20)

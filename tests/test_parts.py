@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -78,44 +77,6 @@ def test_the_world_describes_its_components(parted: rt.Result) -> None:
     np.testing.assert_array_equal(world.up_in_world, largest.up_in_world)
 
 
-def test_a_track_that_starts_in_the_break_belongs_to_the_next_component() -> None:
-    """Frames 38 to 40 have no pose; the third chair is detected from frame 39 on."""
-    given = unlinked()
-    third = given.tracks.detection_index == 2
-    given = dataclasses.replace(
-        given, tracks=given.tracks[~third | (given.tracks.frame >= BREAK - 1)]
-    )
-    objects = finished(given).objects
-    assert [(o.part, o.status != "rejected") for o in objects] == [(0, True)] * 2 + [(1, True)] * 3
-    assert sorted(o.visits[0][0] for o in objects) == [0, 0, BREAK - 1, BREAK, BREAK]
-
-
-def test_a_component_with_too_few_cameras_rejects_its_objects_only() -> None:
-    poses = two_parts()
-    lost = poses.cam_from_world.copy()
-    lost[BREAK + 3 :] = np.nan  # two cameras are left: 41 and 42
-    result = finished(unlinked(dataclasses.replace(poses, cam_from_world=lost)))
-    assert [o.status for o in result.objects] == ["ok"] * 3 + ["rejected"] * 3
-    assert result.objects[4].reason == "seen in 2 frames with a camera pose (3 are needed)"
-    assert [p.registered_frames for p in result.world.parts] == [38, 2]
-    assert len(result.ellipsoids()) == 3
-
-
-def test_manually_merged_identities_are_kept(parted_folder: Path, tmp_path: Path) -> None:
-    """Object 4 is object 1 after the break: merged in tracks.txt and supplied again."""
-    out = tmp_path / "out"
-    shutil.copytree(parted_folder, out)
-    rows = np.loadtxt(out / "tracks.txt", delimiter=",")
-    rows[rows[:, 1] == 4, 1] = 1
-    np.savetxt(tmp_path / "mot.txt", rows, delimiter=",", fmt="%.6g")
-    assert rt.main(["objects", str(out), "--tracks", str(tmp_path / "mot.txt")]) == 0
-    found = rt.Result.load(out).objects
-    assert [(o.id, o.part, o.frames_seen, o.status) for o in found] == [
-        (1, 0, 64, "ok"), (2, 0, 40, "ok"), (3, 0, 40, "ok"), (5, 1, 24, "ok"), (6, 1, 24, "ok"),
-    ]  # fmt: skip
-    np.testing.assert_allclose(found[0].center, into_part(0, CENTERS[:1])[0], atol=0.02)
-
-
 # ---- Files ----
 
 
@@ -132,30 +93,6 @@ def test_each_component_has_its_own_files(parted_folder: Path) -> None:
         mesh = trimesh.load(parted_folder / name)
         middle = into_part(part, CENTERS).mean(0)
         np.testing.assert_allclose(mesh.vertices.mean(0), middle, atol=0.02 * PARTS[part][0])
-
-
-def test_components_are_loaded(parted_folder: Path, parted: rt.Result, tmp_path: Path) -> None:
-    found = rt.Result.load(parted_folder)
-    assert found.world.to_json() == parted.world.to_json()
-    assert [o.to_json() for o in found.objects] == [o.to_json() for o in parted.objects]
-    assert [w for w in found.warnings if "2 components" in w]
-    np.testing.assert_array_equal(found.poses.part, parted.poses.part)
-    found.save(tmp_path)
-    for name in ("objects.json", "poses.txt", "poses_part1.txt", "cache/last-poses.npz"):
-        assert (tmp_path / name).read_bytes() == (parted_folder / name).read_bytes(), name
-
-
-def test_component_files_of_an_earlier_run_are_deleted(parted: rt.Result, tmp_path: Path) -> None:
-    dataclasses.replace(parted).save(tmp_path)
-    names = ("poses_part1.txt", "objects_part1.ply")
-    assert all((tmp_path / name).exists() for name in names)
-    (tmp_path / "poses_part2.txt").write_text("of three parts")
-    (tmp_path / "poses_partial.txt").write_text("mine")
-    poses = two_parts().of_part(0)
-    one = finished(unlinked(poses, tracks_in_two_parts(two_parts())[: 3 * BREAK]))
-    one.save(tmp_path)
-    left = {path.name for path in tmp_path.iterdir()} - {"cache"}
-    assert left == {"tracks.txt", "objects.json", "poses.txt", "objects.ply", "poses_partial.txt"}
 
 
 def test_the_summary_has_a_line_for_each_component(parted: rt.Result) -> None:

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
-from simulated import BREAK, SIZE, two_parts, unlinked, walk
+from simulated import SIZE, walk
 
 import reobj_track as rt
 from reobj.results.plausibility import implausible
 from reobj.results.result import VideoInfo
-from reobj.results.workspace import Workspace
 
 MOVING = rt.ObjectsConfig().moving_classes
 HIGH = 0.4
@@ -124,41 +120,3 @@ def test_most_strong_boxes_unexplained(untracked: int, score: float, warned: boo
     if warned:
         assert lines[0].startswith(f"{untracked} of {60 + untracked} boxes of score 0.4 or more")
         assert "low confidence" not in lines[0]
-
-
-@pytest.mark.parametrize(("score", "cause"), [(0.45, "below the score at which"), (0.9, "")])
-def test_the_most_frequent_cause_is_reported(score: float, cause: str) -> None:
-    found = result({CHAIR: 3, FRIDGE: 3}, status="tracked")
-    found = dataclasses.replace(found, untracked=rows(70, 0, CHAIR, score))
-    (line,) = implausible(found, HIGH, MOVING, 0.5)
-    assert line.startswith("70 of 130 boxes of score 0.4 or more")
-    assert cause in line and line.endswith("listed object") == (not cause)
-
-
-def test_boxes_of_doubtful_objects_are_unexplained() -> None:
-    found = result({CHAIR: 3, FRIDGE: 3})
-    for k in range(4):
-        found.objects[k] = dataclasses.replace(found.objects[k], status="doubtful")
-    (line,) = said(found)
-    assert line.startswith("40 of 60 boxes") and "output.doubtful=true" in line
-    assert implausible(found, 0.95, MOVING) == []  # another scale of scores
-
-
-def test_the_warning_appears_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """By `objects` and `run`: on stderr, in objects.json and in the viewer."""
-    poses = two_parts()
-    poses.cam_from_world[6:BREAK] = np.nan
-    poses.cam_from_world[BREAK + 12 :] = np.nan
-    (tmp_path / "im").mkdir()
-    for i in range(64):
-        cv2.imwrite(str(tmp_path / f"im/{i:03d}.png"), np.zeros((SIZE[1], SIZE[0], 3), np.uint8))
-    workspace, given = Workspace(tmp_path / "out"), unlinked(poses)
-    workspace.bind(rt.Video(tmp_path / "im"))
-    workspace.save_last(given, poses)
-    text = "only 17 of 64 frames have a camera"
-    for _ in range(2):
-        assert rt.main(["objects", str(tmp_path / "out"), "--set", "output.overlay=0"]) == 0
-        assert capsys.readouterr().err.count(text) == 1
-        kept = json.loads((tmp_path / "out/objects.json").read_text())["warnings"]
-        assert sum(text in line for line in kept) == 1
-        assert (tmp_path / "out/scene.html").read_text().count(text) == 1

@@ -20,7 +20,7 @@ import quadrics
 import reobj_track as rt
 from reobj.config import read_config
 from reobj.export.labels import BOXER_HEADER
-from reobj.results.saving import validate_objects
+from reobj.results.entries import validate_objects
 
 ROOT = Path(__file__).resolve().parent.parent
 FRAMES = 12

@@ -5,11 +5,8 @@ from __future__ import annotations
 import base64
 import dataclasses
 import json
-import os
 import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +15,7 @@ import numpy as np
 import pytest
 from browser import Browser
 from scipy.spatial.transform import Rotation
-from simulated import fitted, into_part, tracks_of, walk
+from simulated import fitted, into_part
 
 import quadrics
 import reobj.viewer.scene as scene
@@ -28,14 +25,12 @@ from reobj.files import Progress, decimals
 from reobj.results.changes import Change, Changes, EarlierSession, Shape
 from reobj.results.result import VideoInfo
 from reobj.types import object_color
-from reobj.viewer.cloud import Cloud
 from reobj.viewer.scene import (
     Pictures,
     best_pictures,
     diverse_rows,
     page_text,
     write_pictures,
-    write_scene,
 )
 
 EVIL = "</script><script>window.hacked=1</script><img src=x onerror=hacked=1>"
@@ -205,22 +200,6 @@ def test_the_slider_plays_the_cameras(browser: Browser, page: Path) -> None:
     assert browser.errors == []
 
 
-def test_the_video_frame_is_moved_enlarged_and_closed(browser: Browser, page: Path) -> None:
-    browser.open(page)
-    browser.eval("goTo(3)")
-    browser.settle()
-    place = "(r => [r.x, r.y, r.width, r.height])($('frame').getBoundingClientRect())"
-    x, y, width, height = browser.eval(place)
-    view = browser.eval(VIEW)
-    browser.drag((x + 40, y + height - 20), (x - 60, y + height - 70), "left")
-    assert browser.eval(place) == pytest.approx([x - 100, y - 50, width, height])
-    assert browser.eval(VIEW) == view  # the 3D view has not been turned
-    browser.eval("$('frame-size').click()")
-    assert browser.eval(place)[2] > 1.8 * width
-    browser.eval("$('frame-close').click(); goTo(4)")
-    assert browser.eval("[$('frame').offsetWidth, $('inset').checked]") == [0, False]
-
-
 def test_wireframes_have_the_extent_of_the_shapes(browser: Browser, page: Path) -> None:
     """The drawn edges, projected, span the box of the shape projected by quadrics."""
     browser.open(page)
@@ -267,34 +246,6 @@ def test_following_a_camera_shows_its_frame(browser: Browser, page: Path) -> Non
     width, height = browser.eval("[canvas.clientWidth, canvas.clientHeight]")
     assert 0.2 * width < x < 0.8 * width and 0.1 * height < y < 0.9 * height
     assert browser.errors == []
-
-
-def test_keys_and_mouse(browser: Browser, page: Path) -> None:
-    browser.open(page)
-    start = browser.eval(VIEW)
-    browser.drag((700, 300), (760, 320), "left")
-    turned = browser.eval(VIEW)
-    assert turned[0] != start[0] and turned[1] != start[1]
-    np.testing.assert_allclose(turned[2:], start[2:])
-    browser.page.mouse.wheel(0, -200)
-    browser.wait(f"{VIEW}[2] < {turned[2]}")
-    zoomed = browser.eval(VIEW)
-    browser.drag((700, 300), (640, 300), "right")
-    assert browser.eval(VIEW)[3:] != zoomed[3:] and browser.eval("state.selected") is None
-    browser.press("r")
-    np.testing.assert_allclose(browser.eval(VIEW), start)
-    browser.press("1")
-    assert browser.eval(VIEW)[1] < 0.01
-    browser.press("2")
-    assert 1.4 < browser.eval(VIEW)[1] < 1.571
-    for key, value in (("f", "state.follow"), ("a", "state.ride"), ("m", "state.measuring"),
-                       (" ", "Boolean(playing)"), ("?", "$('help').open")):  # fmt: skip
-        browser.press(key)
-        assert browser.eval(value) is True, key
-        browser.press(key if key in " ?" else "Escape")
-        assert browser.eval(value) is False, key
-    keys = browser.eval("[...document.querySelectorAll('#help kbd')].map(k => k.textContent)")
-    assert {"Space", "←", "→", "Esc", "?", "r", "f"} <= set(keys) and browser.errors == []
 
 
 @pytest.mark.parametrize(("width", "height"), [(1280, 800), (390, 844)])
@@ -382,12 +333,8 @@ def test_the_list_is_searched_sorted_and_filtered(browser: Browser, page: Path) 
         assert browser.eval(order) == found
         dimmed = np.array(browser.eval(opacity)) < 0.3 * min(before)
         assert dimmed.tolist() == [number not in found for number in (1, 2, 3)]
-    volume = [-float(np.prod(o["size"] or [0])) for o in objects]
-    names = [i for _, i in sorted((o["class"], o["id"]) for o in objects)]
-    for key, found in (("name", names), ("seen", [1, 3, 4, 2]),
-                       ("size", (np.argsort(volume, kind="stable") + 1).tolist())):  # fmt: skip
-        browser.eval(f"$('sort').value = '{key}'; $('sort').onchange()")
-        assert browser.eval(order) == found
+    browser.eval("$('sort').value = 'seen'; $('sort').onchange()")
+    assert browser.eval(order) == [1, 3, 4, 2]
     state = "(draw(), [here.map(o => o.row.hidden), solid.map(o => o.group.visible)])"
     button = "[...document.querySelectorAll('{}')].find(b => b.textContent.includes('{}')).click()"
     for place, name, hidden in (
@@ -403,19 +350,6 @@ def test_the_list_is_searched_sorted_and_filtered(browser: Browser, page: Path) 
     assert browser.eval(state)[1] == [False, False, True]
     browser.eval("$('show-all').click()")
     assert browser.eval(state) == [[False] * 4, [True] * 3] and browser.errors == []
-
-
-def test_light_and_dark_follow_the_system(browser: Browser, page: Path) -> None:
-    browser.open(page)
-    paper = {}
-    for scheme in ("dark", "light"):
-        browser.page.emulate_media(color_scheme=scheme)
-        browser.settle()
-        color = browser.eval("getComputedStyle(document.body).backgroundColor")
-        wire = browser.eval("solid[0].group.parts.wire.material.color.getHex()")
-        paper[scheme] = sum(map(int, re.findall(r"\d+", color))), wire
-    assert paper["dark"][0] < 150 < 600 < paper["light"][0]
-    assert paper["dark"][1] != paper["light"][1] and browser.errors == []
 
 
 def test_corrections_made_in_the_viewer_are_applied(
@@ -460,23 +394,6 @@ def test_corrections_made_in_the_viewer_are_applied(
     before = browser.asked
     browser.page.reload()  # unsaved corrections: the browser shows a dialog
     assert browser.asked == before + 1
-
-
-def test_the_command_for_corrections_runs(parted_folder: Path, tmp_path: Path) -> None:
-    """As the page shows it, in the folder of the downloads; the tool was called with a path."""
-    out = shutil.copytree(parted_folder, tmp_path / "an output")
-    tool = Path(rt.__file__)
-    call = [sys.executable, tool.name, "objects", str(out)]
-    subprocess.run(call, cwd=tool.parent, check=True, capture_output=True)
-    command = data_of(out / "scene.html")["command"]
-    assert command == f"python {tool} objects '{out}'"
-    before = (out / "objects.json").stat().st_mtime_ns
-    edits = '{"format": "reobj-edits", "version": 1, "edits": []}'
-    (tmp_path / "edits.json").write_text(edits)
-    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    subprocess.run(f"{command} --edits edits.json", shell=True, cwd=tmp_path, check=True,
-                   capture_output=True, env=os.environ | {"PATH": path})  # fmt: skip
-    assert (out / "objects.json").stat().st_mtime_ns > before
 
 
 def test_a_visit_is_split_at_the_slider(
@@ -535,28 +452,6 @@ def test_a_picture_of_the_view_is_saved(browser: Browser, page: Path) -> None:
     assert (np.abs(same - image).max(-1)[60:] < 12).mean() > 0.97 and browser.errors == []
 
 
-def test_units_can_be_switched(browser: Browser, page: Path) -> None:
-    """In the list, the panel, the scale bar and measured distances; by the sigma's decimals."""
-    browser.open(page)
-    browser.eval("select(here[0])")
-    (obj, *_) = data_of(page)["objects"]
-    browser.eval("""state.measured = [0, 2].map(i => ({ at: solid[i].at, object: solid[i] }));
-        redraw()""")
-    metres = browser.eval("distanceOf(state.measured)[0]")
-    for unit, per_metre in (("cm", 100), ("ft", 3.28084), ("m", 1)):
-        browser.eval(f"$('unit').value = '{unit}'; $('unit').onchange(); draw()")
-        size = np.array(obj["size_m"]) * per_metre
-        sigma = size * obj["size_rel_sigma"]
-        digits = decimals(sigma.min())
-        text = browser.eval("$('panel').innerText")
-        for s, e in zip(size, sigma, strict=True):
-            assert f"{s:.{digits}f} ± {e:.{digits}f} {unit}" in text
-        assert f" {unit}" in browser.eval("here[0].row.innerText + $('bar').innerText")
-        measured = browser.eval("document.querySelector('.measure text').textContent")
-        assert measured.endswith(f" {unit}")
-        assert float(measured.split()[0]) == pytest.approx(metres * per_metre, rel=0.05)
-
-
 def test_the_top_view_is_aligned_with_the_walls(
     browser: Browser, page: Path, tmp_path: Path
 ) -> None:
@@ -579,33 +474,6 @@ def test_the_top_view_is_aligned_with_the_walls(
     a, b = (browser.eval(f"project(level.place({end})).slice(0, 2)") for end in ends)
     off = np.degrees(np.arctan2(b[1] - a[1], b[0] - a[0])) % 90
     assert min(off, 90 - off) < 1.5 and browser.errors == []
-
-
-def test_dense_points_are_drawn_from_their_front(
-    browser: Browser, page: Path, tmp_path: Path
-) -> None:
-    """A red wall that was seen from one side: it is visible from there only."""
-    x, z = (a.ravel() for a in np.meshgrid(np.linspace(-1.5, 1.5, 200), np.linspace(0, 2, 200)))
-    xyz = np.column_stack([x, np.full_like(x, 1.0), z])
-    rgb = np.tile(np.array([[220, 20, 20]], np.uint8), (len(x), 1))
-    wall = Cloud(xyz, rgb, np.tile([0, -1.0, 0], (len(x), 1)), 0.015)
-    data = data_of(page)
-    data["parts"][0]["dense"] = scene._dense_points(wall, np.zeros(3))
-    (tmp_path / "a.html").write_text(scene._page_of(data, None))
-    browser.open(tmp_path / "a.html")
-    browser.eval("for (const id of ['names', 'solids', 'ellipsoids']) $(id).click()")
-    browser.eval("state.hidden = new Set(here.map(o => o.class)); VIEWS.front()")
-
-    def red(side: int) -> float:
-        browser.eval(f"lookFrom(level.turn([0, {side}, 0.3].map(v => v / Math.hypot(1, 0.3))))")
-        browser.settle()
-        image = image_of(browser.page.screenshot()).astype(int)
-        return float((np.abs(image - [20, 20, 220]).max(-1) < 12).mean())
-
-    assert red(-1) > 0.03 and red(1) < 0.001
-    browser.eval("$('dense').click()")
-    assert red(-1) < 0.001 and browser.eval("$('dense-label').hidden") is False
-    assert browser.errors == []
 
 
 def test_fingers_on_a_phone_screen(browser: Browser, page: Path) -> None:
@@ -772,29 +640,6 @@ def test_an_arrow_leads_from_the_ghost_to_the_moved_object(
     assert browser.eval("ghosts.map(g => g.id)") == [9, 7] and browser.errors == []
 
 
-def test_gone_and_new_objects_are_marked(browser: Browser, changed_page: Path) -> None:
-    browser.open(changed_page)
-    labels = """[...$('labels').children].map(l => [l.textContent, l.className])
-        .filter(([, name]) => name).sort()"""
-    marked = [["chair 1 moved 1.00 m", "moved"], [f"{EVIL} 9 gone", "gone"],
-              ["suitcase 3 new", "new"]]  # fmt: skip
-    assert browser.eval(labels) == sorted(marked)
-    halos = "(draw(), solid.map(o => [o.id, o.group.parts.halo.visible]))"
-    assert browser.eval(halos) == [[1, True], [2, False], [3, True]]
-    gone = "ghosts.find(g => g.kind === 'gone')"
-    browser.eval("$('names').click(); draw()")  # labels could lie above
-    x, y = browser.eval(f"""(r => [...project({gone}.at).slice(0, 2), r.left, r.top])(
-        $('view').getBoundingClientRect()).reduce((s, v, i) => (s[i % 2] += v, s), [0, 0])""")
-    browser.click(x, y)
-    assert browser.eval("state.ghost?.id") == 9 and browser.eval("state.selected") is None
-    text = browser.eval("$('panel').innerText")
-    assert f"{EVIL} 9" in text and "seen through in 3 views" in text
-    browser.eval("select(here[0])")
-    text = browser.eval("$('panel').innerText")
-    assert "moved 1.00 ± 0.03 m" in text and "12 own points agree" in text
-    assert browser.eval("window.hacked") is None and browser.errors == []
-
-
 def test_the_list_shows_and_filters_changes(browser: Browser, changed_page: Path) -> None:
     browser.open(changed_page)
     rows = """[...document.querySelectorAll('.row')].filter(r => !r.hidden)
@@ -820,24 +665,6 @@ def test_the_list_shows_and_filters_changes(browser: Browser, changed_page: Path
     browser.settle()  # off: like a page without a map
     assert browser.eval(rows) == [[1, ""], [3, ""], [2, ""], [4, ""]]
     assert browser.eval(visible) == [[1, 2, 3], []] and browser.errors == []
-
-
-@pytest.mark.parametrize(
-    ("facts", "text"),
-    [
-        (("tuesday", "3 of 24 frames agree with it", 3, 24), "not placed; 3 of 24 frames agree"),
-        (("monday",), "made with 1 object"),
-    ],
-)
-def test_a_map_that_shows_no_changes_is_named(
-    browser: Browser, page: Path, facts: tuple[Any, ...], text: str
-) -> None:
-    """Refused, or made by this recording: its objects are not marked as new."""
-    new = (Change(1, "chair", None, np.zeros(3)),) if len(facts) == 1 else ()
-    browser.open(page_with(page, facts[0], changes=Changes("flat.map", *facts, new=new)))
-    assert text in browser.eval("$('since').innerText")
-    hidden = "[ghosts.length, $('kinds').hidden, here.map(markOf).filter(Boolean)]"
-    assert browser.eval(hidden) == [0, True, []] and browser.errors == []
 
 
 @pytest.fixture(scope="module")
@@ -1002,16 +829,6 @@ def test_crops_show_different_views() -> None:
     assert set(tracks.track_id[diverse_rows(tracks, found, None, 30)]) == {3}
 
 
-def test_views_come_from_the_cameras_of_the_component(parted: rt.Result) -> None:
-    wanted = set(Pictures(parted, VIDEO).wanted.tolist())
-    for o in parted.objects:
-        chosen = [
-            diverse_rows(parted.tracks, o, poses, 8).tolist()
-            for poses in (parted.poses.of_part(o.part), parted.poses.of_part(1 - o.part))
-        ]
-        assert chosen[0] != chosen[1] and wanted >= set(chosen[0])
-
-
 def test_background_frames_are_undistorted(tmp_path: Path) -> None:
     """A distorted line is straight again, at the projection of the viewer's pinhole camera."""
     lens = rt.Camera("SIMPLE_RADIAL", WIDTH, HEIGHT, (250.0, WIDTH / 2, HEIGHT / 2, -0.15))
@@ -1033,30 +850,3 @@ def test_background_frames_are_undistorted(tmp_path: Path) -> None:
     rows = shown[30:-30].astype(float)
     found = (rows * (np.arange(WIDTH) + 0.5)).sum(1) / rows.sum(1)
     np.testing.assert_allclose(found, 60, atol=0.7)
-
-
-def test_up_is_estimated_from_level_cameras(tmp_path: Path) -> None:
-    """Without objects or poses that define up: the cameras of the walk are level, z is up."""
-    poses = dataclasses.replace(poses_of_walk(), up_in_world=None)
-    result = rt.Result(tracks_of_walk(poses), NAMES, VideoInfo("a", WIDTH, HEIGHT, 25.0))
-    result = dataclasses.replace(result, poses=poses, world=rt.World("m", "user", 23, 0, 24))
-    write_scene(result, Pictures(result, VIDEO), tmp_path / "a.html", VIDEO)
-    (part,) = data_of(tmp_path / "a.html")["parts"]
-    np.testing.assert_allclose(part["up"], [0, 0, 1], atol=0.05)
-    assert part["facts"].endswith("units: m · up is guessed from the cameras")
-
-
-def test_long_videos_are_subsampled(tmp_path: Path) -> None:
-    """4,000 frames: the slider has every third one, and plays as long as the video."""
-    poses = walk(4000)
-    tracks = tracks_of(poses, 0.0)
-    result = dataclasses.replace(fitted(tracks[tracks.frame < 9], None), poses=poses)
-    result = dataclasses.replace(
-        result, tracks=tracks[np.isin(tracks.frame, [30, 31, 32, 33, 300])]
-    )
-    write_scene(result, Pictures(result, VIDEO), tmp_path / "a.html", VIDEO)
-    data = data_of(tmp_path / "a.html")
-    assert data["steps"]["frame"] == list(range(0, 4000, 3))
-    assert data["steps"]["seconds"] * 1334 == pytest.approx(4000 / 30)
-    assert data["objects"][0]["seen"] == [10, 11, 100, 100]
-    assert len(base64.b64decode(data["poses"])) == 1334 * 48

@@ -9,7 +9,6 @@ import re
 import shutil
 import signal
 import socket
-import struct
 import subprocess
 import sys
 import time
@@ -289,60 +288,6 @@ def test_undo_restores_the_map(flat: Path) -> None:
     assert not list((flat / "b/cache/undo").iterdir())
 
 
-@pytest.mark.slow
-def test_undo_that_fails_or_is_ended_leaves_the_map(flat: Path) -> None:
-    """Another run writes into the folder; then Ctrl-C while the worker runs."""
-    out = flat / "b"
-    with serving(out) as client:
-        save(client, map_edits(flat))
-        saved = (flat / "flat.map").read_bytes()
-        with Workspace.open(out):
-            assert undo(client)[0] == 200
-            state = client.finished()
-        assert state["failed"] and "another run is writing" in state["text"] and state["undo"] == 1
-        assert (flat / "flat.map").read_bytes() == saved
-        assert undo(client)[0] == 200
-        while not workers_of(client):
-            time.sleep(0.02)
-        assert (flat / "flat.map").read_bytes() != saved
-    assert (flat / "flat.map").read_bytes() == saved and (out / "edits.json").is_file()
-
-
-@pytest.mark.slow
-def test_a_map_that_another_command_changed_is_left_alone(flat: Path) -> None:
-    """Undo is refused in a line that names the map; map and folder stay as they are."""
-    out = flat / "b"
-    with serving(out) as client:
-        save(client, map_edits(flat))
-        number = next(i for i, (name, deleted) in in_map(flat)[1].items() if not (name or deleted))
-        assert rt.main(["map", str(flat / "flat.map"), "--rename", str(number), "lamp"]) == 0
-        files = [flat / "flat.map", out / "objects.json", out / "edits.json"]
-        content = [path.read_bytes() for path in files]
-        status, answer = undo(client)
-        assert status == 409 and answer.count("\n") == 0
-        assert str(flat / "flat.map") in answer and "nothing was undone" in answer
-        state = client.state()
-        assert state["failed"] and state["undo"] == 1 and not state["running"]
-    assert [path.read_bytes() for path in files] == content
-
-
-@pytest.mark.slow
-def test_all_recordings_of_the_map_are_browsed(browser: Browser, flat: Path) -> None:
-    """Also from the folder of the first recording, whose page was made before the second one."""
-    options = "[...$('session').options].map(o => o.textContent)"
-    numbers = {n: [i for i, seen in in_map(flat)[0].items() if n in [x[0] for x in seen]]
-               for n in (1, 2)}  # fmt: skip
-    for name, here, other, number in (("a", "0-80", "4-84", 2), ("b", "4-84", "0-80", 1)):
-        with serving(flat / name) as client:
-            browser.open(client.url, 1440, 900)
-            first, second = browser.eval(options)
-            assert first == f"this recording: room.mp4 {here}"
-            assert second.startswith(f"room.mp4 {other}, ")
-            browser.eval("$('session').value = 0; $('session').onchange()")
-            assert browser.eval("here.map(o => o.id)") == numbers[number]
-            assert browser.errors == []
-
-
 # ---- What is refused ----
 
 
@@ -372,20 +317,6 @@ def test_requests_without_the_token_are_refused(out: Path) -> None:
             assert headers["Referrer-Policy"] == "no-referrer"
             assert headers["Cross-Origin-Resource-Policy"] == "same-origin"
             assert headers["Content-Security-Policy"] == "frame-ancestors 'none'"
-
-
-def test_a_broken_request_leaves_no_traceback(out: Path) -> None:
-    """A browser that closes the connection early, and an address that is none."""
-    with serving(out) as client:
-        assert client.get("http://[")[0] == 400
-        request = f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{client.port}\r\n"
-        request += f"Cookie: reobj_{client.port}={client.token}\r\n\r\n"
-        for _ in range(5):
-            with socket.create_connection(("127.0.0.1", client.port)) as connection:
-                connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-                connection.sendall(request.encode())
-                connection.recv(100)  # the answer has begun; the page is larger than the buffers
-        assert client.get("/state")[0] == 200
 
 
 def test_other_hosts_and_origins_are_refused(out: Path) -> None:
@@ -496,22 +427,6 @@ def test_the_recording_is_sent_in_ranges(film_folder: Path) -> None:
         assert client.ask("/recording")[0] == 403
 
 
-def test_a_file_that_is_not_the_recording_is_not_sent(film_folder: Path, tmp_path: Path) -> None:
-    """A folder that names another file as its recording, and a recording that changed."""
-    out = shutil.copytree(film_folder, tmp_path / "out")
-    binding = json.loads((out / "cache/source.json").read_text())
-    recording = Path(binding["source"])
-    text = tmp_path / "secret.txt"
-    text.write_text("secret")
-    other = shutil.copy(recording, tmp_path / "secret.webm")
-    same_name = shutil.copy(recording, tmp_path / recording.name)  # of another time
-    for source in (text, other, same_name):
-        (out / "cache/source.json").write_text(json.dumps(binding | {"source": str(source)}))
-        with serving(out) as client:
-            assert client.get("/recording")[0] == 404
-            assert b'"recording": ""' in client.get("/")[2]
-
-
 # ---- In the browser ----
 
 
@@ -542,76 +457,3 @@ def test_save_and_undo_in_the_browser(browser: Browser, out: Path) -> None:
         fault = browser.eval("[$('job').textContent, $('job').className, $('save').disabled]")
         assert "no object has the box" in fault[0] and fault[1:] == ["fault", False]
         assert browser.errors == []
-
-
-def test_frames_of_an_image_folder_lie_behind_the_shapes(browser: Browser, out: Path) -> None:
-    """Every frame with a camera, not only those that the page has."""
-    with serving(out) as client:
-        browser.open(client.url)
-        browser.eval("S.thumbs = S.thumbs.slice(0, 2); setRide(true); goTo(21)")
-        browser.wait(
-            "backdrop?.step === 21 && !$('back').hidden && $('back').dataset.frame === '21'"
-        )
-        green = "$('back').getContext('2d').getImageData(50, 50, 1, 1).data[1]"
-        assert abs(browser.eval(green) - (60 + 2 * 21)) < 4
-        browser.press("ArrowRight")
-        browser.wait("$('back').dataset.frame === '22'")
-        assert abs(browser.eval(green) - (60 + 2 * 22)) < 4
-        assert browser.errors == []
-
-
-GREEN = "$('back').getContext('2d').getImageData($('back').width / 2, 99, 1, 1).data[1]"
-
-
-@pytest.mark.slow
-def test_the_recording_plays_behind_the_shapes(browser: Browser, film_folder: Path) -> None:
-    """The slider shows exactly the frame of its step; during play the frame belongs to the step."""
-    with serving(film_folder) as client:
-        browser.open(client.url)
-        assert browser.eval("film.src") == ""  # nothing is loaded before
-        browser.eval("S.thumbs = []; goTo(0); setRide(true)")
-        browser.wait("filmed")
-        for step in (7, 2, 11, 3):
-            browser.eval(f"goTo({step})")
-            browser.wait(f"backdrop?.step === {step} && $('back').dataset.frame === '{step}'")
-            assert abs(browser.eval(GREEN) - 20 * step) < 8, step
-        # the stripe's edge is where the lens maps it to the column of the frame
-        edge = browser.eval("""(back => [0.02, 0.5, 0.98].map(share => {
-            const pen = back.getContext('2d');
-            const row = pen.getImageData(0, share * back.height, back.width, 1).data;
-            let x = 0; while (row[4 * x + 2] > 150) x++; return x / back.width; }))($('back'))""")
-        x = np.linspace(0, SIZE[0] / 4, 1000)
-        for found, share in zip(edge, (0.02, 0.5, 0.98), strict=True):
-            rays = np.c_[x, 0 * x + share * SIZE[1], 1 + 0 * x] @ np.linalg.inv(LENS.K).T
-            distorted = np.asarray(LENS.to_pycolmap().img_from_cam(rays))[:, 0]
-            true = np.interp(SIZE[0] / 8, distorted, x) / SIZE[0]
-            assert abs(found - true) < 0.004 and abs(true - 1 / 8) > 0.02
-        # slow: a frame is shown for 1.6 s, so that a busy machine draws each while it is shown
-        browser.eval("goTo(1); window.seen = new Map(); film.playbackRate = 1 / 16; play()")
-        browser.eval(f"""window.timer = setInterval(() => {{
-            if (backdrop.step === state.seat && +$('back').dataset.frame === state.seat)
-              seen.set(state.seat, {GREEN}); }}, 15)""")
-        browser.wait("seen.size >= 4")
-        browser.eval("clearInterval(timer); play()")
-        for step, value in browser.eval("[...seen]"):
-            assert abs(value - 20 * step) < 8, step
-        assert browser.eval("[playing, film.paused]") == [None, True]
-        assert browser.errors == []
-
-
-def test_a_recording_beside_the_page_is_used_too(
-    browser: Browser, film_folder: Path, tmp_path: Path
-) -> None:
-    """Without a server, a page beside its video has a picture for every step; alone the 60."""
-    page = tmp_path / "scene.html"
-    text = (film_folder / "scene.html").read_text()
-    page.write_text(re.sub(r'"thumbs":\[\[.*?\]\],', '"thumbs":[],', text))
-    browser.open(page)
-    browser.eval("goTo(4); setRide(true)")
-    browser.settle()
-    assert browser.eval("[filmed, $('back').hidden]") == [False, True]
-    shutil.copy(film_folder.parent / "walk #1.webm", tmp_path)
-    browser.open(page)
-    browser.eval("goTo(4); setRide(true); $('boxes').click()")
-    browser.wait("filmed && backdrop?.step === 4 && $('back').dataset.frame === '4'")
-    assert browser.eval("document.querySelectorAll('#drawn .box').length") == 3

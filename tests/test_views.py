@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 import pycolmap
-import pytest
-from simulated import CAMERA, SIZE, chair_solids, tracks_of, walk, with_columns
+from simulated import CAMERA, SIZE, chair_solids, tracks_of, walk
 
 import quadrics
 import reobj_track as rt
@@ -38,26 +37,6 @@ def test_every_box_lies_in_its_frame_and_group() -> None:
     assert views.image_size == SIZE
 
 
-def test_frames_without_a_pose_give_no_views() -> None:
-    poses = walk(5)
-    poses.cam_from_world[2] = np.nan
-    tracks = one_box_each([0, 1, 2, 3, 99])
-    views = gather_views(tracks, poses, np.zeros(5, np.int64), 1, 0.0)
-    assert views.frame.tolist() == [0, 1, 3, 4]
-    assert np.isfinite(views.boxes[:, 0, 0]).tolist() == [True, True, True, False]
-    known = poses.cam_from_world[[0, 1, 3, 4]]
-    np.testing.assert_allclose(views.img_from_world, CAMERA.K @ known)
-
-
-@pytest.mark.parametrize(
-    ("min_score", "seen"), [(0.0, 3), (0.3, 3), (0.31, 2), (0.9, 1), (0.95, 0)]
-)
-def test_boxes_below_the_score_give_no_views(min_score: float, seen: int) -> None:
-    tracks = with_columns(one_box_each([0, 1, 2]), score=np.array([0.3, 0.5, 0.9]))
-    views = gather_views(tracks, walk(3), np.zeros(3, np.int64), 1, min_score)
-    assert np.isfinite(views.boxes[:, 0, 0]).sum() == (views.score > 0).sum() == seen
-
-
 def test_boxes_are_undistorted_as_pycolmap_does() -> None:
     """Each edge goes through its undistorted middle; edges at the border of the image stay."""
     params = (520.0, 320.0, 240.0, 0.2)
@@ -78,18 +57,6 @@ def test_boxes_are_undistorted_as_pycolmap_does() -> None:
     assert (views.boxes[0, 0] < inner).all()  # the lens pushes points outwards
     assert views.boxes[1, 0, 0] == 0 and views.boxes[1, 0, 3] == 480
     assert views.boxes[1, 0, 2] > 200  # left of the middle: outwards is to the left
-
-
-def test_cameras_of_views_project_like_the_poses() -> None:
-    poses = walk(6)
-    tracks = tracks_of(poses, 0.0)
-    views = gather_views(tracks, poses, tracks.track_id - 1, 3, 0.0)
-    pose = pycolmap.Rigid3d(poses.cam_from_world[4])
-    camera = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=list(CAMERA.params))
-    point = np.array([0.3, 0.2, 0.5])
-    x, y, z = views.img_from_world[4] @ [*point, 1]
-    expected = np.ravel(camera.img_from_cam(pose * point))
-    np.testing.assert_allclose([x / z, y / z], expected, atol=1e-9)
 
 
 def test_points_in_boxes_project_into_them() -> None:
@@ -131,15 +98,6 @@ def test_frames_have_the_points_observed_by_neighbours() -> None:
     assert not any(1 in visible.in_frame(row) for row in range(7))  # observed by no frame
 
 
-def test_frames_without_a_pose_or_of_another_component_have_no_points() -> None:
-    poses = dataclasses.replace(sparse_walk(), part=np.array([0, 0, 0, 1, 1, 2, 2]))
-    poses.cam_from_world[1] = np.nan
-    visible = VisiblePoints(poses)
-    assert [visible.in_frame(row).tolist() for row in range(7)] == [
-        [0], [], [0], [0, 2], [0, 2, 3], [], [],
-    ]  # fmt: skip
-
-
 CHAIRS = chair_solids()
 
 
@@ -171,16 +129,6 @@ def test_points_on_an_object_are_in_most_of_its_boxes() -> None:
     assert rows_of(points_on(views, poses, CHAIRS), points)[1] == []
     views.boxes[2:5, 1] = np.nan  # not observed there: no evidence
     assert len(rows_of(points_on(views, poses, CHAIRS), points)[1]) == 6
-
-
-def test_one_view_or_few_points_are_insufficient() -> None:
-    points = CHAIRS.center_in_world[1] + np.random.default_rng(1).uniform(-0.1, 0.1, (5, 3))
-    poses, views = seen_points(points)
-    assert len(rows_of(points_on(views, poses, CHAIRS), points)[1]) == 5
-    fewer, few = seen_points(points[:4])
-    assert not any(rows_of(points_on(few, fewer, CHAIRS), points))
-    views.boxes[1:, 1] = np.nan
-    assert not any(rows_of(points_on(views, poses, CHAIRS), points))
 
 
 def test_a_point_belongs_to_the_nearest_then_smallest_object() -> None:

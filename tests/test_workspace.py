@@ -13,7 +13,7 @@ import pytest
 from simulated import fitted, tracks_of, walk
 
 import reobj_track as rt
-from reobj.results.saving import copy_models, replaced
+from reobj.results.entries import copy_models, replaced
 from reobj.results.workspace import Workspace
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -43,15 +43,6 @@ def test_a_foreign_folder_is_not_written_into(tmp_path: Path) -> None:
     Workspace(tmp_path, overwrite=True)
     assert (tmp_path / "thesis.tex").read_text() == "precious"
     Workspace(tmp_path)  # it belongs to the tool now
-
-
-def test_only_folders_of_earlier_runs_are_opened(tmp_path: Path) -> None:
-    with pytest.raises(rt.ReobjError, match="make one with `run`"):
-        Workspace.open(tmp_path / "nowhere")
-    assert not (tmp_path / "nowhere").exists()
-    Workspace(tmp_path / "out")
-    with pytest.raises(rt.ReobjError, match="no tracks here"):
-        Workspace.open(tmp_path / "out").load_last()
 
 
 # ---- One video a folder ----
@@ -89,7 +80,7 @@ def test_a_run_that_failed_does_not_claim_the_folder(video: rt.Video, tmp_path: 
 
 HOLD = """
 import os, sys, time
-from reobj.results.saving import copy_models, replaced
+from reobj.results.entries import copy_models, replaced
 from reobj.results.workspace import Workspace
 with Workspace(sys.argv[1]):
     print("held", flush=True)
@@ -126,36 +117,7 @@ def test_the_same_video_with_other_options_is_the_same_video(
     assert space.last_tracks is not None
 
 
-FRAMES = '{"source": "a", "input": {}, "frames": {"size": [640, %s], "count": 3%s}}'
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "{", "[]", "{}", '{"source": "a", "input": {"every": 1.5}}', FRAMES % (0, ""),
-        FRAMES % (480, ', "times_s": [1, "x"]'),
-    ],
-)  # fmt: skip
-def test_a_damaged_source_file_is_reported(tmp_path: Path, text: str) -> None:
-    space = Workspace(tmp_path)
-    (space.cache / "source.json").write_text(text)
-    with pytest.raises(rt.ReobjError, match=r"source\.json"):
-        space.video()
-
-
 # ---- The cache ----
-
-
-def test_the_latest_tracks_and_poses_are_kept(tmp_path: Path) -> None:
-    space, poses = Workspace(tmp_path), walk(3)
-    result = fitted(tracks_of(poses), None)
-    space.save_last(result, poses)
-    again = space.load_last()
-    np.testing.assert_array_equal(again.tracks.xyxy, result.tracks.xyxy)
-    np.testing.assert_array_equal(again.poses.cam_from_world, poses.cam_from_world)
-    space.save_last(result, None)  # a later run in 2D
-    assert space.load_last().poses is None
-    assert not [p for p in space.out.rglob("*") if p.name.startswith(".part-")]
 
 
 def published(out: Path, models: list[Path] | None) -> dict[str, list[str]]:

@@ -19,7 +19,7 @@ from reobj.formats import AUTO
 from reobj.poses.supplied.frame_assignment import rows_by_time, seconds_of
 from reobj.poses.supplied.readers import read_pose_file
 from reobj.results.result import Object, Result
-from reobj.types import Array, IntArray, ReobjError, log
+from reobj.types import Array, ReobjError, log
 
 MIN_HALF_AXIS = 0.005  # m, as the truth: sheets count as 1 cm thick; volume IoU needs a volume
 
@@ -29,16 +29,16 @@ def read_true_objects(path: Path) -> tuple[list[int], quadrics.Ellipsoids]:
 
     The `visible_part` of an object, if given, is the truth: no camera saw the rest.
     """
-    ids: list[int] = []
-    rows: list[Array] = []  # (15,) each: centre, half axes, axes
+    rows = []  # (15,) each: centre, half axes, axes
     data = load_json(path)
     try:
-        for entry in data["objects"]:
+        entries = data["objects"]
+        ids = [int(entry["id"]) for entry in entries]
+        for entry in entries:
             seen = entry | entry.get("visible_part", {})
             half = np.array(seen["size"]) / 2 if "R" in seen else seen["half_axes"]
             axes = np.array(seen["R"] if "R" in seen else seen["world_from_obj"])[:3, :3]
             rows.append(np.concatenate([seen["center"], half, axes.ravel()]).astype(np.float64))
-            ids.append(int(entry["id"]))
         table = np.array(rows).reshape(-1, 15)
         if not np.isfinite(table).all():
             raise ValueError("a number is not finite")
@@ -156,38 +156,32 @@ def score_objects(
         "o3d_all": float(o3d.sum() / max(len(pairs), 1)),
         "center_error_median": float(np.median(error)),
         "size_error_median": float(np.expm1(np.median(size))),
-        "sizes_inside": fraction_within_2_sigma(sizes_in_sigma(located, our_rows, fitted, true)),
+        "sizes_inside": _sizes_inside([located[row].cov for row in our_rows], fitted, true),
         "scale_error": scale_errors[0],
         **({"part_scale_errors": scale_errors} if len(scale_errors) > 1 else {}),
         "objects": each,
     }
 
 
-def sizes_in_sigma(
-    objects: Sequence[Object],
-    rows: IntArray,
-    fitted: quadrics.Ellipsoids,
-    true: quadrics.Ellipsoids,
-) -> Array:
-    """Return the errors (n, 3) of log sides along the true axes in sigma; NaN without a sigma.
+def _sizes_inside(
+    covs: Sequence[Array | None], fitted: quadrics.Ellipsoids, true: quadrics.Ellipsoids
+) -> float | None:
+    """Return the fraction of the log sides along the true axes within 2 sigma of the truth.
 
     Args:
-        rows: (n,) of the objects. fitted, true: their ellipsoids and the true ones, in one world.
+        covs: (9, 9) each (`Object.cov`), or None: its sides do not count. fitted, true: the
+            ellipsoids and the true ones, in one world.
+    Returns:
+        None if no side counts.
     """
     cosine = np.abs(true.world_from_obj.swapaxes(1, 2) @ fitted.world_from_obj)  # (n, true, own)
     orders = quadrics.AXIS_ORDERS
     best = orders[cosine[:, np.arange(3), orders].sum(2).argmax(1)]  # (n, 3) own axis of each true
-    none = np.full((9, 9), np.nan)
-    cov = [none if (of := objects[row].cov) is None else of for row in rows.tolist()]
-    variance = np.einsum("nii->ni", np.array(cov, np.float64))[:, 3:6]
+    variance = np.array([np.full(3, np.nan) if c is None else c.diagonal()[3:6] for c in covs])
     error = np.log(np.take_along_axis(fitted.half_axes, best, 1) / true.half_axes)
-    return np.asarray(error / np.sqrt(np.take_along_axis(variance, best, 1)), np.float64)
-
-
-def fraction_within_2_sigma(in_sigma: Array) -> float | None:
-    """Return the fraction of errors within 2 sigma; None if all are NaN."""
-    known = in_sigma[np.isfinite(in_sigma)]
-    return float((np.abs(known) < 2).mean()) if len(known) else None
+    in_sigma = error / np.sqrt(np.take_along_axis(variance, best, 1))
+    known = np.abs(in_sigma[np.isfinite(in_sigma)])
+    return float((known < 2).mean()) if len(known) else None
 
 
 def _ellipsoids_in_truth(
@@ -203,8 +197,7 @@ def _ellipsoids_in_truth(
     solids: list[quadrics.Ellipsoids] = []
     scale_errors: list[float | None] = []
     faults: dict[int, ReobjError] = {}
-    parts = result.parts()
-    for k, part in enumerate(parts):
+    for k, part in enumerate(result.parts()):
         scale_errors.append(None)
         try:
             scale, turn, shift = align_with_truth(part, truth_poses)
@@ -218,7 +211,7 @@ def _ellipsoids_in_truth(
         solids.append(quadrics.Ellipsoids(center, scale * ours.half_axes, axes))
         if part.world.scale is not None and part.world.scale.value:
             scale_errors[k] = abs(part.world.scale.value / scale - 1)
-    if len(faults) == len(parts):
+    if not solids:
         raise faults[0]
     for k, fault in faults.items():
         log.warning("component %d of the trajectory is not evaluated in 3D: %s", k, fault)

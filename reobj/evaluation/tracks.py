@@ -21,6 +21,7 @@ from reobj.evaluation.truth import (
     LabelledBoxes,
     Role,
     check_counts,
+    of_tracks,
     read_result,
     read_truth,
     with_common_names,
@@ -31,15 +32,7 @@ from reobj.results.entries import OutputFile
 from reobj.results.result import Result
 from reobj.results.workspace import Workspace
 from reobj.sources.video import InputConfig
-from reobj.types import (
-    COCO_NAMES,
-    Array,
-    IntArray,
-    ReobjError,
-    box_iou,
-    rows_by,
-    unit_rows,
-)
+from reobj.types import COCO_NAMES, Array, IntArray, ReobjError, box_iou, rows_by, unit_rows
 from reobj.words import meant
 
 MATCH_IOU = 0.5 - 1e-12  # least IoU of a match, except for HOTA (MOTChallenge: .5, inclusive)
@@ -54,15 +47,12 @@ def _frame_steps(truth: LabelledBoxes, predicted: LabelledBoxes) -> list[_Step]:
         for every frame with boxes, ascending: rows of the truth (g,) and of the result (p,), and
         their IoU (g, p), 0 for different classes.
     """
-    frames = np.union1d(truth.frame, predicted.frame)
-    rows = []
-    for boxes in (truth, predicted):
-        order = np.argsort(boxes.frame, kind="stable")
-        rows.append(np.split(order, np.searchsorted(boxes.frame[order], frames[1:])))
     steps = []
-    for g, p in zip(*rows, strict=True):
+    for rows in rows_by(np.append(truth.frame, predicted.frame)):
+        g = rows[rows < len(truth)]
+        p = rows[len(g) :] - len(truth)
         a = truth.name[g][:, None]
-        b = predicted.name[p][None]
+        b = predicted.name[p]
         same = (a == b) | (a == "") | (b == "")
         steps.append((g, p, np.where(same, box_iou(truth.xyxy[g], predicted.xyxy[p]), 0.0)))
     return steps
@@ -75,13 +65,23 @@ def _best_pairs(score: Array) -> tuple[IntArray, IntArray]:
     return rows[positive], columns[positive]
 
 
-def drop_ignored(truth: LabelledBoxes, predicted: LabelledBoxes) -> LabelledBoxes:
-    """Drop results matched to an ignored true box, as MOTChallenge does."""
-    keep = np.ones(len(predicted), bool)
-    for g, p, iou in _frame_steps(truth, predicted) if (truth.role == Role.IGNORED).any() else ():
+def _matched_rows(truth: LabelledBoxes, predicted: LabelledBoxes) -> IntArray:
+    """Match truth and result frame by frame at IoU >= .5, with the largest total IoU.
+
+    Returns:
+        (2, M) rows of the truth, of any role, and of the result.
+    """
+    pairs = [np.empty((2, 0), np.int64)]
+    for g, p, iou in _frame_steps(truth, predicted):
         a, b = _best_pairs(np.where(iou >= MATCH_IOU, iou, 0))
-        keep[p[b]] &= truth.role[g[a]] != Role.IGNORED
-    return predicted[keep]
+        pairs.append(np.stack([g[a], p[b]]))
+    return np.concatenate(pairs, 1)
+
+
+def _scored_rows(truth: LabelledBoxes, predicted: LabelledBoxes) -> IntArray:
+    """Return the matches (2, M) of the true boxes that count, as `_matched_rows` does."""
+    rows = _matched_rows(truth, predicted)
+    return rows[:, truth.role[rows[0]] == Role.SCORED]
 
 
 def _numbered(
@@ -103,6 +103,8 @@ def _numbered(
 def score_tracks(truth: LabelledBoxes, predicted: LabelledBoxes) -> dict[str, float]:
     """Compute HOTA, CLEAR MOT and identity scores as TrackEval does, and further scores.
 
+    As in MOTChallenge, results matched to an ignored true box are dropped first.
+
     Returns:
         rates in [0, 1] and counts by name. Further ones: `ids_per_object`, number of identities
         matched to a true object at IoU .5, mean over the matched objects; `returns`, number of
@@ -110,47 +112,31 @@ def score_tracks(truth: LabelledBoxes, predicted: LabelledBoxes) -> dict[str, fl
         identity of the object.
     Ref: Luiten et al., IJCV 2021; Bernardin & Stiefelhagen, 2008; Ristani et al., 2016.
     """
-    predicted = drop_ignored(truth, predicted)
+    true_row, row = _matched_rows(truth, predicted)
+    ignored = row[truth.role[true_row] == Role.IGNORED]
+    predicted = predicted[np.delete(np.arange(len(predicted)), ignored)]
     gt_ids, ids, steps, gt, pr = _numbered(truth, predicted)
-    result = _hota(steps, gt, pr) | _clear(steps, gt, pr) | _identity(steps, gt, pr)
-    result |= _returns(truth, predicted)
-    return result | {"gt_objects": len(gt_ids), "identities": len(ids)}
+    hits = float(_identity_pairs(steps, gt, pr)[2].sum())
+    identity = {
+        "IDF1": 2 * hits / max(int(gt.sum() + pr.sum()), 1),
+        "IDP": hits / max(int(pr.sum()), 1),
+        "IDR": hits / max(int(gt.sum()), 1),
+    }
+    counts = {"gt_objects": len(gt_ids), "identities": len(ids)}
+    scores = _hota(steps, gt, pr) | _clear(steps, gt, pr) | identity
+    return scores | _returns(truth, predicted) | counts
 
 
-def visits(truth: LabelledBoxes, away: int = 30) -> IntArray:
-    """Number the visits of each object: (N,) visit of each box, from 0.
+def visits(truth: LabelledBoxes) -> IntArray:
+    """Number the visits of all objects, by object and then by time: (N,) visit of each box.
 
-    Args:
-        away: a new visit begins after more frames without a box of the object (30: about a second).
+    A new visit begins after more than 30 frames, about a second, without a box of the object.
     """
     order = np.lexsort((truth.frame, truth.identity))
-    new = np.append(True, np.diff(truth.identity[order]) != 0)[: len(order)]
-    late = np.append(False, np.diff(truth.frame[order]) > away)[: len(order)] & ~new
-    count = np.cumsum(late)
-    visit = np.empty(len(order), np.int64)
-    visit[order] = count - np.maximum.accumulate(np.where(new, count, 0))
+    late = np.diff(truth.frame[order]) > 30
+    visit = np.zeros(len(order), np.int64)
+    visit[order[1:]] = np.cumsum(late | (np.diff(truth.identity[order]) != 0))
     return visit
-
-
-def _visit_of_object(truth: LabelledBoxes, visit: IntArray) -> IntArray:
-    """Number the visits (N,) of all objects, by object and then by time."""
-    number = np.unique(truth.identity, return_inverse=True)[1]
-    return np.asarray(visit + (visit.max(initial=0) + 1) * number, np.int64)
-
-
-def matched_rows(truth: LabelledBoxes, predicted: LabelledBoxes) -> tuple[IntArray, IntArray]:
-    """Match truth and result frame by frame at IoU >= .5, with the largest total IoU.
-
-    Returns:
-        rows (M,) of the Role.SCORED true boxes and of the result.
-    """
-    pairs = [np.empty((2, 0), np.int64)]
-    for g, p, iou in _frame_steps(truth, predicted):
-        a, b = _best_pairs(np.where(iou >= MATCH_IOU, iou, 0))
-        pairs.append(np.stack([g[a], p[b]]))
-    rows = np.concatenate(pairs, 1)
-    scored = truth.role[rows[0]] == Role.SCORED
-    return rows[0][scored], rows[1][scored]
 
 
 def _returns(truth: LabelledBoxes, predicted: LabelledBoxes) -> dict[str, float]:
@@ -158,11 +144,10 @@ def _returns(truth: LabelledBoxes, predicted: LabelledBoxes) -> dict[str, float]
 
     Visits without a match are left out.
     """
-    visit = visits(truth)
-    g, p = matched_rows(truth, predicted)
+    g, p = _scored_rows(truth, predicted)
     known: dict[int, set[int]] = {}
     kept = []
-    for rows in rows_by(_visit_of_object(truth, visit)[g]):
+    for rows in rows_by(visits(truth)[g]):
         ids, votes = np.unique(predicted.identity[p[rows]], return_counts=True)
         before = known.setdefault(int(truth.identity[g[rows[0]]]), set())
         kept += [int(ids[votes.argmax()]) in before] if before else []
@@ -171,53 +156,48 @@ def _returns(truth: LabelledBoxes, predicted: LabelledBoxes) -> dict[str, float]
 
 
 def return_ranks(
-    truth: LabelledBoxes,
-    predicted: LabelledBoxes,
-    embedding: npt.NDArray[Any],
-    query_frames: int = 10,
+    truth: LabelledBoxes, predicted: LabelledBoxes, embedding: npt.NDArray[Any]
 ) -> IntArray:
     """Rank the correct object by cosine similarity for the first views of every return.
 
-    A query is a box of the first frames of a return (see `visits`). Its gallery consists of all
-    boxes of earlier frames with the same class; each object has the similarity of its most similar
-    box. Rank-k is the rate of ranks <= k.
+    A query is a box of the first 10 frames (.3 s) of a return (see `visits`). Its gallery consists
+    of all boxes of earlier frames with the same class; each object has the similarity of its most
+    similar box. Rank-k is the rate of ranks <= k.
 
     Args:
         embedding: (N, E) unit rows for the rows of `predicted`, NaN: not embedded.
-        query_frames: first frames of a return, whose boxes are queries (10: .3 s).
     Returns:
         (Q,) ranks from 1.
     """
-    visit = visits(truth)
-    g, p = matched_rows(truth, predicted)
-    use = np.isfinite(embedding[p]).all(1)
-    g = g[use]
-    p = p[use]
-    ranks = []
-    for rows in rows_by(_visit_of_object(truth, visit)[g]):
-        start = truth.frame[g[rows]].min()
-        identity = int(truth.identity[g[rows[0]]])
-        gallery = np.flatnonzero(truth.frame[g] < start)
-        gallery = gallery[truth.name[g[gallery]] == truth.name[g[rows[0]]]]
-        ids, of = np.unique(truth.identity[g[gallery]], return_inverse=True)
-        if identity in ids:
-            queries = rows[truth.frame[g[rows]] < start + query_frames]
+    pairs = _scored_rows(truth, predicted)
+    g, p = pairs[:, np.isfinite(embedding[pairs[1]]).all(1)]
+    matched = truth[g]
+    ranks = [np.empty(0, np.int64)]
+    for rows in rows_by(visits(truth)[g]):
+        start = matched.frame[rows].min()
+        first = rows[0]
+        earlier = (matched.frame < start) & (matched.name == matched.name[first])
+        ids, of = np.unique(matched.identity[earlier], return_inverse=True)
+        own = ids == matched.identity[first]
+        if own.any():
+            queries = rows[matched.frame[rows] < start + 10]
             best = np.full((len(ids), len(queries)), -np.inf)
-            np.maximum.at(best, of, embedding[p[gallery]] @ embedding[p[queries]].T)
-            ranks.append(1 + (best > best[ids == identity]).sum(0))
-    return np.concatenate(ranks) if ranks else np.empty(0, np.int64)
+            np.maximum.at(best, of, embedding[p[earlier]] @ embedding[p[queries]].T)
+            ranks.append(1 + (best > best[own]).sum(0))
+    return np.concatenate(ranks)
 
 
 def _hota(steps: Sequence[_Step], gt_size: IntArray, pr_size: IntArray) -> dict[str, float]:
     """Compute HOTA, DetA and AssA, each the mean over the IoU thresholds .05 to .95."""
     align = np.zeros((len(gt_size), len(pr_size)))  # (G, P) soft number of common frames
     for g, p, iou in steps:
-        union = iou.sum(0)[None] + iou.sum(1)[:, None] - iou
-        align[g[:, None], p[None]] += iou / np.maximum(union, 1e-12)
-    align /= np.maximum(gt_size[:, None] + pr_size[None] - align, 1e-12)  # soft Jaccard index
+        union = iou.sum(0) + iou.sum(1)[:, None] - iou
+        align[g[:, None], p] += iou / np.maximum(union, 1e-12)
+    boxes = gt_size[:, None] + pr_size  # (G, P)
+    align /= np.maximum(boxes - align, 1e-12)  # soft Jaccard index
     pairs = [(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0))]
     for g, p, iou in steps:
-        a, b = _best_pairs(align[g[:, None], p[None]] * iou)
+        a, b = _best_pairs(align[g[:, None], p] * iou)
         pairs.append((g[a], p[b], iou[a, b]))
     g_all, p_all, iou_all = (np.concatenate(x) for x in zip(*pairs, strict=True))
     parts = []
@@ -225,7 +205,7 @@ def _hota(steps: Sequence[_Step], gt_size: IntArray, pr_size: IntArray) -> dict[
         hit = iou_all >= alpha - 1e-12
         common = np.zeros_like(align)  # (G, P) TPA
         np.add.at(common, (g_all[hit], p_all[hit]), 1)
-        jaccard = common / np.maximum(gt_size[:, None] + pr_size[None] - common, 1)
+        jaccard = common / np.maximum(boxes - common, 1)
         # AssA = sum over TP of TPA / (TPA + FPA + FNA), over |TP|; DetA = |TP| / (|TP| + FP + FN)
         ass = (common * jaccard).sum() / max(hit.sum(), 1)
         det = hit.sum() / max(gt_size.sum() + pr_size.sum() - hit.sum(), 1)
@@ -243,7 +223,7 @@ def _clear(steps: Sequence[_Step], gt_size: IntArray, pr_size: IntArray) -> dict
     for g, p, iou in steps:
         if not len(g) or not len(p):
             continue  # as in TrackEval: such a frame does not end a match
-        kept = 1000.0 * (before[g][:, None] == p[None])  # larger than any sum of IoU
+        kept = 1000.0 * (before[g][:, None] == p)  # larger than any sum of IoU
         a, b = _best_pairs(np.where(iou >= MATCH_IOU, kept + iou, 0))
         g = g[a]
         p = p[b]
@@ -266,35 +246,25 @@ def _clear(steps: Sequence[_Step], gt_size: IntArray, pr_size: IntArray) -> dict
     }
 
 
-def _identity_pairs(steps: Sequence[_Step], shape: tuple[int, ...]) -> tuple[Any, Any, Array]:
+def _identity_pairs(
+    steps: Sequence[_Step], gt_size: IntArray, pr_size: IntArray
+) -> tuple[Any, Any, Array]:
     """Map identities of truth and result one to one, with the most common frames.
 
     Returns:
         numbers of the identities of truth and result, and their common frames, (K,) each.
     """
-    common = np.zeros(shape)
+    common = np.zeros((len(gt_size), len(pr_size)))
     for g, p, iou in steps:
-        common[g[:, None], p[None]] += iou >= MATCH_IOU
+        common[g[:, None], p] += iou >= MATCH_IOU
     a, b = _best_pairs(common)
     return a, b, common[a, b]
 
 
-def _identity(steps: Sequence[_Step], gt_size: IntArray, pr_size: IntArray) -> dict[str, float]:
-    """Compute F1, precision and recall of identities under the best one-to-one map."""
-    hits = float(_identity_pairs(steps, (len(gt_size), len(pr_size)))[2].sum())
-    gt = int(gt_size.sum())
-    pr = int(pr_size.sum())
-    return {
-        "IDF1": 2 * hits / max(gt + pr, 1),
-        "IDP": hits / max(pr, 1),
-        "IDR": hits / max(gt, 1),
-    }
-
-
 def identity_map(truth: LabelledBoxes, predicted: LabelledBoxes) -> dict[int, int | None]:
     """Map every true identity to one of the result, one to one by common frames, or to None."""
-    gt_ids, ids, steps, *_ = _numbered(truth, predicted)
-    a, b, _ = _identity_pairs(steps, (len(gt_ids), len(ids)))
+    gt_ids, ids, steps, gt, pr = _numbered(truth, predicted)
+    a, b, _ = _identity_pairs(steps, gt, pr)
     pairs: dict[int, int | None] = dict.fromkeys(gt_ids.tolist())
     return pairs | dict(zip(gt_ids[a].tolist(), ids[b].tolist(), strict=True))
 
@@ -313,22 +283,15 @@ COLUMNS = {
 }
 
 
-def score_table(scores: dict[str, dict[str, float]]) -> str:
-    """Format one line for each name, rates in per cent."""
-    lines = [f"{'':<14}" + "".join(f"{c:>6}" for c in COLUMNS)]
-    for name, score in scores.items():
-        counts = {key: f"{score[key]:.0f}" for key in ("IDSW", "Frag")}
-        counts["IDs"] = f"{score['ids_per_object']:.4g}"
-        cells = [counts.get(c) or f"{100 * score[c]:.1f}" for c in COLUMNS]
-        lines.append(f"{name[:14]:<14}" + "".join(f" {cell:>5}" for cell in cells))
-    return "\n".join(lines)
-
-
 def score_report(scores: dict[str, Any]) -> str:
-    """Format the result of `evaluate` for the terminal."""
-    tracks: dict[str, dict[str, float]] = scores["tracks"]
-    matched = {n: s for n, s in tracks.items() if n == "all" or s["IDF1"] or s["HOTA"] or s["IDP"]}
-    lines = [score_table(matched)]
+    """Format the result of `evaluate` for the terminal: one line a class, rates in per cent."""
+    lines = [f"{'':<14}" + "".join(f"{c:>6}" for c in COLUMNS)]
+    for name, score in scores["tracks"].items():
+        if name == "all" or score["IDF1"] or score["HOTA"] or score["IDP"]:
+            counts = {key: f"{score[key]:.0f}" for key in ("IDSW", "Frag")}
+            counts["IDs"] = f"{score['ids_per_object']:.4g}"
+            cells = [counts.get(c) or f"{100 * score[c]:.1f}" for c in COLUMNS]
+            lines.append(f"{name[:14]:<14}" + "".join(f" {cell:>5}" for cell in cells))
     if missed := scores["missed"]:
         names = [f"{name} {', '.join(map(str, ids))}".strip() for name, ids in missed.items()]
         count = sum(map(len, missed.values()))
@@ -343,18 +306,17 @@ def score_report(scores: dict[str, Any]) -> str:
     if "objects" in scores:
         numbers = {k: v for k, v in scores["objects"].items() if isinstance(v, int | float)}
         lines += wrapped("3D: " + ", ".join(f"{k} {v:.3g}" for k, v in numbers.items()))
-    for text in scores.get("messages", ()):
+    for text in scores["messages"]:
         lines += wrapped(f"note: {text}")
-    lines += [f"{column:<5}{meaning}" for column, meaning in COLUMNS.items()]
-    return "\n".join(lines)
+    return "\n".join([*lines, *(f"{column:<5}{meaning}" for column, meaning in COLUMNS.items())])
 
 
-def _missed(truth: LabelledBoxes, predicted: LabelledBoxes) -> dict[str, list[int]]:
-    """List the true identities that no identity of the result matches, by class."""
+def _missed(truth: LabelledBoxes, pairs: dict[int, int | None]) -> dict[str, list[int]]:
+    """List the true identities without a match among `pairs` (`identity_map`), by class."""
     scored = truth[truth.role == Role.SCORED]
     name_of = dict(zip(scored.identity.tolist(), scored.name.tolist(), strict=True))
     missed: dict[str, list[int]] = {}
-    for identity, match in identity_map(truth, predicted).items():
+    for identity, match in pairs.items():
         if match is None:
             missed.setdefault(name_of[identity], []).append(identity)
     return dict(sorted(missed.items()))
@@ -392,46 +354,41 @@ def evaluate(
             boxes in a frame, or a class does not occur.
     """
     out = Path(out)
-    names = COCO_NAMES
-    tracked = None
+    gt = Path(gt)
     if out.name == OutputFile.TRACKS and (out.parent / OutputFile.LAST_TRACKS).exists():
         out = out.parent
     notes: list[str] = []
     predicted = read_result(out, notes)
-    if (out / OutputFile.LAST_TRACKS).exists():
-        workspace = Workspace.open(out)
-        tracked = workspace.load_last()
-        names = tracked.class_names
+    workspace = Workspace.open(out) if (out / OutputFile.LAST_TRACKS).exists() else None
+    tracked = None if workspace is None else workspace.load_last()
+    names: Sequence[str] = COCO_NAMES if tracked is None else tracked.class_names
     size = (0, 0) if tracked is None else (tracked.video.width, tracked.video.height)
-    truth = read_truth(Path(gt), names, min_visibility, notes, size, gt_format, first_frame)
-    check_counts(truth, Path(gt))
-    if tracked is not None:
+    truth = read_truth(gt, names, min_visibility, notes, size, gt_format, first_frame)
+    check_counts(truth, gt)
+    if workspace is not None and tracked is not None:
         config = workspace.source[1]
         truth, predicted = _in_frames_of_run(truth, predicted, config, tracked.looked, notes)
         why = "none lies in a frame that was read, and that the detector was run on"
-        check_counts(truth, Path(gt), f"{why} (--start, --stop, --every)")
+        check_counts(truth, gt, f"{why} (--start, --stop, --every)")
     predicted = _in_true_frames(truth, predicted, notes)
     truth, predicted, named = with_common_names(truth, predicted, notes)
     known = sorted({*truth.name.tolist(), *predicted.name.tolist()} - {""})
-    if unknown := [word for word in classes if not meant(word, known)]:
-        raise ReobjError(
-            f"--classes: {', '.join(sorted(unknown))}: neither in the truth nor in the result"
-        )
-    classes = list(dict.fromkeys(known[k] for word in classes for k in meant(word, known)))
-    names_scored = list(classes) or sorted(set(truth.name[truth.role == Role.SCORED]) - {""})
-    if classes:
-        truth, predicted = _of_classes(truth, predicted, classes, named)
-        check_counts(truth, Path(gt), f"none is of {', '.join(classes)}")
+    if unknown := sorted(word for word in classes if not meant(word, known)):
+        raise ReobjError(f"--classes: {', '.join(unknown)}: neither in the truth nor in the result")
+    chosen = list(dict.fromkeys(known[k] for word in classes for k in meant(word, known)))
+    if chosen:
+        truth, predicted = _of_classes(truth, predicted, chosen, named)
+        check_counts(truth, gt, f"none is of {', '.join(chosen)}")
     scores = {"all": score_tracks(truth, predicted)}
-    if named and len(names_scored) > 1:
-        for name in names_scored:
-            scores[name] = score_tracks(*_of_classes(truth, predicted, [name], named))
+    of_truth = chosen or sorted(set(truth.name[truth.role == Role.SCORED].tolist()) - {""})
+    for name in of_truth if named and len(of_truth) > 1 else ():
+        scores[name] = score_tracks(*_of_classes(truth, predicted, [name], named))
+    pairs = identity_map(truth, predicted)
     result: dict[str, Any] = {"version": __version__, "gt": str(gt), "tracks": scores}
-    result["ranks"] = score_appearance(tracked, truth) if tracked is not None else {}
-    result["missed"] = _missed(truth, predicted)
+    result["ranks"] = {} if tracked is None else score_appearance(tracked, truth)
+    result["missed"] = _missed(truth, pairs)
     result["messages"] = notes
     if solids is not None:
-        pairs = identity_map(truth, predicted)
         poses = Path(truth_poses) if truth_poses else None
         result["objects"] = score_objects(Result.load(out), Path(solids), poses, pairs)
     return result
@@ -444,12 +401,10 @@ def _of_classes(
 
     If the result has no classes (not `named`), true boxes of other classes become Role.IGNORED.
     """
-    true_rows, predicted_rows = (
-        np.isin(boxes.name, [*classes, ""]) for boxes in (truth, predicted)
-    )
+    of_truth, of_result = (np.isin(boxes.name, [*classes, ""]) for boxes in (truth, predicted))
     if named:
-        return truth[true_rows], predicted[predicted_rows]
-    role = np.where(true_rows | (truth.role != Role.SCORED), truth.role, Role.IGNORED)
+        return truth[of_truth], predicted[of_result]
+    role = np.where(of_truth, truth.role, np.maximum(truth.role, Role.IGNORED))
     return dataclasses.replace(truth, role=role), predicted
 
 
@@ -457,33 +412,52 @@ def _in_frames_of_run(
     truth: LabelledBoxes,
     predicted: LabelledBoxes,
     config: InputConfig,
-    looked: IntArray | None,
+    detector_ran: IntArray | None,
     notes: list[str],
 ) -> tuple[LabelledBoxes, LabelledBoxes]:
     """Select the frames that were read, and on which the detector was run (None: on all)."""
-    frame = truth.frame - 1
-    read = (frame >= config.start) & ((frame - config.start) % config.every == 0)
-    truth = truth[read & (frame < (config.stop or np.inf))]
-    if looked is None:
+    after = truth.frame - 1 - config.start
+    truth = truth[(after >= 0) & (after % config.every == 0)]
+    truth = truth[truth.frame <= (config.stop or np.inf)]
+    if detector_ran is None:
         return truth, predicted
-    kept = truth[np.isin(truth.frame - 1, looked)]
+    kept, found = (b[np.isin(b.frame - 1, detector_ran)] for b in (truth, predicted))
     notes.append(
         f"{len(truth) - len(kept)} of {len(truth)} true boxes do not count: they lie in frames "
-        f"on which the detector was not run (it was run on {len(looked)})"
+        f"on which the detector was not run (it was run on {len(detector_ran)})"
     )
-    return kept, predicted[np.isin(predicted.frame - 1, looked)]
+    return kept, found
+
+
+SCALES = (0.25, 1 / 3, 0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2, 3, 4)  # of images resized for a detector
 
 
 def _in_true_frames(
     truth: LabelledBoxes, predicted: LabelledBoxes, notes: list[str]
 ) -> LabelledBoxes:
-    """Select the boxes of the result in the frames that the truth lists; note those without it."""
-    unnamed = dataclasses.replace(predicted, name=np.full(len(predicted), ""))
-    if len(predicted) and not any((iou > 0).any() for *_, iou in _frame_steps(truth, unnamed)):
+    """Select the boxes of the result in the frames that the truth lists.
+
+    Notes say that frames have no truth, and that boxes match nowhere, or only after scaling.
+    """
+
+    def best_iou(scale: float) -> Array:
+        xyxy = predicted.xyxy * scale
+        scaled = dataclasses.replace(predicted, xyxy=xyxy, name=np.full(len(predicted), ""))
+        return np.concatenate([iou.max(1, initial=0) for *_, iou in _frame_steps(truth, scaled)])
+
+    iou = best_iou(1)  # (N,) of the true boxes
+    if len(predicted) and not iou.any():
         true, found = (f"{boxes.frame.min()}-{boxes.frame.max()}" for boxes in (truth, predicted))
         notes.append(f"no true box overlaps a box of the result (frames from 1: truth {true}, "
                      f"result {found}): truth of another video?")  # fmt: skip
-    notes += _scale_note(truth, unnamed)
+    plain = (iou >= MATCH_IOU).sum()
+    few = 0.3 * len(truth)
+    if plain <= few:
+        best, scale = max(((best_iou(s) >= MATCH_IOU).sum(), s) for s in SCALES)
+        if best > max(3 * plain, few):
+            notes.append(f"{plain} of {len(truth)} true boxes match a box of the result, but "
+                         f"{best} do if the boxes of the result are scaled by {scale:.3g}: boxes "
+                         "of frames of another size?")  # fmt: skip
     if truth.listed is not None:
         kept = predicted[np.isin(predicted.frame, truth.listed)]
         if left := len(predicted) - len(kept):
@@ -499,25 +473,6 @@ def _in_true_frames(
     return predicted
 
 
-def _scale_note(truth: LabelledBoxes, predicted: LabelledBoxes) -> list[str]:
-    """Note that most true boxes match only after all boxes of the result are scaled."""
-
-    def matches(scale: float) -> int:
-        scaled = dataclasses.replace(predicted, xyxy=predicted.xyxy * scale)
-        steps = _frame_steps(truth, scaled)
-        return sum(int((iou >= MATCH_IOU).any(1).sum()) for *_, iou in steps)
-
-    few = 0.3 * len(truth)
-    if (plain := matches(1)) > few:
-        return []
-    best, scale = max((matches(s), s) for s in (0.25, 1 / 3, 0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2, 3, 4))
-    if best <= max(3 * plain, few):
-        return []
-    return [f"{plain} of {len(truth)} true boxes match a box of the result, but {best} do if the "
-            f"boxes of the result are scaled by {scale:.3g}: boxes of frames of another size?"
-            ]  # fmt: skip
-
-
 def score_appearance(tracked: Result, truth: LabelledBoxes) -> dict[str, float]:
     """Compute Rank-k of the returns by appearance alone (`return_ranks`), k = 1, 5, 20, 50.
 
@@ -528,10 +483,7 @@ def score_appearance(tracked: Result, truth: LabelledBoxes) -> dict[str, float]:
     tracks = tracked.tracks[tracked.embedding_row]
     if not embeddings.foreground.size:
         return {}
-    identity = np.arange(len(tracks))
-    names = np.array([*tracked.class_names, ""])[tracks.class_id]  # -1: unknown
-    role = np.full(len(tracks), Role.SCORED)
-    predicted = LabelledBoxes(tracks.frame + 1, identity, tracks.xyxy, names, role)
+    predicted = of_tracks(tracks, tracked.class_names)
     truth, predicted, _ = with_common_names(truth, predicted, [])
     fused = np.concatenate([embeddings.foreground, embeddings.background], 1)
     rank = return_ranks(truth, predicted, unit_rows(fused))

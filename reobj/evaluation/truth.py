@@ -27,7 +27,7 @@ from reobj.results.result import Result
 from reobj.sources.detection_files import DETECTIONS, FROM_1, Reader, check_rows, read_source
 from reobj.sources.recorded import SIZES, NoVideo, Source, corners, other_form
 from reobj.sources.tables import forms, read_mot_rows
-from reobj.types import CLASS_MAX, Array, BoolArray, IntArray, ReobjError, counted
+from reobj.types import CLASS_MAX, Array, BoolArray, IntArray, ReobjError, Tracks, counted
 from reobj.words import among, canonical
 
 TruthReader = Callable[[Source, float], "LabelledBoxes"]
@@ -69,12 +69,17 @@ class LabelledBoxes:
 
 def labelled(rows: Array, name: Any = "", role: Any = Role.SCORED) -> LabelledBoxes:
     """Convert MOTChallenge rows (N, 6+) to labelled boxes; name, role: for all rows, or (N,)."""
-    n = len(rows)
-    xyxy = corners(rows[:, 2:6], SIZES)  # (N, 4)
-    whole = rows[:, :2].astype(np.int64)
-    names = np.broadcast_to(np.asarray(name, str), n)
-    roles = np.broadcast_to(role, n)
-    return LabelledBoxes(whole[:, 0], whole[:, 1], xyxy, names, np.asarray(roles, np.int64))
+    frame, identity = rows[:, :2].T.astype(np.int64)
+    names = np.broadcast_to(np.asarray(name, str), len(rows))
+    roles = np.broadcast_to(np.asarray(role, np.int64), len(rows))
+    return LabelledBoxes(frame, identity, corners(rows[:, 2:6], SIZES), names, roles)
+
+
+def of_tracks(tracks: Tracks, class_names: Sequence[str]) -> LabelledBoxes:
+    """Convert tracks of a result; class -1 is unknown."""
+    names = np.array([*class_names, ""], str)[tracks.class_id]
+    role = np.full(len(tracks), Role.SCORED)
+    return LabelledBoxes(tracks.frame + 1, tracks.track_id, tracks.xyxy, names, role)
 
 
 def read_truth(
@@ -139,32 +144,20 @@ def read_result(out: Path, notes: list[str] | None = None) -> LabelledBoxes:
     """
     if out.is_dir():
         result = Result.load(out)
-        tracks = result.tracks
-        names = np.array([*result.class_names, ""], str)  # the last one is that of class -1
-        role = np.full(len(tracks), Role.SCORED)
-        frame = tracks.frame + 1
-        names = names[tracks.class_id]
-        predicted = LabelledBoxes(frame, tracks.track_id, tracks.xyxy, names, role)
+        predicted = of_tracks(result.tracks, result.class_names)
         out = out / OutputFile.TRACKS
     else:
-        notes = [] if notes is None else notes
-        predicted = labelled(_checked(read_mot_rows(out), out, notes))
+        rows = _checked(read_mot_rows(out), out, [] if notes is None else notes)
+        predicted = labelled(rows)
     _check_identities(predicted, out)
     return predicted
 
 
-class MotClass(enum.IntEnum):
-    """Classes of MOTChallenge: the one that counts, and those that do not count if matched.
-
-    The latter in TrackEval 1.3.0, mot_challenge_2d_box.py.
-    """
-
-    PEDESTRIAN = 1
-    PERSON_ON_VEHICLE = 2
-    NON_MOTORISED_VEHICLE = 6  # of MOT20 only
-    STATIC_PERSON = 7
-    DISTRACTOR = 8
-    REFLECTION = 12
+# Classes of MOTChallenge (TrackEval 1.3.0, mot_challenge_2d_box.py)
+PEDESTRIAN = 1
+# boxes on a person on a vehicle, a static person, a distractor or a reflection do not count
+DISTRACTORS = (2, 7, 8, 12)
+NON_MOTORISED_VEHICLE = 6  # a distractor of MOT20 only
 
 
 def _read_mot(source: Source, min_visibility: float) -> LabelledBoxes:
@@ -191,8 +184,8 @@ def _read_mot(source: Source, min_visibility: float) -> LabelledBoxes:
     number = rows[:, 7].clip(-CLASS_MAX, CLASS_MAX).astype(np.int64)
     names, role, note = _mot_classes(number, flagged, source, sequence)
     source.say(note)
-    hidden = (rows[:, 8] < min_visibility) & (role == Role.SCORED)
-    return labelled(rows, names, np.where(hidden, Role.IGNORED, role))
+    occluded = (rows[:, 8] < min_visibility) & (role == Role.SCORED)
+    return labelled(rows, names, np.where(occluded, Role.IGNORED, role))
 
 
 def _mot_classes(
@@ -207,20 +200,24 @@ def _mot_classes(
     stated = source.path.with_name("gt_mot_format.json")
     absent = flagged * Role.ABSENT
     if labels.exists():
-        return (_by_line(number, labels, source.path), absent,
-                f"classes are lines of {labels.name}, from 1 (CVAT's MOT 1.1)")  # fmt: skip
+        lines = np.array(["", *(line.strip() for line in read_lines(labels))])
+        if number.max(initial=0) >= len(lines):
+            found = f"class {number.max()}, but {labels} has {len(lines) - 1} lines"
+            raise ReobjError(f"{source.path}: {found}")
+        note = f"classes are lines of {labels.name}, from 1 (CVAT's MOT 1.1)"
+        return lines[number.clip(0)], absent, note
     if stated.exists():
         names = _names_of(number, load_json(stated)["classes"])
         return names, flagged * Role.IGNORED, f"classes are named by {stated.name}"
     benchmark, why = _benchmark(sequence.get("name", ""), source.path, number, flagged)
     if benchmark:
-        only_mot20 = {MotClass.NON_MOTORISED_VEHICLE} if benchmark != "MOT20" else set()
-        distractors = set(MotClass) - {MotClass.PEDESTRIAN} - only_mot20
-        role = (flagged | (number != MotClass.PEDESTRIAN)) * Role.ABSENT
-        role[np.isin(number, list(distractors))] = Role.IGNORED
+        role = (flagged | (number != PEDESTRIAN)) * Role.ABSENT
+        role[np.isin(number, DISTRACTORS)] = Role.IGNORED
+        if benchmark == "MOT20":
+            role[number == NON_MOTORISED_VEHICLE] = Role.IGNORED
         return "", role, (f"classes are {benchmark}'s, by {why}: pedestrians count, boxes on "
                           "distractors do not")  # fmt: skip
-    if (number < 0).all() or (sequence and (number == MotClass.PEDESTRIAN).all()):
+    if (number < 0).all() or (sequence and (number == PEDESTRIAN).all()):
         by = " (class 1, by seqinfo.ini)" if sequence else ""
         note = f"the truth has one class without a name{by}: classes do not count"
         return "", absent, note
@@ -289,17 +286,9 @@ def _benchmark(name: str, path: Path, number: IntArray, flagged: BoolArray) -> t
     for text, why in ((name, "seqinfo.ini"), (folder, f"the folder {folder}")):
         if match := re.match(r"(MOT16|MOT17|MOT20)-\d+", text):
             return match[1], why
-    other = number != MotClass.PEDESTRIAN
+    other = number != PEDESTRIAN
     known = ((number >= 1) & (number <= 13)).all()
     return ("MOT17" if known and other.any() and (flagged == other).all() else ""), "its rows"
-
-
-def _by_line(number: IntArray, labels: Path, path: Path) -> list[str]:
-    """Name classes by the lines of a file, from 1; 0 or less: no class."""
-    lines = [line.strip() for line in read_lines(labels)]
-    if number.max(initial=0) > len(lines):
-        raise ReobjError(f"{path}: class {number.max()}, but {labels} has {len(lines)} lines")
-    return [lines[n - 1] if n > 0 else "" for n in number.tolist()]
 
 
 def _names_of(number: IntArray, names: Mapping[str, str]) -> list[str]:

@@ -21,6 +21,7 @@ from reobj.export.source import (
     warn_of_components,
 )
 from reobj.files import atomic, staged
+from reobj.results.entries import write_json
 from reobj.results.result import Object, Result, object_table
 from reobj.sources.image_files import IMAGE_FPS
 from reobj.types import Tracks, object_classes, rows_by, visible_name
@@ -42,11 +43,10 @@ def export_coco_vid(result: Result, path: Path) -> None:
         for f in frames
     ]  # fmt: skip
     warn_of_components(result, path)
-    part_of: dict[int, dict[str, int]] = {}
-    if len(result.world.parts) > 1:
-        part_of = {o.id: {"part": o.part} for o in result.objects}
-    corners = tracks.xyxy.round(2)
-    boxes = np.hstack([corners[:, :2], corners[:, 2:] - corners[:, :2]]).round(2).tolist()
+    several = len(result.world.parts) > 1
+    part_of = {o.id: {"part": o.part} for o in result.objects if several}
+    low, high = np.hsplit(tracks.xyxy.round(2), 2)  # (N, 2) each
+    boxes = np.hstack([low, high - low]).round(2).tolist()
     columns = (tracks.frame, tracks.track_id, tracks.class_id, tracks.score)
     rows = zip(boxes, *(column.tolist() for column in columns), strict=True)
     annotations = [
@@ -63,8 +63,7 @@ def export_coco_vid(result: Result, path: Path) -> None:
         "images": images,
         "annotations": annotations,
     }
-    with atomic(path) as part:
-        part.write_text(json.dumps(data) + "\n", encoding="utf-8")
+    write_json(path, data, indent=None)
 
 
 def export_cvat(result: Result, path: Path) -> None:

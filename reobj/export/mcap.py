@@ -37,7 +37,7 @@ def export_mcap(result: Result, path: Path) -> None:
         raise ReobjError(advice) from error
     world = upright_world(result, path)
     with atomic(path) as part, part.open("wb") as file, Writer(file) as writer:
-        schemas = {kind: writer.register_msgdef(kind, _definition(kind)) for kind in MESSAGES}
+        schemas = {k: writer.register_msgdef(k, text) for k, text in _definitions().items()}
         for topic, kind, time_ns, message in _recording(world, result, path):
             writer.write_message(topic, schemas[kind], message, time_ns, time_ns)
 
@@ -95,25 +95,21 @@ def _detections_3d(world: UprightWorld, time_ns: int) -> Message:
     quat = world.quat_xyzw
     for i, found in enumerate(world.objects):
         pose = _pose(world.ellipsoids.center_in_world[i], quat[i])
-        covariance = _pose_covariance(found, world, i).ravel().tolist()
+        covariance = {
+            "pose": pose,
+            "covariance": _pose_covariance(found, world, i).ravel().tolist(),
+        }
+        exists = 1.0 if found.confidence is None else found.confidence
         results = [
             {
-                "hypothesis": {"class_id": visible_name(name), "score": score},
-                "pose": {"pose": pose, "covariance": covariance},
+                "hypothesis": {"class_id": visible_name(name), "score": exists * probability},
+                "pose": covariance,
             }
-            for name, score in _hypotheses(found).items()
+            for name, probability in (found.classes or {found.class_name: 1.0}).items()
         ]
-        size = _named(2 * world.ellipsoids.half_axes[i])
-        box = {"center": pose, "size": size}
+        box = {"center": pose, "size": _named(2 * world.ellipsoids.half_axes[i])}
         detections.append({"header": header, "results": results, "bbox": box, "id": str(found.id)})
     return {"header": header, "detections": detections}
-
-
-def _hypotheses(found: Object) -> dict[str, float]:
-    """Return the probabilities that the object exists and has a class, by class name."""
-    exists = 1.0 if found.confidence is None else found.confidence
-    classes = found.classes or {found.class_name: 1.0}
-    return {name: exists * probability for name, probability in classes.items()}
 
 
 def _pose_covariance(found: Object, world: UprightWorld, i: int) -> Array:
@@ -133,30 +129,24 @@ def _pose_covariance(found: Object, world: UprightWorld, i: int) -> Array:
 def _markers(world: UprightWorld, time_ns: int) -> Message:
     """Describe the objects as a MarkerArray: the shape, and a text above it."""
     kinds = {"box": 1, "ellipsoid": 2, "cylinder": 3}  # Marker.CUBE, SPHERE, CYLINDER
-    text_kind = 9  # Marker.TEXT_VIEW_FACING
+    header = _header(time_ns, MAP)
     markers = []
-    quat = world.quat_xyzw
-    upright = np.array([0.0, 0, 0, 1])
-    for i, found in enumerate(world.objects):
-        class_name = visible_name(found.class_name)
-        red_green_blue = np.array(object_color(found.id)[::-1]) / 255.0
-        center = world.ellipsoids.center_in_world[i]
-        half_axes = world.ellipsoids.half_axes[i]
-        common = {"header": _header(time_ns, MAP), "id": found.id % 2**31, "action": 0}
-        color = _named(np.append(red_green_blue, 0.7), "rgba")
-        shape = {"ns": class_name, "type": kinds[found.support or "ellipsoid"], "color": color}
-        markers.append(
-            common | shape | {"pose": _pose(center, quat[i]), "scale": _named(2 * half_axes)}
-        )
-        height = float(np.abs(world.ellipsoids.world_from_obj[i, 2]) @ half_axes)
+    rows = zip(world.objects, world.ellipsoids.center_in_world, world.ellipsoids.half_axes,
+               world.ellipsoids.world_from_obj, world.quat_xyzw, strict=True)  # fmt: skip
+    for found, center, half_axes, axes, quat in rows:
+        name = visible_name(found.class_name)
+        color = np.array([*object_color(found.id)[::-1], 0.7 * 255]) / 255.0
+        height = float(np.abs(axes[2]) @ half_axes)
         letter = max(0.3 * height, 1e-3)
         above = center + np.array([0, 0, height + letter])
-        text = {"ns": "labels", "type": text_kind, "text": f"{class_name} {found.id}"}
-        white = _named(np.ones(4), "rgba")
-        size = _named(np.full(3, letter))
-        markers.append(
-            common | text | {"color": white, "pose": _pose(above, upright), "scale": size}
-        )
+        shape = {"ns": name, "type": kinds[found.support or "ellipsoid"]}
+        text = {"ns": "labels", "type": 9, "text": f"{name} {found.id}"}  # TEXT_VIEW_FACING
+        for facts, rgba, pose, size in (
+            (shape, color, _pose(center, quat), 2 * half_axes),
+            (text, np.ones(4), _pose(above, np.array([0.0, 0, 0, 1])), np.full(3, letter)),
+        ):
+            common = {"header": header, "id": found.id % 2**31, "action": 0, "pose": pose}
+            markers.append(common | facts | {"color": _named(rgba, "rgba"), "scale": _named(size)})
     return {"markers": markers}
 
 
@@ -197,75 +187,13 @@ def _camera_info(camera: Camera, path: Path) -> Message:
     }
 
 
-# ---- Definitions of ROS 2 Humble, in their order of fields ---------------------------------------
-
-MESSAGES = {
-    "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms",
-    "sensor_msgs/msg/CameraInfo": (
-        "std_msgs/Header header\nuint32 height\nuint32 width\nstring distortion_model\n"
-        "float64[] d\nfloat64[9] k\nfloat64[9] r\nfloat64[12] p\nuint32 binning_x\n"
-        "uint32 binning_y\nsensor_msgs/RegionOfInterest roi"
-    ),
-    "vision_msgs/msg/Detection3DArray": (
-        "std_msgs/Header header\nvision_msgs/Detection3D[] detections"
-    ),
-    "vision_msgs/msg/Detection2DArray": (
-        "std_msgs/Header header\nvision_msgs/Detection2D[] detections"
-    ),
-    "visualization_msgs/msg/MarkerArray": "visualization_msgs/Marker[] markers",
-}
-_PARTS = {
-    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
-    "builtin_interfaces/Duration": "int32 sec\nuint32 nanosec",
-    "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id",
-    "std_msgs/ColorRGBA": "float32 r\nfloat32 g\nfloat32 b\nfloat32 a",
-    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z",
-    "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z",
-    "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
-    "geometry_msgs/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation",
-    "geometry_msgs/PoseWithCovariance": "geometry_msgs/Pose pose\nfloat64[36] covariance",
-    "geometry_msgs/Transform": (
-        "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation"
-    ),
-    "geometry_msgs/TransformStamped": (
-        "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/Transform transform"
-    ),
-    "sensor_msgs/RegionOfInterest": (
-        "uint32 x_offset\nuint32 y_offset\nuint32 height\nuint32 width\nbool do_rectify"
-    ),
-    "sensor_msgs/CompressedImage": "std_msgs/Header header\nstring format\nuint8[] data",
-    "vision_msgs/ObjectHypothesis": "string class_id\nfloat64 score",
-    "vision_msgs/ObjectHypothesisWithPose": (
-        "vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose"
-    ),
-    "vision_msgs/Point2D": "float64 x\nfloat64 y",
-    "vision_msgs/Pose2D": "vision_msgs/Point2D position\nfloat64 theta",
-    "vision_msgs/BoundingBox2D": "vision_msgs/Pose2D center\nfloat64 size_x\nfloat64 size_y",
-    "vision_msgs/BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size",
-    "vision_msgs/Detection2D": (
-        "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
-        "vision_msgs/BoundingBox2D bbox\nstring id"
-    ),
-    "vision_msgs/Detection3D": (
-        "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
-        "vision_msgs/BoundingBox3D bbox\nstring id"
-    ),
-    "visualization_msgs/UVCoordinate": "float32 u\nfloat32 v",
-    "visualization_msgs/MeshFile": "string filename\nuint8[] data",
-    "visualization_msgs/Marker": (
-        "std_msgs/Header header\nstring ns\nint32 id\nint32 type\nint32 action\n"
-        "geometry_msgs/Pose pose\ngeometry_msgs/Vector3 scale\nstd_msgs/ColorRGBA color\n"
-        "builtin_interfaces/Duration lifetime\nbool frame_locked\ngeometry_msgs/Point[] points\n"
-        "std_msgs/ColorRGBA[] colors\nstring texture_resource\n"
-        "sensor_msgs/CompressedImage texture\nvisualization_msgs/UVCoordinate[] uv_coordinates\n"
-        "string text\nstring mesh_resource\nvisualization_msgs/MeshFile mesh_file\n"
-        "bool mesh_use_embedded_materials"
-    ),
-}
+# ---- Definitions of ROS 2 Humble ---------------------------------------------------------------
 
 
-def _definition(kind: str) -> str:
-    """Return the definition of a message type followed by those of the types in messages."""
-    rule = "=" * 80
-    parts = [f"{rule}\nMSG: {name}\n{text}" for name, text in _PARTS.items()]
-    return "\n".join([MESSAGES[kind], *parts])
+def _definitions() -> dict[str, str]:
+    """Return the definition of each message type, followed by those of the types in messages."""
+    text = Path(__file__).with_name("ros2_humble.msg").read_text(encoding="utf-8")
+    types = dict(entry.strip().split("\n", 1) for entry in text.split("MSG: ")[1:])
+    parts = [f"{'=' * 80}\nMSG: {name}\n{fields}" for name, fields in types.items()
+             if "/msg/" not in name]  # fmt: skip
+    return {k: "\n".join([fields, *parts]) for k, fields in types.items() if "/msg/" in k}

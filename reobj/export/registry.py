@@ -123,9 +123,7 @@ class Viewer:
         self.followed = True
         if poses is not None:
             poses = shifted(poses, far_origin(poses, np.empty((0, 3))))
-        pose_of = _pose_by_frame(poses)
-        if poses is not None:
-            self._points(poses)
+        pose_of = self._log_points(poses)
         for frame, tracks in steps:
             labels = live_labels(tracks, names)
             native = dataclasses.replace(tracks, xyxy=tracks.xyxy / video.scale)
@@ -139,41 +137,39 @@ class Viewer:
         Args:
             path: for warnings. images: read the video again and log its images.
         """
-        rr = self.rr
-        rec = self.rec
         world = upright_world(result, path, float32=True, may_be_empty=True)
         names = {o.id: f"{o.id} {o.class_name}" for o in result.objects}
         solids = world.ellipsoids
         xyzw = world.quat_xyzw
         for i, o in enumerate(world.objects):
-            solid = rr.Ellipsoids3D(
+            solid = self.rr.Ellipsoids3D(
                 half_sizes=solids.half_axes[i : i + 1], labels=[names[o.id]],
                 centers=solids.center_in_world[i : i + 1],
                 quaternions=xyzw[i : i + 1], fill_mode="solid",
                 colors=[object_color(o.id)[::-1]],
             )  # fmt: skip
-            rec.log(["world", "objects", o.class_name, str(o.id)], solid, static=True)
-        poses = world.poses
-        if poses is not None:
-            self._points(poses)
-        pose_of = _pose_by_frame(poses)
-        tracks = result.tracks
+            self.rec.log(["world", "objects", o.class_name, str(o.id)], solid, static=True)
+        pose_of = self._log_points(world.poses)
         frames, _ = frames_read(result)
         video = video_of(result) if images else None
         shown = iter(video if video is not None and video.has_images else ())
         ahead = next(shown, None)
         for frame in frames:
-            rows = tracks[tracks.frame == frame]
+            rows = result.tracks[result.tracks.frame == frame]
             labels = [names[i] for i in rows.track_id.tolist()]
-            self._frame(frame, poses, pose_of.get(frame), rows, labels)
+            self._frame(frame, world.poses, pose_of.get(frame), rows, labels)
             while ahead is not None and ahead.index <= frame:
                 if ahead.index == frame:
                     self._image(ahead.image)
                 ahead = next(shown, None)
 
-    def _points(self, poses: Poses) -> None:
+    def _log_points(self, poses: Poses | None) -> dict[int, Array]:
+        """Log the sparse points; return the poses by frame."""
+        if poses is None:
+            return {}
         cloud = self.rr.Points3D(poses.points, colors=poses.colors)
         self.rec.log("world/points", cloud, static=True)
+        return dict(zip(poses.frame.tolist(), poses.cam_from_world, strict=True))
 
     def _frame(
         self, frame: int, poses: Poses | None, pose: Array | None, rows: Tracks,
@@ -211,12 +207,6 @@ class Viewer:
     def close(self) -> None:
         """Send or write the remaining data."""
         self.rec.disconnect()
-
-
-def _pose_by_frame(poses: Poses | None) -> dict[int, Array]:
-    if poses is None:
-        return {}
-    return dict(zip(poses.frame.tolist(), poses.cam_from_world, strict=True))
 
 
 def export_rrd(result: Result, path: Path) -> None:

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from reobj import __version__
-from reobj.cameras import CV_FROM_GL, Camera, Poses, invert_rigid
+from reobj.cameras import CV_FROM_GL, Poses, invert_rigid
 from reobj.export.source import (
     UprightWorld,
     centred,
     distortion,
     image_files,
-    largest_part,
+    largest_component,
     upright_world,
     video_of,
 )
@@ -24,7 +24,6 @@ from reobj.files import atomic, staged
 from reobj.results.ply import write_ply, write_point_ply
 from reobj.results.result import Result
 from reobj.sources.image_files import IMAGE_FPS
-from reobj.sources.video import Video
 from reobj.types import Array, ReobjError, object_color, visible_name
 
 
@@ -83,7 +82,7 @@ def export_ply(result: Result, path: Path) -> None:
 
     In the world and units of poses.txt: the fitted boxes, cylinders and ellipsoids.
     """
-    result = largest_part(result, path)
+    result = largest_component(result, path)
     if not result.located:
         raise ReobjError(f"{path}: nothing to export: the result has no solids, see `run`")
     located = result.located
@@ -218,7 +217,7 @@ def export_nerfstudio(result: Result, path: Path) -> None:
 
     Ref: docs.nerf.studio, "Data conventions": camera axes of OpenGL, world_from_cam.
     """
-    result, origin = centred(largest_part(result, path))
+    result, origin = centred(largest_component(result, path))
     poses = result.poses
     video = video_of(result)
     if poses is None or not poses.known.any():
@@ -226,37 +225,25 @@ def export_nerfstudio(result: Result, path: Path) -> None:
     if video is None or not video.has_images:
         why = "the video was moved or deleted" if video is None else "this run had none"
         raise ReobjError(f"{path}: nerfstudio needs the images, but {why}; try --to rrd")
-    with staged(path.parent, ".part-nerfstudio") as folder:
-        _write_nerfstudio(poses, origin, video, path, folder)
-
-
-def _write_nerfstudio(poses: Poses, origin: Array, video: Video, path: Path, folder: Path) -> None:
-    """Write `path`, its points and images into a new folder.
-
-    Args:
-        origin: (3,) of the written world, in the world of poses.txt.
-    """
-    files = image_files(video, poses.frame[poses.known].tolist(), path.parent, folder)
-    frames = [
-        {"file_path": files[frame], "transform_matrix": pose.tolist()}
-        for frame, pose in zip(poses.frame.tolist(), world_from_gl(poses), strict=True)
-        if frame in files and np.isfinite(pose).all()
-    ]
-    data = _nerf_camera(poses.camera, path) | {"frames": frames}
-    if origin.any():  # nerfstudio has float32
-        data["applied_transform"] = np.column_stack([np.eye(3), -origin]).tolist()
-    if len(poses.points):
-        write_point_ply(folder / "sparse_pc.ply", poses.points, poses.colors)
-        data["ply_file_path"] = "sparse_pc.ply"
-    (folder / path.name).write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
-
-
-def _nerf_camera(camera: Camera, path: Path) -> dict[str, Any]:
-    """Convert the intrinsics to nerfstudio's."""
+    camera = poses.camera
     fisheye = "FISHEYE" in camera.model
-    terms = distortion(camera, ("k1", "k2", *(("k3", "k4") if fisheye else ("p1", "p2"))), path,
-                       "nerfstudio")  # fmt: skip
     K = camera.K.tolist()
-    pinhole = {"fl_x": K[0][0], "fl_y": K[1][1], "cx": K[0][2], "cy": K[1][2]}
-    model = {"camera_model": "OPENCV_FISHEYE" if fisheye else "OPENCV"}
-    return model | pinhole | {"w": camera.width, "h": camera.height} | terms
+    data: dict[str, Any] = {"camera_model": "OPENCV_FISHEYE" if fisheye else "OPENCV"}
+    data |= {"fl_x": K[0][0], "fl_y": K[1][1], "cx": K[0][2], "cy": K[1][2]}
+    data |= {"w": camera.width, "h": camera.height}
+    terms = ("k1", "k2", *(("k3", "k4") if fisheye else ("p1", "p2")))
+    data |= distortion(camera, terms, path, "nerfstudio")
+    with staged(path.parent, ".part-nerfstudio") as folder:
+        files = image_files(video, poses.frame[poses.known].tolist(), path.parent, folder)
+        data["frames"] = [
+            {"file_path": files[frame], "transform_matrix": pose.tolist()}
+            for frame, pose in zip(poses.frame.tolist(), world_from_gl(poses), strict=True)
+            if frame in files and np.isfinite(pose).all()
+        ]
+        if origin.any():  # nerfstudio has float32
+            data["applied_transform"] = np.column_stack([np.eye(3), -origin]).tolist()
+        if len(poses.points):
+            write_point_ply(folder / "sparse_pc.ply", poses.points, poses.colors)
+            data["ply_file_path"] = "sparse_pc.ply"
+        text = json.dumps(data, indent=1) + "\n"
+        (folder / path.name).write_text(text, encoding="utf-8")

@@ -20,8 +20,8 @@ import numpy as np
 import quadrics
 from reobj.cameras import Camera, Poses, camera_parameters, invert_rigid, quat_wxyz_from_matrix
 from reobj.files import Progress, spans
+from reobj.results.entries import rotation_to_up
 from reobj.results.result import Object, Result
-from reobj.results.upright import rotation_to_up
 from reobj.results.workspace import Workspace
 from reobj.sources.image_files import IMAGE_SUFFIXES
 from reobj.sources.video import Video
@@ -30,7 +30,7 @@ from reobj.types import Array, ReobjError, log
 # ---- Components and worlds ---------------------------------------------------------------------
 
 
-def largest_part(result: Result, path: Path) -> Result:
+def largest_component(result: Result, path: Path) -> Result:
     """Return the objects and cameras of component 0; warn if there are others."""
     if len(parts := result.world.parts) > 1:
         exported = f"component 0 of {len(parts)} ({parts[0].span_text})"
@@ -136,7 +136,7 @@ def upright_world(
     Raises:
         ReobjError: no objects with a shape and no cameras, unless the world `may_be_empty`.
     """
-    part = largest_part(result, path)
+    part = largest_component(result, path)
     origin = np.zeros(3)
     if float32:
         part, origin = centred(part)

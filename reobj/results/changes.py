@@ -1,8 +1,7 @@
-"""Changes of a room between a map and a recording: what stayed, moved, went, came; changes.json."""
+"""Changes between a map and a recording: objects that stayed, moved, left, arrived; changes.json"""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,8 +9,8 @@ from typing import Annotated, Any
 
 import msgspec
 
-from reobj.files import atomic, numbers, rounded
-from reobj.results.entries import Object, check_shape, read_json
+from reobj.files import numbers, rounded
+from reobj.results.entries import Object, check_shape, read_json, write_json
 from reobj.types import (
     Array,
     FiniteFloat,
@@ -78,6 +77,11 @@ class Change:
     def name(self) -> str:
         """Class and number: "chair 6"."""
         return f"{self.class_name} {self.id}"
+
+    @property
+    def _text(self) -> str:
+        """Its name, of a moved object with the distance: "chair 6 by 0.56 m"."""
+        return self.name if self.distance_m is None else f"{self.name} by {self.distance_m:.2f} m"
 
     def to_json(self) -> dict[str, Any]:
         """Return the entry of changes.json."""
@@ -181,10 +185,8 @@ class Changes:
             if not changes and kind != "stayed":
                 continue
             text = f"{len(changes)} {kind.replace('_', ' ')}"
-            if kind == "moved":
-                text += f" ({', '.join(map(_moved_text, changes))})"
-            elif kind in ("gone", "new"):
-                text += f" ({', '.join(c.name for c in changes)})"
+            if kind in ("moved", "gone", "new"):
+                text += f" ({', '.join(c._text for c in changes)})"
             counts.append(text)
         if self.ambiguous:
             counts.append(f"{len(self.ambiguous)} ambiguous among identical objects")
@@ -221,8 +223,7 @@ def write_earlier(path: Path, sessions: Sequence[EarlierSession]) -> None:
         }
         for session in sessions
     ]  # fmt: skip
-    with atomic(path) as part:
-        part.write_text(json.dumps({"sessions": data}) + "\n", encoding="utf-8")
+    write_json(path, {"sessions": data}, indent=None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,17 +242,9 @@ def read_earlier(path: Path) -> tuple[EarlierSession, ...]:
     return read_json(_EarlierFile, path, own=True).sessions
 
 
-def _moved_text(change: Change) -> str:
-    """Format a moved object: "chair 6 by 0.56 m"."""
-    if change.distance_m is None:
-        return change.name
-    return f"{change.name} by {change.distance_m:.2f} m"
-
-
 def write_changes(path: Path, changes: Changes) -> None:
     """Write changes.json."""
-    with atomic(path) as part:
-        part.write_text(json.dumps(changes.to_json(), indent=1) + "\n", encoding="utf-8")
+    write_json(path, changes.to_json())
 
 
 def read_changes(path: Path) -> Changes:

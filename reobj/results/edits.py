@@ -7,7 +7,6 @@ the identities.
 from __future__ import annotations
 
 import dataclasses
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -15,8 +14,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 import numpy as np
 
-from reobj.files import atomic
-from reobj.results.entries import OutputFile, read_json
+from reobj.results.entries import OutputFile, read_json, write_json
 from reobj.types import (
     CLASS_NAME_MAX,
     COORDINATE_MAX,
@@ -29,6 +27,7 @@ from reobj.types import (
     Tracks,
     box_area,
     box_iou,
+    counted,
     rows_by,
 )
 
@@ -38,7 +37,7 @@ KEYS = {  # besides `do` and `object`, one each
 }  # fmt: skip
 Coordinate = Annotated[float, msgspec.Meta(ge=-COORDINATE_MAX, le=COORDINATE_MAX)]  # px
 
-# Two boxes of a merged object in one frame (chosen)
+# Two boxes of a merged object in one frame
 DUPLICATE_IOU = 0.6  # above it they show the same (as in the association)
 LARGEST_GAP = 0.1  # between boxes of parts, over the side of the box around both
 LEAST_COVERED = 0.55  # by the boxes of parts, of the box around both
@@ -146,8 +145,7 @@ def write_edits(folder: Path, edits: Edits | None) -> None:
     if edits is None or not edits.edits:
         return
     data = HEADER | {"map": edits.map_id, "edits": edits.to_json()}
-    with atomic(folder / OutputFile.EDITS) as part:
-        part.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+    write_json(folder / OutputFile.EDITS, data)
 
 
 def kept_edits(folder: Path) -> Edits | None:
@@ -202,8 +200,8 @@ def apply_edits(
             hint = "were these edits made for another result? make them anew in scene.html"
             raise ReobjError(f"{where}: {error.args[0]}; {hint}") from error
     keep, boxes, messages = table.one_box_a_frame(str(edits.path))
-    if (count := len(edits.edits)) > 0:
-        corrections = f"{count} correction{'s' * (count != 1)}"
+    if edits.edits:
+        corrections = counted(len(edits.edits), "correction", "corrections")
         messages.append(f"{NOTE_START}{corrections} by hand applied ({OutputFile.EDITS})")
     edited = dataclasses.replace(
         tracks, track_id=table.identity, class_id=table.class_id, xyxy=boxes
@@ -249,16 +247,14 @@ class _Tables:
         An edit that was made after a merge may refer to a joined box.
         """
         rows = np.flatnonzero((self.identity > 0) & (self.tracks.frame == ref.frame))
-        own = box_iou(self.tracks.xyxy[rows], np.array([ref.box]))[:, 0]  # (n,)
-        joined = box_iou(self.joined(rows)[0][rows], np.array([ref.box]))[:, 0]  # (n,)
-        iou: Array = np.maximum(own, joined)
-        same = iou >= 0.9  # the box of an edit is rounded to .1 px, which costs .02 at 10 px
-        rows = rows[same]
-        iou = iou[same]
-        if not len(rows):
+        boxes = (self.tracks.xyxy[rows], self.joined(rows)[0][rows])
+        iou = np.maximum(*(box_iou(xyxy, np.array([ref.box]))[:, 0] for xyxy in boxes))  # (n,)
+        # the box of an edit is rounded to .1 px, which costs .02 at 10 px
+        order = np.lexsort((-iou, self.identity[rows] != ref.id, iou < 0.9))
+        if not (iou >= 0.9).any():
             box = ", ".join(f"{value:.1f}" for value in ref.box)
             raise LookupError(f"no object has the box {box} in frame {ref.frame}")
-        return int(rows[np.lexsort((-iou, self.identity[rows] != ref.id))[0]])
+        return int(rows[order[0]])
 
     def _split(self, identity: int, edit: Edit) -> None:
         of_object = self.identity == identity  # (N,)
@@ -312,9 +308,10 @@ class _Tables:
         boxes, removed = self.joined(np.flatnonzero(keep))
         keep[removed] = False
         messages = list[str]()
-        for number in np.unique(self.identity[removed]).tolist():
-            frames = len(np.unique(self.tracks.frame[removed][self.identity[removed] == number]))
-            text = f"merged object {number} has two boxes in {frames} frame{'s' * (frames != 1)}"
+        for rows in rows_by(self.identity[removed]):
+            number = self.identity[removed[rows[0]]]
+            frames = counted(len(np.unique(self.tracks.frame[removed[rows]])), "frame", "frames")
+            text = f"merged object {number} has two boxes in {frames}"
             messages.append(
                 f"{where}: {text}; boxes of parts are joined, of others the best is kept"
             )
@@ -329,21 +326,20 @@ def joined_box(boxes: Array) -> Array:
     """
     whole: Array = boxes[0]
     others = list(boxes[1:])
-    k = 0
-    while k < len(others):
-        low = np.minimum(whole, others[k])
-        high = np.maximum(whole, others[k])
-        around = np.append(low[:2], high[2:])  # (4,) the box around both
-        side = low[2:] - high[:2]  # (2,) of what they share, < 0: a gap
-        common = side.clip(0).prod()
-        covered = box_area(whole) + box_area(others[k]) - common
-        adjoins = (side >= -LARGEST_GAP * (around[2:] - around[:2])).all()
-        if common > DUPLICATE_IOU * covered or not (
-            adjoins and covered >= LEAST_COVERED * box_area(around)
-        ):
-            k += 1
-        else:  # those before may adjoin it now
-            whole = around
-            del others[k]
-            k = 0
+    while others:
+        for k, other in enumerate(others):
+            low = np.minimum(whole, other)
+            high = np.maximum(whole, other)
+            around = np.append(low[:2], high[2:])  # (4,) the box around both
+            side = low[2:] - high[:2]  # (2,) of what they share, < 0: a gap
+            common = side.clip(0).prod()
+            covered = box_area(whole) + box_area(other) - common
+            adjoins = (side >= -LARGEST_GAP * (around[2:] - around[:2])).all()
+            is_part = adjoins and covered >= LEAST_COVERED * box_area(around)
+            if is_part and common <= DUPLICATE_IOU * covered:
+                whole = around  # those before may adjoin it now
+                del others[k]
+                break
+        else:
+            break
     return whole

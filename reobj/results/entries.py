@@ -1,6 +1,6 @@
 """Entries of objects.json as data: objects, their world, components of the trajectory, video.
 
-Also the names of the files of an output folder, and the reader of its JSON files.
+Also the files of an output folder: names, the reader of JSON, how new files replace earlier ones.
 """
 
 from __future__ import annotations
@@ -8,21 +8,36 @@ from __future__ import annotations
 import contextlib
 import enum
 import json
+import math
 import os
 import re
+import shutil
 import typing
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import msgspec
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 import quadrics
 from reobj import __version__
-from reobj.files import load_json, rounded, shortened
+from reobj.cameras import Poses, load_poses, write_tum
+from reobj.files import (
+    atomic,
+    check_places,
+    cut,
+    load_json,
+    numbers,
+    part_path,
+    part_paths,
+    rounded,
+    shortened,
+    staged,
+)
 from reobj.poses.floor import Floor
 from reobj.sources.video import Video
 from reobj.types import (
@@ -37,6 +52,7 @@ from reobj.types import (
     PositiveInt,
     Quaternion,
     ReobjError,
+    Tracks,
     Vector,
     counted,
     printable,
@@ -183,7 +199,7 @@ def _classes_text(objects: Sequence[Object]) -> str:
 
 
 VISIT_GAP_S = 2.0  # between two visits of an object; a detector misses objects for shorter times
-VISIT_GAP_SHARE = 1 / 3  # of the recording, at most: 2 s are 60 photos without times (chosen)
+VISIT_GAP_SHARE = 1 / 3  # of the recording, at most: 2 s are 60 photos without times
 
 
 def visit_gap(frame: IntArray, fps: float) -> float:
@@ -303,6 +319,48 @@ class VideoInfo:
         return VideoInfo(str(video.source), *video.size, video.fps)
 
 
+# ---- Upright metric frame ----------------------------------------------------------------------
+
+# z up, metres, the origin of the world: robots plan in such a frame (ROS REP 103)
+
+
+def rotation_to_up(up: Array | None) -> Array:
+    """Return the smallest rotation (3, 3) that maps `up` (3,) to z; identity for None."""
+    z = np.array([0.0, 0, 1])
+    return np.asarray(Rotation.align_vectors([z], [z if up is None else up])[0].as_matrix())
+
+
+def upright_pose(found: Object, world: World | Part) -> dict[str, Any]:
+    """Return the position and heading of an object in the upright metric frame of its world.
+
+    Args:
+        world: of the object's component.
+    Returns:
+        "center_m": [x, y, z] in metres, z up, None where scale or up is unknown. "yaw_deg": angle
+        of the object's x axis about z from the frame's x axis, in (-180, 180], None where up is
+        unknown. Both are None without a shape.
+    """
+    entry: dict[str, Any] = {"center_m": None, "yaw_deg": None}
+    up = world.up_in_world
+    scale = world.scale
+    if found.center is None or found.quat_wxyz is None or up is None:
+        return entry
+    rotation = rotation_to_up(up)
+    turn = Rotation.from_quat(found.quat_wxyz[[1, 2, 3, 0]])
+    x, y, _ = rotation @ turn.as_matrix()[:, 0]
+    entry["yaw_deg"] = rounded(math.degrees(math.atan2(y, x)), 2)
+    if scale is not None and scale.source != "none":
+        center = scale.value * rotation @ found.center
+        extent = 1.0 if found.half_axes is None else scale.value * float(found.half_axes.max())
+        entry["center_m"] = numbers(center, extent)
+    return entry
+
+
+def component_of(found: Object, world: World) -> World | Part:
+    """Return the world of the component that an object lies in."""
+    return world.parts[found.part] if len(world.parts) > 1 else world
+
+
 # ---- Files of an output folder -----------------------------------------------------------------
 
 
@@ -368,6 +426,12 @@ def read_json(
     return content
 
 
+def write_json(path: Path, data: Any, indent: int | None = 1) -> None:
+    """Write a JSON file of ours; it appears only when it is complete."""
+    with atomic(path) as part:
+        part.write_text(json.dumps(data, indent=indent) + "\n", encoding="utf-8")
+
+
 RUN_AGAIN = f"damaged, or not written by reobj_track {__version__}: run the video again"
 
 
@@ -413,3 +477,118 @@ def _array(kind: Any, value: Any) -> Array:
         if array.shape == shape and array.dtype.kind in "iuf" and (np.abs(array) <= most).all():
             return array.astype(np.float64)
     raise ValueError(f"Expected {' x '.join(map(str, shape))} finite numbers")
+
+
+# ---- How new files replace earlier ones ---------------------------------------------------------
+
+HEADER = {"format": "reobj-objects", "version": 1}  # of objects.json
+STALE = (  # files that not every run writes
+    OutputFile.POSES, OutputFile.MESH, OutputFile.LAST_POSES, OutputFile.CHANGES,
+    OutputFile.EARLIER, OutputFile.LAST_LINKS,
+    "overlay.mp4", "scene.html",
+)  # fmt: skip
+
+
+def check_results(out: Path) -> None:
+    """Check that results can be written into an output folder, before they are computed."""
+    others = (OutputFile.TRACKS, OutputFile.OBJECTS, OutputFile.EDITS, OutputFile.CONFIG)
+    check_places(out, (*STALE, *others, f"{OutputFile.MODEL}/cameras.txt"))
+
+
+@contextlib.contextmanager
+def replaced(out: Path, stale: Sequence[str] = STALE) -> Iterator[Path]:
+    """Yield an empty folder whose files replace those of `out` at the end of the block.
+
+    An exception in the block leaves `out` unchanged.
+
+    Args:
+        stale: files that are removed from `out` if the block does not write them.
+    """
+    with staged(out) as new:
+        yield new
+        made = {path.relative_to(new) for path in new.rglob("*")}
+    remove_stale(out, stale, made)
+
+
+def remove_stale(
+    out: Path, stale: Sequence[str] = STALE, made: Iterable[Path] = frozenset()
+) -> None:
+    """Remove files of an earlier run, also those of further components.
+
+    Args:
+        made: paths that are kept, relative to `out`; of a folder only the listed files.
+    """
+    kept = {out / path for path in made}
+    for name in stale:
+        for found in (out / name, *part_paths(out / name)):
+            found.with_name(f".part-{found.name}").unlink(missing_ok=True)  # of a killed run
+            if name == OutputFile.MODEL and found.is_dir() and not found.is_symlink():
+                for old in set(found.iterdir()) - kept:
+                    shutil.rmtree(old) if old.is_dir() else old.unlink()
+                if found not in kept:
+                    found.rmdir()
+            elif found not in kept:
+                found.unlink(missing_ok=True)
+
+
+def copy_models(models: Sequence[Path], folder: Path) -> None:
+    """Copy the existing COLMAP models, one a component, to sparse/, sparse_part1/, ..."""
+    for k, model in enumerate(models):
+        if model.is_dir():
+            shutil.copytree(model, part_path(folder / OutputFile.MODEL, k))
+
+
+def write_trajectories(out: Path, poses: Poses) -> None:
+    """Write poses.txt, and poses_part1.txt, ... of further components: a TUM file has one world."""
+    if not poses.known.any():
+        return
+    for old in part_paths(out / OutputFile.POSES):
+        old.unlink()
+    for k in range(poses.part_count):
+        write_tum(part_path(out / OutputFile.POSES, k), poses.of_part(k))
+
+
+def write_mot(path: Path, tracks: Tracks) -> None:
+    """Write MOTChallenge results: frame (from 1), id, left, top, width, height, score, 3 x -1."""
+    ltwh = np.column_stack([tracks.xyxy[:, :2], tracks.xyxy[:, 2:] - tracks.xyxy[:, :2]])
+    rows = np.column_stack([tracks.frame + 1, tracks.track_id, ltwh, tracks.score])  # (N, 7)
+    with atomic(path) as part:
+        np.savetxt(part, rows, ("%d", "%d", *["%.2f"] * 4, "%.4f,-1,-1,-1"), ",")
+
+
+def load_last_poses(out: Path) -> Poses | None:
+    """Read the latest poses of an output folder, None if it has none."""
+    path = out / OutputFile.LAST_POSES
+    if not path.is_file():
+        return None
+    try:
+        return load_poses(path)
+    except (KeyError, TypeError, ReobjError) as error:
+        raise ReobjError(f"{path}: {RUN_AGAIN}") from error
+
+
+def validate_objects(path: Path) -> list[str]:
+    """Check an objects.json, or that of a folder, against its JSON schema.
+
+    Returns:
+        one line for each error: file, JSON path, and what was expected.
+    """
+    try:
+        from jsonschema import Draft202012Validator, validators
+    except ImportError as error:
+        advice = "jsonschema is not installed: pip install jsonschema"
+        raise ReobjError(advice) from error
+    path = path / OutputFile.OBJECTS if path.is_dir() else path
+    schema = load_json(Path(__file__).with_name("objects.schema.json"))
+    types = Draft202012Validator.TYPE_CHECKER.redefine("number", _is_finite)
+    validator = validators.extend(Draft202012Validator, type_checker=types)(schema)
+    lines = []
+    for found in validator.iter_errors(load_json(path)):
+        fault = cut(f"{found.json_path}: {found.message}", 200)  # it quotes the value
+        lines.append(printable(f"{path}: {fault}"))
+    return sorted(lines)
+
+
+def _is_finite(_: Any, value: Any) -> bool:
+    """Check for a number; NaN, which Python's parser accepts, is none in JSON."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

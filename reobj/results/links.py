@@ -23,7 +23,7 @@ from reobj.cameras import Poses
 from reobj.files import columns_of, from_columns, load_npz, save_npz
 from reobj.types import Existence, IntArray, LinkEvent, ReobjError, Tracks
 
-SAME_PX = 0.02  # between a box and the same one; chosen
+SAME_PX = 0.02  # between a box and the same one: twice the rounding of tracks.txt
 
 
 class ComponentShapes(NamedTuple):
@@ -134,18 +134,15 @@ class Links:
         Args:
             row: (M,) of the same detection here, or -1.
         """
-        kept = np.append(self.tracks.track_id, -1)[row] == tracks.track_id  # (M,)
-        found = np.zeros(len(self.tracks), bool)
-        found[row[kept]] = True
-        changed = {*self.tracks.track_id[~found].tolist(), *tracks.track_id[~kept].tolist()}
-        return len(changed & {*self.tracks.track_id.tolist()})
+        own = self.tracks.track_id
+        kept = np.append(own, -1)[row] == tracks.track_id  # (M,)
+        changed = {*np.delete(own, row[kept]).tolist(), *tracks.track_id[~kept].tolist()}
+        return len(changed.intersection(own.tolist()))
 
 
 def _mapped(identity: IntArray, numbers: Mapping[int, int]) -> IntArray:
     """Return the new numbers (N,) of identities (N,); 0 stays."""
-    own, row = np.unique(identity, return_inverse=True)
-    new = np.array([numbers[i] if i else 0 for i in own.tolist()], np.int64)
-    return np.asarray(new[row])
+    return np.array([numbers[i] if i else 0 for i in identity.tolist()], np.int64)
 
 
 def tracked_key(tables: Sequence[Tracks], poses: Poses | None) -> str:
@@ -155,7 +152,7 @@ def tracked_key(tables: Sequence[Tracks], poses: Poses | None) -> str:
         arrays += [poses.cam_from_world, poses.part]
     digest = hashlib.sha256()
     for array in arrays:
-        digest.update(np.ascontiguousarray(array).tobytes())
+        digest.update(array.tobytes())
     return digest.hexdigest()
 
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from reobj.results.result import Object, Result
-from reobj.types import IntArray, Tracks
+from reobj.types import Tracks
 from reobj.words import among
 
 OTHER_BOXES = "another detector (--detector, or other boxes with --detections)"
@@ -36,28 +36,28 @@ def implausible(
 
 def _few_cameras(result: Result) -> str:
     """Warn if most frames have no camera; messages of the poses explain if none has."""
-    if result.poses is None or not 0 < 2 * result.poses.known.sum() < len(result.poses.known):
+    poses = result.poses
+    if poses is None or not 0 < 2 * poses.known.sum() < len(poses.known):
         return ""
-    known = result.poses.known.sum()
-    count = len(result.poses.known)
     remedy = "film with slower turns and more overlap, or give --camera (intrinsics) or --poses"
-    if result.poses.source == "user":
+    if poses.source == "user":
         remedy = "check that --poses is of this video, and that names or times of its frames agree"
     return (
-        f"only {known} of {count} frames have a camera; objects seen only in the others are not "
-        f"located: {remedy}"
+        f"only {poses.known.sum()} of {len(poses.known)} frames have a camera; objects seen only "
+        f"in the others are not located: {remedy}"
     )
 
 
 def _nothing_measured(result: Result, still: Sequence[Object]) -> str:
-    """Warn if there are cameras and objects, but no object is measured or has a large parallax."""
+    """Warn if there are cameras and objects, but no object is measured or has a large parallax.
+
+    One or two objects without parallax are normal. With 10 deg of parallax an object is seen from
+    around: if its size still rests on the prior, the boxes are inaccurate, and more parallax does
+    not help (redkitchen).
+    """
     poses = result.poses
-    # With 10 deg of parallax an object is seen from around: if its size still rests on the prior,
-    # the boxes are inaccurate, and more parallax does not help (redkitchen).
     measured = any(o.status == "ok" or (o.parallax_deg or 0.0) >= 10.0 for o in still)
-    if poses is None or not poses.known.any() or measured:
-        return ""
-    if len(still) < 3:  # one or two objects without parallax are normal
+    if poses is None or not poses.known.any() or measured or len(still) < 3:
         return ""
     cameras = "" if poses.source == "user" else "--camera (intrinsics), --poses, or "
     return (
@@ -68,12 +68,14 @@ def _nothing_measured(result: Result, still: Sequence[Object]) -> str:
 
 
 def _one_class(result: Result, still: Sequence[Object]) -> str:
-    """Warn if most listed objects are of one class, unless all detections are."""
-    name, count = next(iter(Counter(o.class_name for o in still).most_common(1)), ("", 0))
-    boxes = np.append(result.tracks.class_id, result.untracked.class_id)
-    # Six chairs at a table and seven plants in a living room are normal; partitions taken for
-    # refrigerators were 8 of 10 and more (office_loop).
-    if count < 8 or 2 * count <= len(still) or len(np.unique(boxes)) == 1:
+    """Warn if most listed objects are of one class, unless all detections are.
+
+    Six chairs at a table and seven plants in a living room are normal; partitions taken for
+    refrigerators were 8 of 10 and more (office_loop).
+    """
+    ((name, count),) = Counter(o.class_name for o in still).most_common(1) or [("", 0)]
+    classes = {*result.tracks.class_id.tolist(), *result.untracked.class_id.tolist()}
+    if count < 8 or 2 * count <= len(still) or len(classes) == 1:
         return ""
     return (
         f"{count} of {len(still)} listed objects are of the class {name}: check that the room has "
@@ -85,28 +87,23 @@ def _one_class(result: Result, still: Sequence[Object]) -> str:
 def _unexplained(result: Result, high_score: float, new_score: float) -> str:
     """Warn if most boxes of high score belong to no listed object, with their most common cause."""
     doubtful = [o.id for o in result.objects if o.status == "doubtful"]
-    tracks = result.tracks
-    weak = result.tracks.score < high_score
-    listed = tracks[~weak & ~np.isin(tracks.track_id, doubtful)]
-    strong = Tracks.joined([tracks[~weak], result.untracked[result.untracked.score >= high_score]])
-    count = len(_distinct(listed))
-    total = len(_distinct(strong))
+    tracks = result.tracks[result.tracks.score >= high_score]
+    rest = result.untracked[result.untracked.score >= high_score]
+    count = _distinct(tracks[~np.isin(tracks.track_id, doubtful)])
+    total = _distinct(Tracks.joined([tracks, rest]))
     if total < 50 or 2 * count >= total:  # of fewer boxes the majority is chance
         return ""
     text = f"{total - count} of {total} boxes of score {high_score:g} or more"
     text += " belong to no listed object"
-    rest = result.untracked[result.untracked.score >= high_score]
-    if 2 * len(rest) > total - count:  # else they belong to low-confidence objects
-        if 2 * (rest.score < new_score).sum() > len(rest):
-            return (f"{text}: most of them are below the score at which a track starts "
-                    f"(tracker.new_score={new_score:g})")  # fmt: skip
-        return text
-    return (
-        f"{text}: look at the objects of low confidence (--set output.doubtful=true), or try "
-        f"{OTHER_BOXES}"
-    )
+    if 2 * len(rest) <= total - count:  # they belong to low-confidence objects
+        doubtful_too = "look at the objects of low confidence (--set output.doubtful=true)"
+        return f"{text}: {doubtful_too}, or try {OTHER_BOXES}"
+    if 2 * (rest.score < new_score).sum() > len(rest):
+        text += ": most of them are below the score at which a track starts "
+        text += f"(tracker.new_score={new_score:g})"
+    return text
 
 
-def _distinct(rows: Tracks) -> IntArray:
-    """Return the distinct (frame, detection index) of rows, (n, 2)."""
-    return np.unique(np.stack([rows.frame, rows.detection_index], 1), axis=0)
+def _distinct(rows: Tracks) -> int:
+    """Count the distinct detections (frame, index) of rows."""
+    return len(set(zip(rows.frame.tolist(), rows.detection_index.tolist(), strict=True)))

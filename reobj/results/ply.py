@@ -34,10 +34,12 @@ def write_ply(
     """
     meshes = [unit_mesh(shape) for shape in support or [None] * len(ellipsoids)]
     points = [
-        ellipsoids.half_axes[k] * unit @ ellipsoids.world_from_obj[k].T
-        + ellipsoids.center_in_world[k]
-        for k, (unit, _) in enumerate(meshes)
-    ]
+        half_axes * unit @ axes.T + center
+        for (unit, _), half_axes, axes, center in zip(
+            meshes, ellipsoids.half_axes, ellipsoids.world_from_obj, ellipsoids.center_in_world,
+            strict=True,
+        )
+    ]  # fmt: skip
     start = np.cumsum([0, *map(len, points)])
     colors = [object_color(identity)[::-1] for identity in object_id]
     rgb = np.repeat(np.array(colors, np.uint8).reshape(-1, 3), np.diff(start), axis=0)
@@ -45,21 +47,21 @@ def write_ply(
     faces = np.concatenate([np.empty((0, 3), np.int64), *corners])
     content = "ellipsoids" if support is None else "solids"
     xyz = np.concatenate([np.empty((0, 3)), *points])
-    _write(path, xyz, rgb, f"comment reobj_track {content}\n", faces)
+    write_point_ply(path, xyz, rgb, f"comment reobj_track {content}\n", faces)
 
 
-def write_point_ply(path: Path, points: Array, colors: npt.NDArray[np.uint8]) -> None:
-    """Write points (N, 3) with RGB colours (N, 3) as PLY, binary little endian."""
-    _write(path, points, colors)
-
-
-def _write(
+def write_point_ply(
     path: Path,
     points: Array,
     colors: npt.NDArray[np.uint8],
     comment: str = "",
     faces: IntArray | None = None,
 ) -> None:
+    """Write points (N, 3) with RGB colours (N, 3) as PLY, binary little endian.
+
+    Args:
+        faces: (T, 3) triangles of the points. comment: a line of the header.
+    """
     vertex = np.zeros(len(points), [("xyz", "<f8", 3), ("rgb", "u1", 3)])
     vertex["xyz"] = points
     vertex["rgb"] = colors
@@ -86,29 +88,25 @@ def unit_mesh(shape: str | None, detail: int = 3) -> Mesh:
         detail: of the sphere: 8 x 4^detail triangles.
     """
     if shape == "box":
-        return _box_mesh()
+        corners = (2 * np.indices((2, 2, 2)).reshape(3, 8).T - 1).astype(np.float64)
+        quads = np.array([(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4),
+                          (1, 5, 7, 3)])  # fmt: skip
+        return corners, quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
     return _cylinder_mesh() if shape == "cylinder" else _sphere_mesh(detail)
-
-
-def _box_mesh() -> Mesh:
-    """Triangulate the cube of half side 1: points (8, 3), triangles (12, 3) facing outwards."""
-    points = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij")).reshape(3, 8).T
-    quads = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
-    faces = [half for a, b, c, d in quads for half in ((a, b, c), (a, c, d))]
-    return points.astype(np.float64), np.array(faces)
 
 
 def _cylinder_mesh() -> Mesh:
     """Triangulate the upright cylinder of radius and half height 1, facing outwards."""
-    a = np.arange(CYLINDER_SIDES)
-    angle = 2 * np.pi * a / CYLINDER_SIDES
-    b = (a + 1) % CYLINDER_SIDES
+    sides = CYLINDER_SIDES
+    a = np.arange(sides)
+    angle = 2 * np.pi * a / sides
+    b = (a + 1) % sides
     ring = np.column_stack([np.cos(angle), np.sin(angle)])
-    low, high = (np.column_stack([ring, np.full(CYLINDER_SIDES, z)]) for z in (-1.0, 1.0))
+    low, high = (np.column_stack([ring, np.full(sides, z)]) for z in (-1.0, 1.0))
     points = np.concatenate([low, high, [[0, 0, -1.0], [0, 0, 1.0]]])
-    c = b + CYLINDER_SIDES
-    d = a + CYLINDER_SIDES
-    bottom = np.full(CYLINDER_SIDES, 2 * CYLINDER_SIDES)
+    c = b + sides
+    d = a + sides
+    bottom = np.full(sides, 2 * sides)
     faces = [(a, b, c), (a, c, d), (bottom, b, a), (bottom + 1, d, c)]
     return points, np.concatenate([np.column_stack(f) for f in faces])
 

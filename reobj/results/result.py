@@ -1,15 +1,15 @@
 """Result of a run: tracks, cameras and objects of a video; its files, its table and its report.
 
-`Result` holds data; the functions below it write and read the output folder, and summarise it.
+`Result` holds data, which it saves to and loads from an output folder; the functions below it make
+tables and the report.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -22,7 +22,6 @@ import quadrics
 from reobj import __version__
 from reobj.cameras import Poses, save_poses
 from reobj.files import (
-    atomic,
     columns_of,
     cut,
     from_columns,
@@ -42,26 +41,27 @@ from reobj.results.changes import (
 )
 from reobj.results.edits import Edits, write_edits
 from reobj.results.entries import (
+    HEADER,
     RUN_AGAIN,
+    STALE,
     Object,
     OutputFile,
     Part,
     VideoInfo,
     World,
+    component_of,
     found_text,
-    read_json,
-)
-from reobj.results.links import Links, save_links
-from reobj.results.ply import write_ply
-from reobj.results.saving import (
-    HEADER,
-    STALE,
     load_last_poses,
+    read_json,
     replaced,
+    upright_pose,
+    write_json,
     write_mot,
     write_trajectories,
 )
-from reobj.results.upright import component_of, upright_pose
+from reobj.results.links import Links, save_links
+from reobj.results.ply import write_ply
+from reobj.sources.recorded import SIZES, corners
 from reobj.sources.tables import Boxes3D, read_mot_rows
 from reobj.types import (
     Array,
@@ -129,11 +129,11 @@ class Result:
 
     def __repr__(self) -> str:
         """Describe the result in one line."""
-        facts = [repr(Path(self.video.path).name)]
-        facts.append(found_text(self.objects))
-        facts.append(counted(len(self.tracks), "box", "boxes"))
-        facts += [] if self.poses is None else [self.poses.cameras_text]
-        facts += [] if self.out is None else [f"out={str(self.out)!r}"]
+        name = repr(Path(self.video.path).name)
+        cameras = "" if self.poses is None else self.poses.cameras_text
+        out = "" if self.out is None else f"out={str(self.out)!r}"
+        boxes = counted(len(self.tracks), "box", "boxes")
+        facts = filter(None, (name, found_text(self.objects), boxes, cameras, out))
         return f"Result({', '.join(facts)})"
 
     def _repr_html_(self) -> str:
@@ -148,12 +148,12 @@ class Result:
         Raises:
             ReobjError: there is none; the message names the nearest numbers.
         """
-        for found in self.objects:
-            if found.id == number:
-                return found
-        near = sorted((o.id for o in self.objects), key=lambda i: abs(i - number))[:4]
-        numbers = f"the nearest numbers are {', '.join(map(str, sorted(near)))}"
-        raise ReobjError(f"no object {number}; {numbers if near else 'the result has no objects'}")
+        near = sorted(self.objects, key=lambda o: abs(o.id - number))[:4]
+        if near and near[0].id == number:
+            return near[0]
+        numbers = ", ".join(str(i) for i in sorted(o.id for o in near))
+        known = f"the nearest numbers are {numbers}" if near else "the result has no objects"
+        raise ReobjError(f"no object {number}; {known}")
 
     def to_pandas(self) -> Any:
         """Return the objects as a pandas DataFrame, one row each, indexed by `id` (needs pandas).
@@ -180,25 +180,22 @@ class Result:
         if self.poses is None or self.poses.part_count == 1:
             return self
         facts = self.world.parts[part]
-        names = {f.name for f in dataclasses.fields(Part)} - {"spans"}
-        component_world = {name: getattr(facts, name) for name in names}
+        shared = {f.name for f in dataclasses.fields(Part)} - {"spans"}
+        component = {name: getattr(facts, name) for name in shared}
         return dataclasses.replace(
             self,
             objects=[o for o in self.objects if o.part == part],
-            world=dataclasses.replace(self.world, **component_world, parts=(facts,)),
+            world=dataclasses.replace(self.world, **component, parts=(facts,)),
             poses=self.poses.of_part(part),
             fits=None,
         )
 
     def without_doubtful(self) -> Result:
         """Return the result without objects of low confidence, their tracks and the fits."""
-        doubtful = [o.id for o in self.objects if o.status == "doubtful"]
-        return dataclasses.replace(
-            self,
-            objects=[o for o in self.objects if o.status != "doubtful"],
-            tracks=self.tracks[~np.isin(self.tracks.track_id, doubtful)],
-            fits=None,
-        )
+        kept = [o for o in self.objects if o.status != "doubtful"]
+        doubtful = {o.id for o in self.objects} - {o.id for o in kept}
+        tracks = self.tracks[~np.isin(self.tracks.track_id, list(doubtful))]
+        return dataclasses.replace(self, objects=kept, tracks=tracks, fits=None)
 
     def parts(self) -> list[Result]:
         """Return `of_part` of all components, the largest first."""
@@ -245,8 +242,29 @@ class Result:
         Returns:
             The same result with `out`, which `summary` and the evaluation name.
         """
-        save(self, Path(out), doubtful, more, stale)
-        return dataclasses.replace(self, out=Path(out))
+        out = Path(out)
+        edited = () if self.edits is None else (OutputFile.EDITS,)
+        with replaced(out, (*STALE, *edited, *stale)) as new:
+            shown = self if doubtful else self.without_doubtful()
+            write_mot(new / OutputFile.TRACKS, shown.tracks)
+            write_objects(self, new / OutputFile.OBJECTS)
+            write_edits(new, self.edits)
+            if self.links is not None:
+                save_links(self.links, new / OutputFile.LAST_LINKS)
+            if self.changes is not None:
+                write_changes(new / OutputFile.CHANGES, self.changes)
+            if self.earlier:
+                write_earlier(new / OutputFile.EARLIER, self.earlier)
+            if self.poses is not None:
+                save_poses(new / OutputFile.LAST_POSES, self.poses)
+                write_trajectories(new, self.poses)
+            if self.fits is not None or self.located:
+                for k, component in enumerate(self.parts()):
+                    ids = [o.id for o in component.located]
+                    write_ply(part_path(new / OutputFile.MESH, k), component.ellipsoids(), ids)
+            if more is not None:
+                more(new)
+        return dataclasses.replace(self, out=out)
 
     @classmethod
     def load(cls, out: str | Path) -> Result:
@@ -258,82 +276,40 @@ class Result:
         Raises:
             ReobjError: no `run` or `track` finished there, or another version wrote the folder.
         """
-        return load(Path(out))
-
-
-# ---- Output folder -----------------------------------------------------------------------------
-
-
-def save(
-    result: Result,
-    out: Path,
-    doubtful: bool,
-    write_more: Callable[[Path], None] | None,
-    stale: Sequence[str],
-) -> None:
-    """Write the files of a result; for the arguments see `Result.save`."""
-    edited = () if result.edits is None else (OutputFile.EDITS,)
-    with replaced(out, (*STALE, *edited, *stale)) as new:
-        shown = result if doubtful else result.without_doubtful()
-        write_mot(new / OutputFile.TRACKS, shown.tracks)
-        write_objects(result, new / OutputFile.OBJECTS)
-        write_edits(new, result.edits)
-        if result.links is not None:
-            save_links(result.links, new / OutputFile.LAST_LINKS)
-        if result.changes is not None:
-            write_changes(new / OutputFile.CHANGES, result.changes)
-        if result.earlier:
-            write_earlier(new / OutputFile.EARLIER, result.earlier)
-        if result.poses is not None:
-            save_poses(new / OutputFile.LAST_POSES, result.poses)
-            write_trajectories(new, result.poses)
-        if result.fits is not None or result.located:
-            for k, component in enumerate(result.parts()):
-                ids = [o.id for o in component.located]
-                write_ply(part_path(new / OutputFile.MESH, k), component.ellipsoids(), ids)
-        if write_more is not None:
-            write_more(new)
-
-
-def load(out: Path) -> Result:
-    """Read what `save` wrote; for the errors see `Result.load`."""
-    path = out / OutputFile.OBJECTS
-    if not path.is_file() or not (out / OutputFile.TRACKS).is_file():
-        raise ReobjError(f"{out}: no objects.json and tracks.txt; make them first with `run`")
-    poses = load_last_poses(out)
-    entries = read_json(ObjectsFile, path, HEADER, own=True)
-    if fault := _contradiction(entries, poses):
-        raise ReobjError(f"{path}: {fault}; {RUN_AGAIN}")
-    class_names = tuple(dict.fromkeys(o.class_name for o in entries.objects))
-    class_of = {o.id: class_names.index(o.class_name) for o in entries.objects}
-    rows = read_mot_rows(out / OutputFile.TRACKS)
-    frame = rows[:, 0].astype(np.int64) - 1
-    ids = rows[:, 1].astype(np.int64)
-    corners = np.concatenate([rows[:, 2:4], rows[:, 2:4] + rows[:, 4:6]], 1)  # (N, 4)
-    classes = np.array([class_of.get(i, -1) for i in ids.tolist()], np.int64)
-    unknown = np.full(len(rows), -1, np.int64)
-    changes = out / OutputFile.CHANGES
-    return Result(
-        Tracks(frame, ids, ids, corners, rows[:, 6], classes, unknown),
-        class_names,
-        entries.video,
-        entries.objects,
-        entries.world,
-        poses,
-        warnings=entries.warnings,
-        changes=read_changes(changes) if changes.is_file() else None,
-        earlier=_load_earlier(out / OutputFile.EARLIER),
-        out=out,
-    )
-
-
-def _load_earlier(path: Path) -> Sequence[EarlierSession]:
-    """Read the other recordings of the map; () if there are none, or with a warning if damaged."""
-    try:
-        return read_earlier(path) if path.is_file() else ()
-    except ReobjError as error:
-        log.warning("%s; the result is read without the other recordings of its map", error)
-        return ()
+        out = Path(out)
+        path = out / OutputFile.OBJECTS
+        if not path.is_file() or not (out / OutputFile.TRACKS).is_file():
+            raise ReobjError(f"{out}: no objects.json and tracks.txt; make them first with `run`")
+        poses = load_last_poses(out)
+        entries = read_json(ObjectsFile, path, HEADER, own=True)
+        if fault := _contradiction(entries, poses):
+            raise ReobjError(f"{path}: {fault}; {RUN_AGAIN}")
+        class_names = tuple(dict.fromkeys(o.class_name for o in entries.objects))
+        class_of = {o.id: class_names.index(o.class_name) for o in entries.objects}
+        rows = read_mot_rows(out / OutputFile.TRACKS)
+        frame, ids = rows[:, :2].T.astype(np.int64)
+        classes = np.array([class_of.get(i, -1) for i in ids.tolist()], np.int64)
+        boxes = corners(rows[:, 2:6], SIZES)  # (N, 4)
+        unknown = np.full(len(rows), -1, np.int64)
+        changes = out / OutputFile.CHANGES
+        earlier: Sequence[EarlierSession] = ()
+        if (others := out / OutputFile.EARLIER).is_file():
+            try:
+                earlier = read_earlier(others)
+            except ReobjError as error:
+                log.warning("%s; the result is read without the other recordings of its map", error)
+        return Result(
+            Tracks(frame - 1, ids, ids, boxes, rows[:, 6], classes, unknown),
+            class_names,
+            entries.video,
+            entries.objects,
+            entries.world,
+            poses,
+            warnings=entries.warnings,
+            changes=read_changes(changes) if changes.is_file() else None,
+            earlier=earlier,
+            out=out,
+        )
 
 
 # ---- objects.json ------------------------------------------------------------------------------
@@ -380,24 +356,22 @@ def write_objects(result: Result, path: Path) -> None:
         ],
         "warnings": result.warnings,
     }
-    with atomic(path) as part:
-        part.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+    write_json(path, data)
 
 
 def _contradiction(entries: ObjectsFile, poses: Poses | None) -> str:
     """Describe a contradiction between entries of objects.json, or to the poses; "" if none."""
-    ids = [o.id for o in entries.objects]
-    if len(set(ids)) != len(ids):
+    if len({o.id for o in entries.objects}) != len(entries.objects):
         return "two objects of one id"
-    component_count = 1 if poses is None else poses.part_count
+    count = 1 if poses is None else poses.part_count
     described = len(entries.world.parts)
-    if component_count not in (1, described):
-        return f"{described} components of a trajectory that has {component_count}"
+    if count not in (1, described):
+        return f"{described} components of a trajectory that has {count}"
     for o in entries.objects:
         shape = (o.center, o.half_axes, o.size, o.quat_wxyz)
         if (o.located or o.status == "implausible") and any(value is None for value in shape):
             return f"object {o.id} is {o.status} without a shape"
-        if o.part >= max(component_count, described):
+        if o.part >= max(count, described):
             return f"object {o.id} is in component {o.part}, which does not exist"
     return ""
 
@@ -456,12 +430,13 @@ def object_table(result: Result) -> tuple[list[str], list[list[Any]]]:
     head += ["center_m_x", "center_m_y", "center_m_z", "yaw_deg"]
     rows = list[list[Any]]()
     for o in result.objects:
-        row = [o.id, o.class_name, o.status, o.reason, o.score, o.confidence, o.support]
-        for name in vectors:
-            row += _numbers(getattr(o, name), 3)
-        row += [*_numbers(o.quat_wxyz, 4), o.views, o.frames_seen, len(o.visits), o.part]
+        lengths = [value for name in vectors for value in _numbers(getattr(o, name), 3)]
         pose = upright_pose(o, component_of(o, result.world))
-        rows.append([*row, *(pose["center_m"] or [None] * 3), pose["yaw_deg"]])
+        rows.append([
+            o.id, o.class_name, o.status, o.reason, o.score, o.confidence, o.support, *lengths,
+            *_numbers(o.quat_wxyz, 4), o.views, o.frames_seen, len(o.visits), o.part,
+            *(pose["center_m"] or [None] * 3), pose["yaw_deg"],
+        ])  # fmt: skip
     return head, rows
 
 
@@ -476,33 +451,39 @@ SIZE_WORDS = {"ok": "measured", "prior_dominated": "guessed", "rejected": "none"
 
 def summary(result: Result) -> str:
     """Write the report that `run` prints: what was found, where to look, and the table."""
-    counted = [o for o in result.objects if o.counted]
-    lines = _counts(result, counted)
-    lines += _implausible(result)
+    shown = [o for o in result.objects if o.counted]
+    texts = [_counts(result, shown)]
+    odd = [o for o in result.objects if o.status == "implausible"]
+    if names := ", ".join(f"{o.class_name} {o.id} ({o.reason})" for o in odd):
+        texts.append(f"implausible, not counted: {names}")
     if result.links is not None and (changed := result.links.changed):
         total = len(result.links.before)
-        text = f"linked again: {changed} of {total} identities have other boxes than before"
-        lines += _lines(text)
+        texts.append(f"linked again: {changed} of {total} identities have other boxes than before")
     if result.changes is not None:
-        lines += _lines(result.changes.summary())
+        texts.append(result.changes.summary())
+    lines = _lines(texts)
     if result.out is not None:
-        names = ("scene.html", "overlay.mp4", "objects.json")
-        files = [result.out / name for name in names]
+        files = [result.out / name for name in ("scene.html", "overlay.mp4", "objects.json")]
         lines.append("look at: " + ", ".join(str(file) for file in files if file.exists()))
-    if counted:
-        lines += ["", *_table(result, counted), *_reasons(counted)]
-    if any(o.size_rel_sigma is not None for o in counted):
+    if shown:
+        lines += ["", *_table(result, shown), *_lines(_reasons(shown))]
+    if any(o.size_rel_sigma is not None for o in shown):
         lines.append("sigma: standard deviation of the least certain side")
     lines += ["", *_cameras(result)]
     lines.append("seconds: " + ", ".join(_stage_time(result, s) for s in result.seconds))
     return "\n".join(lines)
 
 
+def _lines(texts: Iterable[str]) -> list[str]:
+    """Wrap lines for a terminal of 80 columns."""
+    return [line for text in texts for line in wrapped(text, 80)]
+
+
 def _stage_time(result: Result, stage: str) -> str:
     """Format the seconds of a stage: of its steps, or that it was taken from the cache."""
     text = f"{stage} {result.seconds[stage]:.1f}"
-    steps = result.step_seconds.get(stage)
-    if steps is None or list(steps) == [stage]:
+    steps = result.step_seconds.get(stage, {stage: 0})
+    if list(steps) == [stage]:
         return text
     times = ", ".join(f"{step} {seconds:.1f}" for step, seconds in steps.items())
     return f"{text} ({times or 'from the cache'})"
@@ -521,76 +502,54 @@ def sides(found: Object) -> list[tuple[str, ...]]:
     return texts_with_sigma(size, sigma)
 
 
-def _table(result: Result, counted: Sequence[Object]) -> list[str]:
+def _table(result: Result, shown: Sequence[Object]) -> list[str]:
     """Format a header and a line for each object; sizes only if there are any.
 
-    Objects of several components are grouped by component, each below a line with its name. Those
-    without a shape come last.
+    The header states metres if any size is known in them; a size in world units then names its
+    unit. The sigma is the largest relative one of the sides. Objects of several components are
+    grouped by component, each below a line with its name. Those without a shape come last.
     """
     in_metres = any(o.size_m is not None for o in result.objects)
-    has_sizes = any(o.size is not None for o in counted)
-    several = len(result.world.parts) > 1
+    has_sizes = any(o.size is not None for o in shown)
     unit = "m" if in_metres else "units"
-    width = max(LEAST_NAME, *(min(len(o.class_name), MOST_NAME) for o in counted))
-    columns = f"{'object':>6}  {'class':<{width}} {'frames':>6}"
+    width = max(LEAST_NAME, *(min(len(o.class_name), MOST_NAME) for o in shown))
+    header = f"{'object':>6}  {'class':<{width}} {'frames':>6}"
     if has_sizes:
-        columns += f"  {f'width x depth x height, {unit}':<26} {'sigma':>6}  size"
-    lines = [columns]
-    component = None
-    for o in sorted(counted, key=lambda o: (o.part, not o.located)):
-        if several and o.part != component:
+        header += f"  {f'width x depth x height, {unit}':<26} {'sigma':>6}  size"
+    lines = [header]
+    component = None if len(result.world.parts) > 1 else 0
+    for o in sorted(shown, key=lambda o: (o.part, not o.located)):
+        if o.part != component and len(result.world.parts) > 1:
             component = o.part
             lines.append(f"component {component}")
         line = f"{o.id:>6}  {cut(o.class_name, MOST_NAME):<{width}} {o.frames_seen:>6}"
         if has_sizes:
-            line += _size_columns(o, in_metres) + SIZE_WORDS.get(o.status, o.status)
+            size = " x ".join(side for side, *_ in sides(o)) or "-"
+            size += " units" * (in_metres and o.size is not None and o.size_m is None)
+            share = o.size_rel_sigma
+            sigma = "-" if share is None else f"{100 * share.max():.0f} %"
+            line += f"  {size:<26} {sigma:>6}  {SIZE_WORDS.get(o.status, o.status)}"
         lines.append(line)
     return lines
 
 
-def _size_columns(found: Object, in_metres: bool) -> str:
-    """Format an object's size and the largest relative sigma of its sides.
-
-    Args:
-        in_metres: the header states metres; a size in world units then names its unit.
-    """
-    size = " x ".join(side for side, *_ in sides(found)) or "-"
-    if in_metres and found.size is not None and found.size_m is None:
-        size += " units"
-    sigma = "-"
-    if found.size_rel_sigma is not None:
-        sigma = f"{100 * found.size_rel_sigma.max():.0f} %"
-    return f"  {size:<26} {sigma:>6}  "
-
-
-def _reasons(counted: Sequence[Object]) -> list[str]:
+def _reasons(shown: Sequence[Object]) -> list[str]:
     """Format each reason once, with the objects that have it."""
     objects_of: dict[str, list[int]] = {}
-    for o in counted:
+    for o in shown:
         for reason in filter(None, o.reason.split("; ")):
             objects_of.setdefault(reason, []).append(o.id)
-    lines = list[str]()
-    for reason, ids in objects_of.items():
-        noun = "object" if len(ids) == 1 else "objects"
-        lines += _lines(f"{reason}: {noun} {', '.join(map(str, ids))}")
-    return lines
+    return [f"{reason}: object{'s' * (len(ids) > 1)} {', '.join(map(str, ids))}"
+            for reason, ids in objects_of.items()]  # fmt: skip
 
 
-def _implausible(result: Result) -> list[str]:
-    """List the objects that are not counted because of their size, with the reason of each."""
-    odd = [o for o in result.objects if o.status == "implausible"]
-    texts = [f"{o.class_name} {o.id} ({o.reason})" for o in odd]
-    return _lines(f"implausible, not counted: {', '.join(texts)}") if texts else []
-
-
-def _counts(result: Result, counted: Sequence[Object]) -> list[str]:
+def _counts(result: Result, shown: Sequence[Object]) -> str:
     """Format the number of objects with and without a shape, in all and of each class."""
-    text = found_text(result.objects, names=True) if counted else "objects: none"
-    if len(result.world.parts) > 1:
-        text += " (each component counted separately)"
+    text = found_text(result.objects, names=True) if shown else "objects: none"
+    text += " (each component counted separately)" * (len(result.world.parts) > 1)
     if doubtful := sum(o.status == "doubtful" for o in result.objects):
         text += f"; {doubtful} more of low confidence, probably false positives (objects.json)"
-    return _lines(text)
+    return text
 
 
 def _cameras(result: Result) -> list[str]:
@@ -602,25 +561,16 @@ def _cameras(result: Result) -> list[str]:
         scale = [f"scale: {_scale_text(world.scale)}"] if world.scale else []
         return [result.poses.cameras_text, *scale]
     count = f"{len(world.parts)} components, each with its own frame and scale"
-    lines = [f"{result.poses.cameras_text} in {count}"]
+    texts = []
     for k, component in enumerate(world.parts):
-        facts = [
-            component.span_text,
-            f"{component.registered_frames} of {component.frames} frames",
-            found_text(o for o in result.objects if o.part == k),
-        ]
-        if component.scale:
-            facts.append(f"scale {_scale_text(component.scale)}")
-        lines += _lines(f"component {k}: " + "; ".join(facts))
-    return lines
+        found = found_text(o for o in result.objects if o.part == k)
+        frames = f"{component.registered_frames} of {component.frames} frames"
+        scale_text = f"; scale {_scale_text(component.scale)}" if component.scale else ""
+        texts.append(f"component {k}: {component.span_text}; {frames}; {found}{scale_text}")
+    return [f"{result.poses.cameras_text} in {count}", *_lines(texts)]
 
 
 def _scale_text(scale: quadrics.Scale) -> str:
     sigma = scale.rel_sigma or 0.0
     ((value, *_),) = texts_with_sigma(np.array([scale.value]), np.array([sigma * scale.value]))
     return f"{value} m per unit, sigma {100 * sigma:.0f} % (from {scale.source.replace('_', ' ')})"
-
-
-def _lines(text: str) -> list[str]:
-    """Wrap a line for a terminal of 80 columns."""
-    return wrapped(text, 80)

@@ -1,4 +1,7 @@
-"""Output folder: bound to one video; caches the results of the stages by a hash of their inputs."""
+"""Output folder: bound to one video; caches the results of the stages by a hash of their inputs.
+
+Also the stages before the objects: detections of all frames, then tracks.
+"""
 
 from __future__ import annotations
 
@@ -7,35 +10,53 @@ import dataclasses
 import hashlib
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
+import numpy as np
+import numpy.typing as npt
 
 from reobj import __version__
 from reobj.cameras import Poses, save_poses
 from reobj.files import (
     PART_RESULTS,
     LockedError,
-    atomic,
+    Progress,
     load_cached,
     load_npz,
     locked,
+    save_npz,
     writing,
 )
-from reobj.results.entries import OutputFile, read_json
-from reobj.results.links import Links, load_links
-from reobj.results.result import Result, load_tracked, save_tracked
-from reobj.results.saving import (
+from reobj.results.entries import (
+    STALE,
+    OutputFile,
     check_results,
     load_last_poses,
+    read_json,
     remove_stale,
+    write_json,
 )
-from reobj.sources.video import ImagelessVideo, InputConfig, Video
-from reobj.types import COORDINATE_MAX, FiniteFloat, Int32, ReobjError
+from reobj.results.links import Links, load_links
+from reobj.results.result import Result, VideoInfo, load_tracked, save_tracked
+from reobj.sources.detectors import DetectionCache, DetectionSource
+from reobj.sources.video import ImagelessVideo, InputConfig, Video, in_batches, one_ahead
+from reobj.types import (
+    COORDINATE_MAX,
+    Array,
+    Detections,
+    Embeddings,
+    FiniteFloat,
+    Frame,
+    Int32,
+    IntArray,
+    ReobjError,
+    Tracks,
+)
 
 Side = Annotated[int, msgspec.Meta(ge=1, le=int(COORDINATE_MAX))]
 
@@ -134,23 +155,18 @@ class Workspace:
             "input": dataclasses.asdict(video.config),
             "frames": video.facts() if isinstance(video, ImagelessVideo) else None,
         }
-        if path.exists():
-            old = load_cached(path, partial(read_json, _Binding)) or _Binding(
-                "another video", InputConfig()
-            )
-            if old.content != fingerprint["content"]:
-                if not overwrite and self._has_results():
-                    found = f"{old.source}, not of {video.source}"
-                    if old.source == fingerprint["source"]:
-                        found = f"{video.source} as it was before it changed"
-                    advice = "choose another -o, or add --overwrite"
-                    raise ReobjError(f"{self.out}: holds the results of {found}; {advice}")
-                remove_stale(self.out)
-                others = (OutputFile.TRACKS, OutputFile.OBJECTS, OutputFile.EDITS)
-                for name in (*others, OutputFile.LAST_TRACKS, OutputFile.LAST_POSES):
-                    (self.out / name).unlink(missing_ok=True)
-        with atomic(path) as part:
-            part.write_text(json.dumps(fingerprint), encoding="utf-8")
+        unknown = _Binding("another video", InputConfig())
+        old = load_cached(path, partial(read_json, _Binding)) or unknown if path.exists() else None
+        if old is not None and old.content != fingerprint["content"]:
+            if not overwrite and self._has_results():
+                found = f"{old.source}, not of {video.source}"
+                if old.source == fingerprint["source"]:
+                    found = f"{video.source} as it was before it changed"
+                advice = "choose another -o, or add --overwrite"
+                raise ReobjError(f"{self.out}: holds the results of {found}; {advice}")
+            others = (OutputFile.TRACKS, OutputFile.OBJECTS, OutputFile.EDITS)
+            remove_stale(self.out, (*STALE, *others, OutputFile.LAST_TRACKS))
+        write_json(path, fingerprint, indent=None)
 
     def _has_results(self) -> bool:
         """Check for results of a run; cached stages are keyed by their video and do not count."""
@@ -259,3 +275,183 @@ class Workspace:
         if tracked is None:
             raise ReobjError(f"{self.out}: no tracks here; make them first with `run` or `track`")
         return dataclasses.replace(tracked, poses=load_last_poses(self.out))
+
+
+# ---- Detections and tracks of all frames --------------------------------------------------------
+
+
+def detections_key(source: DetectionSource, video: Video) -> tuple[Any, ...]:
+    """Return the cache key of the detections of a video."""
+    return (video.fingerprint, video.config, source.key)
+
+
+def keep_detections(source: DetectionSource, video: Video, workspace: Workspace) -> DetectionSource:
+    """Return a source that caches the detections of a slow detector in the output folder."""
+    if video.is_live or not source.slow or not source.key:
+        return source
+    folder = workspace.path("detections", *detections_key(source, video)).with_suffix("")
+    return dataclasses.replace(source, cache=DetectionCache(folder, video.working_size))
+
+
+def detect_all(
+    source: DetectionSource,
+    video: Video,
+    workspace: Workspace,
+    progress: Callable[[str, int], Progress] = Progress,
+) -> tuple[DetectionSource, Tracks]:
+    """Detect objects in all frames of a video; the cameras are not needed.
+
+    Args:
+        progress: makes the progress line of a step from its name and total.
+    Returns:
+        the source, which returns these detections from now on, so that no frame is detected twice;
+        all detections as rows without identities, in native pixels.
+    """
+    if source.recorded is not None:
+        recorded = source.recorded
+        return source, _rows(recorded.frame, recorded.xyxy, recorded.score, recorded.class_id)
+    names = ("frame", "xyxy", "score", "class_id")
+    path = workspace.path("boxes", *detections_key(source, video))
+    if source.key and (cached := load_cached(path, lambda p: load_npz(p, sealed=True))):
+        columns, _ = cached
+        return source, _rows(*(columns[name] for name in names))
+    cache = source.cache
+    if cache is None:  # without a key it is not recognised in a later run
+        folder = workspace.cache / "detections-once"
+        shutil.rmtree(folder, ignore_errors=True)
+        cache = DetectionCache(folder, video.working_size)
+        source = dataclasses.replace(source, cache=cache)
+    steps: list[tuple[npt.NDArray[Any], ...]]
+    steps = [(np.empty(0), np.empty((0, 4)), np.empty(0), np.empty(0))]
+    try:
+        with progress("detect", video.expected) as line:
+            for batch in one_ahead(in_batches(video, source.batch)):  # a thread decodes the next
+                for frame, found in zip(batch, source.detect(batch), strict=True):
+                    d = Detections.empty() if found is None else found
+                    number = np.full(len(d), frame.index)
+                    steps.append((number, d.xyxy / video.scale, d.score, d.class_id))
+                    line.step()
+    finally:
+        cache.flush()
+    number, xyxy, score, kind = map(np.concatenate, zip(*steps, strict=True))
+    rows = _rows(number.astype(np.int64), xyxy, score, kind.astype(np.int64))
+    if source.key:
+        save_npz(path, {name: getattr(rows, name) for name in names})
+    return source, rows
+
+
+def _rows(frame: IntArray, xyxy: Array, score: Array, class_id: IntArray) -> Tracks:
+    """Make rows of detections without identities."""
+    zeros = np.zeros(len(frame), np.int64)
+    return Tracks(frame, zeros, zeros, xyxy, score, class_id, zeros - 1)
+
+
+def _rows_in(tracks: Tracks, frame: IntArray, index: IntArray) -> IntArray:
+    """Return the rows (n,) of detections in the tracks, by frame and index (n,); -1: none."""
+    keys = zip(tracks.frame.tolist(), tracks.detection_index.tolist(), strict=True)
+    row_of = {key: row for row, key in enumerate(keys)}
+    wanted = zip(frame.tolist(), index.tolist(), strict=True)
+    return np.array([row_of.get(key, -1) for key in wanted], np.int64)
+
+
+def _untracked(
+    tracks: Tracks, frames: list[int], detected: list[Detections], scale: float
+) -> Tracks:
+    """Make rows, without tracklets, of the detections that are in no row of the tracks."""
+    columns = [
+        (np.full(len(d), frame), d.xyxy, d.score, d.class_id, np.arange(len(d)))
+        for frame, d in zip(frames, detected, strict=True)
+    ]
+    frame, xyxy, score, class_id, index = map(np.concatenate, zip(*columns, strict=True))
+    rows = dataclasses.replace(_rows(frame, xyxy / scale, score, class_id), detection_index=index)
+    return rows[_rows_in(tracks, frame, index) < 0]
+
+
+def tracked_embeddings(
+    tracks: Tracks,
+    frames: Sequence[int],
+    embedded: Sequence[tuple[IntArray, npt.NDArray[Any]]],
+    foreground_width: int,
+) -> tuple[Embeddings, IntArray]:
+    """Select the tracker's embeddings of detections that are in the tracks.
+
+    Args:
+        frames: source frame numbers. embedded: for each, detection indices (n,) and their fused
+            rows (n, E). foreground_width: columns of the foreground (0: all).
+    Returns:
+        n embeddings, and their rows (n,) in the tracks.
+    """
+    frame = np.repeat(np.array(frames, np.int64), [len(index) for index, _ in embedded])
+    row = _rows_in(tracks, frame, np.concatenate([index for index, _ in embedded]))
+    blocks = [block for _, block in embedded if block.size] or [np.empty((0, 0), np.float16)]
+    fused = np.concatenate(blocks)[row >= 0].astype(np.float16)
+    width = foreground_width or fused.shape[1]
+    return Embeddings(fused[:, :width], fused[:, width:]), row[row >= 0]
+
+
+def collect_tracks(
+    steps: Iterator[tuple[Frame, Tracks]],
+    tracker: Any,
+    video: Video,
+    source: DetectionSource,
+    progress: Callable[[str, int], Progress] = Progress,
+) -> Result:
+    """Run a tracker over a video and collect its tracks, embeddings and warnings.
+
+    Args:
+        steps: the running `track(video, source, tracker)`.
+        progress: makes the progress line of a step from its name and total.
+    """
+    frames: list[int] = []
+    found: list[Tracks] = []  # also tentative ones
+    embedded: list[tuple[IntArray, npt.NDArray[np.float16]]] = []
+    detected: list[Detections] = []
+    detector_ran: list[bool] = []
+    try:
+        with progress("track", video.expected) as line:
+            for frame, _ in steps:
+                index, rows = tracker.latest_embeddings()
+                frames.append(frame.index)
+                found.append(tracker.latest)
+                embedded.append((index, rows.astype(np.float16)))
+                detected.append(dataclasses.replace(tracker.detections, masks=None))
+                detector_ran.append(tracker.looked)
+                line.step()
+    except KeyboardInterrupt:  # the way to end a live source
+        if not video.is_live:
+            raise
+    finally:
+        if source.cache is not None:
+            source.cache.flush()
+            if not source.key:  # no later run can use them
+                shutil.rmtree(source.cache.folder, ignore_errors=True)
+    if not frames:
+        why = "--start/--stop/--every leave none, or the file is damaged"
+        raise ReobjError(f"{video.source}: no frame could be read ({why})")
+    tracks = Tracks.concatenate(frames, found, video.scale)
+    untracked = _untracked(tracks, frames, detected, video.scale)
+    foreground_width = tracker.state.gallery.foreground_width
+    embeddings, embedding_row = tracked_embeddings(tracks, frames, embedded, foreground_width)
+    warnings = [*source.messages, *video.messages]
+    if video.is_live:
+        warnings += [
+            f"live: {video.read} frames came, {video.dropped} of them were dropped to keep up",
+            "a live source cannot be read twice: identities only; record it for 3D",
+        ]
+    if not len(tracks):
+        best = untracked.score.max(initial=0)
+        warnings.append(f"no object was tracked: {len(untracked)} detections in the "
+                        f"{sum(detector_ran)} frames that the detector was run on, the best of "
+                        f"score {best:.2f} "
+                        f"(tracker.new_score={tracker.config.new_score:g}, tracker.n_init)"
+                        )  # fmt: skip
+    return Result(
+        tracks,
+        tuple(source.class_names),
+        VideoInfo.of(video),
+        embeddings=embeddings,
+        embedding_row=embedding_row,
+        untracked=untracked,
+        looked=None if all(detector_ran) else np.array(frames, np.int64)[detector_ran],
+        warnings=warnings,
+    )

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import cv2
@@ -50,10 +51,10 @@ def draw_tracks(
     tracks: Tracks,
     labels: dict[int, str],
     scale: float,
-    positions: dict[int, int] | None = None,
-    thin: frozenset[int] = frozenset(),
-    marks: Mapping[int, Color] | None = None,
-    former: Mapping[int, IntArray] | None = None,
+    positions: dict[int, int],
+    thin: Collection[int] = (),
+    marks: Mapping[int, Color] = MappingProxyType({}),
+    former: Mapping[int, IntArray] = MappingProxyType({}),
 ) -> None:
     """Draw the boxes and identities of one frame's rows, in place; interpolated boxes are dashed.
 
@@ -69,8 +70,6 @@ def draw_tracks(
         former: bounds (4,) of the outlines of former places, pixels of the image, by the number of
             the object, negative: they get the label and the colour of this number.
     """
-    marks = marks or {}
-    former = former or {}
     boxes = (tracks.xyxy * scale).round().astype(int)  # (N, 4)
     ids = tracks.track_id.tolist()
     scores = tracks.score.tolist()
@@ -81,7 +80,6 @@ def draw_tracks(
             _draw_box(image, box + margin, marks[obj], 2, dashed=False)
     ids = [*ids, *former]
     boxes = np.array([*boxes, *former.values()], int).reshape(-1, 4)
-    positions = {} if positions is None else positions
     texts = [labels.get(obj, str(obj)) for obj in ids]
     sizes = np.array([_text_size(image, text) for text in texts], int).reshape(-1, 2)
     spots = place_labels(ids, sizes, boxes, (image.shape[1], image.shape[0]), positions)
@@ -244,12 +242,11 @@ def wireframes(ellipsoids: quadrics.Ellipsoids, support: Sequence[str | None]) -
     """
     columns = [(np.empty((0, 2, 3)), np.empty((0, 2, 4)), np.empty(0, bool), np.empty(0, int),
                 np.empty(0))]  # fmt: skip
-    for k, shape in enumerate(support):
+    rows = zip(ellipsoids.half_axes, ellipsoids.world_from_obj, ellipsoids.center_in_world,
+               support, strict=True)  # fmt: skip
+    for k, (half, turn, center, shape) in enumerate(rows):
         if shape not in EDGED:
             continue
-        half = ellipsoids.half_axes[k]
-        turn = ellipsoids.world_from_obj[k]
-        center = ellipsoids.center_in_world[k]
         ends, planes, crease = _unit_edges(shape)
         normal = (planes[..., :3] / half) @ turn.T  # x = c + R (h u)
         world_planes = np.concatenate([normal, planes[..., 3:] + (normal @ center)[..., None]], 2)
@@ -372,15 +369,14 @@ class _Component:
 
     Attributes:
         ids: (O,) of the located objects. solids: edges of boxes and cylinders among them.
-        round: points (P, 3) of the other solids, by identity.
-        former: points (P, 3) of former places of moved and gone objects, by their numbers.
+        outlined: points (P, 3) of the other solids by identity, and of former places of moved and
+            gone objects by their numbers, negative.
     """
 
     poses: Poses
     ids: list[int]
     solids: Wireframes
-    round: dict[int, Array]
-    former: dict[int, Array]
+    outlined: dict[int, Array]
 
 
 def _component(result: Result, number: int, part: Result) -> _Component | None:
@@ -392,12 +388,11 @@ def _component(result: Result, number: int, part: Result) -> _Component | None:
     solids = shifted.ellipsoids()
     support = [o.support for o in part.located]
     ids = [o.id for o in part.located]
-    around = {
+    outlined = {
         i: surface_points(solids.center_in_world[k], solids.half_axes[k], solids.world_from_obj[k],
                           shape)
         for k, (i, shape) in enumerate(zip(ids, support, strict=True)) if shape not in EDGED
     }  # fmt: skip
-    former: dict[int, Array] = {}
     changes = result.changes
     if changes is not None and number in changes.components:
         here = {o.id for o in part.objects}
@@ -405,8 +400,8 @@ def _component(result: Result, number: int, part: Result) -> _Component | None:
             if (shape := change.before_shape) is not None and change.before is not None:
                 turn = Rotation.from_quat(shape.quat_wxyz[[1, 2, 3, 0]]).as_matrix()
                 place = change.before - origin
-                former[change.id] = surface_points(place, shape.half_axes, turn, shape.support)
-    return _Component(poses, ids, wireframes(solids, support), around, former)
+                outlined[-change.id] = surface_points(place, shape.half_axes, turn, shape.support)
+    return _Component(poses, ids, wireframes(solids, support), outlined)
 
 
 # ---- The video ---------------------------------------------------------------------------------
@@ -468,13 +463,16 @@ class Overlay:
         small = cv2.resize(frame.image, self.size, interpolation=cv2.INTER_AREA)
         image = np.asarray(small, np.uint8)
         seen = set(rows.track_id.tolist())
-        thin: frozenset[int] = frozenset()
+        thin = set[int]()
         former: dict[int, IntArray] = {}
         if frame.index in self.cameras:
             component, pose = self.cameras[frame.index]
-            self._draw_solids(image, component, pose, seen)
-            former = self._draw_former(image, component, pose)
-            thin = frozenset(seen.intersection(component.ids))
+            ids = component.ids
+            drawn = np.array([i in seen or i in self.measured for i in ids], bool)
+            camera = component.poses.camera
+            draw_wireframes(image, component.solids, camera, pose, self.scale, ids, drawn, seen)
+            former = self._draw_outlines(image, component, pose, seen)
+            thin = seen.intersection(ids)
         draw_tracks(
             image, rows, self.labels, self.scale, self.label_positions, thin, self.marks, former
         )
@@ -482,43 +480,31 @@ class Overlay:
             draw_legend(image, self.legend)
         self.writer.write(image)
 
-    def _draw_solids(
+    def _draw_outlines(
         self, image: Image, component: _Component, pose: Array, seen: set[int]
-    ) -> None:
-        ids = component.ids
-        camera = component.poses.camera
-        drawn = np.array([i in seen or i in self.measured for i in ids], bool)
-        draw_wireframes(image, component.solids, camera, pose, self.scale, ids, drawn, seen)
-        for i, points in component.round.items():
-            line = self._outline(image, camera, pose, points)
-            if line is not None and (i in seen or i in self.measured):
-                width = _width_of(image) * (2 if i in seen else 1)
-                lines = [np.round(line * (1 << SHIFT)).astype(np.int32)]
-                cv2.polylines(image, lines, False, object_color(i), width, cv2.LINE_AA, SHIFT)
-
-    def _draw_former(self, image: Image, component: _Component, pose: Array) -> dict[int, IntArray]:
-        """Draw the outlines of moved and gone objects where their former place is in the image.
+    ) -> dict[int, IntArray]:
+        """Draw the outlines of round solids, and of former places whose centre is in the image.
 
         Returns:
-            bounds (4,) of each outline, pixels of the image, by the number of the object, negative.
+            bounds (4,) of the former places, pixels of the image, by number, negative.
         """
         bounds: dict[int, IntArray] = {}
         camera = component.poses.camera
-        for number, points in component.former.items():
-            middle = camera.project(pose[:, :3] @ points.mean(0) + pose[:, 3])
-            line = self._outline(image, camera, pose, points)
-            inside = ((middle > 0) & (middle < (camera.width, camera.height))).all()
-            if line is not None and inside:
-                _draw_dashes(image, line, self.marks[-number], 2)
-                bounds[-number] = np.array([line.min(0), line.max(0)]).round().astype(int).ravel()
+        for i, points in component.outlined.items():
+            outline = outline_of(camera, pose, points)
+            if outline is None or not _fits(self.scale * outline, image):
+                continue
+            line = self.scale * outline - 0.5  # OpenCV's pixels
+            if i < 0:
+                middle = camera.project(pose[:, :3] @ points.mean(0) + pose[:, 3])
+                if ((middle > 0) & (middle < (camera.width, camera.height))).all():
+                    _draw_dashes(image, line, self.marks[i], 2)
+                    bounds[i] = np.array([line.min(0), line.max(0)]).round().astype(int).ravel()
+            elif i in seen or i in self.measured:
+                width = _width_of(image) * (2 if i in seen else 1)
+                lines = [np.round(line * (1 << SHIFT)).astype(np.int32)]
+                cv2.polylines(image, lines, False, object_color(i), width, cv2.LINE_AA, SHIFT)
         return bounds
-
-    def _outline(self, image: Image, camera: Camera, pose: Array, points: Array) -> Array | None:
-        """Return the outline (n, 2) of a solid in OpenCV's pixels of the image; None: too near."""
-        outline = outline_of(camera, pose, points)
-        if outline is None or not _fits(self.scale * outline, image):
-            return None
-        return self.scale * outline - 0.5
 
     def close(self, complete: bool) -> None:
         """Finish the video; the file appears only if it is complete."""
@@ -538,7 +524,7 @@ def _legend(result: Result, components: Sequence[_Component]) -> list[tuple[str,
     """List the kinds of lines in this video and their meaning."""
     kinds = {kind for kind, _ in _changes_of(result).values()}
     former = {kind for i, (kind, _) in _changes_of(result).items()
-              if any(i in component.former for component in components)}  # fmt: skip
+              if any(-i in component.outlined for component in components)}  # fmt: skip
     has_solids = any(component.ids for component in components)
     lines = (
         ("box", "detected; number = identity", True),

@@ -16,7 +16,6 @@ import json
 import math
 import os
 import re
-import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,6 @@ from typing import Any
 import cv2
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
 import quadrics
 from reobj.cameras import Camera, Poses, invert_rigid, place_of, undistort_boxes
@@ -35,21 +33,22 @@ from reobj.results.changes import EarlierSession
 from reobj.results.entries import Object, World, recording_name, visit_gap
 from reobj.results.result import Result, sides
 from reobj.sources.image_files import IMAGE_FPS
-from reobj.sources.video import ImagelessVideo, Video, shrunk
+from reobj.sources.video import Video, shrunk
 from reobj.types import (
     Array,
     BoolArray,
+    Floats,
     Frame,
     Image,
     IntArray,
     ReobjError,
     Tracks,
+    counted,
     log,
     object_color,
     one_line,
     rows_by,
 )
-from reobj.viewer.cloud import Cloud, DenseFrames, dense_frames
 from reobj.viewer.overlay import Overlay
 
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
@@ -68,66 +67,56 @@ class Pictures:
         frames: [frame number, base64] of whole frames, undistorted.
         best: frame number of the best box of each object, by identity.
         time_s: of each frame that was read, by its number.
-        dense: frames for dense points; None: without.
     """
 
-    def __init__(self, result: Result, video: Video, dense: DenseFrames | None = None) -> None:
+    def __init__(self, result: Result, video: Video) -> None:
         """Choose the crops, at most 8 of an object and 480 of all, and 60 frames."""
         self.tracks = result.tracks
         self.scale = video.scale
         self.crops: dict[int, list[tuple[int, str]]] = {o.id: [] for o in result.objects}
         self.frames: list[tuple[int, str]] = []
-        poses = [part.poses for part in result.parts()]
         self.best: dict[int, int] = {}
-        chosen = [np.empty(0, np.int64)]
-        left = 480
+        self.time_s: dict[int, float] = {}
+        poses = [part.poses for part in result.parts()]
+        chosen: list[int] = []
         ranked = sorted(result.objects, key=lambda o: -o.frames_seen)
         for doubtful in (False, True):  # low-confidence objects get the remaining crops
             group = [o for o in ranked if (o.status == "doubtful") == doubtful]
+            left = 480 - len(chosen)
             count = min(max(left // max(len(group), 1), 1), 8)
-            rows = [diverse_rows(result.tracks, o, poses[o.part], count) for o in group[:left]]
-            for views in filter(len, rows):
-                best = int(views[0])
-                self.best[int(result.tracks.track_id[best])] = int(result.tracks.frame[best])
-            chosen = chosen + rows
-            left = left - sum(map(len, rows))
-        self.wanted = np.sort(np.concatenate(chosen))
+            for o in group[:left]:
+                rows = diverse_rows(result.tracks, o, poses[o.part], count).tolist()
+                if rows:
+                    self.best[o.id] = int(result.tracks.frame[rows[0]])
+                chosen += rows
+        self.wanted = np.sort(np.array(chosen, np.int64))
         shown = scene_steps(result)
         cameras = result.poses
         if cameras is not None and cameras.known.any():
             shown = shown[cameras.known[np.searchsorted(cameras.frame, shown)]]
         self.whole = set(shown[:: math.ceil(len(shown) / 60) or 1].tolist())
         self.camera = None if cameras is None else cameras.camera
-        self.grid: npt.NDArray[np.float32] | None = None  # (h, w, 2) distorted pixels, made once
-        self.time_s: dict[int, float] = {}
-        self.dense = dense
+        self.grid: Floats | None = None  # (h, w, 2) distorted pixels of a picture
 
     def take(self, frame: Frame) -> None:
         """Crop the wanted boxes of this frame, and keep the frame if it is one of `whole`."""
         self.time_s[frame.index] = frame.time_s
         rows = self.wanted[self.tracks.frame[self.wanted] == frame.index]
         for obj, box in zip(self.tracks.track_id[rows], self.tracks.xyxy[rows], strict=True):
-            crop = _crop(frame.image, box * self.scale, 112)
-            if crop:
+            if crop := _crop(frame.image, box * self.scale, 112):
                 self.crops[int(obj)].append((frame.index, _base64(crop)))
-        dense = self.dense if self.dense and frame.index in self.dense.wanted else None
-        if not dense and frame.index not in self.whole:
-            return
-        image = self._undistorted(shrunk(frame.image, 640))
         if frame.index in self.whole:
+            image = self._undistorted(shrunk(frame.image, 640))
             self.frames.append((frame.index, _base64(_jpeg(image))))
-        if dense:
-            dense.take(frame.index, image)
 
     def _undistorted(self, image: Image) -> Image:
         """Undistort a small picture, so that projected solids coincide with their objects."""
-        camera = self.camera
-        if camera is None or camera.model in PINHOLES:
+        if self.camera is None or self.camera.model in PINHOLES:
             return image
         if self.grid is None:  # OpenCV's pixels: the centre of the first one is (0, 0)
-            height, width = image.shape[:2]
-            xy = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1)
-            self.grid = (_distorted(camera.resized((width, height)), xy) - 0.5).astype(np.float32)
+            size = image.shape[1::-1]
+            xy = np.stack(np.meshgrid(*map(np.arange, size)), -1).astype(np.float64) + 0.5
+            self.grid = (_distorted(self.camera.resized(size), xy) - 0.5).astype(np.float32)
         x, y = np.moveaxis(self.grid, -1, 0)
         return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR), np.uint8)
 
@@ -143,13 +132,13 @@ def _lens(camera: Camera) -> dict[str, Any] | None:
     Within a cell the viewer neglects that its sides are inclined: a tenth of a pixel of the screen
     at the distortion of a phone.
     """
-    columns, rows = (64, 48)
     if camera.model in PINHOLES:
         return None
-    x = np.linspace(0, camera.width, columns + 1)
-    y = np.linspace(0, camera.height, rows + 1)
-    corners = np.stack(np.meshgrid(x, y), -1)
-    share = _distorted(camera, corners) / [camera.width, camera.height]
+    size = np.array([camera.width, camera.height])
+    cells = np.array([64, 48])
+    columns, rows = cells.tolist()
+    corners = np.stack(np.meshgrid(np.arange(columns + 1), np.arange(rows + 1)), -1) / cells * size
+    share = _distorted(camera, corners) / size
     return {"columns": columns, "rows": rows, "grid": base64_text(share, "<f4")}
 
 
@@ -159,13 +148,11 @@ def _crop(image: Image, box: Array, size_px: int) -> bytes:
     Args:
         size_px: longest side.
     """
-    height, width = image.shape[:2]
     margin = 0.1 * (box[2:] - box[:2])  # shows what the object stands on
     x1, y1 = (box[:2] - margin).clip(0).astype(int)
-    x2, y2 = np.minimum(box[2:] + margin + 1, (width, height)).astype(int)
-    if x1 >= x2 or y1 >= y2:
-        return b""
-    return _jpeg(shrunk(image[y1:y2, x1:x2], size_px))
+    x2, y2 = (box[2:] + margin + 1).clip(0).astype(int)
+    part = image[y1:y2, x1:x2]
+    return _jpeg(shrunk(part, size_px)) if part.size else b""
 
 
 def _jpeg(image: Image) -> bytes:
@@ -188,14 +175,14 @@ def best_pictures(result: Result, video: Video, line: Progress) -> dict[int, byt
     """
     poses = result.of_part(0).poses
     objects = [o for o in result.located if o.part == 0]
-    rows = [diverse_rows(result.tracks, o, poses, 1) for o in objects]
-    row = np.concatenate([np.empty(0, np.int64), *rows])  # (n,)
-    frames = result.tracks.frame[row]
+    rows = [row for o in objects for row in diverse_rows(result.tracks, o, poses, 1).tolist()]
+    best = result.tracks[np.array(rows, np.int64)]
     pictures = {}
-    for frame in video if len(row) else ():
-        for k in row[frames == frame.index].tolist():
-            if crop := _crop(frame.image, result.tracks.xyxy[k] * video.scale, 160):
-                pictures[int(result.tracks.track_id[k])] = crop
+    for frame in video if rows else ():
+        here = best[best.frame == frame.index]
+        for identity, box in zip(here.track_id.tolist(), here.xyxy, strict=True):
+            if crop := _crop(frame.image, box * video.scale, 160):
+                pictures[identity] = crop
         line.step()
     line.close()
     return pictures
@@ -252,12 +239,11 @@ def page_text(served: dict[str, Any] | None = None) -> str:
         served: what the server of `serve` offers to the page; None: the page is a file.
     """
     folder = Path(__file__).with_name("page")
-    text = (folder / "page.html").read_text(encoding="utf-8")
 
-    def text_of(match: re.Match[str]) -> str:
-        return (folder / match[1]).read_text(encoding="utf-8").strip()
+    def text_of(name: str) -> str:
+        return (folder / name).read_text(encoding="utf-8").strip()
 
-    text = re.sub(r"@\{([\w.]+)\}", text_of, text)
+    text = re.sub(r"@\{([\w.]+)\}", lambda match: text_of(match[1]), text_of("page.html"))
     text = text.replace("@ALLOWED@", OF_A_FILE if served is None else OF_A_SERVER)
     return text.replace("@SERVED@", json.dumps(served).replace("<", "\\u003c"))
 
@@ -319,41 +305,19 @@ def write_scene(
         },
         **_scene_cameras(result, steps, np.array(origins)),
         "parts": [
-            _scene_part(k, part, thin) | {"origin": origin.tolist()}
+            _scene_component(k, part, thin) | {"origin": origin.tolist()}
             for k, (part, origin) in enumerate(zip(parts, origins, strict=True))
         ],
     }
     if (changes := result.changes) is not None:
         marked = dataclasses.replace(changes, new=()) if changes.made_the_map else changes
         data["changes"] = marked.to_json() | {"summary": changes.summary()}
-    if pictures.dense is not None:
-        clouds = [pictures.dense.cloud(k) for k in range(len(parts))]
-        for entry, origin, cloud in zip(data["parts"], origins, clouds, strict=True):
-            entry |= {} if cloud is None else {"dense": _dense_points(cloud, origin)}
-        if not any(clouds):
-            log.warning("no dense points: the depth maps contradict each other; are units, "
-                        "intrinsics and poses right?")  # fmt: skip
     if result.earlier:
         data["earlier"] = _earlier_sessions(result.earlier)
         for entry in data["objects"]:
             entry["best"] = pictures.best.get(entry["id"])
     with atomic(path) as part:
         part.write_text(_page_of(data, None), encoding="utf-8")
-
-
-def _dense_points(cloud: Cloud, origin: Array) -> dict[str, Any]:
-    """Return dense points for the page.
-
-    Positions are 16-bit integers from `low` in steps of `step` world units, then colours are three
-    bytes, then directions towards the cameras three signed bytes.
-    """
-    xyz = cloud.xyz - origin
-    low = xyz.min(0)
-    step = max(float(np.ptp(xyz, axis=0).max()) / 65535, np.finfo(float).tiny)
-    data = ((xyz - low) / step).round().clip(0, 65535).astype("<u2").tobytes()
-    data += cloud.rgb.tobytes() + (cloud.seen_from * 127).round().astype(np.int8).tobytes()
-    facts = {"count": len(xyz), "low": low.tolist(), "step": step, "voxel": cloud.voxel}
-    return facts | {"data": _base64(data)}
 
 
 def _page_of(data: dict[str, Any], served: dict[str, Any] | None) -> str:
@@ -376,10 +340,9 @@ def served_page(
     Raises:
         ReobjError: the file is not a viewer of this version.
     """
-    text = read_text(path)
-    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)
+    _, _, rest = read_text(path).partition('<script type="application/json" id="data">')
     try:
-        data = msgspec.json.decode(found[1]) if found else None  # refuses NaN
+        data = msgspec.json.decode(rest.partition("</script>")[0])  # refuses NaN
     except (RecursionError, ValueError):
         data = None
     if not isinstance(data, dict) or data.get("version") != PAGE_VERSION:
@@ -400,24 +363,26 @@ def _scene_cameras(result: Result, steps: IntArray, origins: Array) -> dict[str,
     poses = result.poses
     if poses is None or not poses.known.any():
         return {"camera": None, "poses": ""}
-    size = {"width": poses.camera.width, "height": poses.camera.height}
-    K = poses.camera.K
+    camera = poses.camera
+    (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
     rows = np.isin(poses.frame, steps)
     shown = invert_rigid(poses.cam_from_world[rows])
     shown[:, :, 3] -= origins[poses.part[rows]]
-    pinhole = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
-    camera = size | pinhole | {"lens": _lens(poses.camera)}
-    return {"camera": camera, "poses": base64_text(shown, "<f4")}
+    pinhole = {"width": camera.width, "height": camera.height, "fx": fx, "fy": fy, "cx": cx}
+    return {
+        "camera": pinhole | {"cy": cy, "lens": _lens(camera)},
+        "poses": base64_text(shown, "<f4"),
+    }
 
 
-def _scene_part(number: int, part: Result, thin: int) -> dict[str, Any]:
+def _scene_component(number: int, part: Result, thin: int) -> dict[str, Any]:
     """Collect name, scale, floor, up, every `thin`-th point and their sigma of a component."""
     poses = part.poses
     up = part.world.up_in_world
-    count = len(part.objects)
+    count = counted(len(part.objects), "object", "objects")
     spans = ", ".join(p.span_text for p in part.world.parts)
     facts = {
-        "name": f"component {number}: {spans}; {count} object{'s' * (count != 1)}",
+        "name": f"component {number}: {spans}; {count}",
         "facts": _scene_facts(part.world),
         "scale": part.world.to_json()["scale"],
     }
@@ -451,13 +416,11 @@ def _scene_object(
     x1, y1, x2, y2).
     """
     rows_of_object = result.tracks[result.tracks.track_id == obj.id]
-    seen = np.isin(steps, rows_of_object.frame)
     frames, first = np.unique(rows_of_object.frame, return_index=True)
     shown = rows_of_object[first[np.isin(frames, steps)]]
     box = shown.xyxy
     if result.poses is not None:
         box = undistort_boxes(box, result.poses.camera)
-    filled = np.isin(steps, shown.frame[shown.score == 0])
     detected = rows_of_object
     if detected.score.any():  # without interpolated boxes
         detected = detected[detected.score > 0]
@@ -470,8 +433,8 @@ def _scene_object(
         "cov": "" if obj.cov is None else base64_text(obj.cov, "<f4"),
         "color": object_color(obj.id)[::-1],
         "sides": sides(obj),
-        "seen": _runs(seen),
-        "filled": _runs(filled),
+        "seen": _runs(np.isin(steps, shown.frame)),
+        "filled": _runs(np.isin(steps, shown.frame[shown.score == 0])),
         "boxes": base64_text(box, "<f4"),
         "visits": obj.visits,
         "tracklets": sorted(tracklets, key=lambda tracklet: tracklet[1:]),
@@ -482,7 +445,7 @@ def _scene_object(
 
 def _runs(mask: BoolArray) -> list[int]:
     """Return first and last index of each run of True in a mask (S,)."""
-    runs = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]])))
+    runs = np.flatnonzero(np.diff(mask, prepend=False, append=False))
     runs[1::2] -= 1
     return [int(at) for at in runs]
 
@@ -498,10 +461,9 @@ def _references(detected: Tracks) -> list[list[float]]:
     best = [rows[detected.score[rows].argmax()] for rows in rows_by(detected.tracklet_id)]
     even = np.linspace(0, len(detected) - 1, min(100, len(detected))).round().astype(np.int64)
     row = np.union1d(np.array(best, np.int64), even)
-    row = row[np.argsort(detected.frame[row], kind="stable")]
-    numbers = zip(detected.frame[row].tolist(), detected.tracklet_id[row].tolist(), strict=True)
-    boxes = detected.xyxy[row].round(1).tolist()
-    return [[*pair, *box] for pair, box in zip(numbers, boxes, strict=True)]
+    chosen = detected[row[np.argsort(detected.frame[row], kind="stable")]]
+    columns = (chosen.frame.tolist(), chosen.tracklet_id.tolist(), chosen.xyxy.round(1).tolist())
+    return [[frame, tracklet, *box] for frame, tracklet, box in zip(*columns, strict=True)]
 
 
 def _earlier_sessions(sessions: Sequence[EarlierSession]) -> list[dict[str, Any]]:
@@ -510,8 +472,8 @@ def _earlier_sessions(sessions: Sequence[EarlierSession]) -> list[dict[str, Any]
     left = 240  # pictures of all, .5 MB of the page
     for session in reversed(sessions):
         changes = session.changes
-        count = len(session.objects)
-        first = f"First recording of the map: {count} object{'s' * (count != 1)}"
+        count = counted(len(session.objects), "object", "objects")
+        first = f"First recording of the map: {count}"
         chosen = sorted(session.pictures)[:left]
         left -= len(chosen)
         entries.append({
@@ -565,8 +527,6 @@ def write_pictures(
     doubtful: bool = False,
     progress: Progress | None = None,
     command: str = "",
-    cloud: bool = False,
-    depth: str = "",
 ) -> list[str]:
     """Write the overlay video and scene.html in one pass over the video.
 
@@ -578,30 +538,28 @@ def write_pictures(
             contains them, show them initially.
         progress: the line of the stage, whose steps are the frames.
         command: fits the objects again; the viewer shows it with the file of corrections.
-        cloud: dense points in the viewer. depth: folder of the depth maps that they are made from.
     Returns:
         messages about files that could not be written, with the option to omit them. With the
         environment variable REOBJ_RAISE, as in our tests, bugs are raised instead.
     """
     visible = video.has_images and not video.is_live
-    shown = result if doubtful else result.without_doubtful()
     faults = _Faults()
     film = pictures = None
     with progress or Progress("write", video.expected) as line:
         if overlay and visible:
             with faults.of("overlay"):
+                shown = result if doubtful else result.without_doubtful()
                 film = Overlay(shown, out / "overlay.mp4", video)
         if scene:
             with faults.of("scene"):
-                dense = dense_frames(result.poses, video, depth) if cloud and visible else None
-                pictures = Pictures(result, video, dense)
-        sinks = [(name, sink) for name, sink in (("overlay", film), ("scene", pictures)) if sink]
+                pictures = Pictures(result, video)
+        sinks = {"overlay": film, "scene": pictures}
         line.complete = False
         try:
             with faults.of("video"):
-                for frame in video if sinks and visible else ():
-                    for name, sink in sinks:
-                        if name not in faults:
+                for frame in video if any(sinks.values()) and visible else ():
+                    for name, sink in sinks.items():
+                        if sink is not None and name not in faults:
                             with faults.of(name):
                                 sink.take(frame)
                     line.step()
@@ -613,7 +571,7 @@ def write_pictures(
         if pictures is not None and "scene" not in faults:
             with faults.of("scene"):
                 page = dataclasses.replace(result, warnings=[*result.warnings, *faults.messages()])
-                write_scene(page, pictures, out / "scene.html", video, doubtful, command=command)
+                write_scene(page, pictures, out / "scene.html", video, doubtful, command)
     return faults.messages()
 
 
@@ -651,34 +609,15 @@ class _Faults(dict[str, Exception]):
 
 
 def to_html(result: Result) -> str:
-    """Return the report of a result and its viewer in an iframe, for a notebook.
+    """Return the report of a result, and the scene.html of its folder in an iframe.
 
-    The viewer is the scene.html of the folder, else a page without pictures; without either it is
-    left out. Its page is part of the HTML (.7 MB, with pictures up to 10 MB), so that it works
-    where the notebook's server does not serve the folder. The iframe is sandboxed: scripts of the
-    page cannot reach the notebook.
+    The page is part of the HTML (.7 MB, with pictures up to 10 MB), so that it works where the
+    notebook's server does not serve the folder. The iframe is sandboxed: scripts of the page cannot
+    reach the notebook.
     """
     text = f"<pre>{html.escape(result.summary())}</pre>"
-    if page := viewer_page(result):
-        text += '<iframe sandbox="allow-scripts allow-downloads" '
-        text += f'srcdoc="{html.escape(page)}" style="width:100%;height:{VIEWER_PX}px;border:0">'
-        text += "</iframe>"
+    if result.out is not None and (path := result.out / "scene.html").is_file():
+        page = html.escape(path.read_text(encoding="utf-8"))
+        text += f'<iframe sandbox="allow-scripts allow-downloads" srcdoc="{page}" '
+        text += f'style="width:100%;height:{VIEWER_PX}px;border:0"></iframe>'
     return text
-
-
-def viewer_page(result: Result) -> str:
-    """Return the page of the viewer: that of the folder, else without pictures.
-
-    Without a folder and without cameras there is nothing to show: "".
-    """
-    if result.out is not None and (result.out / "scene.html").is_file():
-        return (result.out / "scene.html").read_text(encoding="utf-8")
-    if result.poses is None or not result.poses.known.any():
-        return ""
-    info = result.video
-    video = ImagelessVideo(info.path, (info.width, info.height))
-    video.fps = info.fps
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "scene.html"
-        write_scene(result, Pictures(result, video), path, video)
-        return path.read_text(encoding="utf-8")

@@ -2,7 +2,8 @@
 
 The standard library's HTTP server on 127.0.0.1, with a token in every request. It has a fixed list
 of addresses: the page, the recording, frames of an image folder, the state of the worker,
-corrections, undo. No address is a path of a file. `live` uses the same server.
+corrections, undo. No address is a path of a file. The live view of a running `track` (rerun's
+viewer, or a page where rerun is missing) has the same server.
 """
 
 from __future__ import annotations
@@ -16,8 +17,9 @@ import secrets
 import subprocess
 import sys
 import threading
+import time
 import webbrowser
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -27,14 +29,18 @@ from urllib.parse import parse_qs, urlsplit
 
 import cv2
 
+from reobj.cameras import Poses
+from reobj.export.registry import Viewer, live_labels
 from reobj.files import atomic
 from reobj.results.changes import EarlierSession
 from reobj.results.edits import HEADER, read_edits
 from reobj.results.entries import OutputFile
+from reobj.results.result import Result, VideoInfo
 from reobj.results.workspace import Workspace
 from reobj.sources.image_files import read_image
 from reobj.sources.video import Video, shrunk, source_fingerprint
-from reobj.types import ReobjError, log, one_line
+from reobj.types import NOTE, Frame, ReobjError, Tracks, log, one_line
+from reobj.viewer.overlay import draw_tracks
 from reobj.viewer.scene import served_page
 
 HOST = "127.0.0.1"
@@ -71,18 +77,19 @@ class LocalHandler(BaseHTTPRequestHandler):
 
     def _may_read(self) -> bool:
         """Check the address, the host, which a page of another server cannot give, the token."""
+        token = self.server.token.encode()
+        fault = None
         try:
-            urlsplit(self.path)
-        except ValueError:  # such as http://[
-            self._refuse(HTTPStatus.BAD_REQUEST, "no address")
-            return False
-        if self.headers.get("Host", "").lower() not in self.server.hosts:
-            self._refuse(HTTPStatus.FORBIDDEN, "unknown host")
-            return False
-        if not any(hmac.compare_digest(t, self.server.token.encode()) for t in self._tokens()):
-            self._refuse(HTTPStatus.FORBIDDEN, "no token: open the address that was printed")
-            return False
-        return True
+            if self.headers.get("Host", "").lower() not in self.server.hosts:
+                fault = (HTTPStatus.FORBIDDEN, "unknown host")
+            elif not any(hmac.compare_digest(t, token) for t in self._tokens()):
+                why = "no token: open the address that was printed"
+                fault = (HTTPStatus.FORBIDDEN, why)
+        except ValueError:  # of the address, such as http://[
+            fault = (HTTPStatus.BAD_REQUEST, "no address")
+        if fault is not None:
+            self._refuse(*fault)
+        return fault is None
 
     def _tokens(self) -> list[bytes]:
         """Return the tokens of the address and of the cookie."""
@@ -311,29 +318,30 @@ class Corrections:
     def _run(
         self, edits: Path, done: Callable[[], None] | None, failed: Callable[[], None] | None
     ) -> None:
-        """Start the worker; `done` is called after its success, `failed` after an error."""
-        arguments = (edits, done, failed)
-        self._thread = threading.Thread(target=self._work, args=arguments, daemon=True)
+        """Apply a file of edits in a thread; then call `done`, or after an error `failed`."""
+
+        def work() -> None:
+            fault = self._applied(edits)
+            try:
+                if (after := failed if fault else done) is not None:
+                    after()
+            except (OSError, ReobjError) as error:
+                fault = fault or one_line(str(error))
+            finally:
+                edits.unlink(missing_ok=True)
+                self._end(fault)
+
+        self._thread = threading.Thread(target=work, daemon=True)
         self._thread.start()
 
-    def _work(
-        self, edits: Path, done: Callable[[], None] | None, failed: Callable[[], None] | None
-    ) -> None:
-        """Apply a file of edits in a child process, as the command line does."""
-        fault = self._applied(edits)
-        try:
-            if (after := failed if fault else done) is not None:
-                after()
-        except (OSError, ReobjError) as error:
-            fault = fault or one_line(str(error))
-        finally:
-            edits.unlink(missing_ok=True)
-            self._end(fault)
-
     def _applied(self, edits: Path) -> str:
-        """Run the child process; return its error, "" after a success."""
+        """Apply edits in a child process, as the command line does, and show its progress.
+
+        Returns:
+            its error, "" after a success.
+        """
         command = [*self._command, "objects", str(self.out), "--edits", str(edits)]
-        environment = os.environ | {"REOBJ_PROGRESS_S": str(PROGRESS_S)}
+        line = ""
         try:
             with subprocess.Popen(
                 command,
@@ -342,29 +350,22 @@ class Corrections:
                 stderr=subprocess.PIPE,
                 text=True,
                 errors="replace",
-                env=environment,
+                env=os.environ | {"REOBJ_PROGRESS_S": str(PROGRESS_S)},
                 start_new_session=True,  # Ctrl-C ends the server, which ends the worker
             ) as process:
                 with self._lock:
                     self._process = process
                     if self._is_ending:
                         process.kill()
-                return self._follow(process, edits)
+                for text in process.stderr or ():
+                    line = text.strip().replace(str(edits), OutputFile.EDITS) or line
+                    if not line.startswith(("warning:", "note:")):
+                        with self._lock:
+                            self._text = line
         except OSError as error:
             return f"the worker could not be started: {one_line(str(error))}"
-
-    def _follow(self, process: subprocess.Popen[str], edits: Path) -> str:
-        """Show the progress of the worker; return its error, "" after a success."""
-        assert process.stderr is not None
-        line = ""
-        for text in process.stderr:
-            line = text.strip().replace(str(edits), OutputFile.EDITS) or line
-            if not line.startswith(("warning:", "note:")):
-                with self._lock:
-                    self._text = line
-        if process.wait() == 0:
-            return ""
-        return line.removeprefix("error: ") or f"the worker ended with {process.returncode}"
+        ended = f"the worker ended with {process.returncode}"
+        return (line.removeprefix("error: ") or ended) if process.returncode else ""
 
 
 def _remove(entry: Path) -> None:
@@ -401,43 +402,39 @@ class _Handler(LocalHandler):
         self.close_connection = True  # an unread body is no next request
         if not self._may_read():
             return
-        if self.headers.get("Origin") not in self.server.origins:
-            self._refuse(HTTPStatus.FORBIDDEN, "from another page")
-            return
-        length = self.headers.get("Content-Length", "")
-        if not re.fullmatch(r"\d{1,9}", length) or int(length) > EDITS_MAX:
-            self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"at most {EDITS_MAX >> 20} MB")
-            return
         parts = urlsplit(self.path)
-        version = parse_qs(parts.query).get("version", [""])[0]
-        text = self.rfile.read(int(length))
+        length = self.headers.get("Content-Length", "")
         corrections = self.server.corrections
-        if parts.path not in ("/edits", "/undo"):
-            self._refuse(HTTPStatus.NOT_FOUND, "no such page")
-            return
-        if version != corrections.version:
-            self._refuse(HTTPStatus.CONFLICT, "the result has changed: reload this page")
-            return
+        fault = None
+        if self.headers.get("Origin") not in self.server.origins:
+            fault = (HTTPStatus.FORBIDDEN, "from another page")
+        elif not re.fullmatch(r"\d{1,9}", length) or int(length) > EDITS_MAX:
+            fault = (HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"at most {EDITS_MAX >> 20} MB")
+        elif parts.path not in ("/edits", "/undo"):
+            fault = (HTTPStatus.NOT_FOUND, "no such page")
+        elif parse_qs(parts.query).get("version", [""])[0] != corrections.version:
+            fault = (HTTPStatus.CONFLICT, "the result has changed: reload this page")
         try:
-            if parts.path == "/edits":
-                corrections.save(text)
-            else:
+            if fault is None and parts.path == "/edits":
+                corrections.save(self.rfile.read(int(length)))
+            elif fault is None:
                 corrections.undo()
         except ReobjError as error:
-            self._refuse(HTTPStatus.CONFLICT, str(error))
-            return
-        self._json(corrections.state())
+            fault = (HTTPStatus.CONFLICT, str(error))
+        if fault is None:
+            self._json(corrections.state())
+        else:
+            self._refuse(*fault)
 
     def _page(self) -> None:
         """Send the page; the token of the address moves to a cookie."""
-        if self._token_moved():
-            return
-        try:
-            page = self.server.page()
-        except ReobjError as error:
-            self._refuse(HTTPStatus.CONFLICT, str(error))
-            return
-        self._answer(HTTPStatus.OK, page.encode(), "text/html; charset=utf-8")
+        if not self._token_moved():
+            try:
+                page = self.server.page().encode()
+            except ReobjError as error:
+                self._refuse(HTTPStatus.CONFLICT, str(error))
+            else:
+                self._answer(HTTPStatus.OK, page, "text/html; charset=utf-8")
 
     def _recording(self, path: Path) -> None:
         """Send the video file, or the range of it that is requested."""
@@ -545,3 +542,120 @@ class Server(LocalServer):
         except ReobjError as error:
             log.warning("%s; the page has the recordings of its last fit", error)
             return None
+
+
+# ---- Live view of a running `track` -------------------------------------------------------------
+
+EVERY_S = 0.1  # least time between two pictures of the page
+PICTURE_PX = 1280  # longer side
+PAGE = b"""<!doctype html><meta charset="utf-8"><title>reobj_track</title>
+<meta name="viewport" content="width=device-width">
+<style>body{margin:0;background:#111}img{display:block;margin:auto;max-width:100%;max-height:100vh}
+</style><img src="/pictures" alt="the latest frame with identities">"""
+
+
+def open_viewer(video: VideoInfo, stack: contextlib.ExitStack) -> Viewer | LivePage:
+    """Open the live view of `--show`; the end of the stack closes it."""
+    viewer: Viewer | LivePage
+    try:
+        viewer = Viewer(video)
+    except ReobjError:  # rerun is missing
+        viewer = LivePage()
+    stack.callback(viewer.close)
+    return viewer
+
+
+class LivePage:
+    """A page with the latest frame and its identities, while a video is tracked.
+
+    Attributes:
+        followed: the frames were shown while the video was tracked.
+    """
+
+    def __init__(self) -> None:
+        self.followed = False
+        self._server = _PictureServer(0, _PictureHandler)
+        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+        url = self._server.url
+        log.log(NOTE, "live view: %s (in 3D with rerun: pip install rerun-sdk)", url)
+        self._server.open_browser()
+
+    def follow(
+        self, steps: Iterable[tuple[Frame, Tracks]], names: Sequence[str], video: Video,
+        poses: Poses | None,
+    ) -> Iterator[tuple[Frame, Tracks]]:  # fmt: skip
+        """Show and yield each frame of a running `track`; `poses` are not shown."""
+        self.followed = True
+        positions: dict[int, int] = {}
+        shown_s = -EVERY_S
+        for frame, tracks in steps:
+            if time.monotonic() - shown_s > EVERY_S:
+                shown_s = time.monotonic()
+                texts = live_labels(tracks, names)
+                labels = dict(zip(tracks.track_id.tolist(), texts, strict=True))
+                image = shrunk(frame.image, PICTURE_PX).copy()
+                scale = image.shape[1] / frame.image.shape[1]
+                draw_tracks(image, tracks, labels, scale, positions)
+                self._server.put(cv2.imencode(".jpg", image)[1].tobytes())
+            yield frame, tracks
+
+    def show(self, result: Result, path: Path, images: bool) -> None:
+        """Show nothing more: scene.html has the result."""
+
+    def close(self) -> None:
+        """End the pictures and the server."""
+        self._server.put(b"")
+        self._server.shutdown()
+        self._server.server_close()
+
+
+class _PictureServer(LocalServer):
+    """The server of the page.
+
+    Attributes:
+        picture: the latest one, a JPEG; None: not yet; b"": there are no more.
+        changed: notified of each picture.
+    """
+
+    picture: bytes | None = None
+
+    def __init__(self, port: int, handler: type[LocalHandler]) -> None:
+        super().__init__(port, handler)
+        self.changed = threading.Condition()
+
+    def put(self, picture: bytes) -> None:
+        """Replace the picture."""
+        with self.changed:
+            self.picture = picture
+            self.changed.notify_all()
+
+
+class _PictureHandler(LocalHandler):
+    """Send the page, and the pictures as one endless answer (multipart/x-mixed-replace)."""
+
+    server: _PictureServer
+
+    def do_GET(self) -> None:
+        if not self._may_read():
+            return
+        path = urlsplit(self.path).path
+        if path == "/pictures":
+            with contextlib.suppress(OSError):  # the browser was closed
+                self._pictures()
+            self.close_connection = True
+        elif path != "/":
+            self._refuse(HTTPStatus.NOT_FOUND, "no such page")
+        elif not self._token_moved():
+            self._answer(HTTPStatus.OK, PAGE, "text/html; charset=utf-8")
+
+    def _pictures(self) -> None:
+        self._head(HTTPStatus.OK, None, "multipart/x-mixed-replace; boundary=frame")
+        picture: bytes | None = None
+        while picture != b"":
+            with self.server.changed:
+                while self.server.picture is picture:
+                    self.server.changed.wait()
+                picture = self.server.picture
+            if picture:
+                head = f"Content-Type: image/jpeg\r\nContent-Length: {len(picture)}\r\n\r\n"
+                self.wfile.write(b"--frame\r\n" + head.encode() + picture + b"\r\n")

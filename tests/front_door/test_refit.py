@@ -74,13 +74,6 @@ def test_options_of_the_fit_keep_the_identities(
     assert [o["center"] for o in new] != [o["center"] for o in old]  # they were fitted again
 
 
-def test_damaged_stored_identities_are_made_again(made: Path, out: Path, capsys: Any) -> None:
-    (out / "cache" / "last-links.npz").write_bytes(b"x")
-    refit(out)
-    assert "last-links.npz" in capsys.readouterr().err
-    assert boxes(out) == boxes(made) and described(out) == described(made)
-
-
 def test_identities_linked_again_keep_the_numbers_of_those_with_most_boxes(
     made: Path, out: Path, capsys: Any
 ) -> None:
@@ -152,21 +145,3 @@ def test_numbers_of_edited_objects_are_never_reassigned(
     refit(out, *edits(path, split(made, last)))
     (new,) = boxes(out).keys() - boxes(made).keys()
     assert new > another
-
-
-@pytest.mark.slow
-def test_given_identities_replace_all_numbers(made: Path, out: Path, tmp_path: Path) -> None:
-    """They are the user's; corrections of a later refit get other numbers."""
-    rows = np.loadtxt(made / "tracks.txt", delimiter=",")
-    rows = rows[rows[:, 6] > 0]
-    rows[:, 1] += 100
-    np.savetxt(tmp_path / "mot.txt", rows, fmt="%g", delimiter=",")
-    refit(out, "--tracks", tmp_path / "mot.txt")
-    assert boxes(out).keys() == {i + 100 for i in boxes(made)}
-    given = boxes(out)
-    refit(out, "--known-size", "chair=2m")
-    assert boxes(out) == given
-    number = next(iter(given))
-    refit(out, *edits(tmp_path / "e.json", split(out, number)))
-    (new,) = boxes(out).keys() - given.keys()
-    assert new > max(given)

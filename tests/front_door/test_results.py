@@ -258,30 +258,6 @@ def test_a_deleted_video_affects_visualisations_only(
 
 # ---- All results or none ----
 
-OUTPUTS = ["config.toml", "objects.json", "overlay.mp4", "sparse", "cache/last-poses.npz"]
-
-
-@pytest.mark.parametrize("name", OUTPUTS)
-def test_nothing_is_replaced_if_one_output_is_blocked(
-    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
-) -> None:
-    """A folder at the path of a file, or a file at the path of a folder."""
-    out = copied(made, tmp_path)
-    path = out / name
-    if name == "sparse":
-        shutil.rmtree(path)
-        path.write_text("mine")
-    else:
-        path.unlink(missing_ok=True)
-        path.mkdir()
-        (path / "mine").write_text("mine")
-    before = contents(out)
-    assert rt.main(["objects", str(out), "--known-size", "chair=2m"]) == 2
-    error = capsys.readouterr().err
-    assert str(path) in error and "move it away" in error and error.count("\n") == 1
-    assert contents(out) == before
-
-
 # ---- A run without images, and worlds far from their origin ----
 
 
