@@ -10,7 +10,7 @@ import contextlib
 import dataclasses
 import itertools
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -112,9 +112,9 @@ def estimate_poses(
     with Child(folder, work_dir / "pycolmap.log") as child:
         made = _Reconstruction(video, config, boxes_to_mask, child, progress)
         keys = made.keyframes()
-        best = made.attempt(keys, {})
+        best = made.attempt(keys)
         if extra := made.add_keyframes(sorted({*best.more_keyframes()} - {*keys})):
-            second = made.attempt(sorted([*keys, *extra]), best.mapped.view_of)
+            second = made.attempt(sorted([*keys, *extra]))
             best = second if second.pairs > best.pairs else best
     for k, model in enumerate(best.mapped.models):
         model.replace(part_path(work_dir / "sparse", k))
@@ -182,22 +182,18 @@ class _Reconstruction:
     def add_keyframes(self, rows: Sequence[int]) -> list[int]:
         """Read the images of more keyframes; return the rows of those with texture."""
         added = list[int]()
-        if rows:
-            line = self.progress("more keyframes", len(self.resized.frames))
-            for frame in self.resized.shown(line):
-                if frame.row in rows and frame.has_texture:
-                    self._keep(frame)
-                    added.append(frame.row)
+        line = self.progress("more keyframes", len(self.resized.frames))
+        for frame in self.resized.shown(line) if rows else ():
+            if frame.row in rows and frame.has_texture:
+                self._keep(frame)
+                added.append(frame.row)
         return added
 
-    def attempt(self, keys: list[int], view_of: Mapping[int, int]) -> _Attempt:
-        """Map keyframes and locate all frames.
-
-        Args:
-            keys: rows of the keyframes. view_of: of the first attempt, with fewer (`Mapped`).
-        """
+    def attempt(self, keys: list[int]) -> _Attempt:
+        """Map keyframes (rows) and locate all frames."""
         frames = self.resized.frames
-        names = [_frame_name(self.video, number) for number in frames]
+        known = self.video.names
+        names = [str(known[i]) if known else f"frame_{i:06d}.jpg" for i in frames]
         job = MappingJob(
             self.images,
             frame_of={row + 1: frames[row] for row in keys},
@@ -207,7 +203,6 @@ class _Reconstruction:
             camera=self.camera,
             focal_guess=_exif_focal(self.video) or FOCAL_GUESS,
             seed=self.config.seed,
-            view_of=view_of,
         )
         mapped = reconstruct(job, self.child, self.progress)
         models = [read_sparse_model(model) for model in mapped.models]
@@ -229,13 +224,12 @@ class _Reconstruction:
         time_s = np.array(video.times_s, np.float64)
         cam_from_world = np.full((len(frame), 3, 4), np.nan)
         status = np.full(len(frame), "none", "<U12")
-        component = np.full(len(frame), -1)
-        line = self.progress("pnp", len(models) * len(frame))
         if not models:
-            line.close()
             guess = (FOCAL_GUESS * max(self.size), self.size[0] / 2, self.size[1] / 2)
             camera = self.camera or Camera("SIMPLE_PINHOLE", *self.size, guess)
             return Poses(camera, frame, time_s, cam_from_world, status, "none")
+        component = np.full(len(frame), -1)
+        line = self.progress("pnp", len(models) * len(frame))
         visibility = []
         first_point = 0
         for number, (model, rows) in enumerate(zip(models, component_rows, strict=True)):
@@ -323,10 +317,6 @@ def rows_to_add(
         count = min(MAX_EXTRA, len(rows))
         chosen += rows[np.linspace(-1, len(rows), count + 2).round().astype(int)[1:-1]].tolist()
     return chosen
-
-
-def _frame_name(video: Any, number: int) -> str:
-    return str(video.names[number]) if video.names else f"frame_{number:06d}.jpg"
 
 
 def _exif_focal(video: Any) -> float:
