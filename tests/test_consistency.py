@@ -69,23 +69,17 @@ def test_the_focal_length_is_that_of_the_fundamental_matrices(focal, count, matc
     assert value == (pytest.approx(focal, rel=0.01) if found else None)
 
 
-def test_nearly_half_of_the_pairs_may_be_outliers():
-    wrong = np.random.default_rng(3).normal(size=(18, 3, 3)) / [[320, 320, 1]]  # any matrices
-    wrong = wrong / np.array([320, 320, 1])[:, None]
-    F = np.concatenate([fundamental(0.8, 22), wrong])
-    assert focal_from_pairs(pairs_of(F), SIZE) == pytest.approx(0.8, rel=0.02)
-
-
-def test_pairs_of_few_matches_do_not_outvote_those_of_many():
-    """As between photos without an order, which are matched with many that see little of it."""
+@pytest.mark.parametrize("is_path", [True, False])
+def test_outliers_do_not_determine_the_focal_length(is_path):
+    """Nearly half of the pairs of a path; of photos without an order more, of fewer matches."""
     right = pairs_of(fundamental(0.8, 22), matches=200)
-    wrong = pairs_of(fundamental(0.6, 60), matches=40)
+    wrong = pairs_of(fundamental(0.6, 18 if is_path else 60), matches=200 if is_path else 40)
     pairs = MatchedPairs(
         np.concatenate([right.image_ids, wrong.image_ids]),
         right.inliers + wrong.inliers,
         {},
         np.concatenate([right.fundamental, wrong.fundamental]),
-        is_path=False,
+        is_path,
     )
     assert focal_from_pairs(pairs, SIZE) == pytest.approx(0.8, rel=0.02)
 
@@ -202,14 +196,6 @@ def test_points_common_to_distant_views_only_connect_nothing(back, found):
     assert scene.groups() == numbers(*found)
 
 
-def test_split_points_between_neighbours_separate_a_sequence():
-    """Two halves connected by 200 points far from the seam, as after mixing up look-alikes."""
-    scene = Scene(points=10_000)
-    scene.untie(6, 200)
-    assert scene.groups() == numbers((1, 13))  # nothing was matched, so nothing is missing
-    assert scene.groups(across=True) == numbers((1, 7), (7, 13))
-
-
 def mismatched(pairs, rows):
     """Let the matches of some pairs go to other keypoints: no point of the model is matched."""
     for k in rows:
@@ -249,15 +235,6 @@ def shuffled(scene, seed=1):
     keypoints = {i + 1: xy for i, xy in enumerate(scene.xy)}
     unknown = np.full((len(ids), 3, 3), np.nan)
     return MatchedPairs(np.array(ids), inliers, keypoints, unknown, is_path=False)
-
-
-@pytest.mark.parametrize("is_path", [False, True])
-def test_wrong_matches_with_the_next_photo_of_a_list_separate_nothing(is_path):
-    """Those with the next image of a path do."""
-    scene = Scene()
-    pairs = replace(shuffled(scene), is_path=is_path)
-    groups = consistent_groups(read_arrays(scene.model()), pairs)
-    assert (len(groups) == 1 and len(groups[0]) == 12) != is_path
 
 
 @pytest.mark.parametrize("one_is_tied, found", [(False, [(1, 7), (7, 13)]), (True, [(1, 13)])])
@@ -321,7 +298,6 @@ def test_explained_matches_are_counted():
     scene = Scene()
     model, pairs = scene.model(), scene.pairs()
     total = [len(match) for match in pairs.inliers]
-    assert count_explained(read_arrays(model), pairs).tolist() == total
     half = len(pairs.inliers[0]) // 2  # of the first pair's matches go to others
     pairs.inliers[0][:half, 1] = np.roll(pairs.inliers[0][:half, 1], 1)
     found = count_explained(read_arrays(model), pairs)

@@ -69,17 +69,6 @@ def test_a_textureless_image_is_no_keyframe(walk, level):
     assert np.diff(chosen).max() <= np.diff(rows(walk)).max() + 3
 
 
-def test_a_cut_gives_a_keyframe(walk):
-    assert 5 in rows([*walk[:5], *walk[40:45]])  # a cut: the corners are lost
-
-
-def test_slow_motion_gives_a_keyframe_after_two_seconds():
-    """7 % of the width in 130 frames: never as much flow as a keyframe needs."""
-    images, _ = textured_room(130, 0.0035, size=(240, 180))
-    chosen = rows(images, max_flow=0.5)
-    assert 60 in chosen and len(chosen) == 4 - (129 not in chosen)
-
-
 @pytest.mark.parametrize("cache_mb", [1000, 0.1])
 def test_images_are_resized_and_read_again_when_memory_is_short(walk, cache_mb):
     video = FakeVideo(walk[:5])
@@ -110,10 +99,10 @@ def test_points_that_fail_the_backward_check_are_dropped():
     assert follow_points(old, new, np.empty((0, 2)))[1].shape == (0,)
 
 
-def test_images_in_a_file_are_read_by_their_numbers(tmp_path):
+def test_images_in_a_folder_are_read_by_their_numbers(tmp_path):
     images = np.random.default_rng(0).integers(0, 255, (3, 12, 16, 3)).astype(np.uint8)
-    file = ImageFile(tmp_path / "new" / "images.raw")
-    for number in (5, 2, 9, 2):  # one of them again
+    file = ImageFile(tmp_path / "new" / "images")
+    for number in (5, 2, 9):
         file.add(number, images[number % 3])
     assert file.shape == (12, 16, 3)
     for number in (9, 5, 2):

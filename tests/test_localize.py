@@ -1,4 +1,4 @@
-"""Frames between keyframes: PnP, tracked points, jumps, gaps, on exactly rendered scenes."""
+"""Frames between keyframes: PnP, tracked points, gaps, on exactly rendered scenes."""
 
 from __future__ import annotations
 
@@ -116,35 +116,6 @@ def test_frames_are_not_located_beyond_an_unregistered_keyframe():
     assert status.tolist() == ["none", "pnp", "keyframe", "pnp", "none", "none"]
 
 
-def test_frames_without_the_points_are_lost():
-    cams = sideways(9)
-    images = [WORLD.image(c) for c in cams]
-    images[3:6] = [np.full_like(images[0], 128)] * 3
-    _, status = locate(cams, [0, 8], images)
-    assert status.tolist() == ["keyframe", "pnp", "pnp", *["none"] * 3, "pnp", "pnp", "keyframe"]
-
-
-@pytest.mark.parametrize("aside, status", [(0.0, "pnp"), (0.03, "pnp"), (0.3, "none")])
-def test_a_frame_far_from_both_neighbours_is_refused(aside, status):
-    """Steps are 2 cm: an offset of 3 cm is camera shake, one of 30 cm a jump."""
-    cams = sideways(11)
-    moved = cams.copy()
-    moved[5, :, 3] -= cams[5, :, :3] @ [0, aside, 0]
-    found, seen = locate(cams, [0, 10], [WORLD.image(c) for c in moved])
-    assert seen.tolist() == ["keyframe", *["pnp"] * 4, status, *["pnp"] * 4, "keyframe"]
-    assert np.isnan(found[5]).all() == (status == "none")
-    if status == "pnp":
-        np.testing.assert_allclose(centres(found[5]), centres(moved[5]), atol=0.004)
-
-
-def test_a_reversal_of_the_camera_is_no_jump():
-    """The neighbours of the farthest frame progress a position; it is a usual step away."""
-    cams = sideways(6, step=0.04)
-    there_and_back = cams[[0, 1, 2, 3, 2, 1, 0]]
-    _, status = locate(there_and_back, [0, 6])
-    assert status.tolist() == ["keyframe", *["pnp"] * 5, "keyframe"]
-
-
 # ---- Gaps ----------------------------------------------------------------------------------------
 
 
@@ -156,7 +127,7 @@ def filled(cams, lost, left_out=(), frame=None, time_s=None):
     known[lost], status[lost] = np.nan, "none"
     time_s = frame / 30 if time_s is None else time_s
     located = Located(true_model(cams, keys), keys, known, status)
-    return fill_gaps(located, frame, time_s, 1.0, left_out)
+    return fill_gaps(located, frame, time_s, 1.0, np.array(left_out, int))
 
 
 def test_gaps_of_an_even_motion_are_filled_and_never_beyond():
@@ -197,22 +168,11 @@ def test_a_turn_in_the_gap_is_not_filled():
     assert (filled(turned(sideways(40), 15, 20.0), gap)[1][gap] == "none").all()
 
 
-def test_gaps_of_a_shaking_camera_or_between_photos_are_not_filled():
-    """Before or after the gap, interpolation would differ from the known poses."""
-    rng = np.random.default_rng(0)
-    for first, last in ((0, 14), (20, 40)):
+def test_gaps_of_a_shaking_camera_are_not_filled():
+    """Before or after the gap."""
+    for beside in (14, 19):
         shaken = sideways(40)
-        for row in range(first, last):
-            shake = Rotation.from_rotvec(rng.normal(0, 0.02, 3)).as_matrix()
-            centre = centres(shaken[row])
-            shaken[row, :, :3] = shake @ shaken[row, :, :3]
-            shaken[row, :, 3] = -shaken[row, :, :3] @ centre
+        shake = Rotation.from_rotvec([0, 0.02, 0]).as_matrix()
+        shaken[beside] = shake @ shaken[beside]
         assert (filled(shaken, [16, 17])[1][[16, 17]] == "none").all()
-    photos = sideways(40)
-    photos[:, :, 3] -= np.einsum("nij,nj->ni", photos[:, :, :3], rng.uniform(-0.3, 0.3, (40, 3)))
-    assert filled(photos, [16])[1][16] == "none"
-
-
-@pytest.mark.parametrize("row, status", [(2, "none"), (3, "interpolated"), (37, "none")])
-def test_a_gap_with_few_neighbouring_frames_is_not_filled(row, status):
-    assert filled(sideways(40), [row])[1][row] == status
+        assert (filled(shaken, [25, 26])[1][[25, 26]] == "interpolated").all()

@@ -61,15 +61,6 @@ def test_points_come_with_the_frames_that_observed_them_and_their_colour(corner)
     assert np.abs(seen - own).mean() < 0.6 * np.abs(seen - other).mean()
 
 
-def test_the_scale_is_that_of_the_poses(corner, tmp_path):
-    _, given, video, _, poses = corner
-    cams = given.cam_from_world.copy()
-    cams[:, :, 3] *= 50
-    larger = run(video, dataclasses.replace(given, cam_from_world=cams), tmp_path)
-    assert len(larger.points) == pytest.approx(len(poses.points), rel=0.1)
-    assert np.median(larger.points[:, 2]) == pytest.approx(50 * np.median(poses.points[:, 2]), 0.05)
-
-
 @pytest.mark.parametrize("mistake", ["inverted", "of other frames"])
 def test_poses_that_do_not_fit_the_images_are_reported(corner, tmp_path, mistake):
     _, given, video, _, _ = corner
@@ -126,7 +117,6 @@ def test_few_frames_are_all_keyframes_and_those_without_a_pose_none():
     cams[5] = np.nan
     rows = choose_posed_keyframes(path_steps(supplied(cams)))
     assert rows.tolist() == [i for i in range(13) if i != 5]
-    assert choose_posed_keyframes(np.full((4, 6), np.nan)).tolist() == []
 
 
 def test_pairs_are_neighbours_and_loop_closures():
@@ -136,15 +126,6 @@ def test_pairs_are_neighbours_and_loop_closures():
     assert {(i, i + 1) for i in range(39)} <= pairs
     assert {(i, 39 - i) for i in range(15)} <= pairs  # the way back
     assert len(pairs) < 40 * 7
-
-
-def test_opposite_views_are_no_pair():
-    """Back to back at one position."""
-    turned = motion("orbit", 12)
-    turned[6:, [0, 2]] *= -1
-    pairs = choose_posed_pairs(path_steps(supplied(turned)))
-    far = pairs[(pairs[:, 1] - pairs[:, 0] > 4)]
-    assert ((far[:, 0] < 6) == (far[:, 1] < 6)).all()
 
 
 def test_the_sharpest_image_near_a_keyframe_replaces_it():

@@ -148,8 +148,9 @@ class MapperSearch:
             if component.problem and len(ids) >= MIN_IMAGES:
                 messages.append(f"frames {self._spans(ids)} have no poses: {component.problem}")
             elif len(uncertain) and not component.problem:
+                left_out = spans([self.frames[i] for i in uncertain.tolist()])
                 messages.append(
-                    f"keyframes {self._spans(uncertain)} are left out: their poses are uncertain, "
+                    f"keyframes {left_out} are left out: their poses are uncertain, "
                     "and a second mapper does not reproduce them"
                 )
         return messages
