@@ -128,14 +128,6 @@ def test_poses_of_the_next_frame_are_named_by_boxes(kind, shift):
         check_boxes(Supplied(supplied(late)), box_tracks(cams, 1, 0))
 
 
-def test_another_order_of_the_images_is_named():
-    cams = motion("orbit")
-    order = np.argsort([str(k) for k in range(len(cams))])
-    given = Supplied(supplied(cams[order]), orders={"the order of the names": cams})
-    with pytest.raises(rt.ReobjError, match="the order of the names"):
-        check_matches(given, False, *matches(cams, 0.5))
-
-
 def test_matches_that_fit_nothing_do_not_contradict_boxes_that_agree():
     """Pictures that do not show the objects: a rolling test image."""
     cams = motion("orbit")

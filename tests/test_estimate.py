@@ -78,15 +78,6 @@ def test_options_reach_the_reconstruction(walk, tmp_path, monkeypatch):
 # ---- Failures ------------------------------------------------------------------------------------
 
 
-def test_a_smaller_step_is_advised_first(tmp_path):
-    """Of every sixth frame some do not connect: two rooms."""
-    video = FakeVideo(textured_room(5, 3.0)[0] + textured_room(4, 3.0, seed=5)[0])
-    video.config = rt.InputConfig(every=6)
-    first, *others = rt.estimate_poses(video, config(), tmp_path).messages
-    assert "--every 6" in first and "--every 3" in first and others
-    assert not any("--every" in text for text in others)
-
-
 @pytest.mark.parametrize(
     "images, message",
     [

@@ -96,16 +96,6 @@ def test_scenes_without_a_floor(points, centres, metres, reason):
     assert any(part in why for part in reason.split("|")), why
 
 
-def test_a_table_top_is_not_the_floor_if_the_floor_is_visible():
-    """The cameras are near the table; a strip of floor beside it is enough."""
-    rng = np.random.default_rng(0)
-    strip = np.column_stack([rng.uniform([-2, 0.8], [2, 2], (250, 2)), rng.normal(0, 0.005, 250)])
-    points = np.concatenate([table_top() + TABLE, strip])
-    floor, why = find_floor(points, UP, ORBIT + TABLE, 1.0)
-    assert floor is not None, why
-    assert abs(floor.normal @ [0, 1.4, 0] - floor.offset) < 0.02
-
-
 # ---- From poses, and in a result -----------------------------------------------------------------
 
 
