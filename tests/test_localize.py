@@ -168,11 +168,22 @@ def test_a_turn_in_the_gap_is_not_filled():
     assert (filled(turned(sideways(40), 15, 20.0), gap)[1][gap] == "none").all()
 
 
-def test_gaps_of_a_shaking_camera_are_not_filled():
-    """Before or after the gap."""
-    for beside in (14, 19):
+def test_gaps_of_a_shaking_camera_or_between_photos_are_not_filled():
+    """Before or after the gap, interpolation would differ from the known poses."""
+    rng = np.random.default_rng(0)
+    for first, last in ((0, 14), (20, 40)):
         shaken = sideways(40)
-        shake = Rotation.from_rotvec([0, 0.02, 0]).as_matrix()
-        shaken[beside] = shake @ shaken[beside]
+        for row in range(first, last):
+            shake = Rotation.from_rotvec(rng.normal(0, 0.02, 3)).as_matrix()
+            centre = centres(shaken[row])
+            shaken[row, :, :3] = shake @ shaken[row, :, :3]
+            shaken[row, :, 3] = -shaken[row, :, :3] @ centre
         assert (filled(shaken, [16, 17])[1][[16, 17]] == "none").all()
-        assert (filled(shaken, [25, 26])[1][[25, 26]] == "interpolated").all()
+    photos = sideways(40)
+    photos[:, :, 3] -= np.einsum("nij,nj->ni", photos[:, :, :3], rng.uniform(-0.3, 0.3, (40, 3)))
+    assert filled(photos, [16])[1][16] == "none"
+
+
+@pytest.mark.parametrize("row, status", [(2, "none"), (3, "interpolated"), (37, "none")])
+def test_a_gap_with_few_neighbouring_frames_is_not_filled(row, status):
+    assert filled(sideways(40), [row])[1][row] == status

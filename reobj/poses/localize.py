@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import CubicHermiteSpline
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from reobj.cameras import Camera, SparseModel, import_pycolmap, invert_rigid
 from reobj.files import Progress
@@ -188,6 +188,7 @@ def absolute_pose(
 
 
 MAX_GAP = 15  # consecutive lost frames that are interpolated: half a second at 30 Hz
+NEAR_GAPS = 2.0  # gap lengths, before and after it, in which the error is measured
 
 
 def fill_gaps(
@@ -195,10 +196,9 @@ def fill_gaps(
 ) -> tuple[Array, npt.NDArray[np.str_]]:
     """Interpolate the poses of at most MAX_GAP consecutive lost frames where the error is small.
 
-    The rotation is interpolated by slerp and the camera's centre linearly. The error is the
-    distance from a cubic curve with the velocities at the ends of the gap, as a shift of points in
-    the image; like that of PnP it must be below `INLIER_PX`. There is no extrapolation, and no
-    interpolation past a row of `unmapped`, a keyframe that mapping rejected.
+    It must be below `INLIER_PX`, as that of PnP (`_interpolation_px`). There is no
+    extrapolation, and no interpolation past a row of `unmapped`, a keyframe that mapping rejected.
+    The rotation is interpolated by slerp and the camera's centre linearly.
 
     Args:
         frame: (F,) numbers in the source: frames that were not read count too. time_s: (F,).
@@ -207,49 +207,109 @@ def fill_gaps(
         cam_from_world (F, 3, 4) and status (F,), "interpolated" where filled.
     """
     model = located.model
-    filled = located.cam_from_world.copy()
+    cam_from_world = located.cam_from_world
+    filled = cam_from_world.copy()
     status = located.status.copy()
-    size = shrink * np.array([model.cameras[0].width, model.cameras[0].height])
-    focal = float(shrink * model.cameras[0].K[0, 0])
-    known = np.flatnonzero(np.isfinite(filled).all((1, 2)))
+    known = np.flatnonzero(np.isfinite(cam_from_world).all((1, 2)))
     for k in np.flatnonzero(np.diff(known) > 1).tolist():
-        four = known[max(k - 1, 0) : k + 3]  # two on each side
         a, b = known[k : k + 2].tolist()
-        inner = np.arange(a + 1, b)
-        too_long = frame[b] - frame[a] - 1 > MAX_GAP
-        if len(four) < 4 or too_long or np.isin(inner, unmapped).any():
+        if frame[b] - frame[a] - 1 > MAX_GAP or any(a < row < b for row in unmapped):
             continue
-        first = max(int(np.searchsorted(located.key_rows, a, "right")) - 1, 0)
-        around = np.arange(first, np.searchsorted(located.key_rows, b) + 1)  # images of the model
-        seen = np.unique(model.obs_point[np.isin(model.obs_image, around)])
-        points = model.points[seen[:: max(1, len(seen) // 200)]]  # fewer take less time
-        line, curve = _interpolated(located.cam_from_world[four], time_s[four], time_s[inner])
-        if _shift_px(line, curve, points, focal, size) <= INLIER_PX:
-            filled[inner] = line
+        camera = model.cameras[0]
+        points = _points_around(model, located.key_rows, a, b)
+        size = shrink * np.array([camera.width, camera.height])
+        sides = known[: k + 1], known[k + 1 :]
+        focal = float(shrink * camera.K[0, 0])
+        error = _interpolation_px(sides, time_s, cam_from_world, points, focal, size)
+        if error <= INLIER_PX:
+            inner = np.arange(a + 1, b, dtype=np.int64)
+            filled[inner] = _interpolated(cam_from_world[[a, b]], time_s[[a, b]], time_s[inner])
             status[inner] = "interpolated"
     return filled, status
 
 
-def _interpolated(poses: Array, times_s: Array, wanted_s: Array) -> tuple[Array, Array]:
-    """Interpolate between the inner two of four poses (4, 3, 4), linearly and by a cubic.
+def _interpolated(ends: Array, times_s: Array, wanted_s: Array) -> Array:
+    """Interpolate between two poses (2, 3, 4) at times (n,): slerp, and linearly in the centre.
 
-    The coordinates are rotation vectors from the second pose, and centres: linear in the
-    translation of cam_from_world would bend the trajectory. The cubic has at its ends the
-    velocities from the first to the second and from the third to the fourth pose.
+    Linear in the translation of cam_from_world would bend the trajectory.
+    """
+    world_from_cam = invert_rigid(ends)
+    turn = Slerp(times_s, Rotation.from_matrix(world_from_cam[:, :, :3]))(wanted_s).as_matrix()
+    fraction = ((wanted_s - times_s[0]) / (times_s[1] - times_s[0]))[:, None]
+    centre = world_from_cam[0, :, 3] + fraction * (world_from_cam[1] - world_from_cam[0])[:, 3]
+    return invert_rigid(np.concatenate([turn, centre[:, :, None]], 2))
 
+
+def _points_around(model: SparseModel, key_rows: IntArray, a: int, b: int) -> Array:
+    """Return the points (n, 3) that the keyframes around the rows a to b observe."""
+    margin = round(NEAR_GAPS * (b - a))
+    first = int(np.searchsorted(key_rows, a - margin, "right")) - 1  # one before that, one after
+    images = np.arange(max(first, 0), int(np.searchsorted(key_rows, b + margin)) + 1)
+    seen = np.unique(model.obs_point[np.isin(model.obs_image, images)])
+    return model.points[seen[:: max(1, len(seen) // 200)]]  # fewer take less time
+
+
+def _interpolation_px(
+    sides: tuple[IntArray, IntArray],
+    time_s: Array,
+    cam_from_world: Array,
+    points: Array,
+    focal: float,
+    size: Array,
+) -> float:
+    """Estimate the error of interpolation over a gap, as a shift of points in the image.
+
+    It is the largest of: the errors at located frames on each side of the gap, where as long a gap
+    is left out; and the distance between linear interpolation and a cubic Hermite curve with the
+    velocities measured at the ends of the gap. The first is large where the camera shakes, and
+    between photos; the second where its velocity changes across the gap.
+
+    Args:
+        sides: located rows before and after the gap, ascending. points: (N, 3). focal, size: px.
     Returns:
-        two (n, 3, 4).
+        pixels; infinite where too few frames are located beside the gap.
+    """
+    before, after = sides
+    start_s = time_s[before[-1]]
+    end_s = time_s[after[0]]
+    gap_s = float(end_s - start_s)
+    worst = 0.0
+    if min(len(before), len(after)) < 2:
+        return np.inf
+    for side, edge_s in ((before, start_s), (after, end_s)):
+        near = side[np.abs(time_s[side] - edge_s) <= NEAR_GAPS * gap_s * (1 + 1e-6)]
+        until = np.searchsorted(time_s[near], time_s[near] + gap_s * (1 - 1e-6))
+        errors = []
+        for i, j in enumerate(until.tolist()):
+            if j < len(near) and j > i + 1:
+                ends = near[[i, j]]
+                inner = near[i + 1 : j]
+                line = _interpolated(cam_from_world[ends], time_s[ends], time_s[inner])
+                errors.append(_shift_px(line, cam_from_world[inner], points, focal, size))
+        if not errors:
+            return np.inf
+        worst = max(worst, *errors)
+    four = np.array([before[-2], before[-1], after[0], after[1]])
+    ends = four[[1, 2]]
+    inner_s = np.linspace(start_s, end_s, 9)[1:-1]
+    line = _interpolated(cam_from_world[ends], time_s[ends], inner_s)
+    curve = _hermite(cam_from_world[four], time_s[four], inner_s)
+    return max(worst, _shift_px(line, curve, points, focal, size))
+
+
+def _hermite(poses: Array, times_s: Array, wanted_s: Array) -> Array:
+    """Interpolate between the inner two of four poses (4, 3, 4) by a cubic in (rotation, centre).
+
+    The velocities at its ends are those from the first to the second and from the third to the
+    fourth; rotations count as rotation vectors from the second.
     """
     world_from_cam = invert_rigid(poses)
     turn = Rotation.from_matrix(world_from_cam[:, :, :3])
     path = np.hstack([(turn[1].inv() * turn).as_rotvec(), world_from_cam[:, :, 3]])  # (4, 6)
     speed = np.diff(path, axis=0) / np.diff(times_s)[:, None]  # (3, 6)
-    found = []
-    for ends in ([1, 1], [0, 2]):
-        curve = CubicHermiteSpline(times_s[1:3], path[1:3], speed[ends])(wanted_s)  # (n, 6)
-        turned = (turn[1] * Rotation.from_rotvec(curve[:, :3])).as_matrix()
-        found.append(invert_rigid(np.concatenate([turned, curve[:, 3:, None]], 2)))
-    return found[0], found[1]
+    curve = CubicHermiteSpline(times_s[1:3], path[1:3], speed[[0, 2]])(wanted_s)  # (n, 6)
+    turned = (turn[1] * Rotation.from_rotvec(curve[:, :3])).as_matrix()
+    return invert_rigid(np.concatenate([turned, curve[:, 3:, None]], 2))
 
 
 def _shift_px(one: Array, other: Array, points: Array, focal: float, size: Array) -> float:
