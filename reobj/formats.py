@@ -55,8 +55,9 @@ class Probe:
         if b"\0" in head and not head.startswith((b"\xff\xfe", b"\xfe\xff")):
             return []
         coding = "utf-16" if head.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig"
-        lines = head.decode(coding, "replace").splitlines()
-        return [line.strip() for line in lines if line.strip()]
+        lines = [line.strip() for line in head.decode(coding, "replace").splitlines()]
+        cut = len(head) == HEAD_BYTES and len(lines) > 1  # within the last line
+        return [line for line in lines[: -1 if cut else None] if line]
 
     @property
     def json_lines(self) -> bool:

@@ -68,7 +68,8 @@ class DetectionCache:
 
     def _load(self, path: Path) -> None:
         """Add the frames of a file, with packed masks."""
-        chunk, done = read_npz(path, self.image_size, self.image_size, sealed=True)
+        chunk = read_npz(path, self.image_size, self.image_size, sealed=True)
+        done = chunk.frame if chunk.looked is None else chunk.looked
         self._stored |= dict.fromkeys(done.tolist(), chunk)
 
     def __contains__(self, index: int) -> bool:
