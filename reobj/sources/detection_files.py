@@ -14,7 +14,6 @@ import re
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -62,15 +61,24 @@ def _table(name: str) -> Callable[[Probe], bool]:
     return lambda probe: name in tables.forms(probe)
 
 
-def _labels(probe: Probe, numbers: int) -> bool:
-    """Test for a folder of labels that may have a form of `label_folders.forms`."""
-    with contextlib.suppress(ReobjError):
-        return probe.is_dir and numbers in label_folders.forms(probe.path)
-    return not numbers
-
-
 FROM_1 = "from 1; from 0 if there is a 0"
 NAMED = "by image name, else by the number in it"
+
+
+def _labels(name: str, title: str, numbers: int) -> Format[Reader]:
+    """Make the format of folders of labels that may have a form of `label_folders.forms`."""
+
+    def recognise(probe: Probe) -> bool:
+        with contextlib.suppress(ReobjError):
+            return probe.is_dir and numbers in label_folders.forms(probe.path)
+        return not numbers
+
+    return Format(
+        name, f"a folder of YOLO labels, boxes {title}", recognise,
+        lambda source: label_folders.read_label_folder(source, numbers),
+        f"{NAMED}; VIDEO_N.txt from 1", "fractions", "keypoints" * (numbers > 0), kind="folder",
+    )  # fmt: skip
+
 
 DETECTIONS: Registry[Reader] = Registry("detections", "--detections-format", [
     Format("mot", "MOTChallenge, CVAT's MOT 1.1, trackers: rows of 6 to 10 numbers",
@@ -100,14 +108,8 @@ DETECTIONS: Registry[Reader] = Registry("detections", "--detections-format", [
            "keypoints", kind="JSON"),
     Format("oa-slam", "OA-SLAM, VOOM", _has("file_name detections", listed=True),
            coco.read_oa_slam, NAMED, "px", kind="JSON"),
-    *(Format[Reader](name, f"a folder of YOLO labels, boxes {title}",
-             partial(_labels, numbers=numbers), partial(label_folders.read_label_folder, pose=numbers),
-             f"{NAMED}; VIDEO_N.txt from 1", "fractions", "keypoints" * (numbers > 0),
-             kind="folder")
-      for name, title, numbers in (
-        ("yolo", "or polygons", 0), ("yolo-pose", "with keypoints", 3),
-        ("yolo-pose-2d", "with keypoints without visibility", 2),
-      )),
+    _labels("yolo", "or polygons", 0), _labels("yolo-pose", "with keypoints", 3),
+    _labels("yolo-pose-2d", "with keypoints without visibility", 2),
     Format("cvat", "CVAT for video 1.1 and for images 1.1, XML or zip",
            lambda probe: "annotations.xml" in probe.names
            or getattr(probe.root, "tag", "") == "annotations", coco.read_cvat,
@@ -333,7 +335,7 @@ def check_rows(recorded: RecordedDetections, path: Path) -> None:
         check_length(name, str(path))
     rows = np.column_stack([recorded.xyxy, recorded.score])  # (N, 5)
     kinds = recorded.class_id
-    finite = np.isfinite(rows).all(1) & (np.abs(rows) <= COORDINATE_MAX).all(1)  # (N,)
+    finite: BoolArray = np.all(np.abs(rows) <= COORDINATE_MAX, axis=1)  # (N,), NaN is not
     named = (kinds >= 0) & (kinds < len(names))
     pixels = np.array([runs.sum() for runs in recorded.runs], np.int64)
     fits = np.isin(pixels, (0, math.prod(recorded.size)))
