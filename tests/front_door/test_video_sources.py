@@ -158,11 +158,9 @@ def test_a_truncated_file_is_reported(name: str, tmp_path: Path) -> None:
         ([0, 1, 2, 3], [0, 1, 2, 3], 0),
         ([0, 1, 2, 2, 4, 5], [0, 1, 2, 3, 4, 5], 0),  # one stamp written twice
         ([0, 1, 2, 1.5, 4, 5], [0, 1, 2, 3, 4, 5], 0),  # a wrong one
-        ([0, 0, 2, 2, 4, 4], [0, 1, 2, 3, 4, 6], 0),  # a coarse clock
         ([0, 1, np.nan, 3, 4], [0, 1, 2, 3, 4], 0),
         ([*range(9), *range(9)], range(18), 1),
         ([*range(9), *range(20), *range(5)], range(34), 2),  # the second passes the first
-        ([5, 6, 7, 8, 9, 0, 1, 2, 3, 4], range(5, 15), 1),
     ],
 )
 def test_times_increase(raw: list[float], settled: list[float], restarts: int) -> None:
@@ -218,11 +216,9 @@ def movie(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     ("config", "expected"),
     [
-        (rt.InputConfig(every=3), [0, 3, 6, 9, 12, 15, 18]),  # numbers stay those of the source
         (rt.InputConfig(every=4, start=5, stop=15), [5, 9, 13]),
         (rt.InputConfig(start=18), [18, 19]),
         (rt.InputConfig(stop=99), list(range(20))),  # beyond the end
-        (rt.InputConfig(every=5, stop=16), [0, 5, 10, 15]),
         (rt.InputConfig(every=5, stop=15), [0, 5, 10]),  # not the frame to stop before itself
         (rt.InputConfig(start=9, stop=5), []),
     ],
@@ -313,33 +309,6 @@ def test_frames_of_another_size_are_left_out_and_said(
     assert len(said) == 1 and ": 10, 11, 12" in said[0]
 
 
-def test_a_codec_that_opencv_does_not_have(tmp_path: Path) -> None:
-    try:
-        path = write_video(tmp_path / "a.mp4", EVEN[:8], codec="libsvtav1", step=4)
-    except ValueError:
-        pytest.skip("no encoder of AV1 here")
-    finally:
-        if hasattr(os, "sched_setscheduler"):  # as root SVT-AV1 takes real-time priority for good
-            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    assert [round(number_of(f.image) / 4) for f in rt.Video(path)] == list(range(8))
-
-
-def test_a_cover_picture_is_no_video(tmp_path: Path) -> None:
-    with av.open(str(tmp_path / "a.mp3"), "w") as file:
-        sound = file.add_stream("mp3", rate=44100)
-        cover = file.add_stream("mjpeg")
-        cover.width, cover.height, cover.pix_fmt = *SIZE, "yuvj420p"
-        cover.disposition = av.stream.Disposition.attached_pic.value
-        frame = av.VideoFrame.from_ndarray(picture(9), "bgr24")
-        frame.pts = 0
-        file.mux([*cover.encode(frame), *cover.encode()])
-        heard = av.AudioFrame.from_ndarray(np.zeros((2, 1152), np.float32), "fltp", "stereo")
-        heard.sample_rate = 44100
-        file.mux([*sound.encode(heard), *sound.encode()])
-    with pytest.raises(rt.ReobjError, match="no video in it"):
-        rt.Video(tmp_path / "a.mp3")
-
-
 @pytest.mark.parametrize("name", ["a.webp", "a.gif", "a.png", "a.tif"])
 def test_an_animated_image_is_a_video_of_its_frames(name: str, tmp_path: Path) -> None:
     first, *others = [Image.fromarray(picture(8 * i)) for i in range(6)]
@@ -374,10 +343,6 @@ def short(folder: Path) -> Path:
         (lambda d: d, "no images there"),  # empty folder
         (lambda d: f"{d}/*.png", "no images there"),  # glob without a match
         (lambda d: (d / "empty.mp4", (d / "empty.mp4").write_bytes(b""))[0], "cannot be opened"),
-        (
-            lambda d: (d / "text.mp4", (d / "text.mp4").write_bytes(b"hello" * 99))[0],
-            "cannot be opened",
-        ),
         (
             lambda d: (d / "a.png", (d / "a.png").write_bytes(b"x"))[0],
             "no frame can be decoded: damaged, or",
@@ -574,21 +539,6 @@ def test_exif_orientation(kind: str, orientation: int, tmp_path: Path) -> None:
     np.testing.assert_allclose(frame.image, expected, atol=9)
 
 
-@pytest.mark.parametrize("mode", ["RGBA", "LA", "P", "CMYK", "I;16", "1", "L"])
-def test_modes_of_pixels(mode: str, tmp_path: Path) -> None:
-    """Alpha is dropped, palettes and CMYK are converted, 16 bits become 8."""
-    shade = Image.linear_gradient("L")
-    path = tmp_path / ("a.jpg" if mode == "CMYK" else "a.png")
-    if mode == "I;16":
-        cv2.imwrite(str(path), 257 * np.asarray(shade).astype(np.uint16))
-    else:
-        shade.convert("RGB" if mode == "CMYK" else "L").convert(mode).save(path)
-    (frame,) = rt.Video(path)
-    if mode != "1":
-        expected = np.repeat(np.asarray(shade)[..., None], 3, 2)
-        np.testing.assert_allclose(frame.image, expected, atol=6)
-
-
 START = 1305031102.175304
 
 
@@ -783,7 +733,10 @@ def test_a_file_behind_a_url_is_read_like_a_file(tmp_path: Path) -> None:
     for n in range(12):
         writer.write(np.full((SIZE[1], SIZE[0], 3), 20 * n, np.uint8))
     writer.release()
-    handler = functools.partial(QuietFiles, directory=str(tmp_path))
+    files = http.server.SimpleHTTPRequestHandler
+    handler = functools.partial(
+        type("Quiet", (files,), {"log_message": Handler.log_message}), directory=str(tmp_path)
+    )
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
         url = f"http://127.0.0.1:{server.server_port}/"
@@ -794,13 +747,6 @@ def test_a_file_behind_a_url_is_read_like_a_file(tmp_path: Path) -> None:
         with pytest.raises(rt.ReobjError, match=r"none\.mp4: cannot be opened"):
             rt.Video(url + "none.mp4")
         server.shutdown()
-
-
-class QuietFiles(http.server.SimpleHTTPRequestHandler):
-    """Files of a folder, without a log."""
-
-    def log_message(self, *_: object) -> None:
-        pass
 
 
 SAYS_WHEN_IT_TRACKS = """
@@ -845,6 +791,3 @@ def test_ctrl_c_leaves_complete_files(stream: tuple[Stream, str], tmp_path: Path
     written = "".join(p.read_text() for p in files) + text + errors
     assert "secret" not in written and str(server.server_port) in written
     assert not list(out.rglob(".part*"))
-
-
-# ---- Processes and packages ----------------------------------------------------------------------
