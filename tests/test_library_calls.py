@@ -116,6 +116,8 @@ def test_rfdetr(picture: Any, tmp_path: Path) -> None:
         return found.xyxy, found.confidence, found.data["class_name"]
 
     check(tmp_path, picture, f"rfdetr:nano={file}", documented, 0.01)
+    with pytest.raises(rt.ReobjError, match=r"rfdetr:huge: no such model; there are base, .*nano"):
+        open_detections(rt.Video(tmp_path / "photos"), rt.DetectConfig(model="rfdetr:huge"))
 
 
 def test_torchvision(picture: Any, tmp_path: Path) -> None:

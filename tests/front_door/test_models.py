@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,6 +17,7 @@ import small_models
 
 import reobj_track as rt
 
+ROOT = Path(rt.__file__).resolve().parent
 SIDE = 128  # px of the networks' input; 1.25 px of the video each
 CELLS = 16 * 16 + 8 * 8 + 4 * 4  # of 8, 16, 32 px
 NAMES = "{0: 'mug', 1: 'lamp', 2: 'box'}"
@@ -237,3 +241,21 @@ def test_a_damaged_yaml_file_is_one_line(text: str, part: str, tmp_path: Path, d
     path = write_model(tmp_path / "m.onnx", values(6))
     said = detect(path, "--set", f"detect.class_names={tmp_path / 'data.yaml'}")[1]
     assert "data.yaml" in said and part in said
+
+
+def test_names_in_a_locale_without_utf8(tmp_path: Path) -> None:
+    """LC_ALL=C, and Python's UTF-8 mode and coercion of the locale are off."""
+    folder = tmp_path / "Stühle"
+    folder.mkdir()
+    rows = ["frame,x1,y1,x2,y2,score,class"]
+    for index in range(6):
+        cv2.imwrite(str(folder / f"{index}.png"), np.zeros((120, 160, 3), np.uint8))
+        rows.append(f"{index},20,30,60,70,.9,椅子")
+    (tmp_path / "det.csv").write_text("\n".join(rows), encoding="utf-8")
+    off = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    words = ["track", "Stühle", "--detections", "det.csv", *QUICK, "-o", "out ü"]
+    command = [sys.executable, str(ROOT / "reobj_track.py"), *words]
+    shown = subprocess.check_output(command, cwd=tmp_path, env=os.environ | off)
+    assert b"1 object" in shown
+    data = json.loads((tmp_path / "out ü/objects.json").read_text(encoding="utf-8"))
+    assert {entry["class"] for entry in data["objects"]} == {"椅子"}
