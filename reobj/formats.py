@@ -164,7 +164,7 @@ class Registry(Generic[R]):
             raise ReobjError(f"{path} does not exist")
         return self.choose(Probe(path), name)
 
-    def choose(self, probe: Probe, name: str = AUTO) -> Format[R]:
+    def choose(self, probe: Any, name: str = AUTO) -> Format[R]:
         """Return the format that the user names, or that a probe fits, as `reader` does."""
         known = {entry.name: entry for entry in self.readable}
         if name not in ("", AUTO):

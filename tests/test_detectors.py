@@ -290,7 +290,7 @@ def test_a_cache_survives_a_kill_and_a_damaged_file(
     first.write_bytes(first.read_bytes()[:-40])
     for _ in range(2):
         again = DetectionCache(tmp_path, (32, 24))
-    assert caplog.text.count("its frames are detected again") == 1 and first.name in caplog.text
+    assert caplog.text.count("removed and computed again") == 1 and first.name in caplog.text
     assert again.get(0) is None and again.get(98) is None
     for index in (*range(64, stored), 99):
         found, true = again.get(index), some(index, masks)

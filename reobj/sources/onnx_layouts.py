@@ -18,7 +18,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from reobj.formats import Format, Probe, Registry
+from reobj.formats import Format, Registry
 from reobj.sources.class_names import load_class_names, names_by_number, parse_yaml
 from reobj.sources.detection_files import DetectConfig, class_filter, unnamed_class
 from reobj.sources.video import in_batches
@@ -75,25 +75,34 @@ class Decoded:
     masks: Callable[[IntArray], BoolArray] | None = None
 
 
-class ModelProbe(Probe):
+@dataclass(slots=True)
+class ModelProbe:
     """What a layout is recognised by.
 
     Attributes:
-        inputs: their shapes by name. outputs: of a trial run, by name. size: (w, h) of the input.
-        metadata: of the file. count: number of class names, then of classes of the layout.
-        shapes: of the outputs. first: the first output.
+        path: of the file. inputs: their shapes by name. outputs: of a trial run, by name.
+        size: (w, h) of the input. metadata: of the file.
+        count: number of class names, then of classes of the layout. found, kind: as of a `Probe`.
     """
 
-    def __init__(self, path: Path, inputs: Mapping[str, Sequence[Any]], outputs: Mapping[str, Any],
-                 size: tuple[int, int], metadata: Mapping[str, str]) -> None:  # fmt: skip
-        super().__init__(path)
-        self.inputs = inputs
-        self.outputs = outputs
-        self.size = size
-        self.metadata = metadata
-        self.count = 0
-        self.first = next(iter(outputs.values()))
-        self.shapes = [output.shape for output in outputs.values()]
+    path: Path
+    inputs: Mapping[str, Sequence[Any]]
+    outputs: Mapping[str, Any]
+    size: tuple[int, int]
+    metadata: Mapping[str, str]
+    count: int = 0
+    found: str = ""
+    kind: str = ""
+
+    @property
+    def first(self) -> Any:
+        """The first output."""
+        return next(iter(self.outputs.values()))
+
+    @property
+    def shapes(self) -> list[tuple[int, ...]]:
+        """Shapes of the outputs."""
+        return [output.shape for output in self.outputs.values()]
 
     def values(self, axis: int, levels: int = 3, boxes: int = 1) -> int:
         """Return the length of axis 1 + `axis` of the first output, the other one being its cells.
@@ -158,14 +167,15 @@ def fit_image(image: Image, size: tuple[int, int], fit: str) -> tuple[Image, Geo
 
     Borders have the grey level of YOLOX and Ultralytics.
     """
-    sides = np.array(image.shape[1::-1])  # (2,) w, h
-    ratio = np.array(size) / sides
-    w, h = size if fit == "stretch" else np.maximum(np.round(sides * ratio.min()), 1).astype(int)
+    height, width = image.shape[:2]
+    w, h = size
+    if fit != "stretch":
+        ratio = min(w / width, h / height)
+        w, h = max(round(width * ratio), 1), max(round(height * ratio), 1)
     left, top = ((size[0] - w) // 2, (size[1] - h) // 2) if fit == "centre" else (0, 0)
     canvas = np.full((size[1], size[0], 3), 114, np.uint8)
-    canvas[top : top + h, left : left + w] = cv2.resize(image, (int(w), int(h)))
-    scale = (w / sides[0], h / sides[1])
-    return canvas, Geometry((int(sides[0]), int(sides[1])), size, scale, (left, top))
+    canvas[top : top + h, left : left + w] = cv2.resize(image, (w, h))
+    return canvas, Geometry((width, height), size, (w / width, h / height), (left, top))
 
 
 def _grid(size: tuple[int, int], levels: int) -> tuple[Array, Array]:
@@ -492,7 +502,9 @@ class OnnxDetector:
 
     def detect(self, images: Sequence[Image]) -> Iterator[Detections]:
         """Detect the objects in each of several images, as one call for each would."""
-        fitted = [self._fitted(as_frame(image)) for image in images]
+        fit = self._layout.fit
+        fitted = [fit_image(image, self._input_size(*image.shape[1::-1]), fit)
+                  for image in map(as_frame, images)]  # fmt: skip
         # Images of the same input size are given to the network together
         for _, group in itertools.groupby(fitted, lambda one: one[1].input_size):
             for batch in in_batches(group, self.batch):
@@ -500,10 +512,6 @@ class OnnxDetector:
                     each = self._run(batch, self._layout.pixels)
                 for outputs, (_, geometry) in zip(each, batch, strict=True):
                     yield self._decoded(outputs, geometry)
-
-    def _fitted(self, image: Image) -> tuple[Image, Geometry]:
-        size = self._input_size(*image.shape[1::-1])
-        return fit_image(image, size, self._layout.fit)
 
     def _decoded(self, outputs: list[Any], geometry: Geometry) -> Detections:
         """Decode and select the detections of one image."""
