@@ -186,10 +186,8 @@ def open_detections(
     if detections not in (None, ""):
         return as_source(detections, names)
     words = [word.strip() for word in config.words.split(",") if word.strip()]
-    if library_of(config.model):
-        source, version = _library_source(config.model, words, config, device)
-        file = config.model.partition(":")[2] or config.model
-        return dataclasses.replace(source, key=_cache_key(config, version, file, device))
+    if library := library_of(config.model):
+        return _library_source(*library, words, config, device)
     if words:
         raise fixed_classes(config.model)
     if is_function(config.model):
@@ -498,20 +496,17 @@ def library_of(detector: str) -> tuple[str, str] | None:
 
 
 def _library_source(
-    detector: str, words: list[str], config: DetectConfig, device: str
-) -> tuple[DetectionSource, str]:
+    name: str, model: str, words: list[str], config: DetectConfig, device: str
+) -> DetectionSource:
     """Open a detector of another library.
 
     Args:
-        detector: `library:model`, or a .pt file of ultralytics. words: to look for; []: the
-            model's classes. device: of PyTorch.
-    Returns:
-        the source, and name and version of its library for cache keys.
+        name: of the library. words: to look for; []: the model's classes. device: of PyTorch.
     Raises:
         ReobjError: the library is not installed, has no such model, or does not take words.
     """
-    name, model = library_of(detector) or ("", "")
     library = LIBRARIES[name]
+    detector = config.model
     if words and not library.takes_words:
         raise fixed_classes(detector)
     with failing(f"--detector {detector}"):
@@ -526,11 +521,13 @@ def _library_source(
         with failing(f"--detector {detector}", len(images)):
             yield from run([a[..., ::-1].copy() for a in images] if library.is_rgb else images)
 
-    source = _source_of(answer, names, has_numbers=False)
-    batch = frames_at_once(config.batch, device)
-    source = dataclasses.replace(source, slow=True, always_looks=True, batch=batch)
     package = library.install.partition(" ")[0]
-    return _filtered(source, config), f"{package} {importlib.metadata.version(package)}"
+    version = f"{package} {importlib.metadata.version(package)}"
+    source = dataclasses.replace(
+        _source_of(answer, names, has_numbers=False), slow=True, always_looks=True,
+        batch=frames_at_once(config.batch, device), key=_cache_key(config, version, model, device),
+    )  # fmt: skip
+    return _filtered(source, config)
 
 
 def is_function(detector: str) -> bool:

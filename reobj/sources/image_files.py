@@ -218,17 +218,6 @@ class Header:
     orientation: int = 1
 
 
-def _orientation(image: PillowImage.Image) -> int:
-    """Return EXIF's orientation; 1 (upright) where there is none, or damaged EXIF."""
-    exif = PillowImage.Exif()
-    with contextlib.suppress(Exception):
-        # Not getexif(): of a PNG it decodes the pixels, and it reads XMP, which OpenCV does not
-        exif.load(image.info.get("exif", b""))
-        value: Any = exif.get(274) or (image.getexif().get(274) if image.format == "TIFF" else 1)
-        return int(value) if value in range(1, 9) else 1
-    return 1
-
-
 def exif_orientation(path: Path) -> int:
     """Return the EXIF orientation of a photo, 1 to 8; 1 (upright) where there is none.
 
@@ -244,7 +233,14 @@ def header(path: Path) -> Header | None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # many pixels, as photos of phones have
             with PillowImage.open(path) as image:
-                turn = _orientation(image)
+                exif = PillowImage.Exif()
+                with contextlib.suppress(Exception):  # damaged: upright
+                    # Not getexif(): of a PNG it decodes the pixels, and it reads XMP, which OpenCV
+                    # does not
+                    exif.load(image.info.get("exif", b""))
+                exif = image.getexif() if image.format == "TIFF" else exif
+                stated: Any = exif.get(274)
+                turn = int(stated) if stated in range(1, 9) else 1
                 turned = image.format != "TIFF" and turn >= 5  # Pillow turns TIFF itself
                 return Header(
                     image.size[::-1] if turned else image.size,

@@ -142,14 +142,6 @@ def _is_empty(cell: str) -> bool:
     return cell.lower() in ("", "nan", "none", "null", "na")  # as pandas and others write it
 
 
-def _separator(line: str) -> str:
-    """Return the separator of a line: the most frequent of ; tab and comma, or a space."""
-    best = max(";\t,", key=line.count)
-    data = line.lstrip()[:1] in tuple("+-.0123456789")
-    is_space = len(line.split()) > line.count(best) + 1 and (data or best not in line)
-    return " " if is_space else best
-
-
 def split(lines: Sequence[str]) -> tuple[list[list[str]], IntArray]:
     """Split lines into rows of cells, without comments and an empty last column.
 
@@ -160,7 +152,11 @@ def split(lines: Sequence[str]) -> tuple[list[list[str]], IntArray]:
     """
     header = re.compile(r"(^|[^a-z])(frame|image|file|time)(stamp|_?[a-z]+)?\b", re.IGNORECASE)
     lines = ["\n" if line[:1] == "#" and not header.search(line) else line for line in lines]
-    separator = _separator(next((line for line in lines if line.strip()), ""))
+    first = next((line for line in lines if line.strip()), "")
+    separator = max(";\t,", key=first.count)  # else a space
+    data = first.lstrip()[:1] in tuple("+-.0123456789")
+    if len(first.split()) > first.count(separator) + 1 and (data or separator not in first):
+        separator = " "
     reader: Any = csv.reader(lines, delimiter=separator, strict=True)
     if separator == " ":
         pairs = [(line.split(), i) for i, line in enumerate(lines, 1)]
