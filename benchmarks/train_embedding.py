@@ -258,7 +258,7 @@ def recorded_masks(folder: Path) -> list[RecordedDetections]:
             if "mask_counts" not in data or not len(data["mask_counts"]):
                 continue
             size = tuple(data["image_size"].tolist())
-        found.append(read_npz(path, size, size)[0])
+        found.append(read_npz(path, size, size))
     return found
 
 

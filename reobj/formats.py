@@ -57,8 +57,9 @@ class Probe:
         is_utf16 = head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
         if b"\0" in head and not is_utf16:
             return []
-        text = head.decode("utf-16" if is_utf16 else "utf-8-sig", "replace")
-        return list(filter(None, map(str.strip, text.splitlines())))
+        lines = head.decode("utf-16" if is_utf16 else "utf-8-sig", "replace").splitlines()
+        cut = len(head) == HEAD_BYTES and len(lines) > 1  # within the last line
+        return list(filter(None, map(str.strip, lines[: -1 if cut else None])))
 
     @property
     def json_lines(self) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,9 +12,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from small_models import write_model
 
 import reobj_track as rt
-from reobj.config import read_config
 from reobj.sources.detectors import (
     DetectionCache,
     DetectionSource,
@@ -30,64 +31,12 @@ needs_shared = pytest.mark.skipif(
 
 # ---- Layouts -------------------------------------------------------------------------------------
 
-onnx = pytest.importorskip("onnx", reason="pip install onnx (extra `dev`)")
+model = partial(write_model, names="{0: 'cup', 1: 'bowl', 2: 'tv'}")
 IMAGE = np.zeros((160, 320, 3), np.uint8)  # (H, W, 3)
 BOX = [80.0, 40.0, 160.0, 120.0]  # what every model below detects in it
 # The same in a 64 x 64 input.
 STRETCHED, CORNER, CENTRE = [16, 16, 32, 48], [16, 8, 32, 24], [16, 24, 32, 40]
 LABEL, SCORE = 2, 0.75
-
-
-def model(
-    folder: Path,
-    outputs: dict[str, Any],
-    shape: tuple[Any, ...] = (1, 3, 64, 64),
-    kind: int = 1,
-    sizes: bool = False,
-    names: str = "{0: 'cup', 1: 'bowl', 2: 'tv'}",
-    task: str = "",
-    seen: tuple[str, tuple[int, ...], Any] | None = None,
-) -> Path:
-    """Write a model whose output is the same for every image.
-
-    seen: (output, index, weights): to this number the mean of weights * input is added.
-    """
-    helper, proto = onnx.helper, onnx.TensorProto
-    arrays = {name: np.asarray(value) for name, value in outputs.items()}
-    arrays = {
-        name: a.astype(np.float32) if a.dtype == np.float64 else a for name, a in arrays.items()
-    }
-    nodes = []
-    constants = {f"constant {name}": a for name, a in arrays.items()}
-    for name in arrays:
-        if seen is None or seen[0] != name:
-            nodes.append(helper.make_node("Identity", [f"constant {name}"], [name]))
-            continue
-        at = np.zeros_like(arrays[name])
-        at[seen[1]] = 1
-        constants |= {"weights": np.float32(seen[2]), "at": at}
-        nodes += [helper.make_node("Mul", ["images", "weights"], ["weighted"]),
-                  helper.make_node("ReduceMean", ["weighted"], ["mean"], keepdims=0),
-                  helper.make_node("Mul", ["mean", "at"], ["added"]),
-                  helper.make_node("Add", ["added", f"constant {name}"], [name])]  # fmt: skip
-    inputs = [helper.make_tensor_value_info("images", kind, shape)]
-    if sizes:
-        inputs.append(helper.make_tensor_value_info("orig_target_sizes", proto.INT64, ["n", 2]))
-    made = [
-        helper.make_tensor_value_info(name, helper.np_dtype_to_tensor_dtype(a.dtype), a.shape)
-        for name, a in arrays.items()
-    ]
-    tensors = [onnx.numpy_helper.from_array(a, name) for name, a in constants.items()]
-    graph = helper.make_graph(nodes, "g", inputs, made, tensors)
-    return save_model(graph, folder, names=names, task=task)
-
-
-def save_model(graph: Any, folder: Path, **metadata: str) -> Path:
-    opset = onnx.helper.make_opsetid("", 17)
-    made = onnx.helper.make_model(graph, opset_imports=[opset], ir_version=8)
-    onnx.helper.set_model_props(made, {key: text for key, text in metadata.items() if text})
-    onnx.save(made, folder / "m.onnx")
-    return folder / "m.onnx"
 
 
 def center(box: list[int]) -> list[float]:
@@ -181,7 +130,7 @@ LAYOUT_ROWS = [
     ("yolov5", yolov5(1, "outputs"), {}, 0),  # YOLOv6
     ("nanodet", nanodet(), {}, 0),
     ("picodet", picodet(), {}, 0),
-    ("detr", detr(), {"sizes": True}, 0),
+    ("detr", detr(), {}, 0),
     ("ssd", ssd(), {}, 0),
     ("r-cnn", mask_rcnn(), {"shape": (3, 64, 64)}, 120),
     ("r-cnn", dict(list(mask_rcnn().items())[:3]), {"shape": (3, 64, 64)}, 0),  # Faster R-CNN
@@ -211,7 +160,7 @@ def test_layouts(
 # What the projects' own inference code feeds: order of the channels, mean and deviation of 0..255.
 TORCHVISION = (np.multiply([0.485, 0.456, 0.406], 255), np.multiply([0.229, 0.224, 0.225], 255))
 SEEN_ROWS = [
-    ("detr", detr(), ("scores", (0, 0)), {"sizes": True}, "RGB", 0, 255),
+    ("detr", detr(), ("scores", (0, 0)), {}, "RGB", 0, 255),
     ("picodet", picodet(), ("o0", (0, 26, 2)), {}, "RGB", *TORCHVISION),
     ("nanodet", nanodet(), ("output", (0, 35, 2)), {}, "BGR",
      [103.53, 116.28, 123.675], [57.375, 57.12, 58.395]),
@@ -279,7 +228,7 @@ def test_detections_are_selected(tmp_path: Path) -> None:
         rows[0, :, 30 - column] = [*center(box), *scores]
     rows[0, :, 9] = [60, 32, 20, 20, 0, 0, 0.5]  # reaches beyond the image: clipped
     rows[0, :, 5] = [30, 8, 10, 10, 0, 0, 0.8]  # in the border above the image: nothing is left
-    path = model(tmp_path, {"o": rows}, names="{0: 'cup', 1: 'bowl', 2: 'tv'}")
+    path = model(tmp_path, {"o": rows})
     found = rt.OnnxDetector(path)(IMAGE)
     # NMS within a class only; min_score; best first
     assert found.score.tolist() == pytest.approx([0.9, 0.7, 0.6, 0.5])
@@ -314,61 +263,40 @@ def test_other_networks_are_refused(
 # ---- Cache ---------------------------------------------------------------------------------------
 
 
-def some(index: int, masks: bool = False) -> rt.Detections:
-    count = index % 4  # also none at all
+def some(index: int, masks: bool) -> rt.Detections:
+    """Three random boxes, or none at all of every fourth frame."""
+    count = 3 * (index % 4 > 0)
     rng = np.random.default_rng(index)
     corner = rng.random((count, 2)) * 20
-    found = rng.random((count, 24, 32)) < 0.5 if masks else None
-    return rt.Detections(
-        np.hstack([corner, corner + 5]), rng.random(count), rng.integers(0, 9, count), found
-    )
+    found = rng.random((count, 24, 32)) < 0.5 if masks and count else None
+    xyxy = np.hstack([corner, corner + 5])
+    return rt.Detections(xyxy, rng.random(count), rng.integers(0, 9, count), found)
 
 
-def assert_same(a: rt.Detections | None, b: rt.Detections) -> None:
-    assert a is not None
-    for key in ("xyxy", "score", "class_id"):
-        np.testing.assert_array_equal(getattr(a, key), getattr(b, key))
-    if b.masks is not None and len(b):
-        np.testing.assert_array_equal(a.masks, b.masks)
-
-
-@pytest.mark.parametrize("masks", [False, True])
-def test_cache_survives_a_kill_between_flushes(tmp_path: Path, masks: bool) -> None:
-    """Frames without detections are kept too."""
-    cache = DetectionCache(tmp_path / "c", (32, 24))
-    for index in range(0, 300, 2):
-        cache.put(index, some(index, masks))
-        assert_same(cache.get(index), some(index, masks))
-    stored = 128 if not masks else 144  # files of 64 frames, of 8 with masks
-    (tmp_path / "c" / ".part-chunk_000009.npz").write_bytes(b"half")  # a kill while writing
-    reopened = DetectionCache(tmp_path / "c", (32, 24))
-    assert reopened.get(2 * stored - 2) is not None and reopened.get(2 * stored) is None
-    assert reopened.get(299) is None and reopened.get(298) is None
-    for index in range(0, 2 * stored, 2):
-        assert_same(reopened.get(index), some(index, masks))
-    reopened.put(298, some(298, masks))
-    reopened.flush()
-    assert_same(DetectionCache(tmp_path / "c", (32, 24)).get(298), some(298, masks))
-
-
-def test_damaged_cache_files_are_detected_again(tmp_path: Path, caplog: Any) -> None:
+@pytest.mark.parametrize(("masks", "stored"), [(False, 64), (True, 96)])
+def test_a_cache_survives_a_kill_and_a_damaged_file(
+    tmp_path: Path, caplog: Any, masks: bool, stored: int
+) -> None:
+    """Files of 64 frames, of 8 with masks; frames without detections are kept too."""
     cache = DetectionCache(tmp_path, (32, 24))
-    for index in (1, 2, 3):
-        cache.put(index, some(index))
-        cache.flush()
-    second = tmp_path / "chunk_000001.npz"
-    second.write_bytes(second.read_bytes()[:-40])
+    for index in range(100):
+        cache.put(index, some(index, masks))
+    (tmp_path / ".part-chunk_000009.npz").write_bytes(b"half")  # a kill while writing
     reopened = DetectionCache(tmp_path, (32, 24))
-    assert reopened.get(2) is None
-    for index in (1, 3):
-        assert_same(reopened.get(index), some(index))
-    assert caplog.text.count("its frames are detected again") == 1 and second.name in caplog.text
-    reopened.put(2, some(2))
+    assert [k for k in range(120) if k in reopened] == list(range(stored))
+    reopened.put(99, some(99, masks))
     reopened.flush()
-    again = DetectionCache(tmp_path, (32, 24))
-    for index in (1, 2, 3):
-        assert_same(again.get(index), some(index))
-    assert len(caplog.records) == 1  # said once, not in every later run
+    first = tmp_path / "chunk_000000.npz"
+    first.write_bytes(first.read_bytes()[:-40])
+    for _ in range(2):
+        again = DetectionCache(tmp_path, (32, 24))
+    assert caplog.text.count("removed and computed again") == 1 and first.name in caplog.text
+    assert again.get(0) is None and again.get(98) is None
+    for index in (*range(64, stored), 99):
+        found, true = again.get(index), some(index, masks)
+        assert found is not None
+        for key in ("xyxy", "score", "class_id", "masks"):
+            np.testing.assert_array_equal(getattr(found, key), getattr(true, key))
 
 
 # ---- Sources of detections -----------------------------------------------------------------------
@@ -414,12 +342,6 @@ def test_a_function_is_a_source_of_detections(found: Any) -> None:
         at(as_source(lambda image: [[*BOX, 0.5]]), frame(7))
 
 
-@pytest.mark.parametrize("other", ["det.txt", None, 3])
-def test_invalid_detectors_are_refused(other: Any) -> None:
-    with pytest.raises(rt.ReobjError, match="is no detector: expected a function"):
-        as_source(other)
-
-
 @pytest.fixture
 def clip(tmp_path: Path) -> rt.Video:
     """Six black images of 64 x 48, read at half their size."""
@@ -460,23 +382,6 @@ def test_a_changed_option_or_file_changes_the_key(clip: rt.Video, tmp_path: Path
     assert len(keys) == 5
 
 
-def test_a_model_is_a_source_of_detections(clip: rt.Video, tmp_path: Path) -> None:
-    """Named by the options, cached on disk under a key."""
-    path = model(tmp_path, yolov8(), names="{0: 'cup', 1: 'bowl', 2: 'tv'}")
-    config = rt.DetectConfig(model=str(path))
-    source = open_detections(clip, config, threads=1)
-    assert source.class_names == ("cup", "bowl", "tv")
-    np.testing.assert_allclose(at(source, frame()).xyxy, [BOX], atol=1e-3)
-    direct = as_source(rt.OnnxDetector(path))
-    np.testing.assert_array_equal(at(direct, frame()).xyxy, at(source, frame()).xyxy)
-    assert direct.class_names == source.class_names
-    keys = {source.key, open_detections(clip, config).key}
-    assert len(keys) == 1 and "" not in keys and str(tmp_path) in source.key
-    for change in ({"min_score": 0.2}, {"classes": "tv"}):
-        keys.add(open_detections(clip, rt.DetectConfig(model=str(path), **change)).key)
-    assert len(keys) == 3
-
-
 def test_a_detector_is_named_where_detections_are_given(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -491,31 +396,8 @@ def test_a_detector_is_named_where_detections_are_given(
         assert with_detector(config, other) == (config, other)
     with pytest.raises(rt.ReobjError, match=r"fsat: no such file .*; did you mean fast"):
         rt.run("a.mp4", detector="fsat")
-
-
-def test_run_and_track_accept_a_model_a_video_and_a_dict(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The output folder is named by the source; the folder keeps the options of all three."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "my room").mkdir()
-    for index in range(5):
-        cv2.imwrite(str(tmp_path / f"my room/{index}.png"), IMAGE)
-    path = model(tmp_path, yolov8(), names="{0: 'cup', 1: 'bowl', 2: 'tv'}")
-    options = {"embed": {"model": "none"}, "output": {"overlay": "none", "scene": False}}
-    video = rt.Video("my room", rt.InputConfig(start=1))
-    result = rt.run(video, config=options, detector=path, in_3d=False)
-    assert result.out == Path("my_room_out") and result.class_names == ("cup", "bowl", "tv")
-    assert [int(f) for f in result.tracks.frame] == [1, 2, 3, 4]
-    kept = read_config(rt.Config(), "my_room_out/config.toml")
-    assert (kept.detect.model, kept.input.start) == (str(path), 1)
-    tracker = rt.Tracker()
-    online = [tracks for _, tracks in rt.track(video, str(path), tracker)]
-    np.testing.assert_array_equal(rt.Tracks.joined(online).xyxy, result.tracks.xyxy)
     with pytest.raises(rt.ReobjError, match="the same argument"):
-        rt.run(video, detector="fast", detections="det.txt")
-    with pytest.raises(rt.ReobjError, match="give these options to the Video only"):
-        rt.run(video, config={"input": {"every": 2}})
+        rt.run("a.mp4", detector="fast", detections="det.txt")
 
 
 # ---- Real weights --------------------------------------------------------------------------------

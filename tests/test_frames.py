@@ -9,7 +9,7 @@ from simulated import CAMERA, chair_solids, looking_at, tracks_of, unlinked
 
 import reobj_track as rt
 from reobj.objects.fit import fill, link_and_fit
-from reobj.objects.observations import FrameOptions, informative_frames, only_frames
+from reobj.objects.observations import FrameOptions, informative_frames
 
 STEP = 30
 FEW = FrameOptions(all_of=20, longest_step=STEP)  # so that short videos count as long
@@ -59,14 +59,6 @@ def test_a_new_identity_is_chosen_until_it_has_enough_frames() -> None:
     assert set(range(200, 200 + FEW.identity_frames)) <= set(frames.tolist())
     late = new & (tracks.frame >= 200)
     assert (tracks.track_id[late] == 2).all() and late.sum() == FEW.identity_frames
-
-
-def test_frames_without_a_pose_are_never_chosen() -> None:
-    poses = only_frames(circle(np.arange(0, 90, 0.1)), np.arange(0, 900, 3))
-    assert poses.known.sum() == 300
-    frames, new = informative_frames(tracks_of(circle(np.arange(0, 90, 0.1))), poses,
-                                     poses.frame[poses.known], FEW)  # fmt: skip
-    assert (frames % 3 == 0).all() and 60 < len(frames) < 200 and new.any()
 
 
 # ---- Objects of a long video ----

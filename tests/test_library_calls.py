@@ -79,6 +79,10 @@ def check(
     (frame,) = list(video)
     source = open_detections(video, rt.DetectConfig(model=detector, min_score=min_score))
     (found,) = source.detect([frame])
+    pair = [one for one in source.detect([frame, frame]) if one is not None]  # in one batch
+    for one in pair:
+        np.testing.assert_allclose(one.score, found.score, atol=1e-4)
+    assert len(pair) == 2
     names = [source.class_names[k] for k in found.class_id]
     assert len(found) >= 5
     assert_same(found, names, documented(picture))
@@ -116,6 +120,8 @@ def test_rfdetr(picture: Any, tmp_path: Path) -> None:
         return found.xyxy, found.confidence, found.data["class_name"]
 
     check(tmp_path, picture, f"rfdetr:nano={file}", documented, 0.01)
+    with pytest.raises(rt.ReobjError, match=r"rfdetr:huge: no such model; there are base, .*nano"):
+        open_detections(rt.Video(tmp_path / "photos"), rt.DetectConfig(model="rfdetr:huge"))
 
 
 def test_torchvision(picture: Any, tmp_path: Path) -> None:

@@ -7,9 +7,6 @@ import hashlib
 import http.server
 import re
 import threading
-import urllib.parse
-import urllib.request
-import urllib.response
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -109,12 +106,10 @@ def test_a_truncated_download_leaves_nothing_and_restarts(server: Any, mode: str
 def test_without_network_the_message_has_a_remedy(server: Any) -> None:
     server.shutdown()
     server.server_close()
-    with pytest.raises(rt.ReobjError) as caught:
+    with pytest.raises(rt.ReobjError, match=r"download failed .*refused") as caught:
         rt.model_path("toy")
-    url = weights.WEIGHTS[0].url
-    for part in ("download failed", "refused", url, SHA256, str(server.target), "REOBJ_MODELS"):
+    for part in (weights.WEIGHTS[0].url, SHA256, str(server.target), "REOBJ_MODELS"):
         assert part in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 def test_offline_forbids_the_download(server: Any) -> None:
@@ -146,9 +141,8 @@ def test_the_users_folder_comes_first(
 def test_a_changed_file_is_refused_but_not_deleted(server: Any) -> None:
     rt.model_path("toy")
     server.target.write_bytes(b"changed")
-    for name in ("toy", "toy_416.onnx"):
-        with pytest.raises(rt.ReobjError, match="delete the file to fetch it again"):
-            rt.model_path(name)
+    with pytest.raises(rt.ReobjError, match="delete the file to fetch it again"):
+        rt.model_path("toy")
     assert rt.model_path(server.target) == server.target  # by its path: not verified
     assert [row.state for row in rt.list_models()] == ["changed"]
     assert server.target.read_bytes() == b"changed"
@@ -171,19 +165,15 @@ def test_states_and_unknown_names(server: Any) -> None:
 
 def test_table_of_weights() -> None:
     names = [row.name for row in weights.WEIGHTS]
-    assert len(set(names)) == len(names) and rt.DetectConfig().model == "deimv2-femto" == names[0]
+    assert len(set(names)) == len(names) and rt.DetectConfig().model == names[0]
     fast = weights.known_weights("fast")
     assert fast is not None and fast.name == "deimv2-atto" and weights.known_weights("") is None
-    not_run = {row.name for row in weights.WEIGHTS if "not run here" in row.note}
-    assert not_run == {"deimv2-n", "deimv2-pico"}
+    layouts = {layout.name for layout in LAYOUTS.formats}
     for row in weights.WEIGHTS:
         assert re.fullmatch("[0-9a-f]{64}|[0-9a-f]{40}", row.digest)
-        assert row.role in ("detector", "backbone") and (row.size > 0 or len(row.digest) == 40)
-        names = {layout.name for layout in LAYOUTS.formats}
-        assert row.layout in names if row.role == "detector" else row.layout == ""
+        assert row.role == "backbone" or row.layout in layouts
         if row.url:
-            assert "AGPL" not in row.licence
-            assert urllib.parse.urlparse(row.url).scheme == "https"
+            assert "AGPL" not in row.licence and row.url.startswith("https://")
             assert len(row.url.split("/raw/")[1].split("/")[0]) == 40  # pinned at a commit
         else:
             assert (weights.own_models() / row.file).stat().st_size == row.size

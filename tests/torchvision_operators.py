@@ -12,21 +12,15 @@ import importlib.util
 import sys
 from typing import Any
 
-REASON = "torchvision is built for CUDA and PyTorch is not: its compiled operators are missing"
 
-
-def declare_nms() -> bool:
-    """Import torchvision, with NMS in Python if necessary.
-
-    Returns:
-        whether its compiled operators are missing; False if it is not installed.
-    """
+def declare_nms() -> None:
+    """Import torchvision, if it is installed, with NMS in Python if necessary."""
     if not (importlib.util.find_spec("torch") and importlib.util.find_spec("torchvision")):
-        return False
+        return
     import torch
 
     try:
-        import torchvision
+        pass
     except RuntimeError:
         for name in [name for name in sys.modules if name.partition(".")[0] == "torchvision"]:
             del sys.modules[name]
@@ -34,11 +28,9 @@ def declare_nms() -> bool:
             schema = "(Tensor dets, Tensor scores, float iou_threshold) -> Tensor"
             torch.library.define(f"torchvision::{operator}", schema)
         torch.library.impl("torchvision::nms", "CPU")(nms)
-        import torchvision
         from torchvision.ops import boxes
 
         boxes._assert_has_ops = lambda: None
-    return not torchvision.extension._has_ops()
 
 
 def nms(dets: Any, scores: Any, iou_threshold: float) -> Any:

@@ -25,8 +25,9 @@ from reobj.formats import AUTO, Format, Registry
 from reobj.results.entries import OutputFile
 from reobj.results.result import Result
 from reobj.sources.detection_files import DETECTIONS, FROM_1, Reader, check_rows, read_source
-from reobj.sources.recorded import SIZES, NoVideo, Source, corners, other_form
+from reobj.sources.recorded import SIZES, Source, corners, other_form
 from reobj.sources.tables import forms, read_mot_rows
+from reobj.sources.video import ImagelessVideo
 from reobj.types import CLASS_MAX, Array, BoolArray, IntArray, ReobjError, Tracks, counted
 from reobj.words import among, canonical
 
@@ -105,7 +106,7 @@ def read_truth(
     if first not in ("", "0", "1"):
         raise ReobjError(f"detect.first_frame {first}: expected 0 or 1 for ground truth")
     notes = [] if notes is None else notes
-    source = Source(path, NoVideo(path.stem, size, size), class_names, first, messages=notes)
+    source = Source(path, ImagelessVideo(path, size), class_names, first, messages=notes)
     truth = reader(source, min_visibility)
     _check_identities(truth, path)
     return truth
@@ -121,12 +122,9 @@ def _read_labelled(entry: Format[Reader], source: Source, _: float) -> LabelledB
     image = min(sizes) if len(sizes) == 1 else (0, 0)
     if fault := other_form(recorded.xyxy, recorded.form, image, recorded.frame, recorded.identity):
         raise ReobjError(f"{path}: {fault}")
-    if not len(recorded.identity):
-        raise ReobjError(f"{path}: boxes without identities; expected tracks")
     names = np.array([*recorded.class_names, ""], str)[recorded.class_id]
     role = np.full(len(recorded), Role.SCORED)
-    if len(recorded.ignored):
-        role[recorded.ignored] = Role.IGNORED
+    role[recorded.ignored] = Role.IGNORED
     if entry.name == "kitti":
         names[recorded.ignored] = ""
         source.say("KITTI's labels: frames from 0; boxes on DontCare do not count; KITTI's rules "

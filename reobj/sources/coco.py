@@ -29,11 +29,11 @@ from reobj.sources.recorded import (
     RecordedDetections,
     Source,
     coco_runs,
-    crop_runs,
     frames_of_names,
     frames_of_numbers,
     original_name,
     polygon_runs,
+    rle_encode,
 )
 from reobj.types import COCO_NAMES, Array, IntArray, ReobjError
 
@@ -44,20 +44,15 @@ Id = Whole | str
 
 
 class Image(msgspec.Struct):
-    """An image of a dataset."""
+    """An image of a dataset; frame_id: COCO-VID, frame_index: TAO."""
 
     id: Id
     file_name: str | None = None
-    width: float | None = None
-    height: float | None = None
-    frame_id: Whole | None = None  # COCO-VID
-    frame_index: Whole | None = None  # TAO
+    width: float = 0
+    height: float = 0
+    frame_id: Whole | None = None
+    frame_index: Whole | None = None
     video_id: Id | None = None
-
-    @property
-    def number(self) -> int | None:
-        """Number of the frame."""
-        return self.frame_index if self.frame_id is None else self.frame_id
 
 
 class Named(msgspec.Struct):
@@ -98,9 +93,8 @@ class Annotation(Identities, kw_only=True):
     @property
     def identity(self) -> int:
         """Identity, -1: none."""
-        values = [self.track_id, self.instance_id]
-        if isinstance(self.attributes, Identities):
-            values += [self.attributes.track_id, self.attributes.instance_id]
+        stated = [one for one in (self, self.attributes) if isinstance(one, Identities)]
+        values = [value for one in stated for value in (one.track_id, one.instance_id)]
         value = next((value for value in values if value is not None), -1)
         if value % 1:
             raise ValueError(f"track_id {value}, expected a whole number")
@@ -142,34 +136,28 @@ def _beside(source: Source, entries: Sequence[Annotation]) -> Dataset | None:
         ReobjError: several datasets have them; or none does, and the results do not name their
             images.
     """
-    path = source.path
-    ids = {entry.image_id for entry in entries}
-    kinds = {entry.category_id for entry in entries}
     fault = ""
     matches: dict[str, Dataset] = {}
-    for other in sorted(path.parent.glob("*.json")):
+    for other in sorted({*source.path.parent.glob("*.json")} - {source.path}):
         data = None
         with contextlib.suppress(ReobjError, OSError):  # an invalid JSON file is no dataset
-            data = load_json(other) if other != path else None
+            data = load_json(other)
         if not isinstance(data, dict) or not data.get("images"):
             continue
         dataset = converted(data | {"annotations": None}, Dataset, other)
-        missing = [*ids.difference(image.id for image in dataset.images)]
-        missing += kinds.difference(named.id for named in dataset.categories or ())
+        missing = {entry.image_id for entry in entries} - {image.id for image in dataset.images}
+        missing |= {one.category_id for one in entries} - {one.id for one in dataset.categories}
         if missing:
-            fault = f"id {missing[0]!r} is not in the dataset JSON {other.name} beside this file"
+            fault = f"id {min(missing, key=str)!r} is not in {other.name} beside it"
         else:
             matches[other.name] = dataset
     if len(matches) > 1:
-        raise ReobjError(f"{path}: {' and '.join(matches)} beside it all have the ids of its "
-                         "images; keep only the dataset of this file")  # fmt: skip
+        fault = f"{' and '.join(matches)} beside it all have the ids of its images"
     by_name = all(entry.file_name or isinstance(entry.image_id, str) for entry in entries)
-    if fault and not matches and not by_name:
-        raise ReobjError(f"{path}: {fault}; put its own dataset there, or remove the other")
-    for name, dataset in matches.items():
-        source.say(f"images and classes of {name} beside it")
-        return dataset
-    return None
+    if fault and len(matches) != 1 and not (by_name and not matches):
+        raise ReobjError(f"{source.path}: {fault}; keep only the dataset of this file there")
+    source.say("".join(f"images and classes of {name} beside it" for name in matches))
+    return next(iter(matches.values()), None)
 
 
 def read_coco(source: Source) -> RecordedDetections:
@@ -192,13 +180,12 @@ def _read(source: Source, entries: list[Annotation], dataset: Dataset | None) ->
     classes = _categories(source, entries, dataset)
     frame, size, looked = _images(source, entries, dataset)
     scale = source.scale(size, frame >= 0)
-    modes = {entry.bbox_mode for entry in entries}
     masks = [_mask(entry.segmentation, source.video.size, ratio)
              for entry, ratio in zip(entries, scale[:, :2], strict=True)]  # fmt: skip
+    form = CORNERS if any(entry.bbox_mode == 0 for entry in entries) else SIZES
     return source.recorded(
-        frame, np.array([entry.bbox for entry in entries]), classes,
-        np.array([entry.score for entry in entries], np.float64), masks,
-        form=CORNERS if 0 in modes else SIZES, scale=scale, looked=looked,
+        frame, [entry.bbox for entry in entries], classes, form, scale, looked=looked, runs=masks,
+        score=np.array([entry.score for entry in entries], np.float64),
         identity=np.array([entry.identity for entry in entries], np.int64),
         ignored=np.array([bool(entry.iscrowd or entry.ignore) for entry in entries], bool),
     )  # fmt: skip
@@ -212,14 +199,13 @@ def _categories(
     Category ids are those of the dataset; else positions in the names that the user gives, from 0,
     or from 1 if none is 0 and one is their number; else COCO's.
     """
-    used = list(dict.fromkeys(entry.category_id for entry in entries))
+    used = {entry.category_id for entry in entries}
     gaps = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)  # unused among COCO's category ids 1 to 90
-    numbers = [number for number in range(1, 91) if number not in gaps]
-    name_of: dict[Id, str] = dict(zip(numbers, COCO_NAMES, strict=True))
+    name_of: dict[Id, str] = dict(zip(sorted({*range(1, 91)} - {*gaps}), COCO_NAMES, strict=True))
     if source.names:
-        from_1 = 0 not in used and len(source.names) in used
-        name_of = dict(enumerate(source.names, int(from_1)))
-        text = f"category ids are taken as positions in the class names, from {int(from_1)}"
+        from_1 = int(0 not in used and len(source.names) in used)
+        name_of = dict(enumerate(source.names, from_1))
+        text = f"category ids are taken as positions in the class names, from {from_1}"
         source.say(text * bool(used and 0 not in used))
     elif dataset is not None and dataset.categories:
         name_of = {category.id: category.name for category in dataset.categories}
@@ -227,11 +213,10 @@ def _categories(
         source.say("no categories in it or beside it: category_id is taken as COCO's (1 to 90)")
     for at, entry in enumerate(entries):
         if entry.category_id not in name_of:
-            known = shortened([repr(i) for i in name_of])
             raise ReobjError(f"{source.path}, entry {at}: category_id {entry.category_id!r} is "
-                             f"unknown, expected one of {known}: put the dataset JSON beside this "
-                             "file, or give a file of names (ids from 0) with --set "
-                             "detect.class_names=FILE")  # fmt: skip
+                             f"unknown, expected one of {shortened([*map(repr, name_of)])}: put "
+                             "the dataset JSON beside this file, or give a file of names (ids from "
+                             "0) with --set detect.class_names=FILE")  # fmt: skip
     names = list(dict.fromkeys(name_of.values()))
     return np.array([names.index(name_of[e.category_id]) for e in entries], np.int64), names
 
@@ -248,14 +233,14 @@ def _images(
     ids = [entry.image_id for entry in entries]
     if dataset is not None:
         frame_of = _dataset_frames(dataset, source)
-        size_of = {image.id: (image.width or 0, image.height or 0) for image in dataset.images}
+        size_of = {image.id: (image.width, image.height) for image in dataset.images}
         for at in [at for at, i in enumerate(ids) if i not in size_of][:1]:
-            known = shortened([*map(repr, size_of)])
             raise ReobjError(f"{source.path}, entry {at}: image_id {ids[at]!r} is not in the "
-                             f"dataset, which has {known}")  # fmt: skip
+                             f"dataset, which has {shortened([*map(repr, size_of)])}")  # fmt: skip
         listed = np.unique(np.array(list(frame_of.values()), np.int64))
         size = np.array([size_of[i] for i in ids], np.float64).reshape(-1, 2)
-        return np.array([frame_of[i] for i in ids], np.int64), size, listed[listed >= 0]
+        frame = np.array([frame_of.get(i, -1) for i in ids], np.int64)
+        return frame, size, listed[listed >= 0]
     size = np.zeros((len(entries), 2))
     numbers = [i for i in ids if isinstance(i, int)]
     if source.video.names or len(numbers) < len(ids):
@@ -266,7 +251,7 @@ def _images(
 
 
 def _dataset_frames(dataset: Dataset, source: Source) -> dict[Id, int]:
-    """Return the frame of every image of a dataset, -1: none.
+    """Return the frames of the images of a dataset, -1: none.
 
     By file name; else by `frame_id` (COCO-VID) or `frame_index` (TAO); else by the numbers in the
     file names; in the order of the list only if the user says so.
@@ -274,31 +259,27 @@ def _dataset_frames(dataset: Dataset, source: Source) -> dict[Id, int]:
     video = source.video
     images = _of_one_video(dataset, source)
     names = [original_name(image.file_name or "") for image in images]
-    named = bool(images) and all(names)
-    numbers = [image.number for image in images]
-    rule = named and frames_by_name(list(dict.fromkeys(names)), video.files or video.names)[1]
+    numbers = [i.frame_index if i.frame_id is None else i.frame_id for i in images]
+    rule = all(names) and frames_by_name([*dict.fromkeys(names)], video.files or video.names)[1]
     if source.first == "order":
         frame = np.arange(len(images))
-    elif not (rule or (named and source.describes)) and all(
-        number is not None for number in numbers
-    ):
+    elif not (rule or (all(names) and source.describes)) and None not in numbers:
         frame = frames_of_numbers(np.array(numbers, np.int64), source, 0)
-    elif named or not images:
+    elif all(names):
         frame = frames_of_names(names, source)
     else:
         raise ReobjError(f"{source.path}: {len(images)} images without file_name or frame_id; add "
                          "them, or say that the list has the order of the frames "
                          "(--set detect.first_frame=order)")  # fmt: skip
-    frame_of: dict[Id, int] = dict.fromkeys((image.id for image in dataset.images), -1)
-    return frame_of | dict(zip((image.id for image in images), frame.tolist(), strict=True))
+    return dict(zip((image.id for image in images), frame.tolist(), strict=True))
 
 
 def _of_one_video(dataset: Dataset, source: Source) -> list[Image]:
     """Return the images of the video, of a dataset of several; all if images are found by name."""
     images = dataset.images
     stem = Path(source.video.source).stem
-    of_video = {video.id for video in dataset.videos or () if Path(video.name).stem == stem}
-    kept = [image for image in images if image.video_id in of_video and len(of_video) == 1]
+    of_video = [video.id for video in dataset.videos or () if Path(video.name).stem == stem]
+    kept = [image for image in images if [image.video_id] == of_video]
     ids = {image.video_id for image in images}
     if len(ids) < 2 or (not kept and source.video.names and any(i.file_name for i in images)):
         return images
@@ -328,18 +309,20 @@ def read_oa_slam(source: Source) -> RecordedDetections:
     images = converted(load_json(source.path), list[_OaImage], source.path)
     rows = [found for image in images for found in image.detections]
     frames = frames_of_names([image.file_name for image in images], source)
+    kinds = np.array([row.category_id for row in rows], np.int64)
     return source.recorded(
         np.repeat(frames, [len(image.detections) for image in images]),
-        np.array([row.bbox for row in rows], np.float64),
-        (np.array([row.category_id for row in rows], np.int64), source.names or COCO_NAMES),
-        np.array([row.detection_score for row in rows], np.float64), unit="detection",
+        [row.bbox for row in rows], (kinds, source.names or COCO_NAMES), unit="detection",
+        score=np.array([row.detection_score for row in rows], np.float64),
     )  # fmt: skip
 
 
 # ---- CVAT ---------------------------------------------------------------------------------------
 
 
-KINDS = ("box", "polygon", "polyline", "points", "ellipse", "mask")
+# Kinds of shapes that are read, and as what those without a mask are counted in a message
+KINDS = {"box": "turned boxes", "polygon": "", "mask": "", "polyline": "polylines",
+         "points": "points", "ellipse": "ellipses"}  # fmt: skip
 
 
 def read_cvat(source: Source) -> RecordedDetections:
@@ -348,108 +331,102 @@ def read_cvat(source: Source) -> RecordedDetections:
     The identity is the track id + 1. Polygons and masks have a mask. Other shapes than these and
     upright boxes become their bounding boxes, and are counted in a message.
     """
-    bounded = Counter[str]()  # number of shapes of each kind that became bounding boxes
-    identity = np.empty(0, np.int64)
-    looked = None
-    root = _cvat_root(source.path)
+    path = source.path
+    most = MEMORY_MAX // 16  # bytes, 800,000 boxes: the parser needs ten times as much memory
+    with contextlib.ExitStack() as opened:
+        file: Any = path
+        size = path.stat().st_size
+        if zipfile.is_zipfile(path):
+            packed = opened.enter_context(zipfile.ZipFile(path))
+            size = packed.getinfo("annotations.xml").file_size
+            file = opened.enter_context(packed.open("annotations.xml"))
+        check_unpacked(size, most)
+        root = ET.parse(file).getroot()
     tracks = list(root.iter("track"))
     parents = tracks or list(root.iter("image"))
-    left = Counter(child.tag for parent in parents for child in parent)
     shapes = [(parent, shape) for parent in parents for shape in parent
               if shape.tag in KINDS and shape.get("outside") != "1"]  # fmt: skip
     if not shapes:
-        raise ReobjError(f"{source.path}: no track with a box; export the task as 'CVAT for video "
-                         "1.1'")  # fmt: skip
-    boxes = np.array([_bounds(shape, bounded) for _, shape in shapes])
-    size = [float(root.findtext(f".//meta//original_size/{side}", "0"))
-            for side in ("width", "height")]  # fmt: skip
-    scale = source.scale(np.tile(size, (len(shapes), 1)))
-    runs = [_cvat_runs(shape, ratio, source.video.size)
-            for (_, shape), ratio in zip(shapes, scale[:, :2], strict=True)]  # fmt: skip
+        raise ReobjError(f"{path}: no track with a box; export the task as 'CVAT for video 1.1'")
+    outlines = [_outline(shape) for _, shape in shapes]
+    sides = [float(root.findtext(f".//meta//original_size/{side}", "0"))
+             for side in ("width", "height")]  # fmt: skip
+    scale = source.scale(np.tile(sides, (len(shapes), 1)))
+    columns: dict[str, Any] = {}
     if tracks:
         begin = int(source.first == "1")
-        numbers = [int(shape.attrib["frame"]) for _, shape in shapes]
-        frame = np.array(numbers, np.int64) - begin
-        looked = _listed_frames(root, numbers, begin)
-        identity = np.array([int(track.attrib["id"]) + 1 for track, _ in shapes], np.int64)
-        labels = [track.attrib["label"] for track, _ in shapes]
+        numbers = np.array([int(shape.attrib["frame"]) for _, shape in shapes], np.int64)
+        frame = numbers - begin
+        columns["looked"] = _listed_frames(root, numbers, begin)
+        columns["identity"] = np.array([int(track.attrib["id"]) + 1 for track, _ in shapes])
     else:
         frame = frames_of_names([image.attrib["name"] for image, _ in shapes], source)
-        labels = [shape.attrib["label"] for _, shape in shapes]
+    labels = [(track if tracks else shape).attrib["label"] for track, shape in shapes]
+    bounded = Counter(KINDS[shape.tag] for _, shape in shapes
+                      if shape.tag != "box" or _angle(shape))  # fmt: skip
+    others = Counter(shape.tag for parent in parents for shape in parent
+                     if shape.tag not in (*KINDS, "tag"))  # fmt: skip
     for kind, count in sorted(bounded.items()):
-        source.say(f"{count} {kind} taken as their bounding boxes")
-    for kind in sorted(left.keys() - {*KINDS, "tag"}):
-        source.say(f"{left[kind]} shapes {kind} left out")
+        source.say(f"{count} {kind} taken as their bounding boxes" * bool(kind))
+    for kind, count in sorted(others.items()):
+        source.say(f"{count} shapes {kind} left out")
     names, class_id = np.unique(labels, return_inverse=True)
     return source.recorded(
-        frame, boxes, (class_id.astype(np.int64), names.tolist()), runs=runs, unit="box",
-        scale=scale, identity=identity, looked=looked,
+        frame, [np.hstack([outline.min(0), outline.max(0)]) for outline in outlines],
+        (class_id.astype(np.int64), names.tolist()), CORNERS, scale, "box",
+        runs=[_cvat_runs(shape, outline, ratio, source.video.size)
+              for (_, shape), outline, ratio in zip(shapes, outlines, scale[:, :2], strict=True)],
+        **columns,
     )  # fmt: skip
 
 
-def _cvat_root(path: Path) -> ET.Element:
-    """Parse the annotations in an XML file or a zip archive."""
-    most = MEMORY_MAX // 16  # bytes, 800,000 boxes: the parser needs ten times as much memory
-    if not zipfile.is_zipfile(path):
-        check_unpacked(path.stat().st_size, most)
-        return ET.fromstring(path.read_bytes())
-    with zipfile.ZipFile(path) as packed:
-        check_unpacked(packed.getinfo("annotations.xml").file_size, most)
-        return ET.fromstring(packed.read("annotations.xml"))
-
-
-def _listed_frames(root: ET.Element, frames: Sequence[int], begin: int) -> IntArray | None:
+def _listed_frames(root: ET.Element, frames: IntArray, begin: int) -> IntArray | None:
     """Return the frames (F,) of a task that skips some; None: all, or `frames` are not in them.
 
     Our exports begin at 0 and have no step, whatever frames were read.
     """
     start, stop, step = (
-        root.findtext(f"meta/task/{key}", "").removeprefix("step=").strip() or default
-        for key, default in (("start_frame", "0"), ("stop_frame", "-1"), ("frame_filter", "1"))
+        int(root.findtext(f"meta/task/{key}", "").removeprefix("step=").strip() or default)
+        for key, default in (("start_frame", 0), ("stop_frame", -1), ("frame_filter", 1))
     )
-    listed = range(int(start), int(stop) + 1, max(int(step), 1))
-    if (listed.start == 0 and listed.step == 1) or not all(f in listed for f in frames):
+    listed = np.arange(start, stop + 1, max(step, 1))
+    if (start == 0 and step == 1) or not np.isin(frames, listed).all():
         return None
-    return np.array(listed, np.int64) - begin
+    return listed - begin
 
 
-def _floats(shape: ET.Element, names: str) -> Array:
-    """Return attributes of a shape as numbers."""
-    return np.array([float(shape.attrib[name]) for name in names.split()])
+def _angle(shape: ET.Element) -> float:
+    """Return the rotation of a shape, deg clockwise in the image; 180 deg are none."""
+    return float(shape.get("rotation") or 0) % 180
 
 
-def _bounds(shape: ET.Element, bounded: Counter[str]) -> Array:
-    """Return the bounding box (4,) of a shape; count shapes that have no mask and are no box."""
-    angle = np.radians(float(shape.get("rotation") or 0) % 180)
-    turn = np.abs([[np.cos(angle), np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    if shape.tag == "box":
-        box = _floats(shape, "xtl ytl xbr ybr")
+def _outline(shape: ET.Element) -> Array:
+    """Return points (K, 2) on the outline of a shape: its corners, or 360 points of an ellipse."""
+
+    def floats(names: str) -> Array:
+        return np.array([float(shape.attrib[name]) for name in names.split()])
+
+    if "points" in shape.attrib:
+        pairs = [pair.split(",") for pair in shape.attrib["points"].split(";") if pair]
+        return np.array(pairs, np.float64)
+    if shape.tag == "mask":
+        return np.array([floats("left top"), floats("left top") + floats("width height")])
+    angle = np.radians(_angle(shape))
+    if shape.tag == "ellipse":
+        center, half = floats("cx cy"), floats("rx ry")
+        around = np.radians(np.arange(360))
+        unit = np.stack([np.cos(around), np.sin(around)], 1)
+    else:
+        box = floats("xtl ytl xbr ybr").reshape(2, 2)
         if not angle:
             return box
-        bounded["turned boxes"] += 1
-        centre = (box[:2] + box[2:]) / 2
-        reach = turn @ (box[2:] - box[:2]) / 2
-        return np.hstack([centre - reach, centre + reach])
-    if shape.tag not in ("polygon", "mask"):
-        bounded[shape.tag + "s" * (shape.tag != "points")] += 1
-    if shape.tag == "ellipse":
-        centre = _floats(shape, "cx cy")
-        reach = np.sqrt(turn**2 @ _floats(shape, "rx ry") ** 2)
-        return np.hstack([centre - reach, centre + reach])
-    if shape.tag == "mask":
-        low = _floats(shape, "left top")
-        return np.hstack([low, low + _floats(shape, "width height")])
-    corners = _corners(shape)
-    return np.hstack([corners.min(0), corners.max(0)])
+        center, half = box.mean(0), np.ptp(box, 0) / 2
+        unit = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    return np.asarray(center + unit * half @ turn)
 
 
-def _corners(shape: ET.Element) -> Array:
-    """Return the points (K, 2) of a polygon, a polyline or points."""
-    pairs = [pair.split(",") for pair in shape.attrib["points"].split(";") if pair]
-    return np.array(pairs, np.float64)
-
-
-def _cvat_runs(shape: ET.Element, scale: Array, size: tuple[int, int]) -> Counts:
+def _cvat_runs(shape: ET.Element, outline: Array, scale: Array, size: tuple[int, int]) -> Counts:
     """Return the mask of a polygon or a mask as run lengths; of other shapes none.
 
     The file's run lengths of a mask follow its rows.
@@ -458,19 +435,18 @@ def _cvat_runs(shape: ET.Element, scale: Array, size: tuple[int, int]) -> Counts
         scale: (2,) pixels of the video for each of the annotation. size: (w, h) of the video,
             (0, 0): unknown, no mask.
     """
+    scaled = outline * scale
     if size == (0, 0) or shape.tag not in ("polygon", "mask"):
         return NO_RUNS
     if shape.tag == "polygon":
-        return polygon_runs([_corners(shape) * scale], size)
-    left, top, width, height = _floats(shape, "left top width height").astype(int).tolist()
-    box = np.array([[left, top], [left + width, top + height]]) * scale  # (2, 2) corners
-    if (box[0] < -scale).any() or (box[1] > size + scale).any():
-        raise ValueError(f"mask of {width}x{height} from {left}, {top} on, beyond the image")
+        return polygon_runs([scaled], size)
+    width, height = np.ptp(outline, 0).astype(int).tolist()
     counts = np.array(shape.attrib["rle"].split(","), np.int64)
-    if counts.min() < 0 or counts.sum() != width * height:
-        raise ValueError(f"mask of {counts.sum()} pixels, expected {width}x{height}")
+    if (scaled < -scale).any() or (scaled > size + scale).any() or counts.sum() != width * height:
+        raise ValueError(f"a mask of {counts.sum()} pixels that is not {width}x{height}, or not in "
+                         "the image")  # fmt: skip
     mask = np.repeat(np.arange(len(counts)) % 2, counts).reshape(height, width)  # (H, W) 0, 1
-    (x1, y1), (x2, y2) = box.round().astype(int).tolist()
-    scaled = (max(x2 - x1, 1), max(y2 - y1, 1))
-    crop = cv2.resize(mask.astype(np.uint8), scaled, interpolation=cv2.INTER_NEAREST)
-    return crop_runs(crop > 0, (x1, y1), size)
+    low, high = scaled.round().astype(int)  # (2,) corners
+    resized = np.maximum(high - low, 1).tolist()
+    crop = cv2.resize(mask.astype(np.uint8), resized, interpolation=cv2.INTER_NEAREST)
+    return rle_encode(crop > 0, low.tolist(), size)

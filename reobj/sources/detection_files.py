@@ -25,7 +25,6 @@ from reobj.sources import coco, label_folders, tables
 from reobj.sources.class_names import check_length, load_class_names
 from reobj.sources.recorded import (
     NORMALISED_MAX,
-    NoVideo,
     RecordedDetections,
     Source,
     frames_looked_at,
@@ -33,7 +32,7 @@ from reobj.sources.recorded import (
     other_form,
     read_npz,
 )
-from reobj.sources.video import Video
+from reobj.sources.video import ImagelessVideo, Video
 from reobj.types import (
     COORDINATE_MAX,
     DETECTIONS_MAX,
@@ -53,10 +52,6 @@ from reobj.words import meant
 Reader = Callable[[Source], RecordedDetections]
 
 
-def _read_npz(source: Source) -> RecordedDetections:
-    return read_npz(source.path, source.video.size, source.video.working_size)[0]
-
-
 def _has(keys: str, listed: bool) -> Callable[[Probe], bool]:
     """Test for keys in a JSON object, or, if it is `listed`, in the first object of a list."""
     return lambda probe: listed == isinstance(probe.json, list) and probe.keys() >= {*keys.split()}
@@ -66,27 +61,24 @@ def _table(name: str) -> Callable[[Probe], bool]:
     return lambda probe: name in tables.forms(probe)
 
 
-def _is_cvat(probe: Probe) -> bool:
-    return "annotations.xml" in probe.names or getattr(probe.root, "tag", "") == "annotations"
+FROM_1 = "from 1; from 0 if there is a 0"
+NAMED = "by image name, else by the number in it"
 
 
-def _labels(numbers: int) -> Callable[[Probe], bool]:
-    """Test for a folder of labels that may have a form of `label_folders.forms`."""
+def _labels(name: str, title: str, numbers: int) -> Format[Reader]:
+    """Make the format of folders of labels that may have a form of `label_folders.forms`."""
 
     def recognise(probe: Probe) -> bool:
         with contextlib.suppress(ReobjError):
             return probe.is_dir and numbers in label_folders.forms(probe.path)
         return not numbers
 
-    return recognise
+    return Format(
+        name, f"a folder of YOLO labels, boxes {title}", recognise,
+        lambda source: label_folders.read_label_folder(source, numbers),
+        f"{NAMED}; VIDEO_N.txt from 1", "fractions", "keypoints" * (numbers > 0), kind="folder",
+    )  # fmt: skip
 
-
-def _label_reader(numbers: int) -> Reader:
-    return lambda source: label_folders.read_label_folder(source, numbers)
-
-
-FROM_1 = "from 1; from 0 if there is a 0"
-NAMED = "by image name, else by the number in it"
 
 DETECTIONS: Registry[Reader] = Registry("detections", "--detections-format", [
     Format("mot", "MOTChallenge, CVAT's MOT 1.1, trackers: rows of 6 to 10 numbers",
@@ -116,17 +108,14 @@ DETECTIONS: Registry[Reader] = Registry("detections", "--detections-format", [
            "keypoints", kind="JSON"),
     Format("oa-slam", "OA-SLAM, VOOM", _has("file_name detections", listed=True),
            coco.read_oa_slam, NAMED, "px", kind="JSON"),
-    *(Format(name, f"a folder of YOLO labels, boxes {title}", _labels(numbers),
-             _label_reader(numbers),
-             f"{NAMED}; VIDEO_N.txt from 1", "fractions", "keypoints" * (numbers > 0),
-             kind="folder")
-      for name, title, numbers in (
-        ("yolo", "or polygons", 0), ("yolo-pose", "with keypoints", 3),
-        ("yolo-pose-2d", "with keypoints without visibility", 2),
-      )),
-    Format("cvat", "CVAT for video 1.1 and for images 1.1, XML or zip", _is_cvat, coco.read_cvat,
+    _labels("yolo", "or polygons", 0), _labels("yolo-pose", "with keypoints", 3),
+    _labels("yolo-pose-2d", "with keypoints without visibility", 2),
+    Format("cvat", "CVAT for video 1.1 and for images 1.1, XML or zip",
+           lambda probe: "annotations.xml" in probe.names
+           or getattr(probe.root, "tag", "") == "annotations", coco.read_cvat,
            f"from 0; images {NAMED}", "px", "skeletons, cuboids", kind="XML"),
-    Format("npz", "`rt.write_detections_npz`", lambda probe: probe.suffix == ".npz", _read_npz,
+    Format("npz", "`rt.write_detections_npz`", lambda probe: probe.suffix == ".npz",
+           lambda source: read_npz(source.path, source.video.size, source.video.working_size),
            "from 0", "px"),
 ])  # fmt: skip
 
@@ -201,14 +190,14 @@ def class_filter(wanted: str, names: Sequence[str], present: IntArray | None = N
         ReobjError: a name that is not among `names`.
     """
     words = [word.strip() for word in wanted.split(",") if word.strip()]
-    occur = set(range(len(names)) if present is None else present.tolist())
-    here = [name if i in occur else "" for i, name in enumerate(names)]
-    chosen = {word: meant(word, here) or meant(word, names) for word in words}
-    unknown = [name for name, ids in chosen.items() if not ids]
-    if unknown:
-        close = did_you_mean(unknown[0], names) or f" among {', '.join(names)}"
-        raise ReobjError(f"--classes: no class {', '.join(unknown)}{close}")
-    return np.array([i for ids in chosen.values() for i in ids], np.int64)
+    here = [name if present is None or i in present else "" for i, name in enumerate(names)]
+    chosen = list[int]()
+    for word in words:
+        if not (ids := meant(word, here) or meant(word, names)):
+            close = did_you_mean(word, names) or f" among {', '.join(names)}"
+            raise ReobjError(f"--classes: no class {word}{close}")
+        chosen += ids
+    return np.array(chosen, np.int64)
 
 
 # ---- Reading -------------------------------------------------------------------------------------
@@ -279,10 +268,10 @@ def described_images(
         their common (w, h), None: not stated or they differ; their names; their times in s,
         ascending, None: frames are not found by times.
     """
-    source = Source(path, NoVideo(path.stem), class_names(config), config.first_frame)
-    source.describes = True
+    video = ImagelessVideo(path, (0, 0))
+    source = Source(path, video, class_names(config), config.first_frame, describes=True)
     size = read_source(source, DETECTIONS.find(path, config.format).read).size
-    sizes = source.image_sizes if size == (0, 0) else {size}
+    sizes = {size, *source.image_sizes} - {(0, 0)}
     stated = sizes.pop() if len(sizes) == 1 else (0, 0)
     times_s = None if source.times_s is None else np.unique(source.times_s)
     return None if 0 in stated else stated, list(dict.fromkeys(source.image_names)), times_s
@@ -296,38 +285,47 @@ def _check(
     Invalid content is an error; dropped rows are counted in a message.
     """
     check_rows(recorded, path)
+    say = recorded.messages.append
     if ignored := int(recorded.ignored.sum()):
-        recorded.messages.append(f"{ignored} ignored regions of the file left out")
+        say(f"{ignored} ignored regions of the file left out")
         recorded.select(np.flatnonzero(~recorded.ignored))
-    if config.image_size:
-        recorded.xyxy = recorded.xyxy * _stated_scale(config.image_size, recorded.size)
-    keep = _usable(recorded, path, frame_count, not config.image_size)
-    if (low := keep & (recorded.score < config.min_score)).any():
-        text = f"{low.sum()} of {len(recorded)} boxes have a score below {config.min_score:g}"
-        recorded.messages.append(f"{text} (detect.min_score): left out")
-    keep &= recorded.score >= config.min_score
+    if stated := config.image_size:
+        if not (match := re.fullmatch(r"([1-9]\d{0,5})x([1-9]\d{0,5})", stated)):
+            raise ReobjError(f"detect.image_size {stated}: expected WIDTHxHEIGHT, such as 640x480")
+        ratio = np.divide(recorded.size, [int(side) for side in match.groups()])
+        recorded.xyxy = recorded.xyxy * np.tile(ratio, 2)
+    keep = _usable(recorded, path, frame_count, not stated)
+    count = len(recorded)
+    low = keep & (recorded.score < config.min_score)
+    if low.any():
+        say(f"{low.sum()} of {count} boxes have a score below {config.min_score:g} "
+            "(detect.min_score): left out")  # fmt: skip
+    keep &= ~low
     if config.classes:
         present = np.unique(recorded.class_id)
         chosen = class_filter(config.classes, recorded.class_names, present)
         keep &= np.isin(recorded.class_id, chosen)
-    if not len(recorded):
-        recorded.messages.append("no detections in this file")
-    elif not keep.any():
-        recorded.messages.append(
-            f"none of {len(recorded)} boxes is left: those of score {config.min_score:g} or more "
-            f"(detect.min_score){f' and class {config.classes}' * bool(config.classes)} are used"
-        )
+    if not keep.any():
+        kinds = f" and class {config.classes}" * bool(config.classes)
+        say(f"none of {count} boxes is left: those of score {config.min_score:g} or more "
+            f"(detect.min_score){kinds} are used" if count else "no detections in this file"
+            )  # fmt: skip
     rows = np.flatnonzero(keep)
     rows = rows[np.lexsort((rows, -recorded.score[rows], recorded.frame[rows]))]  # best first
-    recorded.select(_best_per_frame(recorded, rows, path, config.max_detections))
+    frame = recorded.frame[rows]
+    rank = np.arange(len(rows)) - np.searchsorted(frame, frame)  # within its frame
+    most = config.max_detections or len(rows)
+    if (rank >= most).any():
+        say(f"{(rank >= most).sum()} boxes beyond the best {most} of a frame left out "
+            "(detect.max_detections)")  # fmt: skip
+    elif len(rows) and rank.max() >= DETECTIONS_MAX:
+        raise ReobjError(
+            f"{path}: {rank.max() + 1} boxes in frame {frame[rank.argmax()]} (0-based), at most "
+            f"{DETECTIONS_MAX} are allowed; raise detect.min_score, or keep the best with --set "
+            "detect.max_detections=N"
+        )
+    recorded.select(rows[rank < most])
     recorded.messages[:] = [f"{last_name(path)}: {text}" for text in recorded.messages]
-
-
-def _stated_scale(text: str, size: tuple[int, int]) -> Array:
-    """Return the factors (4,) from frames of WIDTHxHEIGHT to those of the video."""
-    if not (match := re.fullmatch(r"([1-9]\d{0,5})x([1-9]\d{0,5})", text)):
-        raise ReobjError(f"detect.image_size {text}: expected WIDTHxHEIGHT, such as 640x480")
-    return np.tile(np.divide(size, [int(match[1]), int(match[2])]), 2)
 
 
 def check_rows(recorded: RecordedDetections, path: Path) -> None:
@@ -335,19 +333,16 @@ def check_rows(recorded: RecordedDetections, path: Path) -> None:
     names = recorded.class_names
     for name in names:
         check_length(name, str(path))
-    with np.errstate(invalid="ignore", over="ignore"):  # inf - inf
-        finite = np.isfinite(recorded.xyxy.sum(1) + recorded.score)  # (N,)
-    finite &= (np.abs(recorded.xyxy) <= COORDINATE_MAX).all(1)
-    named = (recorded.class_id >= 0) & (recorded.class_id < len(names))
-    whole = math.prod(recorded.size)
-    unfit = np.array([len(runs) > 0 and runs.sum() != whole for runs in recorded.runs], bool)
-    for row in np.flatnonzero(~finite | ~named | unfit)[:1]:
-        text = f"mask of {recorded.runs[row].sum()} pixels in a video of {recorded.size}"
-        if not finite[row]:
-            values = f"{recorded.xyxy[row]}, {recorded.score[row]}"
-            text = f"{values}: NaN, infinite or beyond 1e7 pixels"
-        elif not named[row]:
-            text = unnamed_class(int(recorded.class_id[row]), len(names))
+    rows = np.column_stack([recorded.xyxy, recorded.score])  # (N, 5)
+    kinds = recorded.class_id
+    finite: BoolArray = np.all(np.abs(rows) <= COORDINATE_MAX, axis=1)  # (N,), NaN is not
+    named = (kinds >= 0) & (kinds < len(names))
+    pixels = np.array([runs.sum() for runs in recorded.runs], np.int64)
+    fits = np.isin(pixels, (0, math.prod(recorded.size)))
+    for row in np.flatnonzero(~(finite & named & fits))[:1].tolist():
+        text = f"mask of {pixels[row]} pixels in a video of {recorded.size}"
+        text = text if named[row] else unnamed_class(kinds[row], len(names))
+        text = text if finite[row] else f"{rows[row]}: NaN, infinite or beyond 1e7 pixels"
         raise ReobjError(f"{path}, {recorded.unit} {recorded.line[row]}: {text}")
 
 
@@ -366,61 +361,40 @@ def _check_scores(recorded: RecordedDetections, most: float, path: Path) -> None
     recorded.score = np.clip(score / most, 0, 1)
 
 
-def _best_per_frame(
-    recorded: RecordedDetections, rows: IntArray, path: Path, most: int
-) -> IntArray:
-    """Select the best `most` (0: all) rows of each frame; rows: sorted by frame and score."""
-    frame = recorded.frame[rows]
-    rank = np.arange(len(rows)) - np.searchsorted(frame, frame)  # within its frame
-    if most and (rank >= most).any():
-        text = f"{(rank >= most).sum()} boxes beyond the best {most} of a frame left out"
-        recorded.messages.append(f"{text} (detect.max_detections)")
-        return rows[rank < most]
-    if (worst := int(rank.max(initial=-1)) + 1) > DETECTIONS_MAX:
-        text = f"{worst} boxes in frame {frame[rank.argmax()]} (0-based)"
-        advice = "raise detect.min_score, or keep the best with --set detect.max_detections=N"
-        raise ReobjError(f"{path}: {text}, at most {DETECTIONS_MAX} are allowed; {advice}")
-    return rows
-
-
 def _usable(
     recorded: RecordedDetections, path: Path, frame_count: int, checks_size: bool
 ) -> BoolArray:
     """Test which boxes (N,) have an area, overlap the image and belong to a frame of the video."""
     count = len(recorded)
+    if not count:
+        return np.zeros(0, bool)
     xyxy = recorded.xyxy
+    frame = recorded.frame
     size = recorded.size
     low, high = xyxy[:, :2], xyxy[:, 2:]
     empty: BoolArray = np.any(high <= low, axis=1)  # (N,)
-    outside = ~empty & ((high <= 0) | (low >= np.array(size))).any(1)
-    missing = (recorded.frame < 0) | (recorded.frame >= (frame_count or sys.maxsize))
+    outside: BoolArray = ~empty & np.any((high <= 0) | (low >= size), axis=1)
+    missing: BoolArray = (frame < 0) | (frame >= (frame_count or sys.maxsize))
+    numbers = shortened(np.unique(frame[missing]).tolist())
+    absent = f"of frames that the video lacks (0-based: {numbers}; it has {frame_count or 'some'})"
     larger = outside.sum() > max(10, 0.05 * count) and not (high <= 0).any()
-    numbers = shortened(np.unique(recorded.frame[missing]).tolist())
-    text = f"of frames that the video lacks (0-based: {numbers}; it has {frame_count or 'some'})"
-    fault = ""
-    if count and xyxy.max() <= NORMALISED_MAX:
-        fault = f"no coordinate above {NORMALISED_MAX}: normalised to 0..1? "
-        fault += "Multiply them by the image size"
-    elif count and (other := other_form(xyxy, recorded.form, size, recorded.frame,
-                                        recorded.identity)):  # fmt: skip
-        fault = other
-    elif checks_size and (other := _other_size(xyxy[~empty], size)):
-        fault = other
-    elif 2 * (empty | outside).sum() > count or larger:
-        fault = (
-            f"{empty.sum()} of {count} boxes have no area and {outside.sum()} lie outside "
-            f"the image of {size}: frames of another size (--set detect.image_size=WIDTHxHEIGHT), "
-            "not turned upright, or another video?"
-        )
-    elif count and missing.all():
-        fault = f"all detections are {text}: detections of another video?"
-    if fault:
-        raise ReobjError(f"{path}: {fault}")
-    for bad, fault in ((empty, "without area"), (outside, "wholly outside the image"),
-                       (missing, text)):  # fmt: skip
+    for fault in (
+        f"no coordinate above {NORMALISED_MAX}: normalised to 0..1? Multiply them by the image size"
+        * bool(xyxy.max() <= NORMALISED_MAX),
+        other_form(xyxy, recorded.form, size, frame, recorded.identity),
+        _other_size(xyxy[~empty], size) * checks_size,
+        f"{empty.sum()} of {count} boxes have no area and {outside.sum()} lie outside the image of "
+        f"{size}: frames of another size (--set detect.image_size=WIDTHxHEIGHT), not turned "
+        "upright, or another video?" * bool(larger or 2 * (empty | outside).sum() > count),
+        f"all detections are {absent}: detections of another video?" * bool(missing.all()),
+    ):
+        if fault:
+            raise ReobjError(f"{path}: {fault}")
+    for bad, why in ((empty, "without area"), (outside, "wholly outside the image"),
+                     (missing, absent)):  # fmt: skip
         if bad.any():
             first = f"{recorded.unit} {recorded.line[bad][0]}"
-            recorded.messages.append(f"{bad.sum()} boxes {fault} dropped, the first at {first}")
+            recorded.messages.append(f"{bad.sum()} boxes {why} dropped, the first at {first}")
     return np.logical_not(empty | outside | missing)
 
 
@@ -435,13 +409,13 @@ def _other_size(xyxy: Array, size: tuple[int, int]) -> str:
     share = most / size
     begins = xyxy[:, :2].min(0, initial=np.inf) <= 0.02 * most  # of the largest corner
     cut = [xyxy[xyxy[:, k + 2] >= most[k] - 1, k] // (0.02 * most[k]) for k in (0, 1)]
-    ends = np.array([len(np.unique(starts)) >= 4 for starts in cut])  # chosen: not one object
+    ends = np.array([len(np.unique(starts)) >= 4 for starts in cut])  # 3 may be of one object
     moved = np.abs(share - 1) > 0.02
-    similar = abs(share[0] - share[1]) <= 0.02
-    if not ((moved & begins).any() and (ends.all() or (ends.any() and similar))):
+    similar = np.ptp(share) <= 0.02
+    if not ((moved & begins).any() and ends.sum() + similar >= 2):
         return ""
-    where = f"x = {most[0]:.0f}, y = {most[1]:.0f}, and the image is {size[0]}x{size[1]}"
-    return (f"boxes are cut off at {where}: boxes of frames of another size? Name it with --set "
+    return (f"boxes are cut off at x = {most[0]:.0f}, y = {most[1]:.0f}, and the image is "
+            f"{size[0]}x{size[1]}: boxes of frames of another size? Name it with --set "
             "detect.image_size=WIDTHxHEIGHT")  # fmt: skip
 
 
@@ -464,53 +438,44 @@ def read_tracks(
         tracks, their class names, and messages for the user.
     """
     path = Path(path)
-    config = config or DetectConfig()
-    limit = dataclasses.replace(config, min_score=0.0, max_detections=0)
-    recorded = _read(path, video, limit)
+    config = dataclasses.replace(config or DetectConfig(), min_score=0.0, max_detections=0)
+    recorded = _read(path, video, config)
     recorded.score = np.clip(np.where(recorded.score == -1, 1, recorded.score), 0, 1)
-    _check(recorded, path, limit, video.frame_count)
-    if len(recorded):
-        _check_identities(recorded, path)
-    use = video.config.selects(recorded.frame)
-    pairs = np.column_stack([recorded.frame, recorded.identity])[use]  # (N, 2)
-    unique, first, count = np.unique(pairs, axis=0, return_index=True, return_counts=True)
+    _check(recorded, path, config, video.frame_count)
+    name = last_name(path)
+    identified = recorded.identity >= 0
+    if len(recorded) and not identified.any():
+        raise ReobjError(f"{path}: no box has an identity; expected a file of tracks")
+    if not identified.all():
+        recorded.messages.append(f"{name}: {(~identified).sum()} of {len(recorded)} boxes without "
+                                 "an identity left out")  # fmt: skip
+        recorded.select(np.flatnonzero(identified))
+    if recorded.identity.min(initial=1) == 0:
+        recorded.messages.append(f"{name}: identities count from 0: 1 is added to all of them")
+        recorded.identity = recorded.identity + 1
+    recorded.select(np.flatnonzero(video.config.selects(recorded.frame)))
+    pairs = np.column_stack([recorded.frame, recorded.identity])  # (N, 2)
+    unique, rows, count = np.unique(pairs, axis=0, return_index=True, return_counts=True)
     if (count > 1).any():
         frame, identity = unique[count.argmax()]
         raise ReobjError(f"{path}: identity {identity} has {count.max()} boxes in frame {frame} "
                          "(0-based); an object is in one place at a time")  # fmt: skip
-    rows = np.flatnonzero(use)[first]
-    ids = recorded.identity[rows]
-    unknown = np.full(len(rows), -1, np.int64)
-    columns = (recorded.xyxy[rows], recorded.score[rows], recorded.class_id[rows], unknown)
-    tracks = Tracks(recorded.frame[rows], ids, ids, *columns)
+    recorded.select(rows)
+    ids = recorded.identity
+    tracks = Tracks(recorded.frame, ids, ids, recorded.xyxy, recorded.score, recorded.class_id,
+                    np.full(len(rows), -1, np.int64))  # fmt: skip
     names = recorded.class_names
     if known is not None:
         unnamed = names == ("object",)
         tracks = _with_known(tracks, known, unnamed)
-        names = tuple(known_names) if unnamed else names
         if unnamed:
+            names = tuple(known_names)
             without = (tracks.class_id < 0).sum()
-            given = f"{len(tracks) - without} boxes get the class of the earlier object"
-            text = f"no classes: {given} that they show, {without} are `object`"
-            recorded.messages.append(f"{last_name(path)}: {text}")
+            recorded.messages.append(
+                f"{name}: no classes: {len(tracks) - without} boxes get the class of the earlier "
+                f"object that they show, {without} are `object`"
+            )
     return tracks, names, recorded.messages
-
-
-def _check_identities(recorded: RecordedDetections, path: Path) -> None:
-    """Drop boxes without an identity (-1), make identities count from 1; refuse files without."""
-    identified = recorded.identity >= 0 if len(recorded.identity) else np.zeros(len(recorded), bool)
-    if not identified.any():
-        raise ReobjError(f"{path}: no box has an identity; expected a file of tracks")
-    if not identified.all():
-        count = (~identified).sum()
-        text = f"{last_name(path)}: {count} of {len(recorded)} boxes without an identity left out"
-        recorded.messages.append(text)
-        recorded.select(np.flatnonzero(identified))
-    if recorded.identity.min() == 0:
-        recorded.messages.append(
-            f"{last_name(path)}: identities count from 0: 1 is added to all of them"
-        )
-        recorded.identity = recorded.identity + 1
 
 
 def _with_known(tracks: Tracks, known: Tracks, unnamed: bool) -> Tracks:
@@ -528,15 +493,13 @@ def _with_known(tracks: Tracks, known: Tracks, unnamed: bool) -> Tracks:
             continue
         iou = box_iou(tracks.xyxy[rows], same_frame.xyxy)  # (n, m)
         best = iou.argmax(1)
-        best_iou = iou.max(1)
-        unmoved = best_iou > 0.95  # counts as the tracker's own box
-        score[rows[unmoved]] = same_frame.score[best[unmoved]]
-        same_object = best_iou >= 0.5  # as in PASCAL VOC
-        overlap[rows] = np.where(same_object, best_iou, 0)
+        overlap[rows] = iou.max(1)
+        unmoved = overlap[rows] > 0.95  # counts as the tracker's own box
+        score[rows] = np.where(unmoved, same_frame.score[best], score[rows])
+        same_object = overlap[rows] >= 0.5  # as in PASCAL VOC
         known_class[rows] = np.where(same_object, same_frame.class_id[best], -1)
-    if unnamed:
-        for rows in rows_by(tracks.track_id):
-            voters = rows[known_class[rows] >= 0]
-            votes = np.bincount(known_class[voters], overlap[voters])
-            class_id[rows] = int(votes.argmax()) if len(voters) else -1
+    for rows in rows_by(tracks.track_id) if unnamed else ():
+        voters = rows[known_class[rows] >= 0]
+        votes = np.bincount(known_class[voters], overlap[voters])
+        class_id[rows] = int(votes.argmax()) if len(voters) else -1
     return dataclasses.replace(tracks, class_id=class_id, score=score)

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from reobj.cameras import Poses
-from reobj.files import did_you_mean, save_npz
+from reobj.files import did_you_mean, load_cached, save_npz
 from reobj.sources.class_names import Vocabulary, names_by_number
 from reobj.sources.detection_files import DetectConfig, class_filter, class_names, read_detections
 from reobj.sources.onnx_layouts import OnnxDetector, best_boxes, check_names
@@ -60,16 +60,14 @@ class DetectionCache:
         chunks = sorted(self.folder.glob("chunk_*.npz"))
         self._next = 1 + max((int(path.stem[6:]) for path in chunks), default=-1)
         for path in chunks:
-            try:
-                self._load(path)
-            except ReobjError as error:
-                log.warning("%s; removed, its frames are detected again", error)
-                path.unlink(missing_ok=True)
+            self._load(path)
 
     def _load(self, path: Path) -> None:
-        """Add the frames of a file, with packed masks."""
-        chunk, done = read_npz(path, self.image_size, self.image_size, sealed=True)
-        self._stored |= dict.fromkeys(done.tolist(), chunk)
+        """Add the frames of a file, with packed masks; a damaged one is removed."""
+        size = self.image_size
+        chunk = load_cached(path, lambda path: read_npz(path, size, size, sealed=True))
+        if chunk is not None and chunk.looked is not None:
+            self._stored |= dict.fromkeys(chunk.looked.tolist(), chunk)
 
     def __contains__(self, index: int) -> bool:
         """Test whether `put` was called for a frame."""
@@ -94,10 +92,8 @@ class DetectionCache:
         """Write the pending frames to disk."""
         if not self._pending:
             return
-        frames = sorted(self._pending.items())
         path = self.folder / f"chunk_{self._next:06d}.npz"
-        done = {"done": np.array([index for index, _ in frames])}
-        save_npz(path, pack_detections(frames, [], self.image_size) | done)
+        save_npz(path, pack_detections(sorted(self._pending.items()), [], self.image_size))
         self._next += 1
         self._pending.clear()
         self._load(path)
@@ -190,10 +186,8 @@ def open_detections(
     if detections not in (None, ""):
         return as_source(detections, names)
     words = [word.strip() for word in config.words.split(",") if word.strip()]
-    if library_of(config.model):
-        source, version = _library_source(config.model, words, config, device)
-        file = config.model.partition(":")[2] or config.model
-        return dataclasses.replace(source, key=_cache_key(config, version, file, device))
+    if library := library_of(config.model):
+        return _library_source(*library, words, config, device)
     if words:
         raise fixed_classes(config.model)
     if is_function(config.model):
@@ -216,21 +210,18 @@ def _filtered(
         is_open: the class names are not known in advance.
     """
     wanted = config.classes
-    allowed = class_filter(wanted, source.class_names) if wanted and not is_open else None
+    if wanted and not is_open:
+        class_filter(wanted, source.class_names)  # refuses unknown ones
 
     def select(frame: Frame, found: Detections | None) -> Detections | None:
         if found is None:
             return None
-        use = np.ones(len(found), bool) if allowed is None else np.isin(found.class_id, allowed)
-        if wanted and allowed is None:
-            use = among(source.class_names, wanted.split(","))[found.class_id]
+        named = among(source.class_names, wanted.split(",")) if wanted else None
+        use = np.ones(len(found), bool) if named is None else named[found.class_id]
         boxes, rows = best_boxes(found.xyxy, found.score, use, frame.image.shape[1::-1], config)
         return dataclasses.replace(found, xyxy=boxes)[rows[: config.max_detections or None]]
 
-    def run(frames: Sequence[Frame]) -> Iterator[Detections | None]:
-        return map(select, frames, source.run(frames))
-
-    return dataclasses.replace(source, run=run)
+    return dataclasses.replace(source, run=lambda frames: map(select, frames, source.run(frames)))
 
 
 def with_detector(config: DetectConfig, detections: Any) -> tuple[DetectConfig, Any]:
@@ -282,7 +273,16 @@ def as_source(detector: Any, class_names: Sequence[str] = ()) -> DetectionSource
     if isinstance(detector, DetectionSource):
         return detector
     if isinstance(detector, RecordedDetections):
-        return _recorded_source(detector)
+        looked = None if detector.looked is None else set(detector.looked.tolist())
+
+        def run(frames: Sequence[Frame]) -> Iterator[Detections | None]:
+            for frame in frames:
+                ran = looked is None or frame.index in looked
+                yield detector.at(frame.index) if ran else None
+
+        return DetectionSource(
+            run, detector.class_names, "", detector.messages, recorded=detector, always_looks=True
+        )
     several = isinstance(detector, OnnxDetector)
     if not callable(detector):
         raise ReobjError(f"{detector!r:.80} is no detector: expected a function image -> detections"
@@ -330,20 +330,6 @@ def _source_of(
 
     return DetectionSource(
         lambda frames: map(checked, answer([frame.image for frame in frames])), names
-    )
-
-
-def _recorded_source(recorded: RecordedDetections) -> DetectionSource:
-    """Make a source from the detections of a file; None for frames without detector output."""
-    looked = None if recorded.looked is None else set(recorded.looked.tolist())
-
-    def run(frames: Sequence[Frame]) -> Iterator[Detections | None]:
-        for frame in frames:
-            ran = looked is None or frame.index in looked
-            yield recorded.at(frame.index) if ran else None
-
-    return DetectionSource(
-        run, recorded.class_names, "", recorded.messages, recorded=recorded, always_looks=True
     )
 
 
@@ -510,20 +496,17 @@ def library_of(detector: str) -> tuple[str, str] | None:
 
 
 def _library_source(
-    detector: str, words: list[str], config: DetectConfig, device: str
-) -> tuple[DetectionSource, str]:
+    name: str, model: str, words: list[str], config: DetectConfig, device: str
+) -> DetectionSource:
     """Open a detector of another library.
 
     Args:
-        detector: `library:model`, or a .pt file of ultralytics. words: to look for; []: the
-            model's classes. device: of PyTorch.
-    Returns:
-        the source, and name and version of its library for cache keys.
+        name: of the library. words: to look for; []: the model's classes. device: of PyTorch.
     Raises:
         ReobjError: the library is not installed, has no such model, or does not take words.
     """
-    name, model = library_of(detector) or ("", "")
     library = LIBRARIES[name]
+    detector = config.model
     if words and not library.takes_words:
         raise fixed_classes(detector)
     with failing(f"--detector {detector}"):
@@ -538,11 +521,13 @@ def _library_source(
         with failing(f"--detector {detector}", len(images)):
             yield from run([a[..., ::-1].copy() for a in images] if library.is_rgb else images)
 
-    source = _source_of(answer, names, has_numbers=False)
-    batch = frames_at_once(config.batch, device)
-    source = dataclasses.replace(source, slow=True, always_looks=True, batch=batch)
     package = library.install.partition(" ")[0]
-    return _filtered(source, config), f"{package} {importlib.metadata.version(package)}"
+    version = f"{package} {importlib.metadata.version(package)}"
+    source = dataclasses.replace(
+        _source_of(answer, names, has_numbers=False), slow=True, always_looks=True,
+        batch=frames_at_once(config.batch, device), key=_cache_key(config, version, model, device),
+    )  # fmt: skip
+    return _filtered(source, config)
 
 
 def is_function(detector: str) -> bool:

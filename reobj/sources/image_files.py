@@ -19,7 +19,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
 import cv2
@@ -31,33 +31,22 @@ from PIL import ImageSequence
 from reobj.files import quiet_opencv, shortened
 from reobj.types import Array, Image, ReobjError
 
-IMAGE_FPS = 30.0  # Hz, rate of images without times; chosen: most phones record at 30 Hz
+IMAGE_FPS = 30.0  # Hz, rate of images without times, at which most phones record
 IMAGE_SUFFIXES = tuple(".jpg .jpeg .jpe .jfif .mpo .png .bmp .webp .tif .tiff".split())
 UNREAD_SUFFIXES = tuple(".heic .heif .avif .jxl .jp2 .exr .hdr .dng .cr2 .cr3 .nef".split())
 
 
-@dataclass(frozen=True, slots=True)
-class ImageList:
-    """The frames of an image folder.
-
-    Attributes:
-        files: in order. usual: those whose header has the most common (upright) size.
-        messages: images that are no frames, for the user.
-    """
-
-    files: list[Path]
-    usual: list[Path]
-    messages: list[str]
+ImageList = tuple[list[Path], list[Path], list[str]]  # files, those of the usual size, messages
 
 
 def list_images(source: str) -> ImageList:
     """List the images of a folder, glob or single file in the order of their names.
 
-    Left out are images of one channel with more than 8 bits (depth), and images of one channel or
-    with a name such as mask or depth beside pictures of the same numbers.
+    Left out are kinds of images that are no pictures, beside those that are (`_only_pictures`).
 
     Returns:
-        an empty list for videos and missing files.
+        the files, empty for videos and missing files; those of the most common size by their
+        headers, upright; and messages for the user.
     Raises:
         ReobjError: no images; two kinds of images, either of which may be the frames; or too many
             sizes.
@@ -69,57 +58,40 @@ def list_images(source: str) -> ImageList:
             raise ReobjError(f"{source}: {path.suffix} files are not read; convert it to .jpg")
         head = header(path) if suffix in IMAGE_SUFFIXES else None
         is_video = suffix not in IMAGE_SUFFIXES or (head is not None and head.frames > 1)
-        return ImageList([], [], []) if is_video else ImageList([path], [path], [])
+        return ([], [], []) if is_video else ([path], [path], [])
     if not path.is_dir() and not re.search(r"[*?\[]", source):
-        return ImageList([], [], [])
-    paths = [p for p in _paths(path) if not p.name.startswith(".")]
-    files = [p for p in paths if p.suffix.lower() in IMAGE_SUFFIXES]
-    others = Counter(p.suffix for p in paths if p.suffix.lower() in (*UNREAD_SUFFIXES, ".gif"))
+        return [], [], []
+    # A glob may be in a folder whose name has such characters
+    root, pattern = (path.parent, path.name) if path.parent.is_dir() else (Path(), source)
+    root, pattern = (path, "*") if path.is_dir() else (root, pattern)
+    paths = [root / name for name in glob.glob(pattern, root_dir=root)]
+    headers = {p: header(p) for p in paths if p.suffix.lower() in IMAGE_SUFFIXES}
+    unread = Counter(p.suffix for p in paths if p.suffix.lower() in (*UNREAD_SUFFIXES, ".gif"))
     messages = [f"{n} {suffix} files are not read; convert them to .jpg"
-                for suffix, n in others.items()]  # fmt: skip
-    if not files:
-        folders = [p.name for p in paths if p.is_dir()]
-        more = [f"its folders: {shortened(sorted(folders))}"] if folders and path.is_dir() else []
+                for suffix, n in unread.items()]  # fmt: skip
+    if not headers:
+        folders = shortened(sorted(p.name for p in paths if p.is_dir()))
         fault = f"no images there (looked for {' '.join(IMAGE_SUFFIXES)})"
+        more = [f"its folders: {folders}"] if folders else []
         raise ReobjError("; ".join([f"{source}: {fault}", *messages, *more]))
-    headers = {p: header(p) for p in files}
-    if animated := [p.name for p in files if (h := headers[p]) is not None and h.frames > 1]:
+    if animated := [p.name for p, head in headers.items() if head and head.frames > 1]:
         messages.append(f"of {len(animated)} animated files only the first frame is read: "
                         f"{shortened(animated)}")  # fmt: skip
-    files, left_out = _only_pictures(files, headers, source if path.is_dir() else "")
-    return _sized(source, files, headers, messages + left_out)
+    files, left_out = _only_pictures(headers, source if path.is_dir() else "")
+    files.sort(key=lambda p: (by_number(p.name), str(p)))
+    return files, _usual(source, files, headers), messages + left_out
 
 
-def _paths(path: Path) -> list[Path]:
-    """List a folder, or the matches of a glob in a folder whose name may have glob characters."""
-    if path.is_dir():
-        return list(path.iterdir())
-    root, pattern = (path.parent, path.name) if path.parent.is_dir() else (Path(), str(path))
-    return [root / name for name in glob.glob(pattern, root_dir=root)]
-
-
-def _sized(
-    source: str, files: list[Path], headers: dict[Path, Header | None], messages: list[str]
-) -> ImageList:
-    """Sort files, and select those of the most common size.
-
-    Raises:
-        ReobjError: too many sizes.
-    """
-    sizes = Counter(head.size for p in files if (head := headers[p]) is not None)
-    size, most = max(sizes.items(), key=lambda item: (item[1], item[0]), default=((0, 0), 0))
+def _usual(source: str, files: list[Path], headers: dict[Path, Header | None]) -> list[Path]:
+    """Return the images of the most common size; refuse too many sizes."""
+    sizes = Counter(head.size for p in files if (head := headers[p]))
+    size, most = max(sizes.items(), key=lambda item: item[::-1], default=((0, 0), 0))
     if 2 * most < sizes.total():
         raise ReobjError(
             f"{source}: {sizes.total()} images of {len(sizes)} sizes, at most {most} of the same "
             f"({size[0]}x{size[1]}); expected one size: give a folder or a glob in quotes of those"
         )
-    order = {name: k for k, name in enumerate(sorted_names(p.name for p in files))}
-    files = sorted(files, key=lambda p: (order[p.name], str(p)))
-    usual = [p for p in files if (head := headers[p]) is not None and head.size == size]
-    return ImageList(files, usual, messages)
-
-
-# ---- Which images are frames ---------------------------------------------------------------------
+    return [p for p in files if getattr(headers[p], "size", None) == size]
 
 
 # Of names of images that are no pictures: 7-Scenes, ScanNet, 3D Scanner App, NeRFCapture, DAVIS,
@@ -130,10 +102,11 @@ OTHER_WORDS = frozenset(
 )
 
 
-def _only_pictures(
-    files: list[Path], headers: dict[Path, Header | None], folder: str
-) -> tuple[list[Path], list[str]]:
+def _only_pictures(headers: dict[Path, Header | None], folder: str) -> tuple[list[Path], list[str]]:
     """Separate pictures from depth maps and masks.
+
+    Kinds are images whose names differ in numbers only. Left out are those of one channel with more
+    than 8 bits, of one channel, or with a name such as mask, if there are others.
 
     Args:
         folder: the source if it is a folder, "" for a glob, which selects a kind by itself.
@@ -141,63 +114,37 @@ def _only_pictures(
         the pictures, and messages.
     """
     messages = []
-    deep = [p for p in files if (h := headers[p]) is not None and h.is_deep]
-    if len(deep) == len(files):
+    kinds: dict[str, list[Path]] = {}
+    for path in headers:
+        stem = re.sub(r"\s*\(\d+\)$", "", path.stem.casefold())  # a(1).jpg, a copy
+        kinds.setdefault(re.sub(r"\d+", "#", stem) + path.suffix.lower(), []).append(path)
+    deep, gray = (
+        [name for name in kinds if all(getattr(headers[p], key, False) for p in kinds[name])]
+        for key in ("is_deep", "is_gray")
+    )
+    named = [name for name in kinds if OTHER_WORDS.intersection(re.split(r"[^a-z]+", name))]
+    for names, why in ((deep, "one channel with more than 8 bits, as depth maps have"),
+                       (gray, "one channel, beside images in colour"),
+                       (named, "by their name")):  # fmt: skip
+        for name in names if not kinds.keys() <= {*names} else ():
+            if left := sorted((p.name for p in kinds.pop(name, ())), key=by_number):
+                more = " ..." * (len(left) > 1)
+                messages.append(f"{len(left)} images are no frames ({why}): {left[0]}{more}")
+    if kinds.keys() <= {*deep}:
         messages.append("images of one channel with more than 8 bits are taken as pictures; are "
                         "they depth maps? Then give those in colour")  # fmt: skip
-    elif deep:
-        files = [p for p in files if p not in set(deep)]
-        messages.append(_left_out(deep, "one channel with more than 8 bits, as depth maps have"))
-    kinds = _kinds(files)
-    grays = {p for p in files if (h := headers[p]) is not None and h.is_gray}
-    gray = {name: grays >= kinds[name].keys() for name in kinds}
-    other = {name: not OTHER_WORDS.isdisjoint(re.split(r"[^a-z]+", name)) for name in kinds}
-    for name in list(kinds):
-        beside = [k for k in kinds if k != name and _share_numbers(kinds[k], kinds[name])]
-        masks = gray[name] and not all(gray[k] for k in beside)
-        if masks or (other[name] and not all(other[k] for k in beside)):
-            why = "one channel, beside images in colour" if masks else "by their name"
-            messages.append(_left_out(list(kinds.pop(name)), why))
-    least = 3  # images of each of two kinds: the numbers of fewer may agree by chance
-    for pair in itertools.combinations(kinds.values() if folder else (), 2):
-        if _share_numbers(*pair) and min(map(len, pair)) >= least:
-            names = [min((p.name for p in kind), key=by_number) for kind in pair]
+    for one, two in itertools.combinations(kinds.values() if folder else (), 2):
+        numbers = [{(*re.findall(r"\d+", p.stem),) for p in kind} for kind in (one, two)]
+        least = min(len(one), len(two))
+        # The numbers of fewer than three images may agree by chance
+        if least >= 3 and 2 * len(set.intersection(*numbers)) > least:
+            names = [min((p.name for p in kind), key=by_number) for kind in (one, two)]
             chosen = re.sub(r"\d+", "*", glob.escape(names[0]))
             raise ReobjError(
                 f"{folder}: two kinds of images, {' and '.join(names)}; which are the frames? "
                 f"Give a glob in quotes, such as '{Path(folder) / chosen}'"
             )
     return [p for kind in kinds.values() for p in kind], messages
-
-
-def _left_out(files: Sequence[Path], why: str) -> str:
-    first = min((p.name for p in files), key=by_number)
-    return f"{len(files)} images are no frames ({why}): {first}" + " ..." * (len(files) > 1)
-
-
-def _kinds(files: Sequence[Path]) -> dict[str, dict[Path, tuple[int, ...]]]:
-    """Group images by their names without numbers, in lower case; with the numbers that differ.
-
-    Copies, a(1).jpg, belong to the original.
-    """
-    groups: dict[str, dict[Path, list[str]]] = {}
-    for path in files:
-        stem = re.sub(r"\s*\(\d+\)$", "", path.stem.casefold())
-        name = re.sub(r"\d+", "#", stem) + path.suffix.lower()
-        groups.setdefault(name, {})[path] = re.findall(r"\d+", stem)
-    kinds = {}
-    for name, members in groups.items():
-        columns = list(zip(*members.values(), strict=True))
-        varied = [k for k, column in enumerate(columns) if len({*column}) > 1 or len(members) == 1]
-        kinds[name] = {path: tuple(int(row[k]) for k in varied) for path, row in members.items()}
-    return kinds
-
-
-def _share_numbers(kind: dict[Path, tuple[int, ...]], other: dict[Path, tuple[int, ...]]) -> bool:
-    """Test whether more than half of the smaller kind of images has numbers of the other one."""
-    one = {*kind.values()}
-    two = {*other.values()}
-    return () not in one and 2 * len(one & two) > min(len(one), len(two))
 
 
 # ---- Order and times of names --------------------------------------------------------------------
@@ -208,11 +155,9 @@ def by_number(name: str) -> tuple[Any, ...]:
 
     Copies follow the original: a.jpg, a(1).jpg. Case is ignored.
     """
-    stem, dot, suffix = name.rpartition(".")
-    stem, suffix = (stem, suffix) if dot else (name, "")
-    parts = re.split(r"(\d+)", stem.casefold())
-    key = [(bool(k % 2), int(part) if k % 2 else part) for k, part in enumerate(parts) if part]
-    return (key, suffix.casefold(), name)
+    path = PurePath(name.casefold())
+    parts = re.split(r"(\d+)", path.stem)  # text and numbers in turn
+    return ([int(part) if k % 2 else part for k, part in enumerate(parts)], path.suffix, name)
 
 
 def sorted_names(names: Iterable[str]) -> list[str]:
@@ -273,25 +218,13 @@ class Header:
     orientation: int = 1
 
 
-def _orientation(image: PillowImage.Image) -> int:
-    """Return EXIF's orientation; 1 (upright) where there is none, or damaged EXIF."""
-    exif = PillowImage.Exif()
-    with contextlib.suppress(Exception):
-        # Not getexif(): of a PNG it decodes the pixels, and it reads XMP, which OpenCV does not
-        exif.load(image.info.get("exif", b""))
-        value: Any = exif.get(274) or (image.getexif().get(274) if image.format == "TIFF" else 1)
-        return int(value) if value in range(1, 9) else 1
-    return 1
-
-
 def exif_orientation(path: Path) -> int:
     """Return the EXIF orientation of a photo, 1 to 8; 1 (upright) where there is none.
 
     `read_image` returns images upright: 2 to 4 are mirrored or turned by 180 deg, 5 to 8 have width
     and height exchanged. 6 turns the stored pixels clockwise, 8 anticlockwise.
     """
-    head = header(path)
-    return head.orientation if head is not None else 1
+    return getattr(header(path), "orientation", 1)
 
 
 def header(path: Path) -> Header | None:
@@ -300,7 +233,14 @@ def header(path: Path) -> Header | None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # many pixels, as photos of phones have
             with PillowImage.open(path) as image:
-                turn = _orientation(image)
+                exif = PillowImage.Exif()
+                with contextlib.suppress(Exception):  # damaged: upright
+                    # Not getexif(): of a PNG it decodes the pixels, and it reads XMP, which OpenCV
+                    # does not
+                    exif.load(image.info.get("exif", b""))
+                exif = image.getexif() if image.format == "TIFF" else exif
+                stated: Any = exif.get(274)
+                turn = int(stated) if stated in range(1, 9) else 1
                 turned = image.format != "TIFF" and turn >= 5  # Pillow turns TIFF itself
                 return Header(
                     image.size[::-1] if turned else image.size,
@@ -318,10 +258,9 @@ def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> npt.NDArray[Any] | 
     """Read an image file with OpenCV's `flags`, faster than Pillow; None if it is no image."""
     try:
         data = np.fromfile(path, np.uint8)
-        image = cv2.imdecode(data, flags) if len(data) else None
+        return cv2.imdecode(data, flags) if len(data) else None
     except (OSError, cv2.error):
         return None
-    return image
 
 
 # ---- Decoding ------------------------------------------------------------------------------------
@@ -379,12 +318,8 @@ def _camera_frames(capture: Any, silent_s: float) -> Generator[Decoded]:
         capture.release()
 
 
-def open_animation(path: Path) -> Opened:
-    """Open an animated image file, whose header can be read."""
-    return Opened(_animation_frames(path), path.suffix)
-
-
-def _animation_frames(path: Path) -> Generator[Decoded]:
+def animation_frames(path: Path) -> Generator[Decoded]:
+    """Decode an animated image file, whose header can be read."""
     milliseconds = 0.0
     with PillowImage.open(path) as image:
         for frame in ImageSequence.Iterator(image):

@@ -69,21 +69,30 @@ def read_label_folder(source: Source, pose: int = 0) -> RecordedDetections:
     files = label_files(path)
     source.say(f"a folder of YOLO labels: {len(files)} files")
     of_video = re.compile(re.escape(Path(video.source).stem) + r"_\d+")
-    video_files = [] if video.names else [f for f in files if of_video.fullmatch(f.stem)]
-    if video_files and len(video_files) < len(files):
-        count = len(files) - len(video_files)
-        source.say(f"{count} files of other names than the video's left out")
-        files = video_files
-    rows, lines, of_file = _read_rows(files, path)
+    named = [f for f in files if of_video.fullmatch(f.stem) and not video.names]
+    others = len(files) - len(named)
+    source.say(f"{others} files of other names than the video's left out" * bool(named and others))
+    files = named or files
+    rows = list[list[float]]()
+    lines = list[str]()
+    of_file = list[int]()
+    for at, file in enumerate(files):
+        for number, line in enumerate(read_lines(file), 1):
+            if line.strip():
+                rows.append(_row(line, f"{file}, line {number}"))
+                lines.append(f"{number} of {file.name}")
+                of_file.append(at)
+        if len(rows) > LINES_MAX:
+            raise ReobjError(f"{path}: more than {LINES_MAX} boxes; take fewer frames")
     if pose:
         rows = [row[:5] + row[len(row) - (len(row) - 5) % pose :] for row in rows]
         source.say("keypoints after class cx cy w h are not read")
     triangles = any(row[6] % 1 for row in rows if len(row) == 7)  # else of box, conf and id
     begin = [len(row) - _tail(row) if len(row) > 7 - triangles else 5 for row in rows]
-    polygons = {i: np.reshape(rows[i][1:at], (-1, 2)) for i, at in enumerate(begin) if at > 5}
     box = np.array([row[1:5] for row in rows]).reshape(-1, 4)
     runs = [NO_RUNS] * len(rows)
-    for i, points in polygons.items():
+    for i in np.flatnonzero(np.array(begin) > 5).tolist():
+        points = np.reshape(rows[i][1 : begin[i]], (-1, 2))
         if np.abs(points).max() > NORMALISED_MAX:
             raise ReobjError(f"{path}, line {lines[i]}: {len(rows[i])} columns that are no polygon:"
                              " a corner is no fraction of the image size")  # fmt: skip
@@ -96,11 +105,12 @@ def read_label_folder(source: Source, pose: int = 0) -> RecordedDetections:
                          "class conf cx cy w h: write the confidence after the box")  # fmt: skip
     score, identity = _tails([row[at:] for row, at in zip(rows, begin, strict=True)], path)
     stems = [str(file.relative_to(path)) for file in files]
-    frame = frames_of_names(stems, source, 1 if video_files else None)
-    class_id = np.array([row[0] for row in rows], np.float64).astype(np.int64)
+    frame = frames_of_names(stems, source, 1 if named else None)
+    kinds = np.array([row[0] for row in rows], np.int64)
     return source.recorded(
-        frame[np.array(of_file, np.int64)], box, (class_id, _names(source)), score, runs,
-        np.array(lines, object), "line", CENTRES, np.tile(video.size, 2), identity=identity,
+        frame[np.array(of_file, np.int64)], box, (kinds, _names(source)), CENTRES,
+        np.tile(video.size, 2), "line", score=score, runs=runs, line=np.array(lines, object),
+        identity=identity,
     )  # fmt: skip
 
 
@@ -119,22 +129,6 @@ def _names(source: Source) -> Sequence[str]:
         return load_class_names(beside)
     source.say("no class names beside it: class numbers are taken as COCO's 80")
     return COCO_NAMES
-
-
-def _read_rows(files: Sequence[Path], path: Path) -> tuple[list[list[float]], list[str], list[int]]:
-    """Read the rows of all files: numbers, line for messages, number of the file."""
-    rows = list[list[float]]()
-    lines = list[str]()
-    of_file = list[int]()
-    for at, file in enumerate(files):
-        for number, line in enumerate(read_lines(file), 1):
-            if line.strip():
-                rows.append(_row(line, f"{file}, line {number}"))
-                lines.append(f"{number} of {file.name}")
-                of_file.append(at)
-        if len(rows) > LINES_MAX:
-            raise ReobjError(f"{path}: more than {LINES_MAX} boxes; take fewer frames")
-    return rows, lines, of_file
 
 
 def _row(line: str, where: str) -> list[float]:
@@ -184,15 +178,14 @@ def _tails(tails: Sequence[Sequence[float]], path: Path) -> tuple[Array, IntArra
     Two are confidence and identity. One is the confidence; or the identity, if all such are whole
     and one is above 1.
     """
-    alone = [tail[0] for tail in tails if len(tail) == 1]
-    whole = max(alone, default=0) > 1
-    if whole and any(value % 1 for value in alone):
+    alone = np.array([tail[0] for tail in tails if len(tail) == 1])
+    whole = bool((alone > 1).any())
+    if whole and (alone % 1).any():
         raise ReobjError(f"{path}: the last column of the labels holds numbers above 1 and "
                          "fractions: neither confidences nor identities")  # fmt: skip
-    least = 1 if whole else 2  # numbers of a row with identity
-    score = [tail[0] if len(tail) == 2 or (tail and not whole) else 1.0 for tail in tails]
-    identity = [tail[-1] if len(tail) >= least else -1 for tail in tails]
-    return np.array(score, np.float64), np.array(identity, np.float64).astype(np.int64)
+    pairs = [tail if len(tail) != 1 else (1, tail[0]) if whole else (tail[0], -1) for tail in tails]
+    columns = np.array([pair or (1, -1) for pair in pairs], np.float64).reshape(-1, 2)
+    return columns[:, 0], columns[:, 1].astype(np.int64)
 
 
 def _tail(row: Sequence[float]) -> int:

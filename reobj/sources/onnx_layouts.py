@@ -6,19 +6,19 @@ has its table.
 
 from __future__ import annotations
 
-import functools
 import itertools
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from reobj.formats import Format, Probe, Registry
+from reobj.formats import Format, Registry
 from reobj.sources.class_names import load_class_names, names_by_number, parse_yaml
 from reobj.sources.detection_files import DetectConfig, class_filter, unnamed_class
 from reobj.sources.video import in_batches
@@ -75,23 +75,34 @@ class Decoded:
     masks: Callable[[IntArray], BoolArray] | None = None
 
 
-class ModelProbe(Probe):
+@dataclass(slots=True)
+class ModelProbe:
     """What a layout is recognised by.
 
     Attributes:
-        inputs: their shapes by name. outputs: of a trial run, by name. size: (w, h) of the input.
-        metadata: of the file. count: number of class names, then of classes of the layout.
+        path: of the file. inputs: their shapes by name. outputs: of a trial run, by name.
+        size: (w, h) of the input. metadata: of the file.
+        count: number of class names, then of classes of the layout. found, kind: as of a `Probe`.
     """
 
-    def __init__(self, path: Path, inputs: Mapping[str, Sequence[Any]], outputs: Mapping[str, Any],
-                 size: tuple[int, int], metadata: Mapping[str, str]) -> None:  # fmt: skip
-        super().__init__(path)
-        self.inputs = inputs
-        self.outputs = outputs
-        self.size = size
-        self.metadata = metadata
-        self.count = 0
-        self.shapes = [output.shape for output in outputs.values()]
+    path: Path
+    inputs: Mapping[str, Sequence[Any]]
+    outputs: Mapping[str, Any]
+    size: tuple[int, int]
+    metadata: Mapping[str, str]
+    count: int = 0
+    found: str = ""
+    kind: str = ""
+
+    @property
+    def first(self) -> Any:
+        """The first output."""
+        return next(iter(self.outputs.values()))
+
+    @property
+    def shapes(self) -> list[tuple[int, ...]]:
+        """Shapes of the outputs."""
+        return [output.shape for output in self.outputs.values()]
 
     def values(self, axis: int, levels: int = 3, boxes: int = 1) -> int:
         """Return the length of axis 1 + `axis` of the first output, the other one being its cells.
@@ -104,21 +115,13 @@ class ModelProbe(Probe):
         first, *others = self.shapes
         if len(first) != 3 or not all(len(shape) == 4 for shape in others):
             return 0
-        cells = sum(math.prod(math.ceil(v / (8 << k)) for v in self.size) for k in range(levels))
-        return int(first[1 + axis] if first[2 - axis] == boxes * cells else 0)
+        cells = boxes * len(_grid(self.size, levels)[0])
+        return int(first[1 + axis] if first[2 - axis] == cells else 0)
 
-    @functools.cached_property
+    @property
     def in_px(self) -> bool:
         """Whether rows begin with centres in px, across the input; else with offsets in cells."""
-        first = next(iter(self.outputs.values()))
-        return bool(np.median(np.abs(first[0, :, :2])) >= 8)  # offsets: below 2
-
-    @functools.cached_property
-    def in_fractions(self) -> bool:
-        """Whether all boxes, the first four values of the cells, are fractions of the input."""
-        rows = next(iter(self.outputs.values()))[0]
-        rows = rows if len(rows) > rows.shape[1] else rows.T  # (cells, values)
-        return bool(0 < np.abs(rows[:, :4]).max() <= 1.5)
+        return bool(np.median(np.abs(self.first[0, :, :2])) >= 8)  # offsets: below 2
 
 
 Decode = Callable[[Sequence[Any], Geometry, ModelProbe], Decoded]
@@ -148,7 +151,7 @@ class Layout(Format[Decode]):
         fit: "stretch" the image to the input, or keep its aspect ratio and pad: "corner" (image at
             the top left) or "centre".
         nms_iou: IoU above which two boxes of a class are duplicates (NanoDet: .6); None: the model
-            has selected its boxes.
+            has selected its boxes. px: boxes are in px of the input, centres and sizes first.
     """
 
     shape: str = ""
@@ -156,6 +159,7 @@ class Layout(Format[Decode]):
     pixels: Pixels = UNIT_RGB
     fit: str = "stretch"
     nms_iou: float | None = 0.6
+    px: bool = False
 
 
 def fit_image(image: Image, size: tuple[int, int], fit: str) -> tuple[Image, Geometry]:
@@ -166,9 +170,8 @@ def fit_image(image: Image, size: tuple[int, int], fit: str) -> tuple[Image, Geo
     height, width = image.shape[:2]
     w, h = size
     if fit != "stretch":
-        ratio = min(size[0] / width, size[1] / height)
-        w = max(round(width * ratio), 1)
-        h = max(round(height * ratio), 1)
+        ratio = min(w / width, h / height)
+        w, h = max(round(width * ratio), 1), max(round(height * ratio), 1)
     left, top = ((size[0] - w) // 2, (size[1] - h) // 2) if fit == "centre" else (0, 0)
     canvas = np.full((size[1], size[0], 3), 114, np.uint8)
     canvas[top : top + h, left : left + w] = cv2.resize(image, (w, h))
@@ -220,69 +223,50 @@ def _decode_zoo(outs: Sequence[Any], geometry: Geometry, model: ModelProbe) -> D
     """Decode boxes, labels from 1 (0: background), scores[, masks of the boxes, 0..1]."""
     unit = geometry.input_size if "bboxes" in model.outputs else (1, 1)  # SSD: in 0..1
     boxes = geometry.to_image(outs[0].reshape(-1, 4) * np.tile(unit, 2))
-    label = outs[1].ravel().astype(np.int64) - 1
 
-    def masks(chosen: IntArray) -> BoolArray:
-        found = np.zeros((len(chosen), *geometry.image_size[::-1]), bool)  # (K, H, W)
-        corners = np.clip(np.round(boxes[chosen]), 0, np.tile(geometry.image_size, 2))
-        for mask, row, corner in zip(found, chosen, corners.astype(int).tolist(), strict=True):
-            x1, y1, x2, y2 = corner
-            if x2 > x1 and y2 > y1:
-                mask[y1:y2, x1:x2] = cv2.resize(outs[3][row, 0], (x2 - x1, y2 - y1)) > 0.5
-        return found
+    def masks(rows: IntArray) -> BoolArray:
+        return _paste(outs[3][rows, 0] - 0.5, boxes[rows], boxes[rows], geometry.image_size)
 
     score = outs[2].ravel().astype(np.float64)
+    label = outs[1].ravel().astype(np.int64) - 1
     return Decoded(boxes, score, label, masks if len(outs) > 3 else None)
 
 
-def _decode_yolox(outs: Sequence[Any], geometry: Geometry, model: ModelProbe) -> Decoded:
-    """Decode centre, log size, objectness and class scores of each cell, or of decoded boxes.
-
-    Ref: YOLOX (Ge et al. 2021), whose exports are raw or with the decoder included.
-    """
-    rows = outs[0][0].astype(np.float64)  # (A, 5 + C)
-    if not model.in_px:
-        cells, stride = _grid(geometry.input_size, 3)
-        rows[:, :2] = (rows[:, :2] + cells) * stride
-        rows[:, 2:4] = np.exp(rows[:, 2:4]) * stride
-    return _decode_yolov5([rows[None]], geometry, model)
-
-
-def _decode_yolo(outs: Sequence[Any], geometry: Geometry, model: ModelProbe) -> Decoded:
-    """Decode columns of centre, size, class scores[, mask coefficients]; and mask prototypes.
+def _decode_yolo(
+    outs: Sequence[Any], geometry: Geometry, model: ModelProbe, *, rows: bool = False,
+    objectness: bool = False, offsets: bool = False, rotated: bool = False,
+) -> Decoded:  # fmt: skip
+    """Decode centre, size, [objectness,] class scores of each cell[, mask coefficients; and masks].
 
     A mask is the region of positive sums of the prototypes, weighted by the coefficients (YOLACT,
     Bolya et al. 2019).
+
+    Args:
+        rows: of cells, else columns. offsets: where the boxes are not in px, they are offsets from
+            the cell and logarithms of sizes, in strides (YOLOX, Ge et al. 2021). rotated: the last
+            value is an angle; its boxes become the upright ones around them.
     """
-    rows = outs[0][0].T  # (A, 4 + C [+ 32])
-    end = 4 + model.count
-    score, label = _best_class(rows[:, 4:end])
-    boxes = geometry.to_image(xyxy_from_cxcywh(rows))
-    if len(outs) == 1:
-        return Decoded(boxes, score, label)
-    proto = outs[1][0]  # (32, h, w)
+    cells = outs[0][0] if rows else outs[0][0].T  # (A, values)
+    if offsets and not model.in_px:
+        corner, stride = _grid(geometry.input_size, 3)
+        center, size = (cells[:, :2] + corner) * stride, np.exp(cells[:, 2:4]) * stride
+        cells = np.hstack([center, size, cells[:, 4:]])
+    if rotated:
+        cos, sin = np.abs([np.cos(cells[:, -1:]), np.sin(cells[:, -1:])])
+        upright = cos * cells[:, 2:4] + sin * cells[:, 3:1:-1]
+        cells = np.hstack([cells[:, :2], upright, cells[:, 4:]])
+    begin = 4 + objectness
+    end = begin + model.count
+    score, label = _best_class(cells[:, begin:end])
+    boxes = geometry.to_image(xyxy_from_cxcywh(cells))
 
-    def masks(chosen: IntArray) -> BoolArray:
-        maps = np.tensordot(rows[chosen, end:], proto, 1)  # (K, h, w)
-        return _paste(maps, boxes[chosen], geometry)
+    def masks(keep: IntArray) -> BoolArray:
+        maps = np.tensordot(cells[keep, end:], outs[1][0], 1)  # (K, h, w) of the whole input
+        whole = geometry.to_image(np.tile([0, 0, *geometry.input_size], (len(keep), 1)))
+        return _paste(maps, whole, boxes[keep], geometry.image_size)
 
-    return Decoded(boxes, score, label, masks)
-
-
-def _decode_rotated(outs: Sequence[Any], geometry: Geometry, model: ModelProbe) -> Decoded:
-    """Decode columns of centre, size, class scores and angle: the upright box around each."""
-    rows = outs[0][0].T.copy()  # (A, 4 + C + 1)
-    cos, sin = np.abs(np.cos(rows[:, -1])), np.abs(np.sin(rows[:, -1]))
-    w, h = rows[:, 2:4].T
-    rows[:, 2:4] = np.stack([cos * w + sin * h, sin * w + cos * h], 1)
-    return _decode_yolo([rows.T[None]], geometry, model)
-
-
-def _decode_yolov5(outs: Sequence[Any], geometry: Geometry, model: ModelProbe) -> Decoded:
-    """Decode rows of centre, size, objectness and class scores, in px."""
-    rows = outs[0][0]  # (A, 5 + C)
-    score, label = _best_class(rows[:, 5:])
-    return Decoded(geometry.to_image(xyxy_from_cxcywh(rows)), score * rows[:, 4], label)
+    score = score * cells[:, 4] if objectness else score
+    return Decoded(boxes, score, label, masks if len(outs) > 1 else None)
 
 
 def _decode_gfl(outs: Sequence[Any], geometry: Geometry, _: ModelProbe) -> Decoded:
@@ -311,24 +295,22 @@ def _decode_gfl(outs: Sequence[Any], geometry: Geometry, _: ModelProbe) -> Decod
     return Decoded(geometry.to_image(boxes), score[keep], label[keep])
 
 
-def _paste(maps: Any, boxes: Array, geometry: Geometry) -> BoolArray:
+def _paste(maps: Any, covered: Array, boxes: Array, size: tuple[int, int]) -> BoolArray:
     """Resample the maps of masks inside their boxes.
 
     Args:
-        maps: (K, h, w) of the network's input, positive in the mask. boxes: (K, 4) px of the image.
+        maps: (K, h, w) positive in the mask. covered: (K, 4) px of the image that each map covers.
+        boxes: (K, 4) px of the image. size: (w, h) of the image.
     Returns:
         (K, H, W) masks, False outside the boxes.
     """
-    size = geometry.image_size
     masks = np.zeros((len(maps), size[1], size[0]), bool)  # (K, H, W)
-    ratio = np.divide(maps.shape[:0:-1], geometry.input_size)  # (2,) map / input
-    scale = ratio * geometry.scale  # map = image * scale + pad, from the corner
-    pad = ratio * geometry.pad
+    scale = np.divide(maps.shape[:0:-1], covered[:, 2:] - covered[:, :2])  # (K, 2) map / image
     low = np.clip(np.floor(boxes[:, :2]), 0, size).astype(int)
     high = np.clip(np.ceil(boxes[:, 2:]), 0, size).astype(int)
+    shift = scale * (low + 0.5 - covered[:, :2]) - 0.5  # pixel centres on pixel centres
     for k in np.flatnonzero((high > low).all(1)):
-        shift = scale * (low[k] + 0.5) + pad - 0.5  # pixel centres on pixel centres
-        affine = np.column_stack([np.diag(scale), shift])  # (2, 3)
+        affine = np.column_stack([np.diag(scale[k]), shift[k]])  # (2, 3)
         values = cv2.warpAffine(
             np.ascontiguousarray(maps[k], np.float32), affine, (high[k] - low[k]).tolist(),
             flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE,
@@ -360,15 +342,12 @@ def _layout(
     return Layout(name, title, recognise, decode, shape=shape, classes=classes, **fields)
 
 
-def _in_px(model: ModelProbe) -> bool:
-    return not model.in_fractions
-
-
 IMAGENET_RGB = Pixels("RGB, ImageNet", True, IMAGENET_MEAN, IMAGENET_STD)
 IMAGENET_BGR = Pixels("BGR, ImageNet", False, IMAGENET_MEAN[::-1], IMAGENET_STD[::-1])
 BYTES_BGR = Pixels("BGR, 0..255", False, std=(1.0, 1.0, 1.0))
 CAFFE_BGR = Pixels("BGR, less the mean", False, (102.9801, 115.9465, 122.7717), (1.0, 1.0, 1.0))
 YOLO = "YOLOv8, YOLO11"
+CENTRED: dict[str, Any] = {"fit": "centre", "px": True}
 
 ENTRIES: list[Layout] = [
     _layout("detr", "DEIM, D-FINE, RT-DETR", "labels, boxes, scores",
@@ -385,23 +364,22 @@ ENTRIES: list[Layout] = [
             _decode_zoo, fit="corner", pixels=CAFFE_BGR, nms_iou=None),
     _layout("yolo", f"{YOLO}, also -seg", "(1, 4 + classes [+ 32], cells)[, (1, 32, h, w)]",
             lambda m: m.values(0) - 4 - sum(shape[1] for shape in m.shapes[1:] if len(shape) == 4),
-            _decode_yolo, ("", "detect", "segment"), also=_in_px,
-            fit="centre"),
+            _decode_yolo, ("", "detect", "segment"), **CENTRED),
     _layout("yolo-rows", f"{YOLO}, transposed", "(1, cells, 4 + classes)",
-            lambda m: m.values(1) - 4,
-            lambda outs, *more: _decode_yolo([outs[0].swapaxes(1, 2)], *more),
-            also=_in_px, fit="centre"),
+            lambda m: m.values(1) - 4, partial(_decode_yolo, rows=True), **CENTRED),
     _layout("yolo-obb", f"{YOLO}, rotated boxes: the upright one around each",
-            "(1, 4 + classes + 1, cells)", lambda m: m.values(0) - 5, _decode_rotated, ("obb",),
-            also=_in_px, fit="centre"),
+            "(1, 4 + classes + 1, cells)", lambda m: m.values(0) - 5,
+            partial(_decode_yolo, rotated=True), ("obb",), **CENTRED),
     _layout("yolo-pose", f"{YOLO}, key points", "(1, 4 + classes + key points, cells)",
             lambda m: m.values(0) - 4 - _keypoint_values(m), _decode_yolo, ("pose",),
-            also=_in_px, fit="centre", unread="the key points"),
+            unread="the key points", **CENTRED),
     _layout("yolov5", "YOLOv5, YOLOv7, YOLOv6", "(1, cells or 3 * cells, 5 + classes)",
-            lambda m: max(m.values(1), m.values(1, boxes=3)) - 5, _decode_yolov5,
+            lambda m: max(m.values(1), m.values(1, boxes=3)) - 5,
+            partial(_decode_yolo, rows=True, objectness=True),
             also=lambda m: m.in_px and ("output" not in m.outputs or not m.values(1)),
-            fit="centre"),
-    _layout("yolox", "YOLOX", "(1, cells, 5 + classes)", lambda m: m.values(1) - 5, _decode_yolox,
+            **CENTRED),
+    _layout("yolox", "YOLOX", "(1, cells, 5 + classes)", lambda m: m.values(1) - 5,
+            partial(_decode_yolo, rows=True, objectness=True, offsets=True),
             also=lambda m: not m.in_px or "outputs" not in m.outputs,  # which YOLOv6 has
             fit="corner", pixels=BYTES_BGR),
     _layout("nanodet", "NanoDet-Plus", "(1, cells, classes + 32)",
@@ -420,23 +398,25 @@ def find_layout(model: ModelProbe, declared: str, names_of: str) -> Layout:
     names_of: who gives the class names, for messages.
 
     Raises:
-        ReobjError: its outputs fit no layout, or several, or not the declared one.
+        ReobjError: its outputs fit no layout, or several, or not the declared one; or the boxes are
+            not in px.
     """
     shapes = ", ".join(f"{name} {output.shape}" for name, output in model.outputs.items())
     counts = {entry.name: entry.classes(model) for entry in ENTRIES}
-    near = [f"{name} with {count} classes" for name, count in counts.items() if count and count > 0]
-    model.found = f": {shapes}"
-    if near:
-        task = f" and task {task}" if (task := model.metadata.get("task")) else ""
-        small = "yolo with" in near[0] and model.in_fractions
-        fractions = ", but its boxes are fractions: export them in px of the input" * small
-        model.found += (f" with {model.count} class names ({names_of}){task}; by its shape "
-                        f"{' or '.join(near)}{fractions}")  # fmt: skip
-    layout = ENTRIES[LAYOUTS.formats.index(LAYOUTS.choose(model, declared))]
+    near = [f"{name} with {count} classes" for name, count in counts.items() if (count or 0) > 0]
+    model.found = (
+        f": {shapes}; {model.count} class names ({names_of}), task "
+        f"{model.metadata.get('task') or 'not named'}, by shape {' or '.join(near) or 'none'}"
+    )
+    layout = LAYOUTS.choose(model, declared)
+    assert isinstance(layout, Layout)
     count = counts[layout.name]
     if count is not None and count < 1:
         raise ReobjError(f"{model.path}: {shapes}: not the outputs of layout {declared}, "
                          f"{layout.shape}")  # fmt: skip
+    boxes = np.abs(model.first[..., :4] if layout.shape[4] == "c" else model.first[:, :4])
+    if layout.px and 0 < boxes.max() <= 1.5:
+        raise ReobjError(f"{model.path}: its boxes are fractions: export them in px of the input")
     return layout
 
 
@@ -507,8 +487,12 @@ class OnnxDetector:
         self._fixed = axis if isinstance(axis, int) else 0  # images of every run; 0: any number
         self.batch = self._fixed or frames_at_once(self.config.batch, device)
         self._model = self._trial_run()
-        self._layout, self.class_names = self._recognise(weights.layout if weights else "")
+        declared = self.config.layout or (weights.layout if weights else "")
+        self._layout, self.class_names = self._recognise(declared)
         self.layout = self._layout.name
+        unread = f"; not read: {self._layout.unread}" if self._layout.unread else ""
+        text = f"{NOTE_START}{self.path}: read as {self.layout} ({self._layout.title}){unread}"
+        self.messages = () if declared else (text,)
         wanted = self.config.classes
         self._allowed = class_filter(wanted, self.class_names) if wanted else None
 
@@ -518,14 +502,15 @@ class OnnxDetector:
 
     def detect(self, images: Sequence[Image]) -> Iterator[Detections]:
         """Detect the objects in each of several images, as one call for each would."""
-        images = [as_frame(image) for image in images]
+        fit = self._layout.fit
+        fitted = [fit_image(image, self._input_size(*image.shape[1::-1]), fit)
+                  for image in map(as_frame, images)]  # fmt: skip
         # Images of the same input size are given to the network together
-        for size, group in itertools.groupby(images, lambda a: self._input_size(*a.shape[1::-1])):
+        for _, group in itertools.groupby(fitted, lambda one: one[1].input_size):
             for batch in in_batches(group, self.batch):
-                fitted = [fit_image(image, size, self._layout.fit) for image in batch]
                 with failing(str(self.path), len(batch)):
-                    each = self._run(fitted, self._layout.pixels)
-                for outputs, (_, geometry) in zip(each, fitted, strict=True):
+                    each = self._run(batch, self._layout.pixels)
+                for outputs, (_, geometry) in zip(each, batch, strict=True):
                     yield self._decoded(outputs, geometry)
 
     def _decoded(self, outputs: list[Any], geometry: Geometry) -> Detections:
@@ -546,9 +531,8 @@ class OnnxDetector:
     def _input_size(self, width: int, height: int) -> tuple[int, int]:
         """Return the input (w, h) for an image: the model's, or, if dynamic, the image's shape."""
         fixed = self._inputs[self._image_input][:-3:-1]
-        longer = 640  # px, longer side (YOLO11's training size)
         stride = 32  # px, largest cells of YOLO: sides are multiples of it
-        ratio = longer / max(width, height) / stride
+        ratio = 640 / max(width, height) / stride  # px of the longer side (YOLO11's training size)
         scaled = [max(math.ceil(round(v * ratio, 3)), 1) * stride for v in (width, height)]
         w, h = (a if isinstance(a, int) else b for a, b in zip(fixed, scaled, strict=True))
         return w, h
@@ -579,39 +563,36 @@ class OnnxDetector:
         size = self._input_size(1, 1)
         grey = np.full((size[1], size[0], 3), 114, np.uint8)
         with failing(f"{self.path}: no known object detector: a trial run", 1):
-            (outputs,) = self._run([(grey, Geometry(size, size, (1.0, 1.0), (0, 0)))], UNIT_RGB)
-            names = [output.name for output in self._session.get_outputs()]
-            metadata = self._session.get_modelmeta().custom_metadata_map
+            (outputs,) = self._run([fit_image(grey, size, "stretch")], UNIT_RGB)
+        names = (output.name for output in self._session.get_outputs())
+        metadata = self._session.get_modelmeta().custom_metadata_map
         of_name = dict(zip(names, outputs, strict=True))
         return ModelProbe(self.path, self._inputs, of_name, size, metadata)
 
     def _recognise(self, declared: str) -> tuple[Layout, tuple[str, ...]]:
         """Find the layout, and the names of its classes: by option, metadata, COCO, or numbers.
 
-        declared: layout of known weights.
+        declared: by the user, or of known weights.
         """
+        model = self._model
         names: tuple[str, ...] = ()
-        names_of = f"of COCO, as the model names none; {NAMES}"
-        if self.config.class_names:
-            names_of = self.config.class_names
+        names_of = self.config.class_names
+        if names_of:
             names = load_class_names(names_of)
-        elif text := self._model.metadata.get("names", "").strip():
+        elif text := model.metadata.get("names", "").strip():
             names_of = "of its metadata"
             where = f"{self.path}: metadata `names`; {NAMES}"
             names = names_by_number(parse_yaml(text, where), where)
-        self._model.count = len(names or COCO_NAMES)
-        declared = self.config.layout or declared
-        layout = find_layout(self._model, declared, names_of)
-        count = layout.classes(self._model)
-        if count not in (None, self._model.count):
-            if names:
-                raise ReobjError(f"{self.path}: {len(names)} class names ({names_of}), but layout "
-                                 f"{layout.name} has {count} classes")  # fmt: skip
-            log.warning("%s: %d classes without names: %s", self.path, count, NAMES)
-            names = tuple(f"class {i}" for i in range(count or 0))
-        names = names or COCO_NAMES
-        self._model.count = len(names)
-        unread = f"; not read: {layout.unread}" if layout.unread else ""
-        text = f"{NOTE_START}{self.path}: read as {layout.name} ({layout.title}){unread}"
-        self.messages = () if declared else (text,)
-        return layout, names
+        known = names or COCO_NAMES
+        model.count = len(known)
+        names_of = names_of or f"of COCO, as the model names none; {NAMES}"
+        layout = find_layout(model, declared, names_of)
+        count = layout.classes(model)
+        if count is None or count == model.count:
+            return layout, known
+        if names:
+            raise ReobjError(f"{self.path}: {len(names)} class names ({names_of}), but layout "
+                             f"{layout.name} has {count} classes")  # fmt: skip
+        log.warning("%s: %d classes without names: %s", self.path, count, NAMES)
+        model.count = count
+        return layout, tuple(f"class {i}" for i in range(count))

@@ -12,13 +12,13 @@ A mask without pixels has none (`NO_RUNS`) and means "no mask".
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -26,16 +26,16 @@ import numpy as np
 import numpy.typing as npt
 
 from reobj.cameras import Poses
-from reobj.files import LINES_MAX, MEMORY_MAX, load_npz, save_npz, shortened
+from reobj.files import load_npz, save_npz, shortened
 from reobj.formats import frames_by_name
 from reobj.types import (
-    CLASS_MAX,
     COORDINATE_MAX,
     Array,
     BoolArray,
     Detections,
     IntArray,
     ReobjError,
+    cxcywh_from_xyxy,
     visible_name,
     xyxy_from_cxcywh,
 )
@@ -43,7 +43,7 @@ from reobj.types import (
 CORNERS, SIZES, CENTRES = "x1, y1, x2, y2", "x, y, w, h", "cx, cy, w, h"  # forms of a box
 Counts = npt.NDArray[np.uint32]
 NO_RUNS: Counts = np.empty(0, np.uint32)
-# Coordinates up to this are fractions of the image size; chosen: boxes may extend a little outside
+# Coordinates up to this are fractions of the image size: boxes may extend a little outside
 NORMALISED_MAX = 1.5
 
 
@@ -71,28 +71,26 @@ def other_form(
         image (of boxes in another form 41 % or more do); and sizes of an identity that change as
         its place does.
     """
-    low, high = xyxy[:, :2], xyxy[:, 2:]
-    given = xyxy  # the numbers in the file
     remedy = "convert them, or name these columns in the header of a CSV"
-    if form != CORNERS:
-        given = np.hstack([low if form == SIZES else (low + high) / 2, high - low])
-        if len(identity) and _move_as_corners(given, frame, identity):
-            return (f"all boxes are {CORNERS}, expected {form}: the third and fourth number "
-                    f"are above the first and second, and change with them; {remedy}")  # fmt: skip
-    inverted = (high < low).any(1)
+    size_of = xyxy[:, 2:] - xyxy[:, :2]
+    sizes = np.hstack([xyxy[:, :2], size_of])
+    given = {CORNERS: xyxy, SIZES: sizes, CENTRES: cxcywh_from_xyxy(xyxy)}[form]
+    if form != CORNERS and _move_as_corners(given, frame, identity):
+        return (f"all boxes are {CORNERS}, expected {form}: the third and fourth number are above "
+                f"the first and second, and change with them; {remedy}")  # fmt: skip
+    inverted = (size_of < 0).any(1)
     leave = ~_inside(xyxy, size)
     if 0 in size or (not inverted.any() and leave.sum() <= max(2, 0.1 * len(xyxy))):
         return ""
-    others = [other for other in (CORNERS, SIZES, CENTRES) if other != form]
-    fits = [other for other in others if _inside(corners(given, other), size).mean() > 0.98]
+    fits = " or ".join(other for other in (CORNERS, SIZES, CENTRES)
+                       if other != form and _inside(corners(given, other), size).mean() > 0.98
+                       )  # fmt: skip
+    why = (f"{leave.sum()} of {len(xyxy)} boxes leave the image of {size[0]:g}x{size[1]:g}, "
+           f"{inverted.sum()} have x2 < x1 or y2 < y1")  # fmt: skip
+    if fits:
+        return f"as {form}, {why}; all fit it as {fits}: {remedy}"
     turned = _inside(xyxy, size[::-1]).all()
-    if not fits and not turned:
-        return ""
-    why = f"{leave.sum()} of {len(xyxy)} boxes leave the image of {size[0]:g}x{size[1]:g}"
-    why += f", and {inverted.sum()} have x2 < x1 or y2 < y1" * bool(inverted.any())
-    if not fits:
-        return f"{why}; all fit the frame turned by 90 deg: detect on upright frames"
-    return f"as {form}, {why}; all fit it as {' or '.join(fits)}: {remedy}"
+    return f"{why}; all fit the frame turned by 90 deg: detect on upright frames" * bool(turned)
 
 
 def _move_as_corners(box: Array, frame: IntArray, identity: IntArray) -> bool:
@@ -132,10 +130,10 @@ class RecordedDetections:
         size, working_size: (w, h) of the masks, and of the frames of `at`.
         line: (N,) position in the file, a number of `unit`s or text; for messages.
         messages: about dropped rows and assumptions, for the user.
-        identity: (N,) as in the file, or empty.
+        identity: (N,) as in the file, -1: none.
+        ignored: (N,) regions that do not count, as the file marks them.
         looked: frames on which the detector was run, ascending; None: all.
-        boxes_3d: (N, 15) of `tables.Boxes3D`, or empty.
-        ignored: (N,) regions that do not count, as the file marks them, or empty.
+        boxes_3d: (N, 15) of `tables.Boxes3D`; None: the detector gives none.
         form: of the boxes in the file.
     """
 
@@ -149,59 +147,41 @@ class RecordedDetections:
     working_size: tuple[int, int]
     line: npt.NDArray[Any]
     unit: str
-    messages: list[str] = field(default_factory=list)
-    identity: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+    messages: list[str]
+    identity: IntArray
+    ignored: BoolArray
     looked: IntArray | None = None
-    boxes_3d: Array = field(default_factory=lambda: np.empty((0, 15)))
-    ignored: BoolArray = field(default_factory=lambda: np.empty(0, bool))
+    boxes_3d: Array | None = None
     form: str = CORNERS
-
-    def __post_init__(self) -> None:
-        self.class_names = tuple(map(visible_name, self.class_names))
 
     def __len__(self) -> int:
         return len(self.frame)
 
     def select(self, rows: IntArray) -> None:
         """Select rows (n,), in this order."""
-        count = len(self)
-        for name in "frame xyxy score class_id line identity boxes_3d ignored".split():
-            values = getattr(self, name)
-            setattr(self, name, values[rows] if len(values) == count else values)
+        for name in "frame xyxy score class_id line identity ignored boxes_3d".split():
+            if (values := getattr(self, name)) is not None:
+                setattr(self, name, values[rows])
         self.runs = [self.runs[row] for row in rows]
 
     def fingerprint(self) -> str:
         """Hash the detections, independently of the format of the file."""
         digest = hashlib.sha256(repr((self.class_names, self.size)).encode())
-        given: list[npt.NDArray[Any]] = [self.boxes_3d] if len(self.boxes_3d) else []
-        given = [self.frame, self.xyxy, self.score, self.class_id, *given, *self.runs]
-        for values in given:
-            digest.update(repr(values.shape).encode() + np.ascontiguousarray(values).tobytes())
+        boxes_3d = () if self.boxes_3d is None else (self.boxes_3d,)
+        columns = (self.frame, self.xyxy, self.score, self.class_id, *boxes_3d, *self.runs)
+        for values in columns:
+            digest.update(repr(values.shape).encode() + values.tobytes())
         return digest.hexdigest()[:16]
 
     def at(self, frame_index: int) -> Detections:
         """Return the detections of a frame, with masks, in px of the working size."""
-        low, high = np.searchsorted(self.frame, [frame_index, frame_index + 1])
-        rows = slice(low, high)
+        rows = slice(*np.searchsorted(self.frame, [frame_index, frame_index + 1]))
         masks = None
         ratio = np.tile(np.divide(self.working_size, self.size), 2)  # (4,)
         if any(map(len, self.runs[rows])):
             decoded = (rle_decode(counts, self.size) for counts in self.runs[rows])
             masks = np.stack([_resized_mask(mask, self.working_size) for mask in decoded])
         return Detections(self.xyxy[rows] * ratio, self.score[rows], self.class_id[rows], masks)
-
-
-@dataclass(slots=True)
-class NoVideo:
-    """The video of a file that is read alone: frames of unknown number, size and names."""
-
-    source: str
-    size: tuple[int, int] = (0, 0)
-    working_size: tuple[int, int] = (0, 0)
-    names: Sequence[str] = ()
-    files: Sequence[Path] = ()
-    frame_count: int = 0
-    times_s: Array | None = None
 
 
 @dataclass(slots=True)
@@ -234,29 +214,23 @@ class Source:
         self.messages += [text] if text else []
 
     def recorded(
-        self,
-        frame: IntArray,
-        box: Array,
-        classes: tuple[IntArray, Sequence[str]],
-        score: Array | None = None,
-        runs: list[Counts] | None = None,
-        line: npt.NDArray[Any] | None = None,
-        unit: str = "entry",
-        form: str = CORNERS,
-        scale: Array | float = 1.0,
-        **columns: Any,
-    ) -> RecordedDetections:
+        self, frame: IntArray, box: Any, classes: tuple[IntArray, Sequence[str]],
+        form: str = CORNERS, scale: Any = 1.0, unit: str = "entry", **columns: Any,
+    ) -> RecordedDetections:  # fmt: skip
         """Return the detections of N rows; columns: further attributes of RecordedDetections.
 
         scale: px of the video for each unit of the boxes (N, 4).
         """
         count = len(frame)
-        xyxy = corners(np.reshape(box, (-1, 4)).astype(np.float64), form) * scale  # (N, 4)
+        usual: dict[str, Any] = {
+            "score": np.ones(count), "runs": [NO_RUNS] * count, "line": np.arange(count),
+            "identity": np.full(count, -1), "ignored": np.zeros(count, bool),
+        }  # fmt: skip
         return RecordedDetections(
-            frame, xyxy, np.ones(count) if score is None else score, classes[0],
-            [NO_RUNS] * count if runs is None else runs, tuple(classes[1]), self.video.size,
-            self.video.working_size, np.arange(count) if line is None else line, unit,
-            self.messages, form=form, **columns,
+            frame=frame, xyxy=corners(np.reshape(box, (-1, 4)).astype(np.float64), form) * scale,
+            class_id=classes[0], class_names=tuple(map(visible_name, classes[1])),
+            size=self.video.size, working_size=self.video.working_size, unit=unit,
+            messages=self.messages, form=form, **usual | columns,
         )  # fmt: skip
 
     def scale(self, made_for: Array, used: BoolArray | bool = True) -> Array:
@@ -367,44 +341,32 @@ def frames_of_names(names: Sequence[str], source: Source, usual: int | None = No
         return np.asarray(frame[row], np.int64)
     number = _last_numbers(given)
     if number.min() < 0 or len(np.unique(number)) < len(number):
-        why = "have no number" if number.min() < 0 else "repeat their last number"
         raise ReobjError(
             f"{source.path}: names such as {given[int(number.argmin())]!r} match no frame of the "
-            f"video, and {why}; name them as the images {shortened(video.names)}, or by the frame, "
-            "or list the images of all frames in order (--set detect.first_frame=order)"
+            "video, and have no number, or the same as another; name them as the images "
+            f"{shortened(video.names)}, or by the frame, or list the images of all frames in order "
+            "(--set detect.first_frame=order)"
         )
-    numbered = _by_image_number(number, source, given)
-    if numbered is not None:
-        number = numbered
-    elif (number.min(), number.max()) != (0, video.frame_count - 1):  # else it is unambiguous
+    image = _last_numbers(video.names).tolist()  # (F,)
+    frame_of = {n: frame for frame, n in enumerate(image) if video.times_s is None}
+    by_image = np.array([frame_of.get(n, -1) for n in number.tolist()], np.int64)
+    matched = by_image >= 0
+    begin = _first_number(number, video.frame_count)
+    is_frame = begin is not None and number.max() - begin < video.frame_count
+    if source.first or len(frame_of) < len(image):
+        matched[:] = False
+    if matched.all() or (matched.any() and not is_frame):
+        missing = [given[k] for k in np.flatnonzero(~matched)]
+        k = matched.argmax()
+        source.say(f"the number in a name or id is that of an image ({given[k]}: "
+                   f"{video.names[by_image[k]]})"
+                   + f"; {len(missing)} match none: {shortened(missing)}" * bool(missing)
+                   )  # fmt: skip
+        return by_image[row]
+    if (number.min(), number.max()) != (0, video.frame_count - 1):  # else it is unambiguous
         source.say("the number in a name is the frame's")
         number = frames_of_numbers(number, source, usual)
     return np.asarray(number[row], np.int64)
-
-
-def _by_image_number(number: IntArray, source: Source, given: Sequence[str]) -> IntArray | None:
-    """Match numbers (N,) to the last numbers in the names of images: frames (N,), -1: none.
-
-    None: the images have no such numbers, or the numbers are those of frames.
-    """
-    video = source.video
-    image = _last_numbers(video.names)
-    unusable = not len(image) or video.times_s is not None or image.min() < 0
-    if source.first or unusable or len(np.unique(image)) < len(image):
-        return None
-    frame_of = {n: frame for frame, n in enumerate(image.tolist())}
-    frame = np.array([frame_of.get(n, -1) for n in number.tolist()])
-    matched = frame >= 0
-    begin = _first_number(number, video.frame_count)
-    position = begin is not None and number.max() - begin < video.frame_count
-    if not matched.any() or (position and not matched.all()):
-        return None
-    missing = [name for name, match in zip(given, matched.tolist(), strict=True) if not match]
-    first = int(matched.argmax())
-    example = f"{given[first]}: {video.names[frame[first]]}"
-    text = f"the number in a name or id is that of an image ({example})"
-    source.say(text + f"; {len(missing)} match none: {shortened(missing)}" * bool(missing))
-    return frame
 
 
 @dataclass(slots=True)
@@ -473,17 +435,23 @@ def looked_message(looked: IntArray, listed: bool) -> str:
 # ---- Masks ---------------------------------------------------------------------------------------
 
 
-def rle_encode(mask: BoolArray) -> Counts:
-    """Encode an (H, W) mask as run lengths."""
-    return _runs_of_columns(mask, 0, mask.shape[1])
+def rle_encode(mask: BoolArray, corner: Sequence[int] = (0, 0), size: Sequence[int] = ()) -> Counts:
+    """Encode an (h, w) part of the mask of an image; what lies outside the image is cut off.
 
-
-def _runs_of_columns(columns: BoolArray, first: int, width: int) -> Counts:
-    """Encode columns (H, w) of the mask of an image, from `first` of `width`; others are zero."""
-    flat = cv2.transpose(columns.view(np.uint8)).ravel()  # (w * H,)
+    Args:
+        corner: (x, y) of its first pixel in the image. size: (w, h) of the image; default: (h, w).
+    """
+    width, height = size or mask.shape[::-1]
+    x, y = corner
+    mask = mask[max(-y, 0) : max(height - y, 0), max(-x, 0) : max(width - x, 0)]
+    if not mask.size:
+        return NO_RUNS
+    strip = np.zeros((height, mask.shape[1]), bool)  # whole columns: runs follow them
+    strip[max(y, 0) :][: len(mask)] = mask
+    flat = cv2.transpose(strip.view(np.uint8)).ravel()  # (w * H,)
     none = np.uint8(0)
-    edges = np.flatnonzero(np.diff(flat, prepend=none, append=none)) + first * len(columns)
-    end = width * len(columns)
+    edges = np.flatnonzero(np.diff(flat, prepend=none, append=none)) + max(x, 0) * height
+    end = width * height
     counts = np.diff(edges[edges < end], prepend=0, append=end).astype(np.uint32)
     return counts if len(counts) > 1 else NO_RUNS
 
@@ -517,37 +485,20 @@ def coco_runs(text: str) -> Counts:
     return np.array(runs, np.uint32)
 
 
-def crop_runs(mask: BoolArray, corner: tuple[int, int], size: tuple[int, int]) -> Counts:
-    """Encode an (h, w) part of the mask of an image; what lies outside the image is cut off.
-
-    Args:
-        corner: (x, y) of its first pixel in the image. size: (w, h) of the image.
-    """
-    width, height = size
-    x, y = corner
-    mask = mask[max(-y, 0) : max(height - y, 0), max(-x, 0) : max(width - x, 0)]
-    strip = np.zeros((height, mask.shape[1]), bool)  # whole columns: runs follow them
-    strip[max(y, 0) :][: len(mask)] = mask
-    return _runs_of_columns(strip, max(x, 0), width) if mask.size else NO_RUNS
-
-
 def polygon_runs(rings: Sequence[Array], size: tuple[int, int]) -> Counts:
     """Fill polygons (K, 2), in px (corner convention), in a (w, h) image."""
     flat = np.concatenate([np.empty((0, 2)), *rings])
     if not (np.abs(flat) <= COORDINATE_MAX).all():
         raise ValueError("a polygon with corners that are not finite, or beyond 1e7 px")
-    width, height = size
-    low, high = flat.min(0, initial=width), flat.max(0, initial=0)
-    left = int(np.clip(np.floor(low[0]) - 1, 0, width))  # only the columns of the polygon
-    right = int(np.clip(np.ceil(high[0]) + 1, left, width))
-    canvas = np.zeros((height, right - left), np.uint8)
-    if not canvas.size:
-        return NO_RUNS
+    low = np.clip(np.floor(flat.min(0, initial=max(size))) - 1, 0, size).astype(int)
+    high = np.clip(np.ceil(flat.max(0, initial=0)) + 1, low, size).astype(int)
+    canvas = np.zeros((high - low)[::-1], np.uint8)  # only the part of the polygon
     bits = 4  # of fractions of a pixel, 1/16 px: finer than annotations
-    for ring in rings:  # OpenCV's first pixel has its centre at (0, 0), ours at (0.5, 0.5)
-        fixed = np.round((ring - (left + 0.5, 0.5)) * (1 << bits)).astype(np.int32)
+    for ring in rings if canvas.size else ():
+        # OpenCV's first pixel has its centre at (0, 0), ours at (0.5, 0.5)
+        fixed = np.round((ring - (low + 0.5)) * (1 << bits)).astype(np.int32)
         cv2.fillPoly(canvas, [fixed], 1, shift=bits)
-    return _runs_of_columns(canvas > 0, left, width)
+    return rle_encode(canvas > 0, low.tolist(), size)
 
 
 def _resized_mask(mask: BoolArray, size: tuple[int, int]) -> BoolArray:
@@ -611,52 +562,42 @@ def write_detections_npz(
 
 def read_npz(
     path: Path, size: tuple[int, int], working_size: tuple[int, int], sealed: bool = False
-) -> tuple[RecordedDetections, IntArray]:
+) -> RecordedDetections:
     """Read the format of `pack_detections` for a video of (w, h) `size`, (0, 0): any.
+
+    The detections are not validated; `looked` has the frames that were `done`, None: not stated.
 
     Args:
         sealed: as in `load_npz`.
-    Returns:
-        the detections, not validated, and the numbers of the frames that were `done`, including
-        those without detections (default: the frame of every detection).
     """
     data, _ = load_npz(path, sealed)
-    take = functools.partial(_array, data, path)
-    frame = take("frame", "iu", (-1,), LINES_MAX).astype(np.int64)
+
+    def take(key: str, kind: type, *shape: int) -> Any:
+        """Return an array of a shape, (): one axis of any length, converted to a type."""
+        if (array := data.get(key)) is None:
+            raise ReobjError(f"{path}: array {key} is missing")
+        fits = array.shape == (shape or (array.size,))
+        if not fits or (array.size and not np.can_cast(array.dtype, kind, "same_kind")):
+            expected = f"{kind.__name__} of shape {shape or '(N,)'}"
+            raise ReobjError(f"{path}: array {key} is {array.dtype} of shape {array.shape}, "
+                             f"expected {expected}")  # fmt: skip
+        return array.astype(kind)
+
+    frame = take("frame", np.int64)
     count = len(frame)
-    data.setdefault("mask_counts", NO_RUNS)
-    data.setdefault("mask_offsets", np.zeros(count + 1, np.int64))
-    runs = take("mask_counts", "iu", (-1,), MEMORY_MAX // 8)  # uint32, held twice
-    offsets = take("mask_offsets", "iu", (count + 1,)).astype(np.int64)
-    if (np.diff(offsets, prepend=0) < 0).any() or offsets[-1] > runs.size or (runs < 0).any():
+    offsets = np.zeros(count + 1, np.int64)
+    data = {"mask_counts": NO_RUNS, "mask_offsets": offsets} | data
+    runs, offsets = take("mask_counts", np.int64), take("mask_offsets", np.int64, count + 1)
+    if (np.diff(offsets, prepend=0) < 0).any() or offsets[-1] > len(runs) or (runs < 0).any():
         raise ReobjError(f"{path}: mask_counts and mask_offsets are inconsistent")
-    width, height = take("image_size", "iu", (2,)).tolist()
+    width, height = take("image_size", np.int64, 2).tolist()
     if min(width, height) < 1 or size not in ((0, 0), (width, height)):
         raise ReobjError(f"{path}: made for images of {(width, height)} px, but the video is "
                          f"{size} px, turned upright")  # fmt: skip
-    recorded = RecordedDetections(
-        frame, take("xyxy", "fiu", (count, 4)).astype(np.float64),
-        take("score", "fiu", (count,)).astype(np.float64),
-        take("class_id", "iu", (count,)).astype(np.int64),
-        np.split(runs.astype(np.uint32), offsets[1:])[:count],
-        tuple(take("class_names", "U", (-1,), CLASS_MAX).tolist()), (width, height), working_size,
-        np.arange(count), "row",
+    source = Source(path, SimpleNamespace(size=(width, height), working_size=working_size))
+    classes = (take("class_id", np.int64, count), take("class_names", np.str_).tolist())
+    return source.recorded(
+        frame, take("xyxy", np.float64, count, 4), classes, unit="row",
+        score=take("score", np.float64, count), looked=np.unique(take("done", np.int64))
+        if "done" in data else None, runs=np.split(runs.astype(np.uint32), offsets[1:])[:count],
     )  # fmt: skip
-    if "done" in data:
-        recorded.looked = np.unique(take("done", "iu", (-1,), LINES_MAX)).astype(np.int64)
-    return recorded, frame if recorded.looked is None else recorded.looked
-
-
-def _array(
-    data: dict[str, npt.NDArray[Any]], path: Path, key: str, kinds: str, shape: tuple[int, ...],
-    most: int = MEMORY_MAX,
-) -> npt.NDArray[Any]:  # fmt: skip
-    """Return an array of an npz file; refuse another kind, shape (-1: any) or more rows."""
-    array = data.get(key)
-    if array is None:
-        raise ReobjError(f"{path}: array {key} is missing")
-    fits = array.ndim == len(shape) and all(map(lambda n, m: n in (-1, m), shape, array.shape))
-    if not fits or len(array) > most or (array.size and array.dtype.kind not in kinds):
-        raise ReobjError(f"{path}: array {key} is {array.dtype} of shape {array.shape}, expected "
-                         f"{kinds} of shape {shape} with at most {most} rows")  # fmt: skip
-    return array

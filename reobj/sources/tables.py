@@ -11,12 +11,11 @@ quaternions w first.
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import functools
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,9 +24,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import quadrics
-from reobj.cameras import Poses, distort_boxes
+from reobj.cameras import distort_boxes
 from reobj.files import load_json, read_lines
-from reobj.formats import HEAD_BYTES, Probe
+from reobj.formats import Probe
 from reobj.sources.class_names import load_class_names
 from reobj.sources.image_files import TimeUnit
 from reobj.sources.recorded import (
@@ -105,21 +104,18 @@ class Table:
     cells: dict[str, list[str]]
     line: IntArray
     unit: str = "line"
-    header: tuple[str, ...] = ()
-
-    def where(self, row: int) -> str:
-        """Return the position of a row, for messages."""
-        return f"{self.path}, {self.unit} {self.line[row]}"
+    header: Sequence[str] = ()
 
     def numbers(self, role: str, whole: bool = False) -> Array:
         """Convert a column to finite numbers (N,), perhaps whole ones; an error names the line."""
         values = np.array([_number(cell) for cell in self.cells[role]], np.float64)
-        with np.errstate(invalid="ignore"):
-            # Above 2^53 not every integer is a float64
-            bad = ~np.isfinite(values) | (whole & ((np.abs(values) > 2.0**53) | (values % 1 != 0)))
-        for row in np.flatnonzero(bad)[:1].tolist():
-            text = f"{role} {self.cells[role][row]!r}, expected a {'whole' if whole else 'finite'}"
-            raise ReobjError(f"{self.where(row)}: {text} number")
+        # Above 2^53 not every integer is a float64
+        exact = (np.abs(values) <= 2.0**53) & (values == np.round(values))
+        for row in np.flatnonzero(~(exact if whole else np.isfinite(values)))[:1].tolist():
+            raise ReobjError(
+                f"{self.path}, {self.unit} {self.line[row]}: {role} {self.cells[role][row]!r}, "
+                f"expected a {'whole' if whole else 'finite'} number"
+            )
         return values
 
     def columns(self, roles: Sequence[str]) -> Array:
@@ -142,46 +138,37 @@ def _number(cell: str) -> float:
         return math.nan
 
 
-def are_numbers(cells: Sequence[str]) -> bool:
-    """Test whether all cells are numbers."""
-    return not any(math.isnan(_number(cell)) for cell in cells)
-
-
-def _separator(line: str) -> str:
-    """Return the separator of a line: the most frequent of ; tab and comma, or a space."""
-    best = max(";\t,", key=line.count)
-    data = line.lstrip()[:1] in tuple("+-.0123456789")
-    if len(line.split()) > line.count(best) + 1 and (data or best not in line):
-        return " "
-    return best
-
-
-def _is_comment(line: str) -> bool:
-    """Test whether a line begins with # and is no header."""
-    header = re.search(r"(^|[^a-z])(frame|image|file|time)(stamp|_?[a-z]+)?\b", line.lower())
-    return line[:1] == "#" and not header
+def _is_empty(cell: str) -> bool:
+    return cell.lower() in ("", "nan", "none", "null", "na")  # as pandas and others write it
 
 
 def split(lines: Sequence[str]) -> tuple[list[list[str]], IntArray]:
     """Split lines into rows of cells, without comments and an empty last column.
 
+    A line that begins with # is a comment, unless it is a header.
+
     Returns:
         rows, and the lines on which they end.
     """
-    lines = ["\n" if _is_comment(line) else line for line in lines]
-    separator = _separator(next((line for line in lines if line.strip()), ""))
+    header = re.compile(r"(^|[^a-z])(frame|image|file|time)(stamp|_?[a-z]+)?\b", re.IGNORECASE)
+    lines = ["\n" if line[:1] == "#" and not header.search(line) else line for line in lines]
+    first = next((line for line in lines if line.strip()), "")
+    separator = max(";\t,", key=first.count)  # else a space
+    data = first.lstrip()[:1] in tuple("+-.0123456789")
+    if len(first.split()) > first.count(separator) + 1 and (data or separator not in first):
+        separator = " "
+    reader: Any = csv.reader(lines, delimiter=separator, strict=True)
     if separator == " ":
-        split = [(line.split(), i) for i, line in enumerate(lines, 1)]
+        pairs = [(line.split(), i) for i, line in enumerate(lines, 1)]
     else:
-        reader: Any = csv.reader(lines, delimiter=separator, strict=True)
-        split = [([cell.strip() for cell in cells], reader.line_num) for cells in reader]
-    kept = [(cells, i) for cells, i in split if any(cells)]
-    rows = [cells for cells, _ in kept]
+        pairs = [([cell.strip() for cell in cells], reader.line_num) for cells in reader]
+    pairs = [(cells, i) for cells, i in pairs if any(cells)]
+    rows = [cells for cells, _ in pairs]
     if rows and rows[0][0] == "#":  # of a header, separated from its first name
         rows[0] = rows[0][1:]
     if rows and len(rows[0]) > 1 and not any(cells[-1] for cells in rows):
         rows = [cells[:-1] for cells in rows]
-    return rows, np.array([i for _, i in kept], np.int64)
+    return rows, np.array([i for _, i in pairs], np.int64)
 
 
 def read_columns(path: Path, roles: Sequence[str] = (), least: int = 0) -> Table:
@@ -193,66 +180,59 @@ def read_columns(path: Path, roles: Sequence[str] = (), least: int = 0) -> Table
     header = () if roles or not rows else _header(rows.pop(0))
     line = line[len(line) - len(rows) :]
     names = header or roles
-    count = len(rows[0]) if rows and not header else len(names)
-    fits = least <= count <= len(names)
-    for cells, at in zip(rows, line.tolist(), strict=True):
-        if len(cells) != count or not fits:
-            expected = str(count) if fits else f"{least} to {len(names)}"
+    count = len(rows[0]) if rows and roles else len(names)
+    for cells, at in zip(rows, line, strict=True):
+        if not least <= len(cells) == count <= len(names):
+            expected = str(count) if least <= count <= len(names) else f"{least} to {len(names)}"
             raise ReobjError(f"{path}, line {at}: {len(cells)} columns, expected {expected}")
-    columns = zip(*rows, strict=True) if rows else [()] * len(names)
-    by_name = {name: list(column) for name, column in zip(names, columns, strict=False)}
-    return Table(path, by_name, line, header=header)
+    columns = map(list, zip(*rows, strict=True)) if rows else ([] for _ in names)
+    return Table(path, dict(zip(names, columns, strict=False)), line, header=header)
 
 
-def _header(cells: Sequence[str]) -> tuple[str, ...]:
+def _header(cells: Sequence[str]) -> list[str]:
     """Normalise the names of columns: without text in brackets or after a semicolon; distinct."""
     text = re.sub(r"\s*[\[(](s|ms|us|ns)[\])]", r"_\1", ",".join(cells).lower())  # unit of a time
     text = re.sub(r"\(.*?\)|\[.*?\]", "", text).split(";")[0]
     names = [re.sub(r"[\s.-]+", "_", name.strip()) for name in text.lstrip("# ").split(",")]
     if "detection_id" in names:  # Roboflow's inference: x, y is the centre
         names = [{"x": "cx", "y": "cy"}.get(name, name) for name in names]
-    return tuple(name if name not in names[:i] else f"column {i}" for i, name in enumerate(names))
+    return [name if name not in names[:i] else f"column {i}" for i, name in enumerate(names)]
 
 
-def _roles(by_name: Mapping[str, list[str]]) -> dict[str, str]:
-    """Return the names of the columns of a CSV by their role."""
+def _box_roles(roles: Collection[str]) -> tuple[str, ...]:
+    """Return the four roles that give the boxes; () if one is missing."""
+    return next((form for form in BOX_FORMS if {*form} <= {*roles}), ())
+
+
+def by_role(table: Table) -> None:
+    """Name the columns of a CSV by their roles.
+
+    Raises:
+        ReobjError: there are no columns of frames or boxes.
+    """
+    cells = table.cells
+    empty = {name for name, column in cells.items() if all(map(_is_empty, column))}
     name_of: dict[str, str] = {}
-    optional = ("id", "score", "class")  # roles whose empty columns count as missing
     for role, names in ALIASES.items():
-        present = [name for name in names.split() if name in by_name]
-        filled = [name for name in present if not all(map(_is_empty, by_name[name]))]
-        used = filled or (present if role not in optional else [])
-        if used:
-            name_of[role] = used[0]
+        present = sorted((name for name in names.split() if name in cells), key=empty.__contains__)
+        if present and not (role in ("id", "score", "class") and present[0] in empty):
+            name_of[role] = present[0]
     form = _box_roles(name_of)
     for role in ("w", "h"):  # without corners, width and height are those of the box
-        if role in form and name_of.get(f"image {role}") == name_of[role]:
-            del name_of[f"image {role}"]
-        elif role not in form:
+        if role not in form:
             name_of.pop(role, None)
-    return name_of
-
-
-def _is_empty(cell: str) -> bool:
-    return cell.lower() in ("", "nan", "none", "null", "na")  # as pandas and others write it
-
-
-def _box_roles(roles: Mapping[str, object]) -> tuple[str, ...]:
-    """Return the four roles that give the boxes; () if one is missing."""
-    return next((form for form in BOX_FORMS if all(role in roles for role in form)), ())
+        elif name_of.get(f"image {role}") == name_of[role]:
+            del name_of[f"image {role}"]
+    missing = ["frame"] * name_of.keys().isdisjoint(("frame", "image", "time"))
+    missing += [role for role in ("x1", "y1", "x2", "y2") if role not in name_of and not form]
+    if missing:
+        raise ReobjError(f"{table.path}, line 1: no column {', '.join(missing)} in the header "
+                         f"{','.join(cells)}: expected one such as frame,x1,y1,x2,y2,score,class"
+                         )  # fmt: skip
+    table.cells = {role: cells[name] for role, name in name_of.items()}
 
 
 # ---- Structure -----------------------------------------------------------------------------------
-
-
-def _head(probe: Probe) -> list[list[str]]:
-    """Return the cells of the first rows of a text table; [] of other files and folders."""
-    if probe.kind != "text" or probe.suffix == ".npz":
-        return []
-    cut = len(probe.lines) > 1 and probe.path.stat().st_size > HEAD_BYTES  # within the last line
-    with contextlib.suppress(csv.Error):
-        return split(probe.lines[: -1 if cut else None])[0]
-    return [probe.lines[0].split(",")]
 
 
 @functools.lru_cache(maxsize=1)
@@ -263,15 +243,18 @@ def forms(probe: Probe) -> frozenset[str]:
     nine columns end in 1, a class and a score, without the names of classes that CVAT writes beside
     them; if all identities are below 0, they are detections, which ground truth is not.
     """
-    rows = _head(probe)
     mot = frozenset({"mot"})
-    if not rows:
+    if probe.kind != "text" or probe.suffix == ".npz":
         empty = not probe.is_dir and not probe.path.read_bytes()[:4096].strip()
         return mot if empty else frozenset()
+    try:
+        rows = split(probe.lines)[0] or [["0"]]
+    except csv.Error:
+        rows = [probe.lines[0].split(",")]
     count = len(rows[0])
-    if not are_numbers(rows[0][:1]):
+    if math.isnan(_number(rows[0][0])):
         return frozenset({"boxer-3d" if "tx_world_object" in rows[0] else "csv"})
-    if count in (17, 18) and not are_numbers(rows[0][2:3]):
+    if count in (17, 18) and math.isnan(_number(rows[0][2])):
         return frozenset({"kitti"})
     if count not in (9, 10) or any(len(cells) != count for cells in rows):
         return mot
@@ -354,77 +337,56 @@ def read_records(source: Source) -> RecordedDetections:
     """Read a JSON list of flat objects (supervision's JSONSink)."""
     records = load_json(source.path)
     names = list(dict.fromkeys(name for record in records for name in record))
+    texts = ([str(r.get(name, "")).strip() for r in records] for name in names)
     header = _header([name.replace(",", " ") for name in names])
-    texts = [["" if r.get(name) is None else str(r[name]).strip() for r in records]
-             for name in names]  # fmt: skip
     by_name = dict(zip(header, texts, strict=True))
     table = Table(source.path, by_name, np.arange(len(records)), "entry", header)
     return _read_named(table, source)
 
 
 def _read_named(table: Table, source: Source) -> RecordedDetections:
-    """Convert a table with named columns to detections.
-
-    Raises:
-        ReobjError: there are no columns of frames or boxes, or a cell is invalid.
-    """
-    by_name = table.cells
-    name_of = _roles(by_name)
-    found = {"frame", "image", "time"} & name_of.keys()
-    if not found or not _box_roles(name_of):
-        missing = ["frame"] * (not found)
-        missing += [role for role in ("x1", "y1", "x2", "y2") if role not in name_of]
-        text = f"no column {', '.join(missing)} in the header {','.join(by_name)}"
-        example = "expected one such as frame,x1,y1,x2,y2,score,class"
-        raise ReobjError(f"{table.path}, line 1: {text}: {example}")
-    table.cells = {role: by_name[name] for role, name in name_of.items()}
-    _drop_empty(table, source)
-    if "id" in table.cells:
-        table.cells["id"] = ["-1" if _is_empty(cell) else cell for cell in table.cells["id"]]
-    # MOTChallenge counts frames from 1; its names of columns begin with bb_
-    usual = 1 if any(name.startswith("bb_") for name in table.header) else 0
-    return _recorded(table, source, usual, _text_classes(table, source, COCO_NAMES))
-
-
-def _recorded(
-    table: Table,
-    source: Source,
-    usual: int,
-    classes: tuple[IntArray, Sequence[str]],
-    **columns: Any,
-) -> RecordedDetections:
-    """Convert a table to detections; usual: number of the first frame."""
-    roles = _box_roles(table.cells)
-    box = table.columns(roles)  # (N, 4)
-    frame = _frames(table, source, usual)
-    scale = np.ones(box.shape)
-    if "image w" in table.cells and "image h" in table.cells:
-        size = table.columns(("image w", "image h"))  # (N, 2)
-        if np.abs(size - (box[:, 2:] - box[:, :2])).max(initial=0) > 1.01:  # else the boxes'
-            scale = source.scale(size, frame >= 0)
-    return source.recorded(
-        frame, box, classes, table.numbers("score") if "score" in table.cells else None,
-        line=table.line, unit=table.unit, form=BOX_FORMS[roles], scale=scale,
-        identity=table.whole("id") if "id" in table.cells else np.empty(0, np.int64), **columns,
-    )  # fmt: skip
-
-
-def _drop_empty(table: Table, source: Source) -> None:
-    """Drop, and count, rows without a box."""
+    """Convert a table with named columns to detections; rows without a box are left out."""
+    by_role(table)
     boxes = [table.cells[role] for role in _box_roles(table.cells)]
     none = np.array([all(map(_is_empty, cells)) for cells in zip(*boxes, strict=True)], bool)
     if none.any():
         first = f"{table.unit} {table.line[none][0]}"
         source.say(f"{none.sum()} rows without a box left out, the first at {first}")
-        rows = np.flatnonzero(~none)
-        table.cells = {role: [cells[i] for i in rows] for role, cells in table.cells.items()}
-        table.line = table.line[rows]
+        table.cells = {role: np.array(cells, object)[~none].tolist()
+                       for role, cells in table.cells.items()}  # fmt: skip
+        table.line = table.line[~none]
+    if "id" in table.cells:
+        table.cells["id"] = ["-1" if _is_empty(cell) else cell for cell in table.cells["id"]]
+    # MOTChallenge counts frames from 1; its names of columns begin with bb_
+    usual = int(any(name.startswith("bb_") for name in table.header))
+    return _recorded(table, source, usual, _text_classes(table, source, COCO_NAMES))
+
+
+def _recorded(
+    table: Table, source: Source, usual: int, classes: tuple[IntArray, Sequence[str]],
+    **columns: Any,
+) -> RecordedDetections:  # fmt: skip
+    """Convert a table to detections; usual: number of the first frame."""
+    roles = _box_roles(table.cells)
+    box = table.columns(roles)  # (N, 4)
+    frame = _frames(table, source, usual)
+    scale = np.ones(box.shape)
+    if {"image w", "image h"} <= table.cells.keys():
+        size = table.columns(("image w", "image h"))  # (N, 2)
+        if np.abs(size - (box[:, 2:] - box[:, :2])).max(initial=0) > 1.01:  # else the boxes'
+            scale = source.scale(size, frame >= 0)
+    if "score" in table.cells:
+        columns["score"] = table.numbers("score")
+    if "id" in table.cells:
+        columns["identity"] = table.whole("id")
+    return source.recorded(frame, box, classes, BOX_FORMS[roles], scale, table.unit,
+                           line=table.line, **columns)  # fmt: skip
 
 
 def _frames(table: Table, source: Source, usual: int) -> IntArray:
     """Return the frames of the source (N,), -1: none."""
     names = table.cells.get("frame", table.cells.get("image"))
-    if "frame" in table.cells and are_numbers(table.cells["frame"]):
+    if "frame" in table.cells and not any(math.isnan(_number(cell)) for cell in names or ()):
         return frames_of_numbers(table.whole("frame"), source, usual)
     if names is not None:
         return frames_of_names(names, source, 0)
@@ -440,15 +402,15 @@ def _frames(table: Table, source: Source, usual: int) -> IntArray:
 def _seconds(table: Table) -> Array:
     """Return the times (N,) of a table in s: of the unit that ends the column's name, else in s."""
     name = next(name for name in ALIASES["time"].split() if name in table.header)
-    per_s = next((unit.value for unit in TimeUnit if name.endswith(f"_{unit.name}")), 1.0)
-    return table.numbers("time") / per_s
+    unit: TimeUnit = getattr(TimeUnit, name.rpartition("_")[2], TimeUnit.s)
+    return table.numbers("time") / unit.value
 
 
 def _nearest_times(times_s: Array, time_s: Array) -> IntArray:
     """Return the rows of the nearest times (N,); -1 beyond half of the usual step (1 s)."""
     if not len(times_s):
         return np.full(len(time_s), -1)
-    half = 0.5 * float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.5
+    half = float(np.median(np.diff(times_s))) / 2 if len(times_s) > 1 else 0.5
     nearest = nearest_of(time_s, times_s)
     return np.where(np.abs(times_s[nearest] - time_s) <= half, nearest, -1)
 
@@ -465,7 +427,7 @@ def _text_classes(table: Table, source: Source, base: Sequence[str]) -> tuple[In
     names = list(source.names or base)
     texts = {cell for cell in cells if not _is_empty(cell) and cell != "-1"}
     if all(re.fullmatch(r"[0-9]{1,18}(\.0*)?", cell) for cell in texts):
-        index = {cell: int(cell.partition(".")[0]) for cell in texts}
+        index = {cell: int(float(cell)) for cell in texts}
     else:
         names += sorted(texts - set(names))
         index = {name: i for i, name in reversed(list(enumerate(names)))}
@@ -524,7 +486,7 @@ class Boxes3D:
 
 def boxes_3d_of(recorded: RecordedDetections | None) -> Boxes3D | None:
     """Return the boxes in 3D of validated detections; None: they have none."""
-    if recorded is None or not len(recorded.boxes_3d):
+    if recorded is None or recorded.boxes_3d is None:
         return None
     index = np.arange(len(recorded)) - np.searchsorted(recorded.frame, recorded.frame)
     return Boxes3D(recorded.frame, index, recorded.boxes_3d, recorded.score)
@@ -546,17 +508,24 @@ def read_source_3d(source: Source) -> RecordedDetections:
     time_s = _seconds(table)
     if source.describes:
         source.times_s = time_s
-        return source.recorded(np.empty(0, np.int64), np.empty((0, 4)), (np.empty(0, np.int64), ()))
-    if source.poses is None:
-        fault = "these are 3D boxes in the world, which need its cameras"
-        raise ReobjError(f"{path}, line 1: {fault}: `run` with --detections and --poses FILE")
+        return source.recorded(np.empty(0, np.int64), (), (np.empty(0, np.int64), ()))
+    poses = source.poses
+    if poses is None:
+        raise ReobjError(f"{path}, line 1: these are 3D boxes in the world, which need its cameras:"
+                         " `run` with --detections and --poses FILE")  # fmt: skip
     box = _boxes(table)
-    known = source.poses.known
-    frames = source.poses.frame[known]
-    times_s = source.poses.time_s[known] if video.times_s is None else video.times_s[frames]
+    frames = poses.frame[poses.known]
+    times_s = poses.time_s[poses.known] if video.times_s is None else video.times_s[frames]
     nearest = _nearest_times(times_s, time_s)
-    xyxy = _projected(box, nearest, source.poses, video.size)
     timed = nearest >= 0
+    xyxy = np.full((len(box), 4), np.nan)
+    img_from_world = poses.camera.K @ poses.cam_from_world[poses.known]  # (F, 3, 4)
+    solids = quadrics.Ellipsoids(box[:, :3], box[:, 3:6], box[:, 6:].reshape(-1, 3, 3))
+    for k in np.unique(nearest[timed]):
+        rows = np.flatnonzero(nearest == k)
+        xyxy[rows] = quadrics.solid_boxes(solids[rows], "box", img_from_world[k : k + 1])[0]
+    size = (poses.camera.width, poses.camera.height)
+    xyxy = quadrics.clip_boxes(distort_boxes(xyxy, poses.camera), size)
     visible = np.isfinite(xyxy[:, 0])
     if len(box) and not visible.any():
         span = f"{time_s.min():.3f} to {time_s.max():.3f} s"
@@ -565,8 +534,9 @@ def read_source_3d(source: Source) -> RecordedDetections:
                          f"time stamp ({poses_span}); expected boxes in the world of --poses"
                          )  # fmt: skip
     recorded = source.recorded(
-        frames[nearest], xyxy, _text_classes(table, source, COCO_NAMES), table.numbers("score"),
-        line=table.line, unit=table.unit, boxes_3d=box,
+        frames[nearest], xyxy, _text_classes(table, source, COCO_NAMES), CORNERS,
+        np.tile(np.divide(video.size, size), 2), table.unit, score=table.numbers("score"),
+        line=table.line, boxes_3d=box,
     )  # fmt: skip
     for left, why in ((~timed, "at times without a frame with a pose"),
                       (timed & ~visible, "outside the image of their frame")):  # fmt: skip
@@ -579,24 +549,11 @@ def _boxes(table: Table) -> Array:
     """Return centre, half extents and rotation (N, 15) of the rows."""
     center, quat, size = np.split(table.columns(BOXES_3D), [3, 7], 1)
     bad = (size <= 0).any(1) | (np.abs(np.linalg.norm(quat, axis=1) - 1) > 0.01)
-    if bad.any():
-        row = int(bad.argmax())
-        raise ReobjError(f"{table.where(row)}: extents {size[row]} and quaternion {quat[row]}, "
-                         "expected extents above 0 and a quaternion of length 1")  # fmt: skip
+    for row in np.flatnonzero(bad)[:1]:
+        raise ReobjError(f"{table.path}, {table.unit} {table.line[row]}: extents {size[row]} and "
+                         f"quaternion {quat[row]}, expected extents above 0 and a quaternion of "
+                         "length 1")  # fmt: skip
     turn = np.empty((0, 3, 3))
     if len(quat):
         turn = Rotation.from_quat(np.roll(quat, -1, 1)).as_matrix()
     return np.hstack([center, size / 2, turn.reshape(-1, 9)])
-
-
-def _projected(box: Array, nearest: IntArray, poses: Poses, video_size: tuple[int, int]) -> Array:
-    """Return the image bounds (N, 4) of boxes (N, 15), NaN: not visible; nearest: known pose."""
-    xyxy = np.full((len(box), 4), np.nan)
-    img_from_world = poses.camera.K @ poses.cam_from_world[poses.known]  # (F, 3, 4)
-    solids = quadrics.Ellipsoids(box[:, :3], box[:, 3:6], box[:, 6:].reshape(-1, 3, 3))
-    for k in np.unique(nearest[nearest >= 0]):
-        rows = np.flatnonzero(nearest == k)
-        xyxy[rows] = quadrics.solid_boxes(solids[rows], "box", img_from_world[k : k + 1])[0]
-    size = (poses.camera.width, poses.camera.height)
-    xyxy = quadrics.clip_boxes(distort_boxes(xyxy, poses.camera), size)
-    return np.asarray(xyxy * np.tile(np.divide(video_size, size), 2))

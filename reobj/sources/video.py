@@ -25,7 +25,6 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from fractions import Fraction
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -38,10 +37,9 @@ from reobj.sources.image_files import (
     IMAGE_FPS,
     IMAGE_SUFFIXES,
     Decoded,
-    ImageList,
     Opened,
+    animation_frames,
     list_images,
-    open_animation,
     open_camera,
     open_file,
     packet_count,
@@ -151,14 +149,13 @@ class Video:
         self.messages: list[str] = []
         self._is_url = _is_stream_url(self._address)
         self.fingerprint = source_fingerprint(source)
-        images = ImageList([], [], []) if self._is_url else list_images(self.source)
-        self.files = images.files
-        for text in images.messages:
+        self.files, usual, said = ([], [], []) if self._is_url else list_images(self.source)
+        for text in said:
             self._warn(text)
         self.names = [path.name for path in self.files]
         self.times_s = times_of_names(self.names)
         self.is_live = self._is_url or (self.source.isdecimal() and not Path(self.source).exists())
-        self.size, self._announced_fps, self._announced = self._probe(images.usual)
+        self.size, self._announced_fps, self._announced = self._probe(usual)
         start = self.config.start
         if start and not self.is_live and not start < self.frame_count:
             raise ReobjError(f"{self.source}: --start {start}, but it has only "
@@ -209,12 +206,18 @@ class Video:
             return packet_count(self._path)
         return len(self._measured()[0])
 
+    @property
+    def _known_times_s(self) -> Array | None:
+        """Times (F,) of images, or of the frames of a file; None: unknown."""
+        if self.files or self.is_live:
+            return self.times_s
+        times_s, known = self._measured()
+        return times_s if known else None
+
     @functools.cached_property
     def fps(self) -> float:
         announced = self._announced_fps
-        times_s = self.times_s
-        if not self.files and not self.is_live and self.times_are_known:
-            times_s = self._measured()[0]
+        times_s = self._known_times_s
         if times_s is None or len(times_s) < 2:
             return announced
         steps = len(times_s) - 1
@@ -224,9 +227,7 @@ class Video:
 
     @functools.cached_property
     def times_are_known(self) -> bool:
-        if self.files or self.is_live:
-            return self.is_live or self.times_s is not None
-        return self._measured()[1]
+        return self.is_live or self._known_times_s is not None
 
     def __iter__(self) -> Iterator[Frame]:
         self.skipped.clear()
@@ -378,7 +379,7 @@ class Video:
             if is_camera:
                 return open_camera(int(self._address), self._live.silent_s)
             if self._is_animation:
-                return open_animation(path)
+                return Opened(animation_frames(path), path.suffix)
             limits = (self._live.open_s, self._live.silent_s) if self._is_url else ()
             return open_file(self._path, *limits)
         except ReobjError as error:
@@ -409,28 +410,22 @@ class Video:
             return (image.shape[1], image.shape[0]), IMAGE_FPS, len(self.files)
         opened = self._open()
         first = itertools.islice(opened.frames, MAX_UNREADABLE)
-        frame = next((frame for frame in first if frame.image is not None), Decoded())
+        frame = next((frame for frame in first if frame.image), Decoded())
         if frame.image is None:
             raise ReobjError(f"{self.source}: no frame can be decoded (codec {opened.codec})")
         self.is_live = self.is_live and not opened.count  # the URL of a file is not live
-        if self.is_live:
-            self._opened = opened
-        else:
-            self._declared_s = opened.duration_s
-            self._set_aspect(opened.pixel_aspect, frame.turned % 180 == 90)
+        self._opened = opened if self.is_live else None
+        self._declared_s = opened.duration_s
+        aspect = 1 / opened.pixel_aspect if frame.turned % 180 == 90 else opened.pixel_aspect
+        if abs(aspect - 1) > 0.01 and not self.is_live:  # less is not visible
+            self.pixel_aspect = float(aspect)
+            self._warn(f"its pixels are {aspect.numerator}:{aspect.denominator}, not square, by "
+                       "its metadata: boxes are in stored pixels, cameras have two focal lengths; "
+                       "if that is wrong, correct its sample aspect ratio (ffmpeg -i IN -vf "
+                       "setsar=1 OUT)")  # fmt: skip
         height, width = frame.image().shape[:2]
         fps = opened.fps if 0 < opened.fps < math.inf else IMAGE_FPS
         return (width, height), fps, opened.count
-
-    def _set_aspect(self, aspect: Fraction, turned: bool) -> None:
-        """Set the aspect ratio of the pixels; warn if they are not square."""
-        aspect = 1 / aspect if turned else aspect
-        if abs(aspect - 1) > 0.01:  # less is not visible
-            self.pixel_aspect = float(aspect)
-            wide, high = aspect.as_integer_ratio()
-            self._warn(f"its pixels are {wide}:{high}, not square, by its metadata: boxes are in "
-                       "stored pixels, cameras have two focal lengths; if that is wrong, correct "
-                       "its sample aspect ratio (ffmpeg -i IN -vf setsar=1 OUT)")  # fmt: skip
 
 
 class ImagelessVideo(Video):
