@@ -38,7 +38,10 @@ def load_class_names(path: str | Path) -> tuple[str, ...]:
     if isinstance(entries := data.get("categories"), list):
         named = [entry for entry in entries if isinstance(entry, dict)]
         data = {"names": {entry.get("id"): entry.get("name") for entry in named}}
-    return names_by_number(data.get("names", data), where)
+    names = names_by_number(given := data.get("names", data), where)
+    if "nc" in data and str(data["nc"]) not in (str(len(names)), str(len(given))):
+        raise ReobjError(f"{path}: nc is {data['nc']}, but there are {len(names)} names")
+    return names
 
 
 def _of_lines(path: Path) -> list[str] | dict[str, str]:
