@@ -70,6 +70,7 @@ class OutputConfig:
 
     overlay: bool = option(True, "write the overlay video, overlay.mp4")
     scene: bool = option(True, "write the viewer, scene.html")
+    cloud: bool = option(False, "dense coloured points in the viewer, from the maps of --depth")
     doubtful: bool = option(
         False, "include low-confidence objects in tracks.txt, overlay video and viewer"
     )

@@ -391,6 +391,8 @@ def _write(job: Job, result: Result) -> Result:
         output.doubtful,
         job.progress("write", job.video.expected),
         command=f"{program(absolute=True)} objects {shlex.quote(str(out.absolute()))}",
+        cloud=output.cloud,
+        depth=job.config.poses.depth,
     )
     if failures:
         result = dataclasses.replace(result, warnings=[*result.warnings, *failures])

@@ -49,6 +49,7 @@ from reobj.types import (
     one_line,
     rows_by,
 )
+from reobj.viewer.cloud import Cloud, DenseFrames, dense_frames
 from reobj.viewer.overlay import Overlay
 
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
@@ -67,9 +68,10 @@ class Pictures:
         frames: [frame number, base64] of whole frames, undistorted.
         best: frame number of the best box of each object, by identity.
         time_s: of each frame that was read, by its number.
+        dense: frames for dense points; None: without.
     """
 
-    def __init__(self, result: Result, video: Video) -> None:
+    def __init__(self, result: Result, video: Video, dense: DenseFrames | None = None) -> None:
         """Choose the crops, at most 8 of an object and 480 of all, and 60 frames."""
         self.tracks = result.tracks
         self.scale = video.scale
@@ -77,6 +79,7 @@ class Pictures:
         self.frames: list[tuple[int, str]] = []
         self.best: dict[int, int] = {}
         self.time_s: dict[int, float] = {}
+        self.dense = dense
         poses = [part.poses for part in result.parts()]
         chosen: list[int] = []
         ranked = sorted(result.objects, key=lambda o: -o.frames_seen)
@@ -105,9 +108,13 @@ class Pictures:
         for obj, box in zip(self.tracks.track_id[rows], self.tracks.xyxy[rows], strict=True):
             if crop := _crop(frame.image, box * self.scale, 112):
                 self.crops[int(obj)].append((frame.index, _base64(crop)))
-        if frame.index in self.whole:
+        is_dense = self.dense is not None and frame.index in self.dense.wanted
+        if is_dense or frame.index in self.whole:
             image = self._undistorted(shrunk(frame.image, 640))
+        if frame.index in self.whole:
             self.frames.append((frame.index, _base64(_jpeg(image))))
+        if self.dense is not None and is_dense:
+            self.dense.take(frame.index, image)
 
     def _undistorted(self, image: Image) -> Image:
         """Undistort a small picture, so that projected solids coincide with their objects."""
@@ -312,12 +319,34 @@ def write_scene(
     if (changes := result.changes) is not None:
         marked = dataclasses.replace(changes, new=()) if changes.made_the_map else changes
         data["changes"] = marked.to_json() | {"summary": changes.summary()}
+    if pictures.dense is not None:
+        clouds = [pictures.dense.cloud(k) for k in range(len(parts))]
+        for entry, origin, cloud in zip(data["parts"], origins, clouds, strict=True):
+            entry |= {} if cloud is None else {"dense": _dense_points(cloud, origin)}
+        if not any(clouds):
+            log.warning("no dense points: the depth maps contradict each other; are units, "
+                        "intrinsics and poses right?")  # fmt: skip
     if result.earlier:
         data["earlier"] = _earlier_sessions(result.earlier)
         for entry in data["objects"]:
             entry["best"] = pictures.best.get(entry["id"])
     with atomic(path) as part:
         part.write_text(_page_of(data, None), encoding="utf-8")
+
+
+def _dense_points(cloud: Cloud, origin: Array) -> dict[str, Any]:
+    """Return dense points for the page.
+
+    Positions are 16-bit integers from `low` in steps of `step` world units, then colours are three
+    bytes, then directions towards the cameras three signed bytes.
+    """
+    xyz = cloud.xyz - origin
+    low = xyz.min(0)
+    step = max(float(np.ptp(xyz, axis=0).max()) / 65535, np.finfo(float).tiny)
+    data = ((xyz - low) / step).round().clip(0, 65535).astype("<u2").tobytes()
+    data += cloud.rgb.tobytes() + (cloud.seen_from * 127).round().astype(np.int8).tobytes()
+    facts = {"count": len(xyz), "low": low.tolist(), "step": step, "voxel": cloud.voxel}
+    return facts | {"data": _base64(data)}
 
 
 def _page_of(data: dict[str, Any], served: dict[str, Any] | None) -> str:
@@ -527,6 +556,8 @@ def write_pictures(
     doubtful: bool = False,
     progress: Progress | None = None,
     command: str = "",
+    cloud: bool = False,
+    depth: str = "",
 ) -> list[str]:
     """Write the overlay video and scene.html in one pass over the video.
 
@@ -538,6 +569,7 @@ def write_pictures(
             contains them, show them initially.
         progress: the line of the stage, whose steps are the frames.
         command: fits the objects again; the viewer shows it with the file of corrections.
+        cloud: dense points in the viewer. depth: folder of the depth maps that they are made from.
     Returns:
         messages about files that could not be written, with the option to omit them. With the
         environment variable REOBJ_RAISE, as in our tests, bugs are raised instead.
@@ -552,7 +584,8 @@ def write_pictures(
                 film = Overlay(shown, out / "overlay.mp4", video)
         if scene:
             with faults.of("scene"):
-                pictures = Pictures(result, video)
+                dense = dense_frames(result.poses, video, depth) if cloud and visible else None
+                pictures = Pictures(result, video, dense)
         sinks = {"overlay": film, "scene": pictures}
         line.complete = False
         try:

@@ -31,6 +31,7 @@ function enter(part) {                           // show one part of the cameras
   $("frame").hidden = true;
   $("list").style.removeProperty("--now");
   $("unit-label").hidden = !level.metres;
+  $("dense-label").hidden = !S.parts[part].dense;
   fillList();
   showOnly([], null);
   if (renderer) { fillScene(); VIEWS.reset(); }
@@ -96,7 +97,7 @@ $("unit").onchange = () => {
   if (o) { select(o); select(o); }
   redraw();
 };
-for (const id of ["solids", "ellipsoids", "names", "points", "cameras", "grid", "boxes"]) {
+for (const id of ["solids", "ellipsoids", "names", "points", "dense", "cameras", "grid", "boxes"]) {
   $(id).onchange = redraw;
 }
 $("doubtful").onchange = () => {
@@ -157,6 +158,7 @@ $("part").hidden = S.parts.length < 2;
 startChanges();
 startSessions();
 $("doubtful").checked = S.doubtful;
+$("points").checked = !S.parts.some((part) => part.dense);   // the same surfaces
 $("doubtful-label").hidden = !S.objects.some((o) => o.status === "doubtful");
 objects = S.objects.map((o) => ({ ...o, ids: [o.id], sources: [o.id] }));
 if (S.why_flat || !prepare()) {

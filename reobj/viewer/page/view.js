@@ -6,7 +6,7 @@ scene.add(root);
 const orbit = new THREE.PerspectiveCamera(50, 1, 0.01, 1000), seat = new THREE.PerspectiveCamera();
 seat.matrixAutoUpdate = false;
 orbit.up.set(0, 0, 1);
-let controls, room, cloud, wires, former, travel, now, floorGrid;
+let controls, room, cloud, dense, wires, former, travel, now, floorGrid;
 const dark = matchMedia("(prefers-color-scheme: dark)");
 const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
@@ -107,6 +107,30 @@ function cloudOf({ at, color }) {                // round points, about 2.5 pixe
   return made;
 }
 
+function denseOf({ count, low, step, voxel, data }) {   // points that are hidden from behind
+  const geometry = new THREE.BufferGeometry(), all = bytes(data);
+  const column = (Type, from, normalized) => new THREE.BufferAttribute(
+    new Type(all.buffer, from, 3 * count), 3, normalized);
+  geometry.setAttribute("position", column(Uint16Array, 0, false));
+  geometry.setAttribute("tint", column(Uint8Array, 6 * count, true));
+  geometry.setAttribute("seen", column(Int8Array, 9 * count, true));
+  const material = new THREE.ShaderMaterial({
+    uniforms: { size: { value: 1.5 * voxel * level.size }, focal: { value: 1 }, pixels: { value: 1 } },
+    vertexShader: `attribute vec3 tint, seen; uniform float size, focal, pixels; varying vec3 shade;
+      void main() { shade = tint; vec4 at = modelMatrix * vec4(position, 1.);
+        vec3 from = mat3(modelMatrix) * seen;
+        gl_Position = dot(from, cameraPosition - at.xyz) < 0. ? vec4(2., 2., 2., 1.)
+          : projectionMatrix * viewMatrix * at;
+        gl_PointSize = pixels * clamp(size * focal / gl_Position.w, 1.2, 14.); }`,
+    fragmentShader: `varying vec3 shade; void main() { gl_FragColor = vec4(shade, 1.); }`,
+  });
+  const made = new THREE.Points(geometry, material), size = step * level.size;
+  const at = level.place(low);
+  made.matrixAutoUpdate = made.frustumCulled = false;
+  made.matrix.set(...[0, 1, 2].flatMap((i) => [...times(level.rows[i], size), at[i]]), 0, 0, 0, 1);
+  return made;
+}
+
 const nice = (x) => { const p = 10 ** Math.floor(Math.log10(x)); return x / p < 2 ? p
   : x / p < 5 ? 2 * p : 5 * p; };
 
@@ -171,6 +195,8 @@ function fillScene() {                           // everything of the part
   [wires, former, travel, now] = [1, 2, 3, 4].map(() => new THREE.Group());
   floorGrid = gridOf();
   root.add(floorGrid, cloud, travel, now, wires, former);
+  dense = S.parts[state.part].dense ? denseOf(S.parts[state.part].dense) : null;
+  if (dense) root.add(dense);
   const ends = [], color = css("--path");
   cams.forEach((c, i) => { if (c && cams[i + 1]) ends.push(...c.at, ...cams[i + 1].at); });
   if (ends.length) travel.add(lines(ends, color, 2, 0.9));
@@ -315,6 +341,11 @@ function draw() {
   }
   drawGhosts(inside);
   cloud.visible = $("points").checked && !inside;
+  if (dense) {
+    dense.visible = $("dense").checked && !inside;
+    dense.material.uniforms.pixels.value = devicePixelRatio;
+    dense.material.uniforms.focal.value = h / 2 / Math.tan(orbit.fov / 360 * Math.PI);
+  }
   cloud.material.uniforms.size.value = Math.max(2.4, Math.min(w, h) / 270);   // of the screen
   cloud.material.uniforms.pixels.value = devicePixelRatio;
   cloud.material.uniforms.reach.value = orbit.position.distanceTo(controls.target);
