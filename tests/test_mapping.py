@@ -238,7 +238,7 @@ def test_a_silent_child_is_shown_to_work(importable, tmp_path, monkeypatch, caps
     with Child(tmp_path / "mapping", tmp_path / "log") as child:
         assert child.run(Sleep(1.2), Progress) == "done"
     lines = capsys.readouterr().err.splitlines()
-    assert any(line.startswith("second mapper ") and "[00:0" in line for line in lines)
+    assert any(line.startswith("second mapper:") and "[00:0" in line for line in lines)
 
 
 PARENT = """
