@@ -20,7 +20,7 @@ def wall(width, per_metre=150, seed=0):
 
 
 class PointWorld:
-    """Points that K cameras observe, without any image.
+    """Points with descriptors that K cameras observe, without any image.
 
     Image k has the id k + 1; its keypoints are the observed points, with noise.
 
@@ -36,6 +36,8 @@ class PointWorld:
         self.camera = world.camera
         self.points = points
         self.cams = np.asarray(cams)
+        self.descriptors = rng.integers(0, 256, (len(points), 128)).astype(np.uint8)
+        self.descriptors //= rng.integers(1, 9, (len(points), 128)).astype(np.uint8)
         self.observed = []
         self.xy = []
         for cam in self.cams:
@@ -97,7 +99,7 @@ class PointWorld:
         return inverse.T @ np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ motion[:3, :3] @ inverse
 
     def write(self, database, ids, pairs=None):
-        """Write images with keypoints, and verified matches, into a database."""
+        """Write images with keypoints and descriptors, and verified matches, into a database."""
         with contextlib.closing(pycolmap.Database.open(str(database))) as db:
             if not db.exists_camera(1):
                 camera = self.camera.to_pycolmap()
@@ -113,6 +115,9 @@ class PointWorld:
                 frame.add_data_id(image.data_id)
                 db.write_frame(frame, use_frame_id=True)
                 db.write_keypoints(number, self.xy[number - 1].astype(np.float32))
+                rows = self.descriptors[self.observed[number - 1]]
+                sift = pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, rows)
+                db.write_descriptors(number, sift)
             for row, pair in enumerate([] if pairs is None else pairs.image_ids.tolist()):
                 geometry = pycolmap.TwoViewGeometry()
                 geometry.config = pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED

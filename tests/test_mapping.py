@@ -43,6 +43,7 @@ def job_of(folder, images, ids=None, **changes):
             "camera": None,
             "focal_guess": FOCAL_GUESS,
             "seed": 0,
+            "view_of": {},
         }
         | changes
     )

@@ -10,7 +10,7 @@ import contextlib
 import dataclasses
 import itertools
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -112,9 +112,9 @@ def estimate_poses(
     with Child(folder, work_dir / "pycolmap.log") as child:
         made = _Reconstruction(video, config, boxes_to_mask, child, progress)
         keys = made.keyframes()
-        best = made.attempt(keys)
+        best = made.attempt(keys, {})
         if extra := made.add_keyframes(sorted({*best.more_keyframes()} - {*keys})):
-            second = made.attempt(sorted([*keys, *extra]))
+            second = made.attempt(sorted([*keys, *extra]), best.mapped.view_of)
             best = second if second.pairs > best.pairs else best
     for k, model in enumerate(best.mapped.models):
         model.replace(part_path(work_dir / "sparse", k))
@@ -189,8 +189,8 @@ class _Reconstruction:
                 added.append(frame.row)
         return added
 
-    def attempt(self, keys: list[int]) -> _Attempt:
-        """Map keyframes (rows) and locate all frames."""
+    def attempt(self, keys: list[int], view_of: Mapping[int, int]) -> _Attempt:
+        """Map keyframes (rows) and locate all frames; view_of: of an attempt with fewer."""
         frames = self.resized.frames
         known = self.video.names
         names = [str(known[i]) if known else f"frame_{i:06d}.jpg" for i in frames]
@@ -203,6 +203,7 @@ class _Reconstruction:
             camera=self.camera,
             focal_guess=_exif_focal(self.video) or FOCAL_GUESS,
             seed=self.config.seed,
+            view_of=view_of,
         )
         mapped = reconstruct(job, self.child, self.progress)
         models = [read_sparse_model(model) for model in mapped.models]

@@ -1,7 +1,9 @@
 """Features and matches of keyframes in a pycolmap database, and the focal length from matches.
 
 RootSIFT by OpenCV; pairs in sequence and by retrieval, or by supplied poses; verification by
-pycolmap. Results in the database are kept, so that keyframes can be added.
+pycolmap. Results in the database are kept, so that keyframes can be added. Keyframes that repeat
+the view of an earlier one are not mapped but registered by PnP afterwards: they add little to a
+model, and a mapper takes longer for each image in it.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from reobj.cameras import import_pycolmap
-from reobj.poses.bundle import FOCAL_RANGE
+from reobj.poses.bundle import FOCAL_RANGE, INLIER_PX
 from reobj.types import Array, BoolArray, Floats, Image, IntArray
 
 
@@ -104,13 +106,14 @@ MIN_MATCHES = 30  # verified matches of a pair that count as evidence (COLMAP re
 
 
 def choose_pairs(
-    ids: Sequence[int], vlad: Floats, retrieved: int = RETRIEVED
+    path: Sequence[int], ids: Sequence[int], vlad: Floats, retrieved: int = RETRIEVED
 ) -> list[tuple[int, int]]:
     """Choose all pairs of a few keyframes, else sequential pairs and retrieved ones.
 
     Sequential: COLMAP's quadratic overlap.
 
     Args:
+        path: ids along the path of the camera, which may pass a keyframe several times.
         ids: of the keyframes, in the order of time. vlad: (K, D) of `vlad_vectors`.
         retrieved: most similar keyframes of each.
     """
@@ -118,6 +121,8 @@ def choose_pairs(
     if count <= ALL_PAIRS:
         return list(itertools.combinations(ids, 2))
     pairs = {(ids[i], ids[i + (1 << k)]) for k in range(12) for i in range(count - (1 << k))}
+    for offset in (1, 2, 4):  # neighbours where the path comes back to earlier keyframes
+        pairs |= set(zip(path[:-offset], path[offset:], strict=True))
     if vlad.shape[1]:  # the most similar keyframes close loops
         similarity = vlad @ vlad.T  # (K, K)
         order = np.arange(count)
@@ -133,7 +138,7 @@ def match_pairs(
     """Match pairs of images and verify them by two-view geometry; verified pairs are skipped.
 
     Args:
-        pairs: ids of images in the database. stage: of the line of progress.
+        pairs: ids of images in the database. stage: of the line of progress; "": none.
     """
     pc = import_pycolmap()
     listed = database.parent / "pairs.txt"
@@ -145,7 +150,7 @@ def match_pairs(
     ransac.dyn_num_trials_multiplier = 1.0
     with open_database(database) as db:
         todo = [pair for pair in pairs if not db.exists_two_view_geometry(*pair)]
-    if todo:
+    if stage and todo:
         send_progress(stage, 0, len(todo))
     unit: dict[int, Floats] = {}
     step = 100  # pairs between two lines of progress; their descriptors are in memory
@@ -160,7 +165,8 @@ def match_pairs(
                     db.write_matches(*pair, match)
             listed.write_text("".join(f"{i:06d} {j:06d}\n" for i, j in chunk), encoding="utf-8")
             pc.verify_matches(str(database), str(listed), verification)
-            send_progress(stage, start + len(chunk), len(todo))
+            if stage:
+                send_progress(stage, start + len(chunk), len(todo))
 
 
 def _descriptors(db: Any, number: int) -> Image:
@@ -372,3 +378,93 @@ def focal_from_pairs(pairs: MatchedPairs, size: tuple[int, int]) -> float | None
     best = int(cost.argmin())
     is_inside = 0 < best < len(cost) - 1
     return float(tried[best]) if is_inside else None
+
+
+# ---- Repeated views ------------------------------------------------------------------------------
+
+
+MAP_ALL_OF = 100  # keyframes up to which all are mapped: it takes a minute
+# Median displacement of the matches, over the width: half of that between consecutive keyframes
+REPEATED_FLOW = 0.06
+REPEATED_MATCHES = 3 * MIN_MATCHES  # verified ones, which register a keyframe with certainty
+CANDIDATES = 3  # most similar mapped keyframes with which one is compared
+BLOCK = 32  # keyframes that are compared at once with those mapped before them
+
+
+def find_repeated(
+    database: Path,
+    ids: Sequence[int],
+    width: int,
+    seed: int,
+    before: Mapping[int, int],
+    map_all_of: int = MAP_ALL_OF,
+    block: int = BLOCK,
+) -> dict[int, int]:
+    """Find for each keyframe the earlier mapped one whose view it repeats.
+
+    Args:
+        ids: of keyframes, in the order of time, whose features are in the database.
+        width: of the images, px.
+        before: result of an earlier attempt with fewer keyframes, or empty. The others were added
+            where the steps between these were too wide: they are mapped.
+    Returns:
+        by id: the keyframe whose view is repeated; its own id: it is to be mapped.
+    """
+    if before or len(ids) <= map_all_of:
+        return {number: before.get(number, number) for number in ids}
+    view_of = {number: number for number in ids}
+    vlad = vlad_vectors(database, ids, visual_words(database, ids, seed))  # (K, D)
+    mapped = np.empty(0, np.int64)  # rows of `ids`
+    for start in range(0, len(ids), block):
+        some = ids[start : start + block]
+        similarity = vlad[start : start + block] @ vlad[mapped].T
+        ranked = mapped[np.argsort(-similarity, axis=1, kind="stable")[:, :CANDIDATES]]
+        pairs = [(ids[j], i) for i, rows in zip(some, ranked.tolist(), strict=True) for j in rows]
+        match_pairs(database, pairs, seed, stage="")
+        least = dict.fromkeys(some, REPEATED_FLOW * width)
+        with open_database(database) as db:
+            for view, number in pairs:
+                if (flow_px := _median_flow(db, view, number)) < least[number]:
+                    least[number] = flow_px
+                    view_of[number] = view
+        new = [k for k, i in enumerate(some, start) if view_of[i] == i]
+        mapped = np.append(mapped, np.array(new, np.int64))
+        send_progress("views", start + len(some), len(ids))
+    return view_of
+
+
+def _median_flow(db: Any, one: int, other: int) -> float:
+    """Return the median displacement of the verified matches, px; infinite with too few."""
+    matches = np.asarray(db.read_two_view_geometry(one, other).inlier_matches, np.int64)
+    if len(matches) < REPEATED_MATCHES:
+        return float("inf")
+    ends = zip((one, other), matches.T, strict=True)
+    start, end = (np.asarray(db.read_keypoints(i))[rows, :2] for i, rows in ends)
+    return float(np.median(np.linalg.norm(start - end, axis=1)))
+
+
+def register(model: Any, database: Path, ids: Sequence[int], seed: int) -> list[int]:
+    """Register images in a model by PnP on its points, which do not change.
+
+    Args:
+        model: `pycolmap.Reconstruction`; gets the images. ids: of images with verified matches.
+    Returns:
+        those that were registered.
+    """
+    pc = import_pycolmap()
+    names = {f"{number:06d}" for number in {*model.reg_image_ids(), *ids}}
+    with open_database(database) as db:
+        initial = db.read_camera(1)
+        db.update_camera(model.camera(1))  # a cache takes it from the database
+        cache = pc.DatabaseCache.create(db, pc.DatabaseCacheOptions({"image_names": names}))
+        db.update_camera(initial)
+    mapper = pc.IncrementalMapper(cache)
+    mapper.begin_reconstruction(model)
+    kept = {"abs_pose_refine_focal_length": False, "abs_pose_refine_extra_params": False}
+    least = {"abs_pose_min_num_inliers": MIN_MATCHES, "abs_pose_min_inlier_ratio": 0.5}
+    limits = {"abs_pose_max_error": INLIER_PX, "num_threads": 1, "random_seed": seed}
+    options = pc.IncrementalMapperOptions(kept | least | limits)
+    matched = [number for number in ids if cache.exists_image(number)]  # it has no others
+    registered = [number for number in matched if mapper.register_next_image(options, number)]
+    mapper.end_reconstruction(False)
+    return registered

@@ -36,8 +36,10 @@ from reobj.poses.features import (
     choose_pairs,
     choose_posed_pairs,
     extract_features,
+    find_repeated,
     match_pairs,
     read_pairs,
+    register,
     send_progress,
     visual_words,
     vlad_vectors,
@@ -178,11 +180,13 @@ class Mapped:
         models: folders of COLMAP models, one for each component of the trajectory, the largest
             first; in native pixels, with the given image names. messages: for the user.
         unmatched: ids of keyframes without a verified match with another one.
+        view_of: as of `find_repeated`.
     """
 
     models: list[Path]
     messages: list[str]
     unmatched: frozenset[int] = frozenset()
+    view_of: Mapping[int, int] = dataclasses.field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,6 +199,8 @@ class MappingJob:
         boxes_of: (N, 4) xyxy of moving objects by id, native pixels: no features there.
         size: (w, h), native. camera: kept as it is; None: calibrated.
         focal_guess: over the longer side, used where it cannot be estimated from the matches.
+        view_of: of an earlier attempt with fewer keyframes (`Mapped`); its features and matches
+            are in the folder.
     """
 
     images: ImageFile
@@ -205,12 +211,10 @@ class MappingJob:
     camera: Camera | None
     focal_guess: float
     seed: int
+    view_of: Mapping[int, int]
 
     def work(self, folder: Path) -> Mapped:
-        """Reconstruct the keyframes into COLMAP models in the folder (child process).
-
-        Features and matches of an earlier attempt with fewer keyframes are in the folder.
-        """
+        """Reconstruct the keyframes into COLMAP models in the folder (child process)."""
         database = folder / "database.db"
         height, width = self.images.shape[:2]
         size = (width, height)
@@ -225,23 +229,34 @@ class MappingJob:
         scale = np.tile(np.array(size) / self.size, 2)
         boxes = {number: xyxy * scale for number, xyxy in self.boxes_of.items()}
         extract_features(database, self.images, ids, boxes, camera)
-        vlad = vlad_vectors(database, ids, visual_words(database, ids, self.seed))
-        match_pairs(database, choose_pairs(ids, vlad), self.seed)
-        pairs = read_pairs(database)
-        if not pairs.in_order(ids):
-            match_pairs(database, choose_pairs(ids, vlad, UNORDERED), self.seed, "match again")
-            pairs = dataclasses.replace(read_pairs(database), is_path=False)
+        view_of = find_repeated(database, ids, width, self.seed, self.view_of)
+        mapped = sorted(set(view_of.values()))
+        vlad = vlad_vectors(database, mapped, visual_words(database, mapped, self.seed))
+        path = list(view_of.values())
+        match_pairs(database, choose_pairs(path, mapped, vlad), self.seed)
+        every_pair = read_pairs(database)
+        is_path = every_pair.in_order(mapped)
+        if not is_path:
+            more = choose_pairs(path, mapped, vlad, UNORDERED)
+            match_pairs(database, more, self.seed, "match again")
+            every_pair = read_pairs(database)
+        pairs = dataclasses.replace(every_pair.only(mapped), is_path=is_path)
         focal = Focal(guess, FocalSource.GIVEN)
         if self.camera is None:
             focal = estimate_focal(pairs, size, guess)
-        frames = dict(self.frame_of)
+        frames = {number: self.frame_of[number] for number in mapped}
         models, messages = map_keyframes(MapperSearch(database, frames, pairs, focal, self.seed))
+        for model in models:
+            inside = set(model.reg_image_ids())
+            repeated = [i for i in ids if view_of[i] in inside and view_of[i] != i]
+            register(model, database, repeated, self.seed)
         new = Path(tempfile.mkdtemp(dir=folder))
         paths = [new / str(k) for k in range(len(models))]
         for model, out in zip(models, paths, strict=True):
             self._write(model, out)
-        matched = pairs.image_ids[pairs.enough]
-        return Mapped(paths, messages, frozenset(set(ids) - set(matched.ravel().tolist())))
+        matched = every_pair.image_ids[every_pair.enough]
+        unmatched = frozenset(set(ids) - set(matched.ravel().tolist()))
+        return Mapped(paths, messages, unmatched, view_of)
 
     def _write(self, model: Any, folder: Path) -> None:
         """Write a model in native pixels with the frames' names and coloured points."""
