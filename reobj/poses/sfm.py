@@ -410,7 +410,7 @@ def triangulate(
     if isinstance(found, str):
         return _without_points(poses, f"the triangulation {found}")
     arrays, pairs, rays = found
-    check(rows, *_matched_rays(pairs, rays))
+    explained = check(rows, *_matched_rays(pairs, rays))
     image, point = arrays["visibility"].T
     views = np.bincount(point)[point]  # (M,) of the observed point
     # rays of two views often intersect by chance, as with sideways motion in another order
@@ -419,11 +419,13 @@ def triangulate(
     keypoints = np.concatenate([np.empty((0, 2), np.int64), *pairs.inliers])
     matched = len(np.unique(np.column_stack([ends.ravel(), keypoints.ravel()]), axis=0))
     if triangulated <= MIN_TRIANGULATED * matched:
+        cause = "are the poses of this video, in this order, with this camera?"
+        if explained > 0.5:  # of right poses .6 and more
+            cause = "the poses agree with the matches: too few views, or too little parallax"
         return _without_points(
             poses,
             f"with the supplied poses only {triangulated} of {matched} matched features of "
-            f"{count} images triangulate (usual: half of them); are the poses of this video, in "
-            "this order, with this camera? else there are too few views, or too little parallax",
+            f"{count} images triangulate (usual: half of them); {cause}",
         )
     arrays["visibility"] = np.column_stack([rows[image], point])
     messages = (*poses.messages, *_inconsistent(arrays.pop("ties"), poses.frame[rows]))
