@@ -53,20 +53,21 @@ def look_at(centre, target):
 def motion(kind, count=60):
     """cam_from_world (F, 3, 4) of a hand-held camera."""
     s = np.linspace(0, 1, count)
-    zero = 0 * s
-    ahead = np.array([0, 4, -0.8])
-    centres, targets = {
-        "orbit": ([3 * np.cos(2.5 * s), 3 * np.sin(2.5 * s), 1.5 + zero], None),
-        "walk": ([4 * s - 2, zero - 4, 1.5 + zero], ahead),
-        "pan": (
-            [0.6 * s, -0.5 + 0.3 * s, 1.5 + 0.1 * np.sin(9 * s)],
-            np.column_stack([3 * np.cos(4 * s), 3 * np.sin(4 * s), zero - 0.8]),
-        ),
-        "forward": ([0.1 * np.sin(9 * s), -4 + 3 * s, 1.5 + zero], np.array([0, 4, -0.5])),
-        "still": ([0.01 * s, zero - 4, 1.5 + zero], ahead),
-    }[kind]
-    centres = np.column_stack(centres)
-    targets = np.zeros((count, 3)) if targets is None else centres + targets
+    if kind == "orbit":
+        centres = np.column_stack([3 * np.cos(2.5 * s), 3 * np.sin(2.5 * s), 1.5 + 0 * s])
+        targets = np.zeros((count, 3))
+    elif kind == "walk":
+        centres = np.column_stack([4 * s - 2, -4 + 0 * s, 1.5 + 0 * s])
+        targets = centres + np.array([0, 4, -0.8])
+    elif kind == "pan":
+        centres = np.column_stack([0.6 * s, -0.5 + 0.3 * s, 1.5 + 0.1 * np.sin(9 * s)])
+        targets = centres + np.column_stack([3 * np.cos(4 * s), 3 * np.sin(4 * s), -0.8 + 0 * s])
+    elif kind == "forward":
+        centres = np.column_stack([0.1 * np.sin(9 * s), -4 + 3 * s, 1.5 + 0 * s])
+        targets = centres + np.array([0, 4, -0.5])
+    else:  # nearly still
+        centres = np.column_stack([0.01 * s, -4 + 0 * s, 1.5 + 0 * s])
+        targets = centres + np.array([0, 4, -0.8])
     wobble = 0.3 * np.column_stack([np.sin(11 * s), np.cos(7 * s), np.sin(5 * s)])  # hand-held
     return np.array(
         [look_at(c, t) for c, t in zip(centres, targets + wobble * (kind != "still"), strict=True)]
@@ -171,4 +172,9 @@ def arc(count: int) -> np.ndarray:
     """cam_from_world (F, 3, 4) on an arc of 90 degrees around the origin, z up, 3.5 m off."""
     angle = np.radians(np.linspace(-45, 45, count))
     eye = np.stack([3.5 * np.sin(angle), -3.5 * np.cos(angle), np.full(count, 1.6)], 1)
-    return np.array([look_at(e, np.array([0, 0, 0.4])) for e in eye])
+    forward = [0, 0, 0.4] - eye
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    right = np.cross(forward, [0, 0, 1.0])
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    turn = np.stack([right, np.cross(forward, right), forward], 1)  # (F, 3, 3)
+    return np.concatenate([turn, -turn @ eye[:, :, None]], 2)

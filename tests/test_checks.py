@@ -104,6 +104,14 @@ def test_the_axes_of_the_file_are_named_not_those_of_the_reading():
         check_matches(given, False, *matches(cams, 0.5))
 
 
+@pytest.mark.parametrize("kind", ["orbit", "pan"])
+def test_poses_of_other_frames_fit_in_no_convention(kind):
+    cams = motion(kind)
+    shuffled = np.random.default_rng(0).permutation(cams)
+    with pytest.raises(rt.ReobjError, match="fit in no convention"):
+        check_matches(Supplied(supplied(shuffled)), False, *matches(cams, 0.5))
+
+
 @pytest.mark.parametrize("kind", ["orbit", "walk", "forward"])
 @pytest.mark.parametrize("step", [2, 3])
 def test_another_number_of_poses_than_one_a_frame_is_named(kind, step):

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import struct
 
+import cv2
 import numpy as np
 import pytest
-from PIL import Image
 from pose_worlds import FakeVideo, ate_percent, blank, textured_room
 
 import reobj_track as rt
 from reobj.poses import estimate
-from reobj.poses.estimate import rows_to_add
+from reobj.poses.estimate import rows_around_breaks
 from reobj.poses.sfm import Mapped
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -78,6 +79,15 @@ def test_options_reach_the_reconstruction(walk, tmp_path, monkeypatch):
 # ---- Failures ------------------------------------------------------------------------------------
 
 
+def test_a_smaller_step_is_advised_first(tmp_path):
+    """Of every sixth frame some do not connect: two rooms."""
+    video = FakeVideo(textured_room(5, 3.0)[0] + textured_room(4, 3.0, seed=5)[0])
+    video.config = rt.InputConfig(every=6)
+    first, *others = rt.estimate_poses(video, config(), tmp_path).messages
+    assert "--every 6" in first and "--every 3" in first and others
+    assert not any("--every" in text for text in others)
+
+
 @pytest.mark.parametrize(
     "images, message",
     [
@@ -107,21 +117,24 @@ def test_empty_video_and_live_camera_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "components, lost, steps",
+    "parts, steps",
     [
-        ([[0, 30, 60, 90, 120, 150]], [], []),  # nothing broke
-        ([[0, 30, 60], [90, 120, 150]], [], [1, 2, 3]),  # between, and one on each side
-        ([[0, 30, 60, 120, 150]], [], [1, 2, 3, 4]),  # a keyframe in no component
-        ([[30, 60, 90, 120, 150]], [], [0, 1]),  # the first
-        ([[0, 30, 60, 90, 120]], [], [3, 4]),  # the last
-        ([[0, 30, 60, 90, 120, 150]], range(31, 60), [1]),  # no frame between was located
+        ([[0, 30, 60, 90, 120, 150]], []),  # nothing broke
+        ([[0, 30, 60], [90, 120, 150]], [1, 2, 3]),  # between, and one on each side
+        ([[0, 30, 60, 120, 150]], [1, 2, 3, 4]),  # a keyframe in no component
+        ([[30, 60, 90, 120, 150]], [0, 1]),  # the first
+        ([[0, 30, 60, 90, 120]], [3, 4]),  # the last
     ],
 )
-def test_more_keyframes_where_frames_have_no_pose(components, lost, steps):
+def test_more_keyframes_around_breaks(parts, steps):
     """At most eight in each step, evenly spread."""
-    keys = np.arange(0, 151, 30)
-    found = rows_to_add(keys, [np.array(rows) for rows in components], np.array(lost, int))
+    found = rows_around_breaks([0, 30, 60, 90, 120, 150], [np.array(part) for part in parts])
     assert found == [30 * k + row for k in steps for row in (3, 7, 10, 13, 17, 20, 23, 27)]
+
+
+def test_no_keyframes_between_adjacent_rows():
+    parts = [np.array([0, 1, 2]), np.array([5, 6])]
+    assert rows_around_breaks([0, 1, 2, 5, 6], parts) == [3, 4]
 
 
 def test_a_broken_reconstruction_is_repeated_with_more_keyframes(walk, tmp_path, monkeypatch):
@@ -156,14 +169,22 @@ def test_a_broken_reconstruction_is_repeated_with_more_keyframes(walk, tmp_path,
 # ---- EXIF ----------------------------------------------------------------------------------------
 
 
+def photo_with_exif(path, image, focal_35mm):
+    """Write a JPEG whose EXIF says FocalLengthIn35mmFilm."""
+    number = struct.pack("<H", 1)
+    tiff = b"II*\0\x08\0\0\0" + number + struct.pack("<HHII", 0x8769, 4, 1, 26) + bytes(4)
+    tiff += number + struct.pack("<HHIHH", 0xA405, 3, 1, focal_35mm, 0) + bytes(4)
+    data = cv2.imencode(".jpg", image)[1].tobytes()
+    head = b"Exif\0\0" + tiff
+    path.write_bytes(data[:2] + b"\xff\xe1" + struct.pack(">H", len(head) + 2) + head + data[2:])
+
+
 @pytest.mark.parametrize("focal_35mm", [48, 0])
 def test_the_exif_focal_length_replaces_the_default_guess(tmp_path, monkeypatch, focal_35mm):
     """COLMAP: 48 mm of a film whose diagonal is 43.27 mm."""
     (tmp_path / "photos").mkdir()
-    exif = Image.Exif()
-    exif[0x8769] = {0xA405: focal_35mm}  # FocalLengthIn35mmFilm
     for i, image in enumerate(textured_room(3, 0.5)[0]):
-        Image.fromarray(image).save(tmp_path / "photos" / f"{i}.jpg", exif=exif)
+        photo_with_exif(tmp_path / "photos" / f"{i}.jpg", image, focal_35mm)
     video = rt.Video(tmp_path / "photos")
     guess = seen_job(monkeypatch, video, tmp_path / "work")[0].focal_guess
     exif = 48 / np.hypot(36, 24) * np.hypot(480, 360) / 480

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from pose_worlds import motion, supplied
 from scipy.spatial.transform import Rotation
+from simulated import walk
 
 import quadrics
 import reobj_track as rt
@@ -66,6 +67,19 @@ def test_the_floor_is_found_within_its_sigma(noise, on_floor, tilt_deg):
     assert np.mean(np.abs(errors) < 2) >= 0.85
 
 
+def test_unit_and_axes_of_the_world_do_not_matter():
+    turn = Rotation.from_euler("zyx", [30, 100, -20], degrees=True)
+    points, centres = room(), cameras()
+    plain, _ = find_floor(points, UP, centres, 1.0)
+    moved, _ = find_floor(
+        20 * turn.apply(points) + 7, turn.apply(UP), 20 * turn.apply(centres) + 7, 0.05
+    )
+    assert plain is not None and moved is not None
+    np.testing.assert_allclose(moved.normal, turn.apply(plain.normal), atol=2e-3)
+    np.testing.assert_allclose(moved.middle, 20 * turn.apply(plain.middle) + 7, atol=0.1)
+    assert moved.sigma == pytest.approx(20 * plain.sigma, rel=0.3)
+
+
 def table_top(size=0.7):
     """A table top with objects on it, and nothing else."""
     rng = np.random.default_rng(0)
@@ -94,6 +108,16 @@ def test_scenes_without_a_floor(points, centres, metres, reason):
     floor, why = find_floor(points, UP, centres, metres)
     assert floor is None
     assert any(part in why for part in reason.split("|")), why
+
+
+def test_a_table_top_is_not_the_floor_if_the_floor_is_visible():
+    """The cameras are near the table; a strip of floor beside it is enough."""
+    rng = np.random.default_rng(0)
+    strip = np.column_stack([rng.uniform([-2, 0.8], [2, 2], (250, 2)), rng.normal(0, 0.005, 250)])
+    points = np.concatenate([table_top() + TABLE, strip])
+    floor, why = find_floor(points, UP, ORBIT + TABLE, 1.0)
+    assert floor is not None, why
+    assert abs(floor.normal @ [0, 1.4, 0] - floor.offset) < 0.02
 
 
 # ---- From poses, and in a result -----------------------------------------------------------------
@@ -153,3 +177,9 @@ def test_every_component_has_its_own_floor():
     assert back.to_json() == world.to_json()
     np.testing.assert_array_equal(back.parts[1].floor.middle, world.parts[1].floor.middle)
     assert describe_world(poses_in_two_parts(), [fit, None], []).parts[1].floor is None
+
+
+def test_the_reason_for_a_missing_floor_is_saved():
+    world = describe_world(poses_in_room(metric=False), [None], [])
+    assert world.floor is None and "scale is unknown" in world.floor_reason
+    assert "0 points" in describe_world(walk(4), [None], []).floor_reason

@@ -1,4 +1,4 @@
-"""Frames between keyframes: PnP, tracked points, gaps, on exactly rendered scenes."""
+"""Frames between keyframes: PnP, tracked points, jumps, gaps, on exactly rendered scenes."""
 
 from __future__ import annotations
 
@@ -116,6 +116,35 @@ def test_frames_are_not_located_beyond_an_unregistered_keyframe():
     assert status.tolist() == ["none", "pnp", "keyframe", "pnp", "none", "none"]
 
 
+def test_frames_without_the_points_are_lost():
+    cams = sideways(9)
+    images = [WORLD.image(c) for c in cams]
+    images[3:6] = [np.full_like(images[0], 128)] * 3
+    _, status = locate(cams, [0, 8], images)
+    assert status.tolist() == ["keyframe", "pnp", "pnp", *["none"] * 3, "pnp", "pnp", "keyframe"]
+
+
+@pytest.mark.parametrize("aside, status", [(0.0, "pnp"), (0.03, "pnp"), (0.3, "none")])
+def test_a_frame_far_from_both_neighbours_is_refused(aside, status):
+    """Steps are 2 cm: an offset of 3 cm is camera shake, one of 30 cm a jump."""
+    cams = sideways(11)
+    moved = cams.copy()
+    moved[5, :, 3] -= cams[5, :, :3] @ [0, aside, 0]
+    found, seen = locate(cams, [0, 10], [WORLD.image(c) for c in moved])
+    assert seen.tolist() == ["keyframe", *["pnp"] * 4, status, *["pnp"] * 4, "keyframe"]
+    assert np.isnan(found[5]).all() == (status == "none")
+    if status == "pnp":
+        np.testing.assert_allclose(centres(found[5]), centres(moved[5]), atol=0.004)
+
+
+def test_a_reversal_of_the_camera_is_no_jump():
+    """The neighbours of the farthest frame progress a position; it is a usual step away."""
+    cams = sideways(6, step=0.04)
+    there_and_back = cams[[0, 1, 2, 3, 2, 1, 0]]
+    _, status = locate(there_and_back, [0, 6])
+    assert status.tolist() == ["keyframe", *["pnp"] * 5, "keyframe"]
+
+
 # ---- Gaps ----------------------------------------------------------------------------------------
 
 
@@ -127,7 +156,7 @@ def filled(cams, lost, left_out=(), frame=None, time_s=None):
     known[lost], status[lost] = np.nan, "none"
     time_s = frame / 30 if time_s is None else time_s
     located = Located(true_model(cams, keys), keys, known, status)
-    return fill_gaps(located, frame, time_s, 1.0, np.array(left_out, int))
+    return fill_gaps(located, frame, time_s, 1.0, left_out)
 
 
 def test_gaps_of_an_even_motion_are_filled_and_never_beyond():

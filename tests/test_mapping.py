@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from point_worlds import PointWorld, wall
-from pose_worlds import ate_percent, sideways, textured_room
+from pose_worlds import DotWorld, ate_percent, sideways, textured_room
 
 import reobj_track as rt
 from reobj.cameras import read_sparse_model
@@ -30,7 +30,7 @@ pycolmap = pytest.importorskip("pycolmap")
 def job_of(folder, images, ids=None, **changes):
     """A job whose frames are numbered by tens."""
     ids = range(1, len(images) + 1) if ids is None else ids
-    file = ImageFile(folder / "keyframes")
+    file = ImageFile(folder / "keyframes.raw")
     for number, image in zip(ids, images, strict=True):
         file.add(number, image)
     return MappingJob(
@@ -42,6 +42,7 @@ def job_of(folder, images, ids=None, **changes):
             "size": images[0].shape[1::-1],
             "camera": None,
             "focal_guess": FOCAL_GUESS,
+            "is_video": True,
             "seed": 0,
             "view_of": {},
         }
@@ -97,6 +98,38 @@ def test_a_given_camera_is_kept_and_boxes_have_no_features(walk, tmp_path):
     assert model.obs_xy.max() > 340 and model.obs_xy[:, 0].min() > 150
 
 
+def test_features_lie_on_the_dots(tmp_path):
+    """Dots at known positions. OpenCV's SIFT is off by a quarter of a pixel (it halves the
+    coordinates of an upsampled image); COLMAP's half pixel is a separate convention.
+    """
+    world = DotWorld(count=700)
+    angles = np.linspace(-0.1, 0.1, 8)
+    cams = np.array([
+        [[np.cos(a), 0, -np.sin(a), -8 * a], [0, 1, 0, 0.05 * i], [np.sin(a), 0, np.cos(a), 0]]
+        for i, a in enumerate(angles)
+    ])  # fmt: skip
+    _, (model,) = run(tmp_path, [world.image(c) for c in cams], camera=world.camera)
+    off = []
+    for image, name in enumerate(model.names):
+        xy, _ = world.project(cams[int(name[:3])])
+        for seen in model.obs_xy[model.obs_image == image]:
+            off.append(seen - xy[np.linalg.norm(xy - seen, axis=1).argmin()])
+    assert len(off) > 100
+    np.testing.assert_allclose(np.median(off, axis=0), 0.25, atol=0.1)
+
+
+@pytest.mark.slow
+def test_two_rooms_come_as_two_components(tmp_path):
+    """The larger one comes first; the better of two cameras is used for both."""
+    one, truth = textured_room(12, 0.45, -3, size=(320, 240))
+    other, _ = textured_room(10, 0.45, -3, seed=5, size=(320, 240))
+    messages, (first, second) = run(tmp_path, other + one)
+    assert messages == [] and len(first.names) == 12
+    assert set(second.names) == {f"{i:03d}.jpg" for i in range(10)}
+    assert ate_percent(first.cam_from_world, truth_of(first, np.r_[truth[:10], truth])) < 1.0
+    assert len({*first.cameras, *second.cameras}) == 1
+
+
 def noise(count):
     return list(np.random.default_rng(0).integers(0, 255, (count, 240, 320, 3), np.uint8))
 
@@ -131,8 +164,8 @@ def test_with_more_keyframes_only_new_work_is_done(walk, tmp_path):
     with Child(tmp_path / "mapping", tmp_path / "log") as child:
         every = job_of(tmp_path, walk[0])
         first = replace(every, frame_of={i: 10 * i for i in range(1, 9, 2)})
-        reconstruct(first, child, note)
-        mapped = reconstruct(every, child, note)
+        view_of = reconstruct(first, child, note).view_of
+        mapped = reconstruct(replace(every, view_of=view_of), child, note)
     found = [entry for entry in totals if entry[0] in ("features", "match")]
     assert found == [("features", 4), ("match", 6), ("features", 4), ("match", 22)]
     model = read_sparse_model(mapped.models[0])
@@ -142,15 +175,15 @@ def test_with_more_keyframes_only_new_work_is_done(walk, tmp_path):
 # ---- Focal lengths, on points with known poses ---------------------------------------------------
 
 
-def search_of(folder, world, focal):
+def search_of(folder, world, focal, guess=0.9):
     """A search for models of all images of a world of points; frames are numbered by tens."""
     database = folder / "database.db"
     ids = range(1, len(world.cams) + 1)
     world.write(database, ids, world.pairs())
-    return MapperSearch(database, {i: 10 * i for i in ids}, read_pairs(database), focal, 0)
+    return MapperSearch(database, {i: 10 * i for i in ids}, read_pairs(database), focal, guess, 0)
 
 
-def zoomed_walk(first, last, count, ratio=1.4):
+def zoomed_walk(first, last, ratio=1.4, count=40):
     """Views of a wall; those of some images are magnified about the principal point."""
     world = PointWorld(sideways(count, 0.35), wall(0.35 * count, per_metre=100))
     centre = np.array(world.size) / 2
@@ -163,11 +196,12 @@ def zoomed_walk(first, last, count, ratio=1.4):
 
 
 @pytest.mark.slow
-def test_a_zoom_is_refused_with_its_frames(tmp_path):
+def test_a_zoom_leaves_the_images_of_one_focal_length_and_is_reported(tmp_path):
     focal = Focal(430 / 480, FocalSource.MATCHES)
-    models, messages = map_keyframes(search_of(tmp_path, zoomed_walk(13, 24, count=24), focal))
-    assert models == [] and "--poses" in messages[0]
-    assert "focal length changed between frames" in messages[0], messages
+    models, messages, _ = map_keyframes(search_of(tmp_path, zoomed_walk(29, 40), focal))
+    assert models and max(i for model in models for i in model.reg_image_ids()) <= 29
+    assert any("the focal length changed between frames" in text for text in messages)
+    assert models[0].camera(1).mean_focal_length() == pytest.approx(430, rel=0.03)
 
 
 def test_an_undetermined_focal_length_is_kept_and_reported(tmp_path):
@@ -176,7 +210,7 @@ def test_an_undetermined_focal_length_is_kept_and_reported(tmp_path):
     cams[:, 0, 3] = -0.35 * np.arange(12)
     world = PointWorld(cams, wall(4.2, per_metre=60))
     search = search_of(tmp_path, world, Focal(0.8, FocalSource.GUESS))
-    _, messages = map_keyframes(search)
+    _, messages, _ = map_keyframes(search)
     assert any("do not determine the focal length" in text and "--camera" in text
                for text in messages)  # fmt: skip
 
@@ -252,7 +286,8 @@ with Child(Path("work/mapping"), Path("work/log")) as child:
 """
 
 
-def test_the_child_ends_with_its_parent(tmp_path):
+@pytest.mark.parametrize("ending", [signal.SIGKILL, signal.SIGTERM])
+def test_the_child_ends_with_its_parent(tmp_path, ending):
     """Also during a job."""
     folders = (str(Path(__file__).parent), str(Path(rt.__file__).parent))
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(folders)}
@@ -262,7 +297,7 @@ def test_the_child_ends_with_its_parent(tmp_path):
     while not noted.exists() or not noted.read_text():
         assert time.monotonic() < deadline and parent.poll() is None
         time.sleep(0.01)
-    parent.kill()
+    parent.send_signal(ending)
     parent.wait()
     child = Path("/proc") / noted.read_text()
     while child.exists() and "\tZ" not in (child / "status").read_text():

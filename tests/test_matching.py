@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -13,7 +15,9 @@ from reobj.poses.supplied.frame_assignment import (
     by_numbers,
     interpolated,
     rows_by_time,
+    source_of,
 )
+from reobj.sources.video import InputConfig
 
 
 def rows_of(found: list[FrameAssignment]) -> dict[str, tuple[list[int], int]]:
@@ -41,6 +45,13 @@ def test_poses_between_two_times_are_interpolated() -> None:
     np.testing.assert_allclose(turn, np.outer([0.1, 0.6], [0, 0, 1]), atol=1e-5)
 
 
+def test_unknown_poses_are_not_interpolated() -> None:
+    poses = np.tile(np.eye(3, 4), (3, 1, 1))
+    poses[1, 0, 3] = np.nan
+    _, at = interpolated(poses, np.array([0.0, 0.1, 0.2]), np.array([0.05, 0.15]))
+    assert not at.any()
+
+
 @pytest.mark.parametrize(
     ("stamps", "rows"),
     [
@@ -60,6 +71,21 @@ def test_of_fast_frames_a_time_matches_within_half_a_frame() -> None:
     """Every third frame of 100 a second: a neighbour that was not read is another frame."""
     frame = np.array([0, 3, 6])
     assert rows_by_time(np.array([0.004, 0.036, 0.06]), frame, frame / 100).tolist() == [0, -1, 2]
+
+
+class Frames(SimpleNamespace):
+    def __iter__(self):
+        return (SimpleNamespace(index=i, time_s=i / 10) for i in range(9))
+
+
+def test_a_fully_decoded_video_has_its_decoded_frame_count() -> None:
+    for config, names, count in (
+        (InputConfig(), (), 9), (InputConfig(every=2), (), 30),
+        (InputConfig(stop=9), (), 30), (InputConfig(), ("a.png",) * 30, 30),
+    ):  # fmt: skip
+        assert (
+            source_of(Frames(config=config, names=names, files=(), frame_count=30)).count == count
+        )
 
 
 def test_numbers_with_an_offset_from_the_images() -> None:

@@ -61,6 +61,15 @@ def test_points_come_with_the_frames_that_observed_them_and_their_colour(corner)
     assert np.abs(seen - own).mean() < 0.6 * np.abs(seen - other).mean()
 
 
+def test_the_scale_is_that_of_the_poses(corner, tmp_path):
+    _, given, video, _, poses = corner
+    cams = given.cam_from_world.copy()
+    cams[:, :, 3] *= 50
+    larger = run(video, dataclasses.replace(given, cam_from_world=cams), tmp_path)
+    assert len(larger.points) == pytest.approx(len(poses.points), rel=0.1)
+    assert np.median(larger.points[:, 2]) == pytest.approx(50 * np.median(poses.points[:, 2]), 0.05)
+
+
 @pytest.mark.parametrize("mistake", ["inverted", "of other frames"])
 def test_poses_that_do_not_fit_the_images_are_reported(corner, tmp_path, mistake):
     _, given, video, _, _ = corner
@@ -87,12 +96,16 @@ def test_a_wrong_interval_of_poses_is_reported(corner, tmp_path):
     assert len(poses.points) > 100
 
 
-@pytest.mark.parametrize("images", [1, 3])
+@pytest.mark.parametrize("images", [0, 1, 3])
 def test_nothing_to_triangulate_gives_a_message(images, tmp_path):
-    """One image alone, and three without texture."""
+    """No images at all, one alone, and three without texture."""
     video = FakeVideo([np.zeros((240, 320, 3), np.uint8)] * images)
-    poses = run(video, supplied(motion("orbit", max(images, 2)), CAMERA), tmp_path)
-    assert len(poses.points) == 0 and poses.messages[0].startswith("no sparse points: ")
+    given = supplied(motion("orbit", max(images, 2)), CAMERA)
+    poses = run(video, given, tmp_path)
+    assert len(poses.points) == 0 and len(poses.messages) == 1
+    assert poses.messages[0].startswith("no sparse points: ")
+    unknown = dataclasses.replace(given, cam_from_world=np.full_like(given.cam_from_world, np.nan))
+    assert "0 images have a pose" in run(video, unknown, tmp_path).messages[0]
 
 
 # ---- Keyframes and pairs -------------------------------------------------------------------------
@@ -113,6 +126,7 @@ def test_few_frames_are_all_keyframes_and_those_without_a_pose_none():
     cams[5] = np.nan
     rows = choose_posed_keyframes(path_steps(supplied(cams)))
     assert rows.tolist() == [i for i in range(13) if i != 5]
+    assert choose_posed_keyframes(np.full((4, 6), np.nan)).tolist() == []
 
 
 def test_pairs_are_neighbours_and_loop_closures():
@@ -122,6 +136,15 @@ def test_pairs_are_neighbours_and_loop_closures():
     assert {(i, i + 1) for i in range(39)} <= pairs
     assert {(i, 39 - i) for i in range(15)} <= pairs  # the way back
     assert len(pairs) < 40 * 7
+
+
+def test_opposite_views_are_no_pair():
+    """Back to back at one position."""
+    turned = motion("orbit", 12)
+    turned[6:, [0, 2]] *= -1
+    pairs = choose_posed_pairs(path_steps(supplied(turned)))
+    far = pairs[(pairs[:, 1] - pairs[:, 0] > 4)]
+    assert ((far[:, 0] < 6) == (far[:, 1] < 6)).all()
 
 
 def test_the_sharpest_image_near_a_keyframe_replaces_it():

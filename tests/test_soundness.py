@@ -1,4 +1,4 @@
-"""Soundness of a model: covariance, agreement of two mappers, constant focal length."""
+"""Soundness of a model: covariance of its cameras, and agreement of two mappers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from test_consistency import Scene
 from reobj.cameras import invert_rigid
 from reobj.poses.bundle import adjusted, read_arrays, refine, relative_sigmas, submodel
 from reobj.poses.mapping import models_of_one_camera
-from reobj.poses.verification import Component, FocalSource, confirmed, focal_changes
+from reobj.poses.verification import JOINT_POINTS, Component, FocalSource, confirmed
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -60,6 +60,15 @@ def test_the_sigma_of_centres_equals_that_of_repeated_noise():
     assert np.median(estimated) == pytest.approx(shown, rel=0.3)
 
 
+def test_less_parallax_and_a_free_focal_length_increase_the_sigma():
+    far, near = Scene(count=6, points=150), Scene(count=6, points=150)
+    seen_from(near, 0.2 * true_centres(far))
+    near.seen &= far.seen
+    small, large = (relative_sigmas(read_arrays(noisy(s, 0.5, 0)), False)[0] for s in (far, near))
+    assert large > 3 * small
+    assert relative_sigmas(read_arrays(noisy(near, 0.5, 0)), True)[0] > large
+
+
 def test_undetermined_sigmas_are_infinite():
     scene = Scene(count=6, points=150)
     scene.seen[:, 2:] = False  # two points
@@ -102,17 +111,18 @@ def test_coincident_cameras_do_not_fix_the_scale():
 
 def component(model, sigma, problem=""):
     arrays = read_arrays(model)
-    return Component(model, arrays, FocalSource.MODEL, 1.0, sigma, 1000, problem, arrays.ids)
+    measures = 10.0, 1.0, 20.0, sigma, 1000
+    return Component(model, arrays, FocalSource.MODEL, *measures, problem, arrays.ids)
 
 
-def moved(step_m=0.0, turn_deg=0.0, last=12):
+def moved(step_m=0.0, turn_deg=0.0, count=12):
     """The scene in another world and scale; one camera is off."""
-    scene = Scene()
+    scene = Scene(count=count)
     turn = Rotation.from_rotvec([0, np.radians(turn_deg), 0]).as_matrix()
     scene.poses = scene.truth.copy()
     scene.poses[3, :, 3] -= scene.truth[3, :, :3] @ [0, step_m, 0]
     scene.poses[3] = turn @ scene.poses[3]
-    model = submodel(scene.model(), set(range(1, last + 1)))
+    model = scene.model()
     there = pycolmap.Sim3d(2.5, pycolmap.Rotation3d(np.array([0.1, 0.2, 0.3, 0.9])), [3.0, -1, 2])
     model.transform(there)
     return model
@@ -126,22 +136,66 @@ def moved(step_m=0.0, turn_deg=0.0, last=12):
         (dict(step_m=0.5), False),
         (dict(turn_deg=3), True),
         (dict(turn_deg=8), False),
-        (dict(last=7), False),  # half of the images
+        (dict(count=7), False),  # half of the images
     ],
 )
 def test_weak_geometry_needs_agreement_of_another_mapper(other, sound):
     weak = component(Scene().model(), 0.002)
     second = component(moved(**other), 0.002)
     (found,) = confirmed([weak], [second], FocalSource.MATCHES)
+    assert (not found.problem) == sound and ("parallax" in found.problem) != sound
+
+
+def piece(first, last):
+    """Some images of the scene in a world and scale of their own."""
+    model = moved()
+    model.transform(pycolmap.Sim3d(1 + 0.1 * first, pycolmap.Rotation3d(), [first, 0, 0]))
+    return component(submodel(model, set(range(first, last))), 0.002)
+
+
+@pytest.mark.parametrize(
+    "ends, count, sound",
+    [
+        ([(1, 7), (7, 13)], None, True),  # two pieces, by all common points
+        ([(7, 13), (1, 4), (4, 7)], None, True),  # in any order
+        ([(1, 7), (7, 13)], JOINT_POINTS, True),
+        ([(1, 7), (7, 13)], JOINT_POINTS - 1, False),
+        ([(1, 7), (8, 13)], None, True),  # without an image
+        ([(1, 5), (9, 13)], None, False),  # without a third of them
+        ([(1, 9), (9, 11)], None, False),  # the scale of a pair is arbitrary
+    ],
+)
+def test_pieces_of_another_mapper_count_if_points_connect_them(ends, count, sound):
+    scene = Scene()
+    if count is not None:  # other common points are split into two
+        arrays, seen = read_arrays(scene.model()), scene.seen
+        joint = arrays.triangulated_by(np.arange(6)) & arrays.triangulated_by(np.arange(6, 12))
+        ids = np.flatnonzero(seen.sum(0) >= 2)[joint]  # as the model has them
+        both = np.flatnonzero(seen[:6].any(0) & seen[6:].any(0))
+        scene.untie(6, int(np.flatnonzero(both == ids[count])[0]))
+    weak = component(scene.model(), 0.002)
+    (found,) = confirmed([weak], [piece(*end) for end in ends], FocalSource.MATCHES)
     assert (not found.problem) == sound
+    if sound:  # only images of both stay
+        assert set(found.kept) == {i for end in ends for i in range(*end)}
 
 
 def test_images_missing_in_the_other_mapper_are_dropped():
     weak = component(Scene().model(), 0.002)
-    second = component(moved(last=10), 0.002)
-    (found,) = confirmed([weak], [second], FocalSource.MATCHES)
+    (found,) = confirmed([weak], [piece(1, 11)], FocalSource.MATCHES)
     (model,) = models_of_one_camera([found])
     assert not found.problem and sorted(model.reg_image_ids()) == list(range(1, 11))
+    (model,) = models_of_one_camera([weak])
+    assert len(model.reg_image_ids()) == 12
+
+
+def test_points_are_triangulated_by_images_whose_rays_spread():
+    scene = Scene(count=4, points=50)
+    scene.seen[:] = True
+    scene.poses[1] = scene.poses[0]  # from one position
+    scene.seen[3, 10:] = False
+    mark = read_arrays(scene.model()).triangulated_by
+    assert [mark(np.array(rows)).sum() for rows in ([0], [0, 1], [0, 2], [2, 3])] == [0, 0, 50, 10]
 
 
 @pytest.mark.parametrize(
@@ -160,39 +214,3 @@ def test_what_needs_confirmation(sigma, source, others, sound):
     second = [component(moved(), 0.002)] * others
     *_, last = found = confirmed([bad, component(Scene().model(), sigma)], second, source)
     assert [not c.problem for c in found].count(True) == sound and last.problem
-
-
-# ---- Zoom ----------------------------------------------------------------------------------------
-
-
-def zoomed(images=range(0), ratio=1.0, noise_px=0.3, points=900):
-    """A walk whose model is right, except for images at another focal length.
-
-    Their poses are shifted by the distance that compensates it best: the model of a mapper with a
-    single focal length.
-    """
-    scene = Scene(count=20)
-    scene.poses = scene.truth.copy()
-    for image in images:
-        scene.xy[image] = [320, 240] + (scene.xy[image] - [320, 240]) * ratio
-        scene.seen[image] &= ((scene.xy[image] > 0) & (scene.xy[image] < (640, 480))).all(1)
-        scene.poses[image, 2, 3] -= 4.2 * (1 - 1 / ratio)  # the wall is 3.5 to 5 m away
-    scene.xy = scene.xy + np.random.default_rng(0).normal(0, noise_px, scene.xy.shape)
-    scene.seen[:, points:] = False
-    return read_arrays(scene.model())
-
-
-@pytest.mark.parametrize("ratio", [1.3, 1 / 1.3])
-def test_changes_of_the_focal_length_are_found(ratio):
-    changes = focal_changes(zoomed(range(7, 13), ratio))
-    largest = sorted(changes, key=lambda change: -abs(np.log(change[2])))[:2]
-    assert sorted((a, b) for a, b, _ in largest) == [(7, 8), (13, 14)]
-    np.testing.assert_allclose([r for *_, r in sorted(largest)], [ratio, 1 / ratio], rtol=0.1)
-
-
-@pytest.mark.parametrize(
-    "ratio, noise_px, points",
-    [(1.0, 1.0, 900), (1.04, 1.0, 900), (1.3, 0.3, 30)],  # focus breathing; too few points
-)
-def test_what_is_no_zoom(ratio, noise_px, points):
-    assert focal_changes(zoomed(range(7, 13), ratio, noise_px, points)) == []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from reobj.poses.features import MatchedPairs, read_pairs
 from reobj.poses.mapping import (
     Focal,
     MapperSearch,
+    _path,
     aligned,
     map_keyframes,
     split,
@@ -69,6 +71,25 @@ def test_windows_cover_all_keyframes_overlap_and_are_even(count):
     assert all(one[-40:] == other[:40] for one, other in itertools.pairwise(windows))
     sizes = [len(window) for window in windows]
     assert max(sizes) - min(sizes) <= 1 and min(120, count) <= min(sizes) <= max(sizes) <= 280
+
+
+def matched(ids, near):
+    """Pairs of images with enough matches; `near` of two ids says which."""
+    found = [pair for pair in itertools.combinations(sorted(ids), 2) if near(*pair)]
+    matches = [np.zeros((50, 2), np.int64)] * len(found)
+    return MatchedPairs(np.array(found), matches, dict.fromkeys(ids), np.ones((len(found), 3, 3)))
+
+
+def test_shuffled_photos_of_a_line_are_put_back_in_a_line():
+    ids = numbers(5, 84)
+    place = dict(zip(ids, np.random.default_rng(0).permutation(80).tolist(), strict=True))
+    pairs = matched(ids, lambda a, b: abs(place[a] - place[b]) <= 3)
+    found = _path(ids, replace(pairs, is_path=pairs.in_order(ids)))
+    assert sorted(found) == ids
+    assert np.abs(np.diff([place[i] for i in found])).max() <= 6
+    for window in split(found, 20, 5):
+        along = sorted(place[i] for i in window)
+        assert along[-1] - along[0] <= len(along) + 6
 
 
 # ---- Joints --------------------------------------------------------------------------------------
@@ -145,6 +166,15 @@ def test_a_false_joint_of_places_that_look_alike_is_dropped():
     assert sorted(group) == [0, 1, 2, 3] and error_of(group, world) < 0.01
 
 
+# ---- One model -----------------------------------------------------------------------------------
+
+
+def error_percent(model, world):
+    ids = sorted(model.reg_image_ids())
+    poses = np.array([model.image(i).cam_from_world().matrix() for i in ids])
+    return ate_percent(poses, world.cams[[i - 1 for i in ids]])
+
+
 # ---- All of it -----------------------------------------------------------------------------------
 
 
@@ -156,9 +186,8 @@ def test_a_walk_mapped_in_windows_is_that_mapped_at_once(tmp_path, size, windows
     world.write(database, ids, world.pairs())
     focal = Focal(430 / 480, FocalSource.GIVEN)
     frames = {i: 10 * i for i in ids}
-    search = MapperSearch(database, frames, read_pairs(database), focal, 0)
-    (model,), messages = map_keyframes(search, size, 4)
-    assert messages == [] and sorted(model.reg_image_ids()) == ids
-    poses = np.array([model.image(i).cam_from_world().matrix() for i in ids])
-    assert ate_percent(poses, world.cams) < 0.3
+    search = MapperSearch(database, frames, read_pairs(database), focal, 0.9, 0)
+    (model,), messages, weak = map_keyframes(search, size, 4)
+    assert messages == [] and weak == [] and sorted(model.reg_image_ids()) == ids
+    assert error_percent(model, world) < 0.3
     assert sorted(path.name for path in tmp_path.glob("window*")) == windows

@@ -20,7 +20,7 @@ from reobj.types import Array, BoolArray, IntArray
 
 MIN_TRI_ANGLE_DEG = 1.5  # between rays that triangulate a point (COLMAP's min_tri_angle)
 INLIER_PX = 4.0  # largest error of an inlier, resized images (COLMAP's filter_max_reproj_error)
-FOCAL_RANGE = (0.4, 2.0)  # plausible focal length over the longer side: 28 to 103 deg wide
+FOCAL_RANGE = (0.4, 2.0)  # plausible focal length over the longer side (chosen: 28-103 deg wide)
 
 
 def triangulates(count: Array, squared_sum: Array) -> BoolArray:
@@ -85,6 +85,16 @@ class ModelArrays:
         )
         observed.data[:] = 1  # a point may be observed twice in an image
         return observed
+
+    def triangulated_by(self, rows: IntArray) -> BoolArray:
+        """Mark the points (N,) that some images alone triangulate, by `triangulates`."""
+        mine = np.isin(self.image, rows)
+        image = self.image[mine]
+        count = len(self.xyz)
+        ray = unit_rows(self.xyz[self.point[mine]] - self.centre[image])  # (m, 3)
+        entries = (np.ones(len(image)), (self.point[mine], np.arange(len(image))))
+        sums = sparse.csr_matrix(entries, (count, len(image))) @ np.insert(ray, 3, 1, 1)  # (N, 4)
+        return triangulates(sums[:, 3], (sums[:, :3] ** 2).sum(1))
 
     def point_of_keypoints(self, keypoints: Mapping[int, Array]) -> dict[int, IntArray]:
         """Return the points (n,) of all keypoints (n, 2) by image id, -1: none."""
@@ -258,13 +268,12 @@ def relative_sigmas(arrays: ModelArrays, free_camera: bool) -> tuple[float, floa
         return np.inf, np.inf
     if len(arrays.ids) > MAX_DENSE:
         return 0.0, 0.0
-    unit = float(np.median(arrays.points_in_cam()[:, 2]))  # of length: the median depth
-    by_pose, by_point, by_camera = _weighted_jacobians(arrays, unit)
-    by_camera = by_camera.reshape(-1, 5)[:, : None if free_camera else 0]
-    count = len(arrays.ids)
-    poses = 6 * count
-    blocks = _block_columns(by_pose, arrays.image, count)
-    J = sparse.hstack([blocks, sparse.csr_matrix(by_camera)]).tocsr()
+    pose, by_pose, by_point, by_camera = _weighted_jacobians(arrays)
+    by_camera = by_camera.reshape(-1, by_camera.shape[2])[:, : None if free_camera else 0]
+    poses = 6 * len(pose)
+    J = sparse.hstack(
+        [_block_columns(by_pose, arrays.image, len(pose)), sparse.csr_matrix(by_camera)]
+    ).tocsr()
     V = np.zeros((len(arrays.xyz), 3, 3))
     np.add.at(V, arrays.point, np.swapaxes(by_point, 1, 2) @ by_point)
     V += 1e-9 * np.trace(V, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-12 * np.eye(3)
@@ -273,14 +282,7 @@ def relative_sigmas(arrays: ModelArrays, free_camera: bool) -> tuple[float, floa
     roots = sparse.bsr_matrix((root, rows[:-1], rows))
     W = J.T @ _block_columns(by_point, arrays.point, len(root)) @ roots.T
     normal = (J.T @ J - W @ W.T).toarray()
-    centre = arrays.centre / unit
-    offset = centre - centre.mean(0)
-    similarities = np.zeros((len(normal), 7))  # of all cameras together: no observation has them
-    by_similarity = similarities[:poses].reshape(count, 6, 7)
-    by_similarity[:, :3, :3] = np.eye(3)
-    by_similarity[:, :3, 3:6] = -skew(*offset.T)
-    by_similarity[:, :3, 6] = offset
-    gauge = np.linalg.qr(similarities)[0]
+    centre, gauge = _gauge(pose, len(normal))
     normal += np.median(np.diag(normal)) * gauge @ gauge.T
     values, vectors = np.linalg.eigh(normal)
     if values[0] <= 1e-12 * values[-1]:
@@ -299,35 +301,54 @@ def _block_columns(blocks: Array, column: IntArray, count: int) -> Any:
     return sparse.bsr_matrix((blocks, column, rows), shape)
 
 
-def _weighted_jacobians(arrays: ModelArrays, unit: float) -> tuple[Array, Array, Array]:
+def _weighted_jacobians(arrays: ModelArrays) -> tuple[Array, Array, Array, Array]:
     """Differentiate the observations, in sigmas of their noise.
 
-    Args:
-        unit: of length.
     Returns:
-        derivatives by centre and rotation of the camera (M, 2, 6), by the point (M, 2, 3), by the
-        log of the focal length, the principal point and two terms of radial distortion (M, 2, 5).
+        pose: (R, 3, 4) cam_from_world; the median depth is the unit of length. Derivatives by
+        centre and rotation of the camera (M, 2, 6), by the point (M, 2, 3), by the log of the focal
+        length, the principal point and two terms of radial distortion (M, 2, 5).
     """
+    image = arrays.image
     focal = arrays.focal
-    X, Y, Z = (arrays.points_in_cam() / unit).T
+    pose = arrays.cam_from_world.copy()
+    xy = focal * arrays.ideal
+    xyz_in_cam = arrays.points_in_cam()
+    unit = np.median(xyz_in_cam[:, 2])
+    pose[:, :, 3] /= unit
+    X, Y, Z = (xyz_in_cam / unit).T
     in_front = Z > 0.01  # a point at a camera centre would have no uncertainty
     Z = np.where(in_front, Z, 1)
     x = X / Z
     y = Y / Z
     zero = np.zeros(len(X))
-    one = np.ones(len(X))
-    residual = focal * (arrays.ideal - np.column_stack([x, y]))
+    residual = xy - focal * np.column_stack([x, y])
     noise = max(1.4826 * float(np.median(np.abs(residual))), 0.1)  # px: SIFT's best
     weight = 1 / (1 + (residual**2).sum(1) / (2 * noise) ** 2)  # Cauchy's, scale 2 sigma
-    scale = focal * np.where(in_front, np.sqrt(weight) / noise, 0)
+    scale = np.where(in_front, np.sqrt(weight) / noise, 0)
+    by_shift = focal * np.array([[1 / Z, zero, -x / Z], [zero, 1 / Z, -y / Z]])  # (2, 3, m)
+    by_shift = np.moveaxis(by_shift, 2, 0) * scale[:, None, None]
+    by_turn = focal * np.array([[-x * y, 1 + x * x, -y], [-1 - y * y, x * y, x]])
+    by_turn = np.moveaxis(by_turn, 2, 0) * scale[:, None, None]
+    by_point = by_shift @ pose[image][:, :, :3]
+    one = np.ones(len(x))
     r2 = x * x + y * y
-    by_shift, by_turn, by_camera = (
-        np.moveaxis(np.array(rows), 2, 0) * scale[:, None, None]
-        for rows in (
-            [[1 / Z, zero, -x / Z], [zero, 1 / Z, -y / Z]],
-            [[-x * y, 1 + x * x, -y], [-1 - y * y, x * y, x]],
-            [[x, one, zero, x * r2, x * r2 * r2], [y, zero, one, y * r2, y * r2 * r2]],
-        )
+    by_camera = focal * np.array(
+        [[x, one, zero, x * r2, x * r2 * r2], [y, zero, one, y * r2, y * r2 * r2]]
     )
-    by_point = by_shift @ arrays.cam_from_world[arrays.image][:, :, :3]
-    return np.concatenate([-by_point, by_turn], 2), by_point, by_camera
+    by_camera = np.moveaxis(by_camera, 2, 0) * scale[:, None, None]
+    return pose, np.concatenate([-by_point, by_turn], 2), by_point, by_camera
+
+
+def _gauge(pose: Array, size: int) -> tuple[Array, Array]:
+    """Return the centres (R, 3) and an orthonormal basis (size, 7) of their similarities."""
+    rotation = pose[:, :, :3]
+    centre = -np.einsum("rji,rj->ri", rotation, pose[:, :, 3])
+    offset = centre - centre.mean(0)
+    basis = np.zeros((len(centre), 6, 7))
+    basis[:, :3, :3] = np.eye(3)
+    basis[:, :3, 3:6] = -skew(*offset.T)
+    basis[:, :3, 6] = offset
+    columns = np.zeros((size, 7))
+    columns[: basis.size // 7] = basis.reshape(-1, 7)
+    return centre, np.linalg.qr(columns)[0]

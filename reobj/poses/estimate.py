@@ -29,10 +29,10 @@ from reobj.poses.keyframes import (
     ResizedVideo,
     pick_keyframes,
 )
-from reobj.poses.localize import fill_gaps, locate_between
+from reobj.poses.localize import beside_mapped, fill_gaps, locate_between
 from reobj.poses.mapping import ADVICE, FOCAL_GUESS
 from reobj.poses.sfm import Child, MakeProgress, Mapped, MappingJob, listed, reconstruct
-from reobj.types import Array, IntArray, ReobjError, nearest_of, option
+from reobj.types import Array, BoolArray, IntArray, ReobjError, nearest_of, option
 
 MAX_KEYFRAMES = 6000  # a longer video has wider steps
 
@@ -122,7 +122,7 @@ def estimate_poses(
     poses = best.poses
     messages = best.mapped.messages
     if poses.known.any():
-        messages = [*messages, *_breaks(poses), *_lost_frames(poses, video)]
+        messages = [*messages, *_breaks(poses), *_lost_frames(poses, best.tried, video)]
     messages = [*_frames_far_apart(poses, video.config.every), *messages]
     return dataclasses.replace(poses, messages=tuple(messages))
 
@@ -150,7 +150,7 @@ class _Reconstruction:
         self.boxes_of = boxes_to_mask or (lambda frame: np.empty((0, 4)))
         self.child = child
         self.progress = progress
-        self.images = ImageFile(child.folder / "keyframes")
+        self.images = ImageFile(child.folder / "keyframes.raw")
 
     def _keep(self, frame: ResizedFrame) -> None:
         self.images.add(frame.row + 1, frame.bgr)
@@ -182,18 +182,22 @@ class _Reconstruction:
     def add_keyframes(self, rows: Sequence[int]) -> list[int]:
         """Read the images of more keyframes; return the rows of those with texture."""
         added = list[int]()
-        line = self.progress("more keyframes", len(self.resized.frames))
-        for frame in self.resized.shown(line) if rows else ():
-            if frame.row in rows and frame.has_texture:
-                self._keep(frame)
-                added.append(frame.row)
+        if rows:
+            line = self.progress("more keyframes", len(self.resized.frames))
+            for frame in self.resized.shown(line):
+                if frame.row in rows and frame.has_texture:
+                    self._keep(frame)
+                    added.append(frame.row)
         return added
 
     def attempt(self, keys: list[int], view_of: Mapping[int, int]) -> _Attempt:
-        """Map keyframes (rows) and locate all frames; view_of: of an attempt with fewer."""
+        """Map keyframes and locate all frames.
+
+        Args:
+            keys: rows of the keyframes. view_of: of the first attempt, with fewer (`Mapped`).
+        """
         frames = self.resized.frames
-        known = self.video.names
-        names = [str(known[i]) if known else f"frame_{i:06d}.jpg" for i in frames]
+        names = [_frame_name(self.video, number) for number in frames]
         job = MappingJob(
             self.images,
             frame_of={row + 1: frames[row] for row in keys},
@@ -202,6 +206,7 @@ class _Reconstruction:
             size=self.size,
             camera=self.camera,
             focal_guess=_exif_focal(self.video) or FOCAL_GUESS,
+            is_video=len(frames) >= 3 * len(keys),
             seed=self.config.seed,
             view_of=view_of,
         )
@@ -225,12 +230,13 @@ class _Reconstruction:
         time_s = np.array(video.times_s, np.float64)
         cam_from_world = np.full((len(frame), 3, 4), np.nan)
         status = np.full(len(frame), "none", "<U12")
+        component = np.full(len(frame), -1)
+        line = self.progress("pnp", len(models) * len(frame))
         if not models:
+            line.close()
             guess = (FOCAL_GUESS * max(self.size), self.size[0] / 2, self.size[1] / 2)
             camera = self.camera or Camera("SIMPLE_PINHOLE", *self.size, guess)
             return Poses(camera, frame, time_s, cam_from_world, status, "none")
-        component = np.full(len(frame), -1)
-        line = self.progress("pnp", len(models) * len(frame))
         visibility = []
         first_point = 0
         for number, (model, rows) in enumerate(zip(models, component_rows, strict=True)):
@@ -282,42 +288,69 @@ class _Attempt:
         """Count the pairs of frames with measured poses in one component."""
         return int((np.bincount(self.poses.part[self.poses.measured], minlength=1) ** 2).sum())
 
+    @property
+    def tried(self) -> BoolArray:
+        """Mark the frames (F,) at or beside a mapped keyframe: PnP is not tried for others."""
+        mapped = np.concatenate([np.empty(0, np.int64), *self.component_rows])
+        return beside_mapped(self.key_rows, mapped, len(self.poses.frame))
+
     def more_keyframes(self) -> list[int]:
         """Choose frames for more keyframes: around breaks, and where frames were not located."""
+        if not self.component_rows:
+            return []
         lost = np.flatnonzero(~self.poses.measured)
-        return rows_to_add(self.key_rows, self.component_rows, lost) if self.component_rows else []
+        around = rows_around_breaks(self.key_rows.tolist(), self.component_rows)
+        return sorted({*around, *rows_of_lost(self.key_rows, lost)})
 
 
-MAX_EXTRA = 8  # keyframes added between two
+# ---- More keyframes ------------------------------------------------------------------------------
 
 
-def rows_to_add(
-    key_rows: IntArray, component_rows: Sequence[IntArray], lost: IntArray
-) -> list[int]:
-    """Choose frames for more keyframes where the trajectory broke or frames were not located.
+MAX_EXTRA = 8  # keyframes added between two at a break (chosen; more take longer)
+
+
+def rows_around_breaks(key_rows: list[int], component_rows: list[IntArray]) -> list[int]:
+    """Choose frames for more keyframes where the trajectory broke.
 
     A break is between two keyframes of different components, or without one; more keyframes are
-    also chosen in the steps before and after it. Elsewhere the lost frames are chosen. Of each step
-    at most MAX_EXTRA are taken, evenly spread.
+    also chosen in the steps before and after it.
 
     Args:
         key_rows: rows of all keyframes, ascending. component_rows: of those of each component.
-        lost: rows of the frames without a measured pose.
     Returns:
         rows of frames that are no keyframes yet, ascending.
     """
     component_of = {int(row): k for k, rows in enumerate(component_rows) for row in rows}
-    components = [component_of.get(row, -1) for row in key_rows.tolist()]
-    broken = set[int]()
+    components = [component_of.get(row, -1) for row in key_rows]
+    steps = set[int]()
     for k, (one, other) in enumerate(itertools.pairwise(components)):
         if one != other or one < 0:
-            broken |= {k - 1, k, k + 1}
-    chosen: list[int] = []
-    for k, (a, b) in enumerate(itertools.pairwise(key_rows.tolist())):
-        rows = np.arange(a + 1, b) if k in broken else lost[(a < lost) & (lost < b)]
-        count = min(MAX_EXTRA, len(rows))
-        chosen += rows[np.linspace(-1, len(rows), count + 2).round().astype(int)[1:-1]].tolist()
-    return chosen
+            steps |= {k - 1, k, k + 1} & set(range(len(key_rows) - 1))
+    rows = set[int]()
+    for a, b in ((key_rows[s], key_rows[s + 1]) for s in steps):
+        count = min(MAX_EXTRA, b - a - 1)
+        rows |= set(np.linspace(a, b, count + 2).round().astype(int)[1:-1].tolist())
+    return sorted(rows - set(key_rows))
+
+
+def rows_of_lost(key_rows: IntArray, lost: IntArray) -> list[int]:
+    """Choose at most MAX_EXTRA of the lost frames between two keyframes for more keyframes.
+
+    Args:
+        key_rows: rows of the keyframes, ascending. lost: (L,) rows of frames without a measured
+            pose, ascending.
+    Returns:
+        rows of frames that are no keyframes yet, ascending.
+    """
+    lost = np.setdiff1d(lost, key_rows)
+    rows: list[int] = []
+    for run in np.split(lost, np.flatnonzero(np.diff(np.searchsorted(key_rows, lost))) + 1):
+        rows += run[np.linspace(0, len(run) - 1, min(MAX_EXTRA, len(run))).astype(int)].tolist()
+    return rows
+
+
+def _frame_name(video: Any, number: int) -> str:
+    return str(video.names[number]) if video.names else f"frame_{number:06d}.jpg"
 
 
 def _exif_focal(video: Any) -> float:
@@ -357,16 +390,27 @@ def _breaks(poses: Poses) -> list[str]:
     ]
 
 
-def _lost_frames(poses: Poses, video: Any) -> list[str]:
-    """Report which frames have no camera, why, and what helps; [] if all have one."""
-    lost = poses.frame[~poses.known].tolist()
-    if not lost:
+def _lost_frames(poses: Poses, tried: BoolArray, video: Any) -> list[str]:
+    """Report which frames have no camera, why, and what helps; [] if all have one.
+
+    Args:
+        tried: (F,) frames for which PnP was tried.
+    """
+    lost = ~poses.known
+    step = int(np.median(np.diff(poses.frame))) if len(lost) > 1 else 1
+    groups = []
+    for mask, reason in (
+        (lost & tried, "show too few points of the reconstruction"),
+        (lost & ~tried, "are next to keyframes that could not be mapped with certainty"),
+    ):
+        if numbers := poses.frame[mask].tolist():
+            files = [video.names[n] for n in numbers[:5]] if video.names else []
+            named = f": {', '.join(files)}" if files else ""
+            named += " ..." if len(numbers) > len(files) > 0 else ""
+            groups.append(f"{spans(numbers, step)} ({len(numbers)}{named}) {reason}")
+    if not groups:
         return []
-    files = [video.names[n] for n in lost[:5]] if video.names else []
-    named = f" ({', '.join(files)}{' ...' * (len(lost) > len(files))})" if files else ""
-    step = int(np.median(np.diff(poses.frame))) if len(poses.frame) > 1 else 1
     return [
-        f"{len(lost)} of {len(poses.frame)} frames have no camera: frames {spans(lost, step)}"
-        f"{named}; they show too few points of the reconstruction, or keyframes beside them could "
-        f"not be mapped with certainty; {ADVICE}, or --poses"
+        f"{lost.sum()} of {len(lost)} frames have no camera: frames {'; frames '.join(groups)}; "
+        f"{ADVICE}, or --poses"
     ]

@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -90,7 +90,7 @@ def root_sift(bgr: Image, boxes: Array) -> tuple[npt.NDArray[np.float32], Image]
         keypoints, descriptors = sift.detectAndCompute(gray, mask)
         if len(keypoints) >= 500:
             break
-    if descriptors is None:
+    if descriptors is None or not len(keypoints):
         return np.empty((0, 2), np.float32), np.empty((0, 128), np.uint8)
     # OpenCV has the centre of the first pixel at (0, 0), COLMAP at (.5, .5)
     xy = np.array([k.pt for k in keypoints], np.float32) + np.float32(0.5)  # (N, 2)
@@ -99,7 +99,7 @@ def root_sift(bgr: Image, boxes: Array) -> tuple[npt.NDArray[np.float32], Image]
 
 
 MAX_RATIO = 0.8  # of angles or distances to the best and the second best (Lowe, IJCV 2004; COLMAP)
-RETRIEVED = 6  # most similar keyframes with which one is matched, to close loops
+RETRIEVED = 6  # most similar keyframes with which one is matched (chosen; more take longer)
 UNORDERED = 20  # the same of photos whose order says nothing (usual: 20 to 50)
 ALL_PAIRS = 30  # keyframes of which all pairs are matched: 435 pairs
 MIN_MATCHES = 30  # verified matches of a pair that count as evidence (COLMAP registers from 30 on)
@@ -312,8 +312,8 @@ class MatchedPairs:
     def in_order(self, ids: Sequence[int]) -> bool:
         """True if at least half of consecutive images match: they follow a path."""
         matched = set(map(tuple, self.image_ids[self.enough].tolist()))
-        steps = set(itertools.pairwise(ids))
-        return 2 * len(steps & matched) >= len(steps)
+        steps = list(itertools.pairwise(ids))
+        return 2 * sum(step in matched for step in steps) >= len(steps)
 
     def only(self, ids: Sequence[int]) -> MatchedPairs:
         """Return the pairs of some images."""
@@ -366,11 +366,14 @@ def focal_from_pairs(pairs: MatchedPairs, size: tuple[int, int]) -> float | None
     """
     used = pairs.enough & np.isfinite(pairs.fundamental[:, 0, 0])
     F = pairs.fundamental[used]  # (P, 3, 3)
-    if len(F) < 10:  # a few wrong pairs decide
+    if len(F) < 10:  # chosen; lower: a few wrong pairs decide
         return None
     tried = np.geomspace(*FOCAL_RANGE, 161)  # (S,) 1 % apart
-    K = np.tile(np.array([[0, 0, size[0] / 2], [0, 0, size[1] / 2], [0, 0, 1]]), (161, 1, 1))
+    K = np.zeros((len(tried), 3, 3))
     K[:, 0, 0] = K[:, 1, 1] = tried * max(size)
+    K[:, 0, 2] = size[0] / 2
+    K[:, 1, 2] = size[1] / 2
+    K[:, 2, 2] = 1
     E = np.swapaxes(K, 1, 2)[:, None] @ F[None] @ K[:, None]  # (S, P, 3, 3)
     s = np.linalg.svd(E, compute_uv=False)
     counts = 1 if pairs.is_path else pairs.matches[used] // MIN_MATCHES
@@ -383,64 +386,125 @@ def focal_from_pairs(pairs: MatchedPairs, size: tuple[int, int]) -> float | None
 # ---- Repeated views ------------------------------------------------------------------------------
 
 
-MAP_ALL_OF = 100  # keyframes up to which all are mapped: it takes a minute
+MAP_ALL_OF = 100  # keyframes up to which all are mapped (chosen: it takes a minute)
+# Keyframes added in a second attempt are all mapped, but only registered where more than this
+# number are mapped already (chosen: it takes minutes)
+MAP_MORE_TO = 300
 # Median displacement of the matches, over the width: half of that between consecutive keyframes
 REPEATED_FLOW = 0.06
 REPEATED_MATCHES = 3 * MIN_MATCHES  # verified ones, which register a keyframe with certainty
-CANDIDATES = 3  # most similar mapped keyframes with which one is compared
+CANDIDATES = 4  # mapped keyframes with which one is compared (chosen; more take longer)
 BLOCK = 32  # keyframes that are compared at once with those mapped before them
 
 
 def find_repeated(
     database: Path,
     ids: Sequence[int],
+    extract: Callable[[Sequence[int]], None],
     width: int,
     seed: int,
+    is_video: bool,
     before: Mapping[int, int],
     map_all_of: int = MAP_ALL_OF,
+    map_more_to: int = MAP_MORE_TO,
     block: int = BLOCK,
 ) -> dict[int, int]:
-    """Find for each keyframe the earlier mapped one whose view it repeats.
+    """Find for each keyframe the mapped one whose view it repeats.
+
+    Keyframes are compared with those mapped before them. Of a video every second one comes first:
+    between two that repeat mapped views the third is left out, as frames are located by either.
 
     Args:
-        ids: of keyframes, in the order of time, whose features are in the database.
-        width: of the images, px.
-        before: result of an earlier attempt with fewer keyframes, or empty. The others were added
-            where the steps between these were too wide: they are mapped.
+        ids: of keyframes, in the order of time. extract: writes the features of some of them into
+            the database. width: of the images, px. is_video: there are frames between keyframes.
+        before: result of an earlier attempt with fewer keyframes, which is kept; or empty.
     Returns:
-        by id: the keyframe whose view is repeated; its own id: it is to be mapped.
+        by id: the keyframe whose view is repeated; its own id: it is to be mapped; 0: left out.
     """
-    if before or len(ids) <= map_all_of:
-        return {number: before.get(number, number) for number in ids}
-    view_of = {number: number for number in ids}
-    vlad = vlad_vectors(database, ids, visual_words(database, ids, seed))  # (K, D)
-    mapped = np.empty(0, np.int64)  # rows of `ids`
-    for start in range(0, len(ids), block):
-        some = ids[start : start + block]
-        similarity = vlad[start : start + block] @ vlad[mapped].T
-        ranked = mapped[np.argsort(-similarity, axis=1, kind="stable")[:, :CANDIDATES]]
-        pairs = [(ids[j], i) for i, rows in zip(some, ranked.tolist(), strict=True) for j in rows]
-        match_pairs(database, pairs, seed, stage="")
-        least = dict.fromkeys(some, REPEATED_FLOW * width)
-        with open_database(database) as db:
-            for view, number in pairs:
-                if (flow_px := _median_flow(db, view, number)) < least[number]:
-                    least[number] = flow_px
-                    view_of[number] = view
-        new = [k for k, i in enumerate(some, start) if view_of[i] == i]
-        mapped = np.append(mapped, np.array(new, np.int64))
-        send_progress("views", start + len(some), len(ids))
+    if len(ids) <= map_all_of:
+        extract(ids)
+        return {number: number for number in ids}
+    view_of = dict(before)
+    new = [number for number in ids if number not in view_of]
+    mapped = sum(number == view for number, view in view_of.items())
+    if before and mapped <= map_more_to:  # they are where the steps were too wide
+        extract(new)
+        return view_of | {number: number for number in new}
+    first = [*ids[::2], *ids[1::2][-1:]] if is_video and not before else new
+    extract(first)
+    compared = {*first, *(number for number, view in view_of.items() if view)}
+    words = visual_words(database, sorted(compared), seed)
+    limit_px = np.inf if before else REPEATED_FLOW * width
+    search = _ViewSearch(database, words, view_of, limit_px, seed)
+    search.add(first, "views", block)
+    is_repeat = {number: view not in (0, number) for number, view in view_of.items()}
+    for one, number, other in zip(ids, ids[1:], ids[2:], strict=False):
+        if number not in view_of and is_repeat.get(one) and is_repeat.get(other):
+            view_of[number] = 0
+    rest = [number for number in ids if number not in view_of]
+    extract(rest)
+    search.add(rest, "views again", block)
     return view_of
 
 
-def _median_flow(db: Any, one: int, other: int) -> float:
-    """Return the median displacement of the verified matches, px; infinite with too few."""
-    matches = np.asarray(db.read_two_view_geometry(one, other).inlier_matches, np.int64)
-    if len(matches) < REPEATED_MATCHES:
-        return float("inf")
-    ends = zip((one, other), matches.T, strict=True)
-    start, end = (np.asarray(db.read_keypoints(i))[rows, :2] for i, rows in ends)
-    return float(np.median(np.linalg.norm(start - end, axis=1)))
+class _ViewSearch:
+    """Compare keyframes with those that are to be mapped.
+
+    Attributes:
+        words: (W, 128) of `visual_words`. view_of: as of `find_repeated`, is extended.
+        limit_px: largest displacement of a repeated view; infinite: no further one is mapped.
+        mapped: keyframes to map. vlad: (M, D) of them.
+    """
+
+    def __init__(
+        self, database: Path, words: Floats, view_of: dict[int, int], limit_px: float, seed: int
+    ) -> None:
+        self.database = database
+        self.words = words
+        self.view_of = view_of
+        self.limit_px = limit_px
+        self.seed = seed
+        self.keypoints: dict[int, Array] = {}
+        self.mapped = np.array([i for i, view in view_of.items() if i == view], np.int64)
+        self.vlad = vlad_vectors(database, self.mapped.tolist(), words)
+
+    def add(self, numbers: Sequence[int], step: str, size: int) -> None:
+        """Find whether keyframes repeat the view of one that is mapped already, `size` at once."""
+        for start in range(0, len(numbers), size):
+            block = numbers[start : start + size]
+            self._add_block(block)
+            send_progress(step, start + len(block), len(numbers))
+
+    def _add_block(self, block: Sequence[int]) -> None:
+        vlad = vlad_vectors(self.database, block, self.words)
+        ranked = np.argsort(-vlad @ self.vlad.T, axis=1, kind="stable")[:, :CANDIDATES]
+        candidates = dict(zip(block, self.mapped[ranked].tolist(), strict=True))
+        self.view_of |= {number: number for number in block}
+        half = CANDIDATES // 2
+        for few in (slice(half), slice(half, None)):  # the most similar often suffice
+            others = {i: candidates[i][few] for i in block if self.view_of[i] == i}
+            pairs = sorted({(min(i, j), max(i, j)) for i, js in others.items() for j in js})
+            match_pairs(self.database, pairs, self.seed, stage="")
+            with open_database(self.database) as db:
+                for number, js in others.items():
+                    flow = [self._flow(db, j, number) for j in js]
+                    if min(flow, default=np.inf) <= self.limit_px:
+                        self.view_of[number] = js[int(np.argmin(flow))]
+        is_mapped = np.array([self.view_of[number] == number for number in block], bool)
+        self.mapped = np.concatenate([self.mapped, np.array(block, np.int64)[is_mapped]])
+        self.vlad = np.concatenate([self.vlad, vlad[is_mapped]])
+
+    def _flow(self, db: Any, one: int, other: int) -> float:
+        """Return the median displacement of the verified matches, px; infinite with too few."""
+        ends = sorted((one, other))
+        matches = np.asarray(db.read_two_view_geometry(*ends).inlier_matches, np.int64)
+        if len(matches) < REPEATED_MATCHES:
+            return float("inf")
+        for image in ends:
+            if image not in self.keypoints:
+                self.keypoints[image] = np.asarray(db.read_keypoints(image))[:, :2]
+        low, high = (self.keypoints[i][rows] for i, rows in zip(ends, matches.T, strict=True))
+        return float(np.median(np.linalg.norm(low - high, axis=1)))
 
 
 def register(model: Any, database: Path, ids: Sequence[int], seed: int) -> list[int]:
@@ -451,6 +515,8 @@ def register(model: Any, database: Path, ids: Sequence[int], seed: int) -> list[
     Returns:
         those that were registered.
     """
+    if ids:
+        send_progress("registering", 0, 0)
     pc = import_pycolmap()
     names = {f"{number:06d}" for number in {*model.reg_image_ids(), *ids}}
     with open_database(database) as db:
@@ -460,10 +526,17 @@ def register(model: Any, database: Path, ids: Sequence[int], seed: int) -> list[
         db.update_camera(initial)
     mapper = pc.IncrementalMapper(cache)
     mapper.begin_reconstruction(model)
-    kept = {"abs_pose_refine_focal_length": False, "abs_pose_refine_extra_params": False}
-    least = {"abs_pose_min_num_inliers": MIN_MATCHES, "abs_pose_min_inlier_ratio": 0.5}
-    limits = {"abs_pose_max_error": INLIER_PX, "num_threads": 1, "random_seed": seed}
-    options = pc.IncrementalMapperOptions(kept | least | limits)
+    options = pc.IncrementalMapperOptions(
+        {
+            "abs_pose_max_error": INLIER_PX,
+            "abs_pose_min_num_inliers": MIN_MATCHES,
+            "abs_pose_min_inlier_ratio": 0.5,
+            "abs_pose_refine_focal_length": False,
+            "abs_pose_refine_extra_params": False,
+            "num_threads": 1,
+            "random_seed": seed,
+        }
+    )
     matched = [number for number in ids if cache.exists_image(number)]  # it has no others
     registered = [number for number in matched if mapper.register_next_image(options, number)]
     mapper.end_reconstruction(False)

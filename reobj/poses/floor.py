@@ -13,7 +13,7 @@ import numpy as np
 
 from reobj.cameras import Poses, invert_rigid
 from reobj.files import numbers
-from reobj.types import Array, BoolArray, FiniteFloat, NonNegativeInt, Vector
+from reobj.types import Array, BoolArray, FiniteFloat, IntArray, NonNegativeInt, Vector
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,22 +35,27 @@ class Floor:
     inliers: NonNegativeInt
 
 
-NOISE = 0.012  # of points along the height, over their distance: 4 cm at 3 m
-MIN_POINTS = 100  # of a component, and of it below the cameras: fewer have planes by chance
-UP_SIGMA_DEG = 2.0  # prior of `up`: the error of an estimated direction
+NOISE = 0.012  # of points along the height, over their distance (chosen: 4 cm at 3 m)
+
+
+# Points of a component, and of it below the cameras (chosen; lower: chance planes of few points)
+MIN_POINTS = 100
+UP_SIGMA_DEG = 2.0  # prior of `up` (chosen: errors of an estimated direction)
 # Fraction of the points below the floor, outliers (measured: at .05 redkitchen gets a floor that
 # lies .08 m high)
 MAX_BELOW = 0.03
-# Heights in NOISE, whole numbers, beyond the noise of the floor: points between count against it
+# Heights in NOISE, whole numbers: points between them count against a plane (chosen: beyond the
+# noise of the floor itself)
 ABOVE = (4, 10)
-# Density of points on the plane over that shortly above it; with more, floors with much on them
-# are refused
+# Density of points on the plane over that shortly above it (chosen; higher: floors with much on
+# them are refused)
 MIN_EDGE = 1.5
 # Sigmas of the height, over the distance, and of the tilt that are common to all half samples:
-# drift of the cameras, gravity (9 mm at 3 m; hololens_kitchen's floor lies .5 deg off its gravity)
+# drift of the cameras, gravity (chosen: 9 mm at 3 m; hololens_kitchen's floor lies .5 deg off its
+# gravity)
 COMMON_SIGMA = 0.003
 COMMON_TILT_DEG = 0.3
-CAMERA_HEIGHT_M = (0.3, 2.5)  # of a hand-held camera above a floor
+CAMERA_HEIGHT_M = (0.3, 2.5)  # of a hand-held camera above a floor (chosen: wide)
 
 
 def floor_of(
@@ -113,30 +118,41 @@ def find_floor(
     foot = np.array(numbers(foot, distance))
     (offset,) = numbers(normal @ foot, distance)  # of the rounded plane: it contains `foot`
     floor = Floor(normal, offset, foot, sigma, tilt_sigma_deg, int(on_plane.sum()))
+    height_m = float(np.median(centres @ floor.normal - floor.offset)) * metres_per_unit
     height = local[:, 2] - np.column_stack([np.ones(len(local)), local[:, :2]]) @ plane
     on, above = ((low * noise < height) & (height < high * noise) for low, high in ((-1, 1), ABOVE))
     if on.sum() < MIN_EDGE * above.sum() * 2 / (ABOVE[1] - ABOVE[0]):
         return None, "no plane has clearly more points on it than above it"
-    across = local[on_plane, :2]
-    if len(across) < max(30, 0.015 * len(local)):
-        return None, f"only {len(across)} points lie on the lowest plane"
-    height_m = float(np.median(centres @ floor.normal - floor.offset)) * metres_per_unit
-    low, high = CAMERA_HEIGHT_M
-    length_m = float(np.ptp(np.percentile(across, (5, 95), axis=0), axis=0).max()) * metres_per_unit
-    extent = np.var(across, axis=0).sum() / np.var(local[:, :2], axis=0).sum()
-    checks = (
-        (extent < 0.3**2, "the lowest plane with points is small"),
-        (floor.sigma > 3 * noise,  # 11 cm at 3 m
-         "its height is uncertain: halves of the room differ by "
-         f"{floor.sigma * metres_per_unit:.2g} m"),
-        (not low <= height_m <= high,
-         f"the lowest plane is {height_m:.2g} m below the cameras ({low}-{high} m expected)"),
-        (height_m < 1.1 and length_m < 2.5,  # tables for eight are 2.4 m long
-         f"the lowest plane may be a table top: {length_m:.2g} m long, {height_m:.2g} m below the "
-         "cameras"),
-    )  # fmt: skip
-    reason = next((text for bad, text in checks if bad), "")
+    reason = _fault(floor, local, on_plane, noise, height_m, metres_per_unit)
     return (None, reason) if reason else (floor, "")
+
+
+def _fault(
+    floor: Floor,
+    local: Array,
+    on_plane: BoolArray,
+    noise: float,
+    height_m: float,
+    metres_per_unit: float,
+) -> str:
+    """Return why a plane is unlikely to be the floor, "" if it is likely."""
+    across = local[on_plane, :2]
+    low, high = CAMERA_HEIGHT_M
+    if len(across) < max(30, 0.015 * len(local)):
+        return f"only {len(across)} points lie on the lowest plane"
+    # rms extent less than .3 of that of all points
+    if np.var(across, axis=0).sum() < 0.3**2 * np.var(local[:, :2], axis=0).sum():
+        return "the lowest plane with points is small"
+    if floor.sigma > 3 * noise:  # 11 cm at 3 m
+        sigma_m = floor.sigma * metres_per_unit
+        return f"its height is uncertain: halves of the room differ by {sigma_m:.2g} m"
+    if not low <= height_m <= high:
+        return f"the lowest plane is {height_m:.2g} m below the cameras ({low}-{high} m expected)"
+    length_m = float(np.ptp(np.percentile(across, (5, 95), axis=0), axis=0).max()) * metres_per_unit
+    if height_m < 1.1 and length_m < 2.5:  # tables for eight are 2.4 m long
+        size = f"{length_m:.2g} m long, {height_m:.2g} m below the cameras"
+        return f"the lowest plane may be a table top: {size}"
+    return ""
 
 
 def _axes(up: Array) -> Array:
@@ -208,10 +224,8 @@ def _refine(local: Array, plane: Array, noise: float) -> tuple[Array, BoolArray]
         if len(below) > 5:  # the median of a half-normal distribution is .67 sigma
             sigma = float(np.clip(np.median(-below) / 0.6745, 0.1 * noise, noise))
         on_plane = np.abs(residual) < 2.5 * sigma
-        _, cell = np.unique(cell_of[on_plane], return_inverse=True)
-        columns = (*across[on_plane].T, local[on_plane, 2])
-        *design, height = (np.bincount(cell, column) / np.bincount(cell) for column in columns)
-        plane = _fit_plane(np.column_stack(design), height, plane, sigma)
+        design, height = _cell_means(cell_of[on_plane], across[on_plane], local[on_plane, 2])
+        plane = _fit_plane(design, height, plane, sigma)
     return plane, on_plane
 
 
@@ -242,3 +256,11 @@ def _fit_plane(design: Array, height: Array, plane: Array, sigma: float) -> Arra
     information = (design.T * weight) @ design + prior
     gradient = design.T @ (weight * residual) - prior @ plane
     return np.asarray(plane + np.linalg.lstsq(information, gradient, rcond=1e-12)[0])
+
+
+def _cell_means(cell: IntArray, across: Array, height: Array) -> tuple[Array, Array]:
+    """Return the mean of rows (N, 3) and heights (N,) in each cell that has any."""
+    _, cell = np.unique(cell, return_inverse=True)
+    count = np.bincount(cell).astype(float)
+    columns = [np.bincount(cell, column) / count for column in across.T]
+    return np.column_stack(columns).reshape(-1, 3), np.bincount(cell, height) / count

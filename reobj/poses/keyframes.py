@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -42,26 +43,33 @@ class ResizedFrame:
 
 
 class ImageFile:
-    """Images (h, w, 3) of one size in a folder, by number; one at a time is in memory.
+    """Images (h, w, 3) of one size in a file, by number; one at a time is in memory.
 
     Attributes:
-        shape: (h, w, 3); () before the first image.
+        path: of the file, which holds the pixels of one image after the other.
+        shape: (h, w, 3); () before the first image. slots: place in the file by number.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, path: Path) -> None:
+        self.path = path
         self.shape: tuple[int, ...] = ()
+        self.slots: dict[int, int] = {}
 
     def __getitem__(self, number: int) -> Image:
-        image: Image = np.load(self.folder / f"{number}.npy")
-        return image
+        size = math.prod(self.shape)
+        pixels = np.fromfile(self.path, np.uint8, size, offset=self.slots[number] * size)
+        return pixels.reshape(self.shape)
 
     def add(self, number: int, image: Image) -> None:
-        """Write an image."""
+        """Write an image at the end of the file, unless it is in it."""
+        if number in self.slots:
+            return
+        with writing(self.path):
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with open(self.path, "ab" if self.slots else "wb") as file:
+                file.write(np.ascontiguousarray(image).data)
         self.shape = image.shape
-        with writing(self.folder):
-            self.folder.mkdir(parents=True, exist_ok=True)
-            np.save(self.folder / f"{number}.npy", image)
+        self.slots[number] = len(self.slots)
 
 
 def _square(image: Image, aspect: float) -> Image:
@@ -161,6 +169,7 @@ class _KeyframeFlow:
     """Optical flow since a keyframe: its corners, tracked from frame to frame."""
 
     def __init__(self, key: ResizedFrame) -> None:
+        self.row = key.row
         self.gray = key.gray
         self.start = self.corners = _corners(key.gray)  # (N, 2) in the keyframe, the last frame
         self.count = max(len(self.start), 1)
@@ -184,10 +193,13 @@ class _KeyframeFlow:
         return float(np.median(flow)) / frame.gray.shape[1] if kept.any() else 0.0, left
 
 
-MIN_KEYFRAMES = 40  # with fewer the steps are halved: wider ones may not be matched
-MAX_FLOW = 0.12  # median since the last keyframe, over the width
-MIN_FLOW = 0.015  # that counts as motion, over the width: 10 px of 640
-MIN_LEFT = 0.55  # fraction of the last keyframe's corners that can still be tracked
+MIN_KEYFRAMES = 40  # with fewer the steps are halved (chosen; lower: too wide to be matched)
+MAX_FLOW = 0.12  # median since the last keyframe, over the width (chosen; lower: more keyframes)
+MIN_FLOW = 0.015  # that counts as motion, over the width (chosen: 10 px of 640)
+# Fraction of the last keyframe's corners that can still be tracked (chosen; higher: more keyframes
+# where the scene changes quickly)
+MIN_LEFT = 0.55
+MAX_INTERVAL = 60  # frames after which any motion makes a keyframe (chosen: 2 s at 30 Hz)
 
 
 def pick_keyframes(
@@ -229,7 +241,8 @@ def pick_keyframes(
         flow, left = update
         if flow >= 0.7 * wider * max_flow:  # near the threshold: the sharpest is chosen
             window.append(frame)
-        if flow > wider * max_flow or left < MIN_LEFT**wider:
+        late = frame.row - track.row >= wider * MAX_INTERVAL and flow > MIN_FLOW
+        if late or flow > wider * max_flow or left < MIN_LEFT**wider:
             best = max(window or [frame], key=lambda f: _sharpness(f.gray))
             replay.extendleft(f for f in reversed(window) if f.row > best.row)
             keep(best)
@@ -249,8 +262,8 @@ def pick_keyframes(
 # ---- Keyframes of supplied poses -----------------------------------------------------------------
 
 
-TURN_DEG = 8.0  # rotation between keyframes: an eighth of a usual field of view
-SPREAD_STEP = 1 / 8  # translation between them, over the spread: 7 deg of an orbit
+TURN_DEG = 8.0  # rotation between keyframes (chosen: an eighth of a usual field of view)
+SPREAD_STEP = 1 / 8  # translation between them, over the spread (chosen: 7 deg of an orbit)
 
 
 def path_steps(poses: Poses) -> Array:

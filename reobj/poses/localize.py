@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -30,7 +30,7 @@ class Located:
 
     Attributes:
         key_rows: (R,) row of each image of the model.
-        cam_from_world: (F, 3, 4), NaN where PnP failed. status: (F,) as in
+        cam_from_world: (F, 3, 4), NaN where PnP failed or the camera jumped. status: (F,) as in
             `Poses`.
     """
 
@@ -89,6 +89,9 @@ def locate_between(
             for done in pool.map(locate, batch):
                 line.step(done)
     cv2.setNumThreads(threads)
+    jump = _detours(cam_from_world) & (status == "pnp")
+    cam_from_world[jump] = np.nan
+    status[jump] = "none"
     return Located(model, key_rows, cam_from_world, status)
 
 
@@ -156,8 +159,8 @@ def _track_model_points(
     return tracked
 
 
-MIN_INLIERS = 15  # of an accepted pose: half of COLMAP's, as tracked points have few outliers
-MIN_RATIO = 0.5  # of inliers among the tracked points (COLMAP: .25 of raw matches)
+MIN_INLIERS = 15  # of an accepted pose (chosen; COLMAP registers images from 30 on)
+MIN_RATIO = 0.5  # of inliers among the tracked points (chosen; COLMAP: .25 of raw matches)
 
 
 def absolute_pose(
@@ -187,12 +190,37 @@ def absolute_pose(
     return pose if np.isfinite(pose).all() and (depth > 0).all() else None
 
 
+MAX_DETOUR = 5.0  # units (chosen; lower: frames of a shaking camera are lost)
+
+
+def _detours(cam_from_world: Array) -> BoolArray:
+    """Mark frames (F,) whose centre is far from both neighbours, while these are near each other.
+
+    The unit of the detour is the distance of the neighbours or the median step of the trajectory,
+    whichever is longer.
+    """
+    known = np.flatnonzero(np.isfinite(cam_from_world).all((1, 2)))
+    detour = np.zeros(len(cam_from_world), bool)
+    if len(known) > 2:
+        centre = invert_rigid(cam_from_world[known])[:, :, 3]  # (N, 3)
+        step = np.linalg.norm(np.diff(centre, axis=0), axis=1)  # (N-1,)
+        direct = np.linalg.norm(centre[2:] - centre[:-2], axis=1)  # (N-2,)
+        usual = np.maximum(direct, np.median(step))
+        detour[known[1:-1]] = step[1:] + step[:-1] - direct > MAX_DETOUR * usual
+    return detour
+
+
 MAX_GAP = 15  # consecutive lost frames that are interpolated: half a second at 30 Hz
-NEAR_GAPS = 2.0  # gap lengths, before and after it, in which the error is measured
+# Gap lengths, before and after it, in which the error is measured (chosen; higher: other motion)
+NEAR_GAPS = 2.0
 
 
 def fill_gaps(
-    located: Located, frame: IntArray, time_s: Array, shrink: float, unmapped: IntArray
+    located: Located,
+    frame: IntArray,
+    time_s: Array,
+    shrink: float,
+    unmapped: Sequence[int] | IntArray = (),
 ) -> tuple[Array, npt.NDArray[np.str_]]:
     """Interpolate the poses of at most MAX_GAP consecutive lost frames where the error is small.
 

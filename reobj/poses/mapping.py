@@ -15,16 +15,17 @@ from __future__ import annotations
 import copy
 import itertools
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy.optimize import least_squares
 from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import connected_components, reverse_cuthill_mckee
 from scipy.spatial.transform import Rotation
 
 from reobj.cameras import import_pycolmap
@@ -32,6 +33,7 @@ from reobj.files import spans
 from reobj.poses.bundle import (
     INLIER_PX,
     SAME_FOCAL,
+    Adjusted,
     adjusted,
     read_arrays,
     refine,
@@ -45,13 +47,16 @@ from reobj.poses.features import (
     send_progress,
 )
 from reobj.poses.verification import (
+    JOINT_POINTS,
     MIN_IMAGES,
     SURE_SIGMA,
+    ZOOM_LOG,
     Component,
     FocalSource,
-    by_size,
     confirmed,
     consistent_groups,
+    constant_focal,
+    count_explained,
     measured,
 )
 from reobj.types import Array, IntArray
@@ -60,6 +65,8 @@ ADVICE = (  # where no cause is established
     "what helps: textured objects in view, more overlap, sharp images, moving sideways instead of "
     "only turning, measured intrinsics (--camera)"
 )
+
+ADJUSTING = "adjusting"  # step of the progress: adjustment and verification of models
 
 FOCAL_GUESS = 0.8  # over the longer side, where it cannot be estimated (phones: .72-.85)
 
@@ -90,87 +97,131 @@ def without_poses(problem: str, advice: str = ADVICE) -> str:
 
 
 # Fraction of the keyframes and of the verified matches in sound components that ends the search
-# (measured: matches, right .91 to 1, wrong up to .89)
+# (matches, measured: right .91-1, wrong up to .89; keyframes: chosen)
 NEARLY_ALL = 0.9
 # Largest centre_sigma of a component of the incremental mapper that needs no second mapper, where a
-# focal length that does not come from the model agrees: it is evidence of its own
+# focal length that does not come from the model agrees: it is evidence of its own (chosen: time)
 ACCEPTED_SIGMA = 0.0012
-# Weight of the verified matches that the global mapper explains: it is right more often where the
-# parallax is weak, and is preferred unless it explains clearly fewer
+# Weight of the verified matches that the global mapper explains (chosen: it is right more often
+# where the parallax is weak; higher: it is kept with fewer matches)
 PREFERRED = 1.1
 
 
-@dataclass
 class MapperSearch:
     """Search for the mapper whose model is the most consistent.
 
     Attributes:
-        frames: number in the video of each keyframe, by id, in the order of time.
-        pairs: their verified matches. focal: of all images, as far as it is known before mapping.
+        ids: of the keyframes in the order of time. frames: their numbers in the video, for
+            messages. pairs: their verified matches.
+        focal: of all images, as far as it is known before mapping. guess: used in its place where
+            the matches no longer determine it.
         show: as `send_progress`, of registered images.
     """
 
-    database: Path
-    frames: dict[int, int]
-    pairs: MatchedPairs
-    focal: Focal
-    seed: int
-    show: Callable[[str, int, int], None] = send_progress
+    def __init__(
+        self,
+        database: Path,
+        frames: dict[int, int],
+        pairs: MatchedPairs,
+        focal: Focal,
+        guess: float,
+        seed: int,
+        show: Callable[[str, int, int], None] = send_progress,
+    ) -> None:
+        self.database = database
+        self.ids = list(frames)
+        self.frames = frames
+        self.pairs = pairs
+        self.focal = focal
+        self.guess = guess
+        self.seed = seed
+        self.show = show
 
-    def report(self, components: Sequence[Component]) -> list[str]:
-        """Report an uncertain focal length, and keyframes without poses; why, if none has one."""
-        if not sound(components):
-            problem = "no pair of keyframes initialises a model"
-            advice = ""
-            if components:
-                problem = components[0].problem
-                advice = components[0].advice
-            enough = self.pairs.enough
-            planar = np.isnan(self.pairs.fundamental[enough, 0, 0]).sum()
-            problem += (
-                f"; {enough.sum()} pairs of {len(self.frames)} keyframes have at least "
-                f"{MIN_MATCHES} verified matches, {planar} of them explained by a plane or a pure "
-                "rotation"
-            )
-            return [without_poses(problem, advice or ADVICE)]
-        messages = list[str]()
-        largest = components[0]
-        if largest.focal_source not in (FocalSource.GIVEN, FocalSource.MODEL):
-            messages.append(
-                f"frames {self._spans(largest.arrays.ids)} do not determine the focal "
-                "length (the camera should turn as well as move): it is assumed to be "
-                f"{largest.focal:.3g} x the longer side, depths are rough; give --camera "
-                "fx,fy,cx,cy, or walk around the objects"
-            )
-        for component in components:
-            ids = component.arrays.ids
-            uncertain = np.setdiff1d(ids, component.kept)
-            if component.problem and len(ids) >= MIN_IMAGES:
-                messages.append(f"frames {self._spans(ids)} have no poses: {component.problem}")
-            elif len(uncertain) and not component.problem:
-                left_out = spans([self.frames[i] for i in uncertain.tolist()])
-                messages.append(
-                    f"keyframes {left_out} are left out: their poses are uncertain, "
-                    "and a second mapper does not reproduce them"
+    def run(self) -> tuple[list[Any], list[str], list[str]]:
+        """Try mappers until sound components contain nearly all keyframes.
+
+        Images of another focal length are left out of `ids` as soon as they are found.
+
+        Returns:
+            models of the components, the largest first ([]: none is sound); messages about the
+            focal length; messages about keyframes without poses.
+        """
+        zooms = list[tuple[int, int, float]]()
+        for _ in range(3):  # each without the images of other focal lengths found before
+            best, messages = self._best()
+            others, changes = self._other_focal(best)
+            if not len(others):
+                break
+            zooms += changes
+            excluded = set(others.tolist())
+            self.ids = [i for i in self.ids if i not in excluded]
+            self.pairs = self.pairs.only(self.ids)
+            if self.focal.source is FocalSource.MATCHES:  # of several focal lengths until now
+                camera = best[0].arrays.camera
+                self.focal = estimate_focal(self.pairs, (camera.width, camera.height), self.guess)
+        else:
+            best = [replace(c, problem="the focal length keeps changing") for c in best]
+        if self.focal.source is FocalSource.GIVEN and zooms:  # which of them is the camera's?
+            why = "its images were taken at another focal length than that of the given camera"
+            best = [c if self._has_its_focal(c) else replace(c, problem=why) for c in best]
+        sound = [component for component in best if not component.problem]
+        if not sound:
+            problem = best[0].problem if best else "no pair of keyframes initialises a model"
+            advice = (best[0].advice if best else "") or ADVICE
+            return [], [], [without_poses(f"{problem}; {self._match_counts()}", advice)]
+        messages = [
+            f"the focal length changed between frames {self.frames[a]} and {self.frames[b]} "
+            f"(x {ratio:.2f}): only the frames of one focal length have poses; do not zoom"
+            for a, b, ratio in zooms
+        ] + messages
+        lost = list[str]()
+        for component in sound:
+            uncertain = np.setdiff1d(component.arrays.ids, component.kept)
+            if len(uncertain):
+                frames = spans([self.frames[i] for i in uncertain.tolist()])
+                lost.append(
+                    f"keyframes {frames} are left out: their poses are uncertain, and a second "
+                    "mapper does not reproduce them"
                 )
-        return messages
+        for component in best:
+            ids = component.arrays.ids.tolist()
+            if component.problem and len(ids) >= MIN_IMAGES:
+                lost.append(f"frames {self._range(ids)} have no poses: {component.problem}")
+        return models_of_one_camera(sound), messages, lost
 
-    def _spans(self, ids: IntArray) -> str:
-        """Name the frames of some keyframes, or of a path the first and the last."""
-        frames = [self.frames[i] for i in ids.tolist()]
+    def _other_focal(
+        self, components: list[Component]
+    ) -> tuple[npt.NDArray[Any], list[tuple[int, int, float]]]:
+        """Find images of another focal length than most, and the changes (`constant_focal`)."""
+        if not self.pairs.is_path:  # the photo before does not show the same points
+            return np.empty(0), []
+        known = [c for c in components if c.focal_source is not FocalSource.GUESS]
+        # with little parallax a zoom cannot be observed
+        known = [c for c in known if not c.problem] or known
+        return constant_focal([component.arrays for component in known])
+
+    def _range(self, ids: list[int]) -> str:
+        """Return the first and last frame of some keyframes; all, of photos without an order."""
+        frames = [self.frames[i] for i in ids]
         return f"{frames[0]}-{frames[-1]}" if self.pairs.is_path else spans(frames)
 
-    def best(self) -> list[Component]:
+    def _match_counts(self) -> str:
+        """Describe the matches of the keyframes for a message."""
+        enough = self.pairs.enough
+        planar = int(np.isnan(self.pairs.fundamental[enough, 0, 0]).sum())
+        return (
+            f"{enough.sum()} pairs of {len(self.ids)} keyframes have at least {MIN_MATCHES} "
+            f"verified matches, {planar} of them explained by a plane or a pure rotation"
+        )
+
+    def _best(self) -> tuple[list[Component], list[str]]:
         """Choose the mapper whose sound components explain most of the verified matches.
 
         The incremental mapper is fast, and right where the parallax is strong; where it is weak, it
         ends in a wrong one of many nearly equal solutions more often than the global mapper, which
-        needs a focal length. The focal length from the matches, or else from the incremental
-        mapper, is kept while mapping: freed too early it drifts off, and images are joined wrongly.
-        The last adjustment frees it.
-
-        Returns:
-            components, sound ones first, the largest first.
+        needs a focal length and is preferred unless it explains clearly fewer matches. The focal
+        length from the matches, or else from the incremental mapper, is kept while mapping: freed
+        too early it drifts off, and images are joined wrongly. The last adjustment frees it.
         """
         source = self.focal.source
         start = self.focal.value
@@ -179,21 +230,31 @@ class MapperSearch:
             best = confirmed(self._components("incremental", False), [], source)
             if best and best[0].focal_source is FocalSource.MODEL:
                 if self._is_sure(best, SURE_SIGMA):
-                    return best
+                    return best, []
                 start = best[0].focal
         if source is not FocalSource.GIVEN:
             _set_focal(self.database, start, True)
         best = self._components("incremental", True)
-        if self._is_sure(best, ACCEPTED_SIGMA):
-            return best
-        other = self._components("global", True)
-        # its focal length was held: that it agrees with the matches proves nothing
-        if self._is_sure(other, SURE_SIGMA):
-            return other
-        by_incremental = confirmed(best, other, source)
-        by_global = confirmed(other, best, source)
-        is_global = PREFERRED * _explained(by_global) >= _explained(by_incremental)
-        return by_global if is_global else by_incremental
+        if not self._is_sure(best, ACCEPTED_SIGMA):
+            other = self._components("global", True)
+            # its focal length was held: that it agrees with the matches proves nothing
+            if self._is_sure(other, SURE_SIGMA):
+                best = other
+            else:
+                by_incremental = confirmed(best, other, source)
+                by_global = confirmed(other, best, source)
+                weighted = PREFERRED * _explained(by_global)
+                best = by_global if weighted >= _explained(by_incremental) else by_incremental
+        given = source is FocalSource.GIVEN
+        if given or not best or best[0].problem or best[0].focal_source is FocalSource.MODEL:
+            return best, []
+        ids = best[0].arrays.ids.tolist()
+        return best, [
+            f"frames {self._range(ids)} do not determine the focal "
+            "length (the camera should turn as well as move): it is assumed to be "
+            f"{start:.3g} x the longer side, depths are rough; give --camera fx,fy,cx,cy, or walk "
+            "around the objects"
+        ]
 
     def _is_sure(self, components: list[Component], limit: float) -> bool:
         """True if sound components of strong geometry explain nearly all matches.
@@ -201,86 +262,99 @@ class MapperSearch:
         Args:
             limit: of centre_sigma, where the focal length is given or the matches give the same.
         """
-        known = self.focal.source
         accepted = list[Component]()
         for component in components:
-            agrees = known is FocalSource.GIVEN or (
-                known is FocalSource.MATCHES
+            agrees = self.focal.source is FocalSource.GIVEN or (
+                self.focal.source is FocalSource.MATCHES
                 and abs(np.log(self.focal.value / component.focal)) < SAME_FOCAL
             )
-            if component.centre_sigma <= (limit if agrees else SURE_SIGMA):
+            most = limit if agrees else SURE_SIGMA
+            if not component.problem and component.centre_sigma <= most:
                 accepted.append(component)
-        registered = sum(component.registered for component in sound(accepted))
+        registered = sum(component.registered for component in accepted)
         matched = sum(map(len, self.pairs.inliers))
         return registered >= NEARLY_ALL and _explained(accepted) >= NEARLY_ALL * matched
 
     def _components(self, mapper: str, keep_intrinsics: bool) -> list[Component]:
-        """Run a mapper and measure the consistent components of its models, largest first."""
-        done = itertools.count(2)
-        count = len(self.frames)
-        step = "second mapper" if mapper == "global" else "mapping"
-
-        def tick() -> None:
-            self.show(step, min(next(done), count), count)
-
-        self.show(step, 0, count if mapper == "incremental" else 0)
-        ids = list(self.frames)
-        models = _run_mapper(self.database, mapper, keep_intrinsics, ids, self.seed, tick)
-        return self.components_of(models)
-
-    def components_of(self, models: Sequence[Any]) -> list[Component]:
-        """Adjust models and measure their consistent components, the largest first.
+        """Run a mapper and measure the consistent components of its models, largest first.
 
         The models are adjusted first: what is checked is what is returned.
         """
-        self.show("adjusting", 0, 0)
-        calibrate = self.focal.source is not FocalSource.GIVEN
-        groups = [
-            (group, whole)
-            for whole in (adjusted(model, calibrate) for model in models)
-            for group in consistent_groups(whole.arrays, self.pairs)
-        ]
+        done = itertools.count(2)
+        count = len(self.ids)
+        step = "second mapper" if mapper == "global" else "mapping"
+
+        def tick() -> None:
+            registered = next(done)
+            if registered <= count:
+                self.show(step, registered, count)
+            if registered == count:  # a global adjustment follows
+                self.show(ADJUSTING, 0, 0)
+
+        self.show(step, 0, count if mapper == "incremental" else 0)
+        models = _run_mapper(self.database, mapper, keep_intrinsics, self.ids, self.seed, tick)
+        return self.components_of(models)
+
+    def components_of(self, models: Sequence[Any]) -> list[Component]:
+        """Adjust models and measure their consistent components, the largest first."""
+        self.show(ADJUSTING, 0, 0)
+        given = self.focal.source is FocalSource.GIVEN
+        groups = list[tuple[IntArray, Adjusted]]()
+        for model in models:
+            whole = adjusted(model, not given)
+            found = consistent_groups(whole.arrays, self.pairs)
+            groups += [(group, whole) for group in found]
         taken = set[int]()
         components = list[Component]()
         for group, whole in sorted(groups, key=lambda found: -len(found[0])):
             kept = set(group.tolist()) - taken  # models may overlap
             own = whole
             if len(kept) < len(whole.arrays.ids):
-                own = adjusted(submodel(whole.model, kept), calibrate)
-            component = measured(own, self.pairs, self.frames, self.focal.source)
+                own = adjusted(submodel(whole.model, kept), not given)
+            component = measured(
+                own.model,
+                own.arrays,
+                own.centre_sigma,
+                count=len(self.ids),
+                explained=int(count_explained(own.arrays, self.pairs).sum()),
+                focal_source=FocalSource.MODEL if own.calibrated else self.focal.source,
+            )
             components.append(component)
             taken |= set() if component.problem else kept
-        return by_size(components)
+        return sorted(components, key=lambda c: (bool(c.problem), -c.registered))
+
+    def _has_its_focal(self, component: Component) -> bool:
+        """True if the focal length of a component, when freed, comes out as the given one."""
+        free = adjusted(component.model, True)
+        log = np.log(free.arrays.focal_over_size / component.focal)
+        return free.calibrated and bool(abs(log) < ZOOM_LOG)
 
 
-def sound(components: Iterable[Component]) -> list[Component]:
-    """Select the components without a problem."""
-    return [component for component in components if not component.problem]
-
-
-def _explained(components: list[Component]) -> int:
-    """Count the verified matches that sound components explain."""
-    return sum(component.explained for component in sound(components))
-
-
-def models_of_one_camera(components: Iterable[Component]) -> list[Any]:
-    """Adjust smaller sound components with the camera of the largest: one camera took all images.
+def models_of_one_camera(sound: list[Component]) -> list[Any]:
+    """Adjust smaller components with the camera of the largest: one camera took all images.
 
     Images outside `kept` are left out; the frames are located later by points of the others.
     """
     models = list[Any]()
-    for component in sound(components):
+    for component in sound:
         model = component.model
         all_kept = len(component.kept) == len(component.arrays.ids)
         if not all_kept:
             model = submodel(model, set(component.kept.tolist()))
         if models:
-            model.camera(1).model = models[0].camera(1).model
-            model.camera(1).params = models[0].camera(1).params
+            own = model.camera(1)
+            camera = models[0].camera(1)
+            own.model = camera.model
+            own.params = camera.params
         if models or not all_kept:
             refine(model)
         models.append(model)
     return models
+
+
+def _explained(components: list[Component]) -> int:
+    """Count the verified matches that sound components explain."""
+    return sum(component.explained for component in components if not component.problem)
 
 
 # ---- Mappers of pycolmap -------------------------------------------------------------------------
@@ -320,7 +394,7 @@ def _run_mapper(
         options["mapper"] = {"bundle_adjustment": kept}
         return list(pc.global_mapping(*paths, options=options).values())
     options |= {"multiple_models": True, "min_model_size": 3, "extract_colors": False}
-    # cheaper global adjustment while mapping than by default: a full one follows
+    # global adjustment more rarely and less exactly than by default (chosen: time; one follows)
     options |= {"ba_global_frames_ratio": 2.0, "ba_global_points_ratio": 2.0}
     options |= {"ba_global_function_tolerance": 1e-5, "ba_global_max_refinements": 1}
     options |= {"ba_local_max_refinements": 1}
@@ -338,84 +412,134 @@ def _run_mapper(
 # ---- Windows -------------------------------------------------------------------------------------
 
 
-WINDOW = 200  # keyframes of a window, for which a mapper needs a minute
+WINDOW = 200  # keyframes of a window (chosen: a mapper needs a minute for them)
 OVERLAP = 40  # keyframes that two consecutive windows share
-# Points in common that prove how two models are joined: they fix rotation, shift and scale
-# (measured: right joins 191 to 386, a mirrored stretch 24, a free scale 0 to 3)
-JOINT_POINTS = 100
 # Largest reprojection error in the other model of a point that joins two models (COLMAP's
 # abs_pose_max_error: windows are not adjusted together yet)
 JOINT_PX = 3 * INLIER_PX
 # Distance of joined points over their depth, median of two models, above which the other joins
-# contradict theirs: five times the usual error of a triangulated point, more than a window drifts
+# contradict theirs (chosen: drift of a window stays below)
 CONTRADICTION = 0.1
 
 
-def split(ids: Sequence[int], size: int = WINDOW, overlap: int = OVERLAP) -> list[Sequence[int]]:
-    """Cut keyframes, in the order of time, into windows of nearly equal size that overlap."""
+def _path(ids: list[int], pairs: MatchedPairs) -> list[int]:
+    """Order images so that near ones match: by time, or, if that says nothing, by their matches.
+
+    Ref: Cuthill and McKee, ACM 1969: an order in which the connections of a graph are short.
+    """
+    if pairs.is_path:
+        return ids
+    ends = np.searchsorted(ids, pairs.image_ids[pairs.enough])
+    graph = csr_matrix((np.ones(len(ends)), ends.T), (len(ids), len(ids)))
+    order = reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True)
+    return [ids[k] for k in order.tolist()]
+
+
+def split(ids: Sequence[int], size: int = WINDOW, overlap: int = OVERLAP) -> list[list[int]]:
+    """Cut keyframes, in the order of their path, into windows of nearly equal size that overlap.
+
+    Those of a window are in ascending order.
+    """
     count = max(1, round((len(ids) - overlap) / (size - overlap)))
     starts = np.linspace(0, max(len(ids) - overlap, 0), count + 1).round().astype(int)
-    return [ids[a : b + overlap] for a, b in itertools.pairwise(starts.tolist())]
+    return [sorted(ids[a : b + overlap]) for a, b in itertools.pairwise(starts.tolist())]
 
 
 def map_keyframes(
     search: MapperSearch, size: int = WINDOW, overlap: int = OVERLAP
-) -> tuple[list[Any], list[str]]:
+) -> tuple[list[Any], list[str], list[int]]:
     """Map keyframes: at once, or in windows whose models are joined.
-
-    Photos without an order have no consecutive ones: they are mapped at once.
 
     Args:
         search: with all keyframes; its database has their features and verified matches.
         size, overlap: keyframes, as of `split`.
     Returns:
-        models of the components, the largest first ([]: none is sound); messages.
+        models of the components, the largest first ([]: none is sound); messages; keyframes whose
+        windows alone do not determine their poses, to be registered in the joined models.
     """
-    windows = split(list(search.frames), size, overlap)
-    in_windows = len(windows) > 1 and search.pairs.is_path
-    components = _map_windows(windows, search) if in_windows else search.best()
-    return models_of_one_camera(components), search.report(components)
+    windows = split(_path(search.ids, search.pairs), size, overlap)
+    if len(windows) == 1:
+        models, messages, lost = search.run()
+        return models, [*messages, *lost], []
+    models, messages, tried = _map_windows(windows, search)
+    if not models:
+        return [], messages, []
+    posed = [_merged_poses(models, place) for place in aligned(models, search.pairs)]
+    del models  # memory
+    sound, problem = _joined(posed, search)
+    if problem:
+        return [], [*messages, without_poses(problem)], []
+    mapped = {number for component in sound for number in component.kept.tolist()}
+    return models_of_one_camera(sound), messages, sorted(tried - mapped)
 
 
-def _map_windows(windows: list[Sequence[int]], whole: MapperSearch) -> list[Component]:
-    """Map windows of keyframes and join their models.
+def _map_windows(
+    windows: list[list[int]], whole: MapperSearch
+) -> tuple[list[Any], list[str], set[int]]:
+    """Map windows of keyframes.
 
     Args:
         whole: a search with all keyframes.
     Returns:
-        components as of `MapperSearch.best`; those of the first window if none is sound.
+        models of all windows; messages; ids of the images that have the focal length of the models.
     """
     lock = threading.Lock()
 
-    def map_window(k: int) -> list[Component]:
+    def map_window(k: int) -> tuple[list[Any], list[str], list[str], list[int]]:
+        ids = windows[k]
         path = whole.database.parent / f"window{k}" / "database.db"
         path.parent.mkdir(exist_ok=True)
+        frames = {i: whole.frames[i] for i in ids}
+        known = (whole.focal, whole.guess, whole.seed, lambda *_: None)
+        search = MapperSearch(path, frames, whole.pairs.only(ids), *known)
         with lock:
-            copy_database(whole.database, path, windows[k])
-        pairs = whole.pairs.only(windows[k])
-        frames = {i: whole.frames[i] for i in windows[k]}
-        search = MapperSearch(path, frames, pairs, whole.focal, whole.seed, lambda *_: None)
-        return search.best()
+            copy_database(whole.database, path, ids)
+        found = search.run()
+        path.unlink()
+        return *found, search.ids
 
-    found = list[list[Component]]()
+    results = []
     send_progress("mapping", 0, len(windows))
     with ThreadPoolExecutor(2) as pool:  # mappers use one core each: reproducible
-        for components in pool.map(map_window, range(len(windows))):
-            found.append(components)
-            send_progress("mapping", len(found), len(windows))
-    models = [model for components in found for model in models_of_one_camera(components)]
+        for found in pool.map(map_window, range(len(windows))):
+            results.append(found)
+            send_progress("mapping", len(results), len(windows))
+    models = [model for found, *_ in results for model in found]
+    messages = [text for _, found, _, _ in results for text in found]
     if not models:
-        return found[0]
-    send_progress("joining", 0, 0)
-    calibrate = whole.focal.source is not FocalSource.GIVEN
+        messages += results[0][2]
+    tried = {number for *_, found in results for number in found}
+    return models, list(dict.fromkeys(messages)), tried
+
+
+def _joined(
+    posed: list[tuple[dict[int, Array], Any]], whole: MapperSearch
+) -> tuple[list[Component], str]:
+    """Triangulate the matches of all images of joined windows, and adjust them together.
+
+    Args:
+        posed: poses by image id, and camera, of each group of windows, as of `_merged_poses`.
+    Returns:
+        sound components; why there is none.
+    """
+    steps = itertools.count()
+
+    def show_step() -> None:
+        send_progress("joining", next(steps), 3 * len(posed) + 1)
+
+    show_step()
     joined = list[Any]()
-    for place in aligned(models, whole.pairs):
-        pose, camera = _merged_poses(models, place)
+    for pose, camera in posed:
         model = triangulated(pose, camera, whole.database, whole.seed)
-        model = adjusted(model, calibrate).model
+        show_step()
+        model = adjusted(model, whole.focal.source is not FocalSource.GIVEN).model
+        show_step()
         pose = {i: model.image(i).cam_from_world().matrix() for i in model.reg_image_ids()}
         joined.append(triangulated(pose, model.camera(1), whole.database, whole.seed))
-    return whole.components_of(joined)
+        show_step()
+    components = whole.components_of(joined)
+    sound = [component for component in components if not component.problem]
+    return sound, "" if sound else components[0].problem
 
 
 def copy_database(source: Path, path: Path, ids: Sequence[int], camera: Any = None) -> None:
@@ -458,13 +582,12 @@ class _Joint:
 
 
 class _Piece:
-    """A model of a window, with the points of its keypoints and their median depth."""
+    """A model of a window, with the points of its keypoints."""
 
     def __init__(self, model: Any, keypoints: dict[int, Array]) -> None:
         arrays = self.arrays = read_arrays(model)
         self.point_of = arrays.point_of_keypoints(keypoints)
         self.first_seen = np.unique(arrays.point, return_index=True)[1]  # (N,) observations
-        self.depth = float(np.median(arrays.points_in_cam()[:, 2]))
 
     def errors_px(self, xyz: Array, points: IntArray) -> Array:
         """Return the reprojection errors (n,) of positions (n, 3) of points (n,) of the model."""
@@ -476,17 +599,22 @@ class _Piece:
         error = np.linalg.norm(in_cam[:, :2] / depth[:, None] - arrays.ideal[seen], axis=1)
         return np.asarray(np.nan_to_num(arrays.focal * error, nan=np.inf))
 
+    def depth(self) -> float:
+        """Return the median depth of the observed points."""
+        return float(np.median(self.arrays.points_in_cam()[:, 2]))
+
 
 def _common_points(one: _Piece, other: _Piece, pairs: MatchedPairs) -> IntArray:
     """Return the points (n, 2) of two models that are the same keypoint, or matching ones."""
     found = [np.empty((0, 2), np.int64)]
     for number in one.point_of.keys() & other.point_of.keys():
         found.append(np.column_stack([one.point_of[number], other.point_of[number]]))
-    for ends, match in zip(pairs.image_ids.tolist(), pairs.inliers, strict=True):
-        for (i, rows), (j, other_rows) in itertools.permutations(zip(ends, match.T, strict=True)):
+    for (a, b), match in zip(pairs.image_ids.tolist(), pairs.inliers, strict=True):
+        for i, j, ends in ((a, b, match.T), (b, a, match.T[::-1])):
             if i in one.point_of and j in other.point_of:
-                points = one.point_of[i][rows], other.point_of[j][other_rows]
-                found.append(np.column_stack(points))
+                found.append(
+                    np.column_stack([one.point_of[i][ends[0]], other.point_of[j][ends[1]]])
+                )
     table = np.concatenate(found)
     return np.unique(table[(table >= 0).all(1)], axis=0)
 
@@ -501,7 +629,7 @@ def _joint(
         return None
     a = one.arrays.xyz[common[:, 0]]
     b = other.arrays.xyz[common[:, 1]]
-    nearby = other.depth * JOINT_PX / other.arrays.focal * 3  # depths are less exact
+    nearby = other.depth() * JOINT_PX / other.arrays.focal * 3  # depths are less exact
     ransac = {"max_error": nearby, "max_num_trials": 1000, "random_seed": 0}
     estimate = pc.estimate_sim3d_robust(a, b, ransac)
     found = estimate["tgt_from_src"] if estimate else None
@@ -534,7 +662,7 @@ def aligned(models: Sequence[Any], pairs: MatchedPairs) -> list[dict[int, Any]]:
         if (joint := _joint((a, b), pieces[a], pieces[b], pairs)) is not None
     ]
     size = [len(piece.arrays.ids) for piece in pieces]
-    depth = [piece.depth for piece in pieces]
+    depth = [piece.depth() for piece in pieces]
     while True:
         ends = np.array([(j.one, j.other) for j in joints], np.int64).reshape(-1, 2)
         graph = csr_matrix((np.ones(len(ends)), ends.T), (len(pieces), len(pieces)))
@@ -588,8 +716,8 @@ def _adjusted(
     def residuals(values: Array) -> Array:
         at = unpacked(values)
         apart = [
-            at[j.one] * j.xyz[0][rows] - at[j.other] * j.xyz[1][rows]
-            for j, rows in zip(mine, few, strict=True)
+            at[j.one] * j.xyz[0][part] - at[j.other] * j.xyz[1][part]
+            for j, part in zip(mine, few, strict=True)
         ]
         return np.concatenate(apart).ravel() / depth[root]
 

@@ -20,9 +20,10 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -86,11 +87,16 @@ class Child:
     def __enter__(self) -> Child:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *error: Any) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
         if kind is not None:
             self.process.kill()
         with contextlib.suppress(BrokenPipeError):
-            self.process.__exit__(kind, *error)  # closes its pipes, waits
+            self.process.__exit__(kind, error, traceback)  # closes its pipes, waits
 
     def run(self, job: Any, progress: MakeProgress) -> Any:
         """Send a job, an object with a method `work(folder)`, and show its progress.
@@ -103,43 +109,57 @@ class Child:
             pickle.dump(job, self.process.stdin)
             self.process.stdin.flush()
         line: Progress | None = None
-        lines = queue.SimpleQueue[bytes]()
-        threading.Thread(target=self._read, args=(lines,), daemon=True).start()
+        for words in self._messages():
+            if words == DONE:
+                break
+            if not words and line is not None:
+                line.step(0)
+            if len(words) < 4 or words[0] != DONE[0]:
+                continue
+            stage = " ".join(words[1:-2])
+            done, total = map(int, words[-2:])
+            if line is None or line.stage != stage:
+                if line is not None:
+                    line.close()
+                line = progress(stage, total)
+            line.step(done - line.done)
+        else:
+            code = self.process.wait()
+            reason = f"signal {-code}" if code < 0 else f"exit code {code}"
+            return f"stopped ({reason}), see {self.log_path}"
+        if line is not None:
+            line.close()
+        return pickle.loads((self.folder / RESULT).read_bytes())
+
+    def _messages(self) -> Iterator[list[str]]:
+        """Yield the words of each line up to DONE or the end; [] after ALIVE_S without one.
+
+        One call of COLMAP takes minutes, in which the child can send nothing.
+        """
+        assert self.process.stdout is not None
+        stream = self.process.stdout
+        found = queue.SimpleQueue[list[str] | None]()
+
+        def read() -> None:
+            words: list[str] = []
+            while words != DONE and (text := stream.readline()):
+                words = text.decode(errors="replace").split()
+                found.put(words)
+            found.put(None)
+
+        threading.Thread(target=read, daemon=True).start()
         while True:
             try:
-                words = lines.get(timeout=ALIVE_S).split()
-            except queue.Empty:  # one call of COLMAP takes minutes, in which nothing is sent
-                if line is not None:
-                    line.step(0)
+                words = found.get(timeout=ALIVE_S)
+            except queue.Empty:
+                yield []
                 continue
-            ended = not words or words == DONE
-            stage = b" ".join(words[1:-2]).decode()
-            if line is not None and (ended or line.stage != stage):
-                line.close()
-                line = None
-            if ended:
-                break
-            done, total = map(int, words[-2:])
-            line = line or progress(stage, total)
-            line.step(done - line.done)
-        if words == DONE:
-            return pickle.loads((self.folder / RESULT).read_bytes())
-        code = self.process.wait()
-        reason = f"signal {-code}" if code < 0 else f"exit code {code}"
-        return f"stopped ({reason}), see {self.log_path}"
-
-    def _read(self, lines: queue.SimpleQueue[bytes]) -> None:
-        """Pass on the child's messages up to DONE; an empty one where its output ends."""
-        assert self.process.stdout is not None
-        for line in iter(self.process.stdout.readline, b""):
-            if line.startswith(b"reobj:"):
-                lines.put(line)
-            if line.split() == DONE:
+            if words is None:
                 return
-        lines.put(b"")
+            yield words
 
 
-DONE = [b"reobj:", b"done"]
+DONE = ["reobj:", "done"]
 ALIVE_S = 0.5  # of silence of the child, after which its progress line is drawn again
 RESULT = "result.pickle"  # file of the child's folder
 
@@ -166,7 +186,7 @@ def serve(folder: Path) -> None:
     import_pycolmap().logging.minloglevel = 0  # stderr is the log file here
     while True:
         (folder / RESULT).write_bytes(pickle.dumps(jobs.get().work(folder)))
-        print("reobj: done", flush=True)
+        print(*DONE, flush=True)
 
 
 # ---- Keyframes of unknown poses ------------------------------------------------------------------
@@ -199,6 +219,7 @@ class MappingJob:
         boxes_of: (N, 4) xyxy of moving objects by id, native pixels: no features there.
         size: (w, h), native. camera: kept as it is; None: calibrated.
         focal_guess: over the longer side, used where it cannot be estimated from the matches.
+        is_video: there are frames between the keyframes.
         view_of: of an earlier attempt with fewer keyframes (`Mapped`); its features and matches
             are in the folder.
     """
@@ -210,6 +231,7 @@ class MappingJob:
     size: tuple[int, int]
     camera: Camera | None
     focal_guess: float
+    is_video: bool
     seed: int
     view_of: Mapping[int, int]
 
@@ -219,23 +241,28 @@ class MappingJob:
         height, width = self.images.shape[:2]
         size = (width, height)
         guess = self.focal_guess
-        pc = import_pycolmap()
         if self.camera is not None:
             camera = _resized(self.camera, size)
         else:
+            pc = import_pycolmap()
             focal_px = guess * max(size)
             camera = pc.Camera.create_from_model_name(1, "SIMPLE_RADIAL", focal_px, *size)
         ids = list(self.frame_of)
         scale = np.tile(np.array(size) / self.size, 2)
         boxes = {number: xyxy * scale for number, xyxy in self.boxes_of.items()}
-        extract_features(database, self.images, ids, boxes, camera)
-        view_of = find_repeated(database, ids, width, self.seed, self.view_of)
-        mapped = sorted(set(view_of.values()))
+
+        def extract(chosen: Sequence[int]) -> None:
+            extract_features(database, self.images, chosen, boxes, camera)
+
+        view_of = find_repeated(
+            database, ids, extract, width, self.seed, self.is_video, self.view_of
+        )
+        mapped = sorted({view for view in view_of.values() if view})
         vlad = vlad_vectors(database, mapped, visual_words(database, mapped, self.seed))
-        path = list(view_of.values())
+        path = [view_of[number] for number in ids if view_of[number]]
         match_pairs(database, choose_pairs(path, mapped, vlad), self.seed)
         every_pair = read_pairs(database)
-        is_path = every_pair.in_order(mapped)
+        is_path = every_pair.only(mapped).in_order(mapped)
         if not is_path:
             more = choose_pairs(path, mapped, vlad, UNORDERED)
             match_pairs(database, more, self.seed, "match again")
@@ -245,11 +272,13 @@ class MappingJob:
         if self.camera is None:
             focal = estimate_focal(pairs, size, guess)
         frames = {number: self.frame_of[number] for number in mapped}
-        models, messages = map_keyframes(MapperSearch(database, frames, pairs, focal, self.seed))
+        search = MapperSearch(database, frames, pairs, focal, guess, self.seed)
+        models, messages, weak = map_keyframes(search)
         for model in models:
             inside = set(model.reg_image_ids())
             repeated = [i for i in ids if view_of[i] in inside and view_of[i] != i]
-            register(model, database, repeated, self.seed)
+            added = register(model, database, [*repeated, *weak], self.seed)
+            weak = [number for number in weak if number not in added]
         new = Path(tempfile.mkdtemp(dir=folder))
         paths = [new / str(k) for k in range(len(models))]
         for model, out in zip(models, paths, strict=True):
@@ -400,7 +429,7 @@ def triangulate(
         return _without_points(poses, f"{count} images have a pose; two or more are needed")
     folder = work_dir / "points"
     with Child(folder, work_dir / "points.log") as child:
-        file = ImageFile(folder / "keyframes")
+        file = ImageFile(folder / "keyframes.raw")
         for number, row in enumerate(rows.tolist(), 1):
             file.add(number, images[row])
         pairs = choose_posed_pairs(steps[rows])
@@ -415,12 +444,12 @@ def triangulate(
     views = np.bincount(point)[point]  # (M,) of the observed point
     # rays of two views often intersect by chance, as with sideways motion in another order
     triangulated = int((views >= min(3, count)).sum())
-    ends = np.repeat(pairs.image_ids, pairs.matches, 0)  # (M, 2)
-    keypoints = np.concatenate([np.empty((0, 2), np.int64), *pairs.inliers])
-    matched = len(np.unique(np.column_stack([ends.ravel(), keypoints.ravel()]), axis=0))
-    if triangulated <= MIN_TRIANGULATED * matched:
+    matched = _count_matched(pairs)
+    if not matched:
+        return _without_points(poses, f"no features of {count} images could be matched")
+    if not triangulated or triangulated < MIN_TRIANGULATED * matched:
         cause = "are the poses of this video, in this order, with this camera?"
-        if explained > 0.5:  # of right poses .6 and more
+        if explained > 0.5:  # chosen; of right poses .6 and more
             cause = "the poses agree with the matches: too few views, or too little parallax"
         return _without_points(
             poses,
@@ -442,6 +471,16 @@ def _matched_rays(pairs: MatchedPairs, rays: Mapping[int, Array]) -> tuple[IntAr
     found = [np.stack([rays[i][rows[:, 0]], rays[j][rows[:, 1]]], 1) for (i, j), rows in both]
     matched = np.concatenate([np.empty((0, 2, 3)), *found])  # (M, 2, 3)
     return np.repeat(pairs.image_ids - 1, pairs.matches, 0), matched[..., :2] / matched[..., 2:]
+
+
+def _count_matched(pairs: MatchedPairs) -> int:
+    """Count the features that have a verified match in another keyframe."""
+    matched = [
+        np.column_stack([np.full(len(rows), number), rows[:, side]])
+        for ids, rows in zip(pairs.image_ids.tolist(), pairs.inliers, strict=True)
+        for side, number in enumerate(ids)
+    ]
+    return len(np.unique(np.concatenate([np.empty((0, 2)), *matched]), axis=0))
 
 
 # Fraction of their matches that must be one point (measured, least of a recording: rendered .71,

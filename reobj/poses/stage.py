@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from reobj.cameras import Poses, import_pycolmap, load_poses, save_poses, write_colmap
-from reobj.files import Progress, load_cached, part_path
+from reobj.files import Progress, load_cached, load_npz, part_path
 from reobj.poses.estimate import PosesConfig, estimate_poses
 from reobj.poses.intrinsics import camera_line, parse_camera
 from reobj.poses.sfm import CheckMatches, MakeProgress, triangulate
@@ -103,7 +103,9 @@ def with_points(
 def _points_path(poses: Poses, video: Video, config: PosesConfig, workspace: Any) -> Path:
     """Return the cache file of poses with points."""
     maps = source_fingerprint(config.depth.partition(":")[0]) if config.depth else ""
-    key = (poses_key(poses), poses.metric, poses.messages, config, maps)
+    arrays = (poses.cam_from_world, poses.points, poses.visibility, poses.part)
+    digest = hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()
+    key = (poses.camera, poses.metric, poses.messages, config, maps, digest)
     path: Path = workspace.path("points", video.fingerprint, video.config, *key)
     return path
 
@@ -138,20 +140,37 @@ def reconstruct_cached(
     without_depth = dataclasses.replace(config, depth="")
     path = workspace.path("poses", video.fingerprint, video.config, without_depth, digest)
     model = path.with_suffix(".sparse")
-    poses = load_cached(path, load_poses)
-    models = [part_path(model, k) for k in range(poses.part_count if poses else 0)]
-    if poses is None or not all(folder.is_dir() for folder in models):
+    poses = load_cached(path, _load_reconstruction)
+    if poses is None:
         work_dir = workspace.cache / "sfm"
         boxes_of = (lambda frame: boxes[boxes[:, 0] == frame, 1:]) if len(boxes) else None
         poses = estimate_poses(video, config, work_dir, progress=progress, boxes_to_mask=boxes_of)
-        models = [part_path(model, k) for k in range(poses.part_count)]
-        if not poses.known.any():
-            return poses, models
-        for k, folder in enumerate(models):
-            shutil.rmtree(folder, ignore_errors=True)
-            part_path(work_dir / "sparse", k).replace(folder)
-        save_poses(path, poses)
+        for k in range(poses.part_count if poses.known.any() else 0):
+            shutil.rmtree(part_path(model, k), ignore_errors=True)
+            part_path(work_dir / "sparse", k).replace(part_path(model, k))
+        if poses.known.any():
+            save_poses(path, poses, models=_digest_of(model, poses.part_count))
+    models = [part_path(model, k) for k in range(poses.part_count)]
     return _with_depth(poses, models, video, config, workspace, progress)
+
+
+def _load_reconstruction(path: Path) -> Poses:
+    """Read cached poses; the models beside them must be those that were written with them."""
+    poses = load_poses(path)
+    model = path.with_suffix(".sparse")
+    if load_npz(path)[1].get("models") != _digest_of(model, poses.part_count):
+        raise ReobjError(f"{model}: damaged or missing")
+    return poses
+
+
+def _digest_of(model: Path, components: int) -> str:
+    """Hash the files of the COLMAP models of all components."""
+    digest = hashlib.sha256()
+    for folder in (part_path(model, k) for k in range(components)):
+        for file in sorted(folder.glob("*")):
+            digest.update(f"{folder.name}/{file.name} {file.stat().st_size} ".encode())
+            digest.update(file.read_bytes())
+    return digest.hexdigest()
 
 
 def poses_key(poses: Poses | None) -> str:
@@ -173,7 +192,7 @@ def _with_depth(
     progress: MakeProgress,
 ) -> tuple[Poses, list[Path]]:
     """Scale a reconstruction by depth maps, with its COLMAP models, and add their points."""
-    if not config.depth:
+    if not config.depth or not poses.known.any():
         return poses, models
     scaled = with_points(poses, video, config, workspace, progress)
     if not scaled.metric:

@@ -10,19 +10,21 @@ of another focal length towards the scene. Three checks find this:
 2. soundness: parallax, triangulation angles, the covariance of the camera centres, and a second
    mapper where that is large;
 3. zoom: the focal length of each image, by points triangulated from its neighbours on one side.
+
+No threshold is fitted to one recording.
 """
 
 from __future__ import annotations
 
 import enum
 import itertools
-from collections.abc import Iterable, Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.spatial.transform import Rotation
 
 from reobj.cameras import import_pycolmap
@@ -30,8 +32,8 @@ from reobj.poses.bundle import (
     FOCAL_RANGE,
     INLIER_PX,
     MIN_TRI_ANGLE_DEG,
-    Adjusted,
     ModelArrays,
+    skew,
     triangulates,
     unit_rows,
 )
@@ -72,10 +74,9 @@ def consistent_groups(arrays: ModelArrays, pairs: MatchedPairs) -> list[IntArray
     todo = evidence.runs_of_neighbours() if pairs.is_path else [np.arange(len(arrays.ids))]
     while todo:
         rows = todo.pop()
-        side = None
-        if not pairs.is_path and (side := evidence.unsupported_cut(rows)) is None:
-            rows = evidence.supported_photos(rows)
+        side = None if pairs.is_path else evidence.unsupported_cut(rows)
         if side is None:
+            rows = rows if pairs.is_path else evidence.supported_photos(rows)
             side = evidence.weak_cut(rows)
         if side is None:
             groups.append(arrays.ids[rows])
@@ -92,17 +93,29 @@ def count_explained(arrays: ModelArrays, pairs: MatchedPairs) -> IntArray:
 
     Ref: Hartley and Zisserman 2004, eq. 11.9.
     """
-    pc = import_pycolmap()
-    poses = zip(arrays.ids.tolist(), arrays.cam_from_world, strict=True)
-    pose = {number: pc.Rigid3d(cam_from_world) for number, cam_from_world in poses}
-    ideal = {i: np.reshape(arrays.camera.cam_from_img(pairs.keypoints[i]), (-1, 2)) for i in pose}
+    inside = np.flatnonzero(np.isin(pairs.image_ids, arrays.ids).all(1))  # (p,)
+    ids = arrays.ids.tolist()
+    first = np.cumsum([0, *(len(pairs.keypoints[i]) for i in ids)])  # keypoint of each image
+    xy = np.concatenate([np.empty((0, 2)), *(pairs.keypoints[i] for i in ids)])
+    ideal = np.reshape(arrays.camera.cam_from_img(xy), (-1, 2))
+    a, b = np.searchsorted(arrays.ids, pairs.image_ids[inside]).T  # (p,)
+    rotation = arrays.cam_from_world[:, :, :3]
+    shift = arrays.cam_from_world[:, :, 3]
+    turn = rotation[b] @ np.swapaxes(rotation[a], 1, 2)  # (p, 3, 3)
+    x, y, z = (shift[b] - np.einsum("pij,pj->pi", turn, shift[a])).T
+    E = skew(x, y, z) @ turn
     count = np.zeros(len(pairs.inliers), np.int64)
-    for row, ends in enumerate(pairs.image_ids.tolist()):
-        if all(number in pose for number in ends):
-            xy = [ideal[i][rows] for i, rows in zip(ends, pairs.inliers[row].T, strict=True)]
-            E = pc.essential_matrix_from_pose(pose[ends[1]] * pose[ends[0]].inverse())
-            error_px = arrays.focal * np.sqrt(pc.compute_squared_sampson_error(*xy, E))
-            count[row] = (~(error_px >= INLIER_PX)).sum()  # NaN without a baseline: any match fits
+    for k, row in enumerate(inside.tolist()):
+        match = pairs.inliers[row]
+        one, other = (
+            np.insert(ideal[first[image[k]] + match[:, side]], 2, 1, 1)  # (n, 3)
+            for side, image in enumerate((a, b))
+        )
+        line_b = one @ E[k].T
+        line_a = other @ E[k]
+        slope = (line_a[:, :2] ** 2).sum(1) + (line_b[:, :2] ** 2).sum(1)
+        distance = np.abs((other * line_b).sum(1)) / np.sqrt(slope + 1e-18) * arrays.focal
+        count[row] = (distance < INLIER_PX).sum()
     return count
 
 
@@ -179,14 +192,21 @@ class _Evidence:
         """
         inside, ends = self._pairs_among(rows)
         matches = self.pairs.matches[inside]
-        weight = np.zeros((len(rows), len(rows)))
-        weight[*ends.T] = matches
-        for side in _tree_cuts(weight):
-            if min(side.sum(), (~side).sum()) >= MIN_GROUP:
-                across = np.flatnonzero(side[ends[:, 0]] != side[ends[:, 1]])
-                strongest = across[np.argsort(-matches[across], kind="stable")[:STRONGEST]]
-                if not self.supported(inside[strongest]).any():
-                    return np.asarray(side)
+        shape = (len(rows), len(rows))
+        tree = minimum_spanning_tree(sparse.csr_matrix((1 / matches, ends.T), shape)).tocsr()
+        edges = np.flatnonzero(np.asarray(tree[ends[:, 0], ends[:, 1]]).ravel())
+        for edge in edges[~self.supported(inside[edges])]:
+            rest = tree.copy()
+            rest[ends[edge, 0], ends[edge, 1]] = 0
+            rest.eliminate_zeros()
+            component = connected_components(rest, directed=False)[1]
+            side = component == component[ends[edge, 0]]
+            if min(side.sum(), (~side).sum()) < MIN_GROUP:
+                continue
+            across = np.flatnonzero(side[ends[:, 0]] != side[ends[:, 1]])
+            strongest = across[np.argsort(-matches[across], kind="stable")[:STRONGEST]]
+            if not self.supported(inside[strongest]).any():
+                return np.asarray(side)
         return None
 
     def supported_photos(self, rows: IntArray) -> IntArray:
@@ -203,13 +223,14 @@ class _Evidence:
             those of `rows` that stay, (n,).
         """
         inside, ends = self._pairs_among(rows)
-        kept = list[int]()
-        for k, row in enumerate(rows.tolist()):
-            own = inside[(ends == k).any(1)]
-            nearest = own[np.argsort(-self.pairs.matches[own], kind="stable")[:2]]
-            if not len(nearest) or self.supported(nearest).any():
-                kept.append(row)
-        return np.array(kept, np.int64)
+        pair = np.repeat(inside, 2)  # (2 E,) each pair belongs to two images
+        image = ends.ravel()
+        order = np.lexsort((-self.pairs.matches[pair], image))
+        rank = np.arange(len(order)) - np.searchsorted(image[order], image[order])
+        nearest = order[rank < 2]
+        judged = np.unique(pair[nearest])
+        supported = np.isin(pair[nearest], judged[self.supported(judged)])
+        return np.delete(rows, np.setdiff1d(image[nearest], image[nearest[supported]]))
 
     def supported(self, rows: IntArray) -> BoolArray:
         """Mark the pairs (n,) whose matches are triangulated in the model.
@@ -260,9 +281,14 @@ class _Evidence:
         covisibility = arrays.covisibility()[rows]
         shared = np.asarray((covisibility @ covisibility.T).todense(), np.float64)  # (R, R)
         np.fill_diagonal(shared, 0)
-        cuts = _tree_cuts(shared)
-        if len(cuts) < len(rows) - 1:  # not even connected
-            return np.asarray(cuts.any(0) | (np.arange(len(rows)) == 0))
+        tree = minimum_spanning_tree(sparse.csr_matrix(np.where(shared > 0, 1 / (shared + 1), 0)))
+        order, parent = breadth_first_order(tree, 0, directed=False)
+        if len(order) < len(rows):  # not even connected
+            return np.isin(np.arange(len(rows)), order)
+        below = np.eye(len(rows), dtype=bool)  # (R, R) the subtree of each image
+        for child in order[:0:-1]:
+            below[parent[child]] |= below[child]
+        cuts = below[order[1:]]  # (R - 1, R) one for each edge of the tree
         ids = self.pairs.image_ids
         inside = np.isin(ids, arrays.ids[rows]).all(1) & (self.explained > 0)
         one, other = np.searchsorted(arrays.ids[rows], ids[inside]).T
@@ -280,37 +306,26 @@ class _Evidence:
         return None
 
 
-def _tree_cuts(weight: Array) -> BoolArray:
-    """Cut the spanning tree of most weight at each of its edges.
-
-    Args:
-        weight: (R, R) of the edges, 0: none.
-    Returns:
-        (C, R) True below each cut, from row 0 on; C < R - 1 where not all rows are connected to it.
-    """
-    tree = minimum_spanning_tree(sparse.csr_matrix(np.where(weight > 0, 1 / (weight + 1), 0)))
-    order, parent = breadth_first_order(tree, 0, directed=False)
-    below = np.eye(len(weight), dtype=bool)  # (R, R) the subtree of each row
-    for child in order[:0:-1]:
-        below[parent[child]] |= below[child]
-    return np.asarray(below[order[1:]])
-
-
 def _bridges(arrays: ModelArrays, rows: IntArray, cuts: BoolArray) -> IntArray:
     """Count the points (C,) that connect the two sides of each cut (C, R) of `rows`.
 
     One side must triangulate the point, by `triangulates`, and the other observe it.
     """
-    observed = arrays.covisibility()[rows].tocoo()
-    ray = unit_rows(arrays.xyz[observed.col] - arrays.centre[rows][observed.row])  # (m, 3)
-    entries = [(u, (observed.row, observed.col)) for u in (*ray.T, observed.data)]
-    terms = [sparse.csc_matrix(found, observed.shape) for found in entries]
+    covisibility = arrays.covisibility()[rows].tocsc()
+    entries = covisibility.tocoo()
+    ray = unit_rows(arrays.xyz[entries.col] - arrays.centre[rows][entries.row])  # (m, 3)
+    rays = [sparse.csc_matrix((u, (entries.row, entries.col)), covisibility.shape) for u in ray.T]
     count = np.zeros(len(cuts), np.int64)
-    for k, cut in enumerate(cuts):
-        sums = [[side.astype(float) @ term for term in terms] for side in (cut, ~cut)]  # (N,) each
-        one, other = (n > 0 for *_, n in sums)
-        one_deep, other_deep = (triangulates(n, x**2 + y**2 + z**2) for x, y, z, n in sums)
-        count[k] = ((one & other_deep) | (other & one_deep)).sum()
+    step = 50  # cuts counted together: memory
+    for start in range(0, len(cuts), step):
+        chunk = cuts[start : start + step].astype(float)
+        sides = []
+        for side in (chunk, 1 - chunk):
+            n = np.asarray(side @ covisibility)  # (c, N)
+            squared_sum = np.asarray(sum(np.asarray(side @ u) ** 2 for u in rays))
+            sides.append((n > 0, triangulates(n, squared_sum)))
+        (one, one_deep), (two, two_deep) = sides
+        count[start : start + step] = ((one & two_deep) | (two & one_deep)).sum(1)
     return count
 
 
@@ -376,9 +391,9 @@ class FocalSource(enum.Enum):
 # Minimum requirements for accepting a model
 MIN_IMAGES = 10  # (COLMAP's min_model_size), or MIN_REGISTERED
 MIN_REGISTERED = 0.5  # fraction of the keyframes of a short video
-MIN_POINTS = 100  # of a model; with more, short walks are refused
-# Parallax that rotations of the camera alone cannot explain (measured: walks have more than 4; with
-# less, rotation alone at a wrong focal length is accepted)
+MIN_POINTS = 100  # of a model (chosen; higher: short walks are refused)
+# Parallax that rotations of the camera alone cannot explain; walks have more than 4 (chosen; lower:
+# rotation alone at a wrong focal length is accepted)
 MIN_PARALLAX_PX = 3.0
 
 # `Component.centre_sigma` up to which all centres are certain. Above, the model may be one of many
@@ -393,8 +408,12 @@ GUESS_SIGMA = 0.004
 # orientation: half of what the benchmark of broken trajectories calls wrong
 SAME_CENTRE = 0.05
 SAME_TURN_DEG = 5.0
-# Fraction of a component's images that the other mapper must have with the same poses
+# Fraction of the component that the other mapper must have (chosen; lower: components are kept of
+# which most images are not confirmed)
 CONFIRMED = 0.75
+# Points that each of two pieces triangulates and that prove how they are joined: they fix rotation,
+# shift and scale (measured: right joins 191 to 386, a mirrored stretch 24, a free scale 0 to 3)
+JOINT_POINTS = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -404,7 +423,9 @@ class Component:
     model: Any
     arrays: ModelArrays
     focal_source: FocalSource
+    tri_angle_deg: float  # median over points of the widest angle between two rays
     registered: float  # fraction of the keyframes
+    parallax_px: float  # that rotations of the camera alone cannot explain
     centre_sigma: float  # largest of a camera centre, over the extent of the trajectory
     explained: int  # verified matches
     problem: str  # "" if it is sound
@@ -418,15 +439,19 @@ class Component:
 
 
 def measured(
-    own: Adjusted, pairs: MatchedPairs, frames: Mapping[int, int], source: FocalSource
+    model: Any,
+    arrays: ModelArrays,
+    centre_sigma: float,
+    *,
+    count: int,
+    explained: int,
+    focal_source: FocalSource,
 ) -> Component:
-    """Measure an adjusted model of some keyframes and name its first problem.
+    """Measure an adjusted model of some of `count` keyframes and name its first problem.
 
     Args:
-        pairs: verified matches of all keyframes. frames: number in the video of each, by id.
-        source: of the focal length before the adjustment.
+        arrays: of the model. explained: verified matches that it explains.
     """
-    arrays = own.arrays
     images = len(arrays.ids)
     points = len(arrays.xyz)
     seen = np.median(np.bincount(arrays.image, minlength=max(images, 1)))
@@ -434,16 +459,16 @@ def measured(
     parallax_px = _parallax_px(arrays)
     focal = arrays.focal_over_size
     # at a wrong focal length a translation along a wall looks like a rotation
-    source = FocalSource.MODEL if own.calibrated else source
+    calibrated = focal_source is FocalSource.MODEL
     advice = ""
     no_depth = f"if the focal length is {focal:.2f} x the longer side"
-    if own.calibrated:
+    if calibrated:
         advice = "move the camera sideways around the objects (turning on the spot gives no depth)"
         no_depth = "so depth cannot be estimated"
     lens = "give measured intrinsics (--camera); pixels must be square"
     checks = (
-        (images < min(MIN_REGISTERED * len(frames), MIN_IMAGES),
-         f"only {images} of {len(frames)} keyframes connect", ""),
+        (images < min(MIN_REGISTERED * count, MIN_IMAGES),
+         f"only {images} of {count} keyframes connect", ""),
         (points < MIN_POINTS, f"only {points} points could be triangulated", ""),
         (seen < MIN_MATCHES,
          f"half of the keyframes see {seen:.0f} points or fewer", ""),
@@ -455,22 +480,10 @@ def measured(
          f"the estimated focal length is {focal:.2f} x the longer side", lens),
     )  # fmt: skip
     problem, advice = next(((text, advice) for bad, text, advice in checks if bad), ("", ""))
-    # of photos without an order the one before shows other points
-    if not problem and pairs.is_path and source is not FocalSource.GUESS:
-        if changes := focal_changes(arrays):
-            one, other, ratio = max(changes, key=lambda change: abs(np.log(change[2])))
-            between = f"between frames {frames[one]} and {frames[other]} (x {ratio:.2f})"
-            problem = f"the focal length changed {between}"
-            advice = "do not zoom, or give the frames before and after the zoom as two videos"
     return Component(
-        own.model, arrays, source, images / len(frames), own.centre_sigma,
-        int(count_explained(arrays, pairs).sum()), problem, arrays.ids, advice,
+        model, arrays, focal_source, angle_deg, images / count, parallax_px, centre_sigma,
+        explained, problem, arrays.ids, advice,
     )  # fmt: skip
-
-
-def by_size(components: Iterable[Component]) -> list[Component]:
-    """Sort components: sound ones first, the largest first."""
-    return sorted(components, key=lambda c: (bool(c.problem), -c.registered))
 
 
 def confirmed(
@@ -488,20 +501,41 @@ def confirmed(
     checked = list[Component]()
     for component in components:
         if not component.problem and component.centre_sigma > SURE_SIGMA:
-            can_confirm = (
-                focal_source is not FocalSource.GUESS or component.centre_sigma <= GUESS_SIGMA
-            )
-            found = [_same(component.arrays, other.arrays) for other in others if can_confirm]
-            kept = component.arrays.ids[max([np.empty(0, np.int64), *found], key=len)]
-            problem = ""
-            if len(kept) < CONFIRMED * len(component.arrays.ids):
+            is_guess = focal_source is FocalSource.GUESS
+            can_confirm = not is_guess or component.centre_sigma <= GUESS_SIGMA
+            found = [other.arrays for other in others if can_confirm]
+            rows = _reproduced_by(component.arrays, found)
+            component = replace(component, kept=component.arrays.ids[rows])
+            if len(rows) < CONFIRMED * len(component.arrays.ids):
                 problem = (
                     "the camera positions are uncertain, and no second mapper confirms them "
-                    f"(largest sigma {100 * component.centre_sigma:.2g} % of the trajectory)"
+                    f"(largest sigma {100 * component.centre_sigma:.2g} % of the trajectory, "
+                    f"parallax {component.parallax_px:.0f} px, rays meet at "
+                    f"{component.tri_angle_deg:.1f} deg)"
                 )
-            component = replace(component, kept=kept, problem=problem)
+                component = replace(component, problem=problem)
         checked.append(component)
-    return by_size(checked)
+    return sorted(checked, key=lambda c: (bool(c.problem), -c.registered))
+
+
+def _reproduced_by(one: ModelArrays, others: Sequence[ModelArrays]) -> IntArray:
+    """Return the images (rows of one) with the same poses in another mapper's models.
+
+    Those may be pieces. A piece only proves the relative poses of its own cameras. What joins it to
+    the others are points that both triangulate: of two scenes that look alike there are few, and
+    none where a single image, or a pair without a third, connects two scales.
+    """
+    pieces = sorted((_same(one, other) for other in others), key=len, reverse=True)
+    rows = pieces[0] if pieces else np.empty(0, np.int64)
+    todo = pieces[1:]
+    while joined := [
+        piece
+        for piece in todo
+        if (one.triangulated_by(rows) & one.triangulated_by(piece)).sum() >= JOINT_POINTS
+    ]:
+        rows = np.union1d(rows, joined[0])
+        todo = [piece for piece in todo if piece is not joined[0]]
+    return np.sort(rows)
 
 
 def _same(one: ModelArrays, other: ModelArrays) -> IntArray:
@@ -568,91 +602,137 @@ def _parallax_px(arrays: ModelArrays) -> float:
 
 
 # When the focal length changes between two consecutive images
-ZOOM_WINDOW = 10  # images on one side whose points are used: a zoom bends the path of more
+ZOOM_WINDOW = 10  # images on one side whose points are used (chosen: a zoom bends farther ones)
 RESECTED = 2  # images next to a gap whose focal length is measured, on each side
-# Least log of the ratio of two focal lengths (measured, mean of both sides: zoomed by 1.25 to 1.5
-# .15-.30, right models below .03)
+# Least log of the change (measured, mean of both sides: zoomed by 1.25 to 1.5 .15-.30, right models
+# below .03)
 ZOOM_LOG = 0.12
 # The same where only one side can be measured: the noise of its depths biases it (measured: zooms
 # .34-.39, right models up to .12)
 ZOOM_LOG_ONE_SIDE = 0.24
-ZOOM_SIGMAS = 5.0  # of that change: 1 in 10^6 by normal noise, which that of few points is not
+ZOOM_SIGMAS = 5.0  # of that change (chosen; lower: noise of few points counts as a zoom)
 
 
-def focal_changes(arrays: ModelArrays) -> list[tuple[int, int, float]]:
-    """Find changes of the focal length between consecutive images.
+def constant_focal(
+    models: list[ModelArrays], window: int = ZOOM_WINDOW
+) -> tuple[IntArray, list[tuple[int, int, float]]]:
+    """Find the images that were not taken at the most frequent focal length.
 
-    A mapper assumes one focal length: it shifts images of a zoomed stretch towards the scene. The
-    images next to each gap are resected from points of the other side.
+    A mapper assumes one focal length: it shifts images of a zoomed stretch towards the scene.
 
     Args:
-        arrays: ids of images ascend in time.
+        models: ids of images ascend in time. window: images, as ZOOM_WINDOW.
     Returns:
-        of each change the ids of the images before and after it, and the ratio of their focal
-        lengths.
+        ids of the images of other focal lengths, or of one that cannot be compared; of each change
+        the ids of the images before and after it and the ratio of their focal lengths.
     """
-    changes = list[tuple[int, int, float]]()
+    changes = sorted(change for arrays in models for change in _changes(arrays, window))
+    changes = [c for c in changes if not any(_is_side_effect(c, other) for other in changes)]
+    ids = np.array(sorted({int(i) for arrays in models for i in arrays.ids}), np.int64)
+    starts = np.searchsorted(ids, [after for _, after, _ in changes])
+    log = np.zeros(len(ids))
+    for k, (start, (_, _, ratio)) in enumerate(zip(starts, changes, strict=True)):
+        # else each bends the other's images
+        is_measured = not k or start - starts[k - 1] >= window
+        log[start:] += np.log(ratio) if is_measured else 10  # as of another camera
+    same = np.abs(log[:, None] - log) < ZOOM_LOG  # (R, R)
+    return ids[~same[same.sum(1).argmax()]] if len(ids) else ids, changes
+
+
+def _is_side_effect(one: tuple[int, int, float], other: tuple[int, int, float]) -> bool:
+    """True if an adjacent larger zoom in the same direction explains this one.
+
+    Images next to a zoom are bent by it.
+    """
+    adjacent = one is not other and (one[0] == other[1] or one[1] == other[0])
+    log = np.log(one[2])
+    other_log = np.log(other[2])
+    return bool(adjacent and log * other_log > 0 and abs(log) < abs(other_log))
+
+
+def _changes(arrays: ModelArrays, window: int) -> list[tuple[int, int, float]]:
+    """List the changes of the focal length between consecutive images.
+
+    The images next to each gap are resected from points of the other side.
+    """
     count = len(arrays.ids)
+    changes = list[tuple[int, int, float]]()
+    ray = np.insert(arrays.ideal, 2, 1, 1)[:, None] @ arrays.cam_from_world[arrays.image][:, :, :3]
+    ray = unit_rows(ray[:, 0])  # (M, 3) in world
+    across = np.eye(3) - ray[:, :, None] * ray[:, None]  # (M, 3, 3)
+    start = (across @ arrays.centre[arrays.image][:, :, None])[:, :, 0]
+    terms = np.hstack([across.reshape(-1, 9), start, ray, np.ones((len(ray), 1))])  # (M, 16)
     for k in range(1, count):
-        before = range(max(0, k - ZOOM_WINDOW), k)
-        after = range(k, min(k + ZOOM_WINDOW, count))
-        sides = []
+        before = range(max(0, k - window), k)
+        after = range(k, min(k + window, count))
+        sides = list[list[list[float]]]()
         for side, images, sign in ((before, after[:RESECTED], 1), (after, before[-RESECTED:], -1)):
-            points = _triangulate(arrays, side)
-            found = [_log_focal(arrays, image, points) for image in images]
-            sides.append([(sign * log, sigma) for log, sigma in found if np.isfinite(log)])
+            points = _triangulate(arrays, terms, side)
+            values = np.array([_log_focal(arrays, image, points) for image in images])
+            values = values * [sign, 1]
+            sides.append(values[np.isfinite(values[:, 0])].tolist())
         if any(sides):
-            log, sigma = np.median([*sides[0], *sides[1]], axis=0)
+            log, sigma = np.median(list(itertools.chain(*sides)), axis=0)
             least = ZOOM_LOG if all(sides) else ZOOM_LOG_ONE_SIDE
             if abs(log) > max(least, ZOOM_SIGMAS * sigma):
-                changes.append((*arrays.ids[k - 1 : k + 1].tolist(), float(np.exp(log))))
+                ids = int(arrays.ids[k - 1]), int(arrays.ids[k])
+                changes.append((*ids, float(np.exp(log))))
     return changes
 
 
-def _triangulate(arrays: ModelArrays, side: range) -> Array:
+def _triangulate(arrays: ModelArrays, terms: Array, side: range) -> Array:
     """Triangulate points from some consecutive images: the nearest to all their rays.
 
+    Args:
+        terms: (M, 16) of each observation with unit ray u from centre c, in world: I - u u' (9),
+            (I - u u') c, u, 1.
     Returns:
         (N, 3) points, NaN where the rays do not determine the depth.
     """
-    seen = slice(*np.searchsorted(arrays.image, (side.start, side.stop)))
-    image = arrays.image[seen]
-    ray = np.insert(arrays.ideal[seen], 2, 1, 1)[:, None] @ arrays.cam_from_world[image][:, :, :3]
-    ray = unit_rows(ray[:, 0])  # (m, 3) in world
-    across = np.eye(3) - ray[:, :, None] * ray[:, None]  # (m, 3, 3) I - u u'
-    start = across @ arrays.centre[image][:, :, None]
-    terms = np.hstack([across.reshape(-1, 9), start[:, :, 0], ray, np.ones((len(ray), 1))])
-    entries = (np.ones(len(ray)), (arrays.point[seen], np.arange(len(ray))))
-    sums = sparse.csr_matrix(entries, (len(arrays.xyz), len(ray))) @ terms  # (N, 16)
-    xyz = np.full((len(arrays.xyz), 3), np.nan)
+    first, last = np.searchsorted(arrays.image, (side.start, side.stop))
+    points, row = np.unique(arrays.point[first:last], return_inverse=True)
+    entries = (np.ones(len(row)), (row, np.arange(len(row))))
+    sums = sparse.csr_matrix(entries, (len(points), len(row))) @ terms[first:last]
     good = triangulates(sums[:, 15], (sums[:, 12:15] ** 2).sum(1))
+    xyz = np.full((len(arrays.xyz), 3), np.nan)
     A = sums[good, :9].reshape(-1, 3, 3)
-    xyz[good] = np.linalg.solve(A, sums[good, 9:12, None])[:, :, 0]
+    b = sums[good, 9:12, None]
+    xyz[points[good]] = np.linalg.solve(A, b)[:, :, 0]
     return xyz
 
 
 def _log_focal(arrays: ModelArrays, image: int, points: Array) -> tuple[float, float]:
     """Estimate an image's focal length from points (N, 3), NaN where there are none.
 
-    A small motion and the focal length are fitted, with a Cauchy loss of 1 px.
-
     Returns:
         log of its ratio to that of the model, and its sigma; NaN with too few points.
     """
-    unknown = np.nan, np.nan
-    seen = slice(*np.searchsorted(arrays.image, (image, image + 1)))
+    first, last = np.searchsorted(arrays.image, (image, image + 1))
     pose = arrays.cam_from_world[image]
-    moved = points[arrays.point[seen]] @ pose[:, :3].T + pose[:, 3]
-    in_front = moved[:, 2] > 0  # no NaN
-    moved = moved[in_front]
-    xy = arrays.focal * arrays.ideal[seen][in_front]
-    if len(xy) < 20:  # for 7 unknowns and the variance of the noise
-        return unknown
+    ideal = arrays.ideal[first:last]
+    xyz_in_cam = points[arrays.point[first:last]] @ pose[:, :3].T + pose[:, 3]
+    in_front = xyz_in_cam[:, 2] > 0  # no NaN
+    if in_front.sum() < 20:  # for 7 unknowns and the variance of the noise
+        return np.nan, np.nan
+    return _resect(xyz_in_cam[in_front], ideal[in_front] * arrays.focal, arrays.focal)
+
+
+def _resect(xyz_in_cam: Array, xy: Array, focal: float) -> tuple[float, float]:
+    """Fit a small motion and the focal length of a camera to points, with a Cauchy loss of 1 px.
+
+    Args:
+        xyz_in_cam: (n, 3) points, nearly in the camera's frame. xy: (n, 2) pixels from the centre.
+    Returns:
+        log of the focal length over `focal`, and its sigma; NaN if the fit fails.
+    """
+    turn = np.eye(3)
+    shift = np.zeros(3)
     log = 0.0
     for _ in range(8):  # focal lengths of a third more need 5
+        moved = xyz_in_cam @ turn.T + shift
         if (moved[:, 2] <= 0).any():
-            return unknown
-        f = arrays.focal * np.exp(log)
+            return np.nan, np.nan
+        f = focal * np.exp(log)
         zero = np.zeros(len(moved))
         inverse = 1 / moved[:, 2]
         x = moved[:, 0] * inverse
@@ -665,9 +745,11 @@ def _log_focal(arrays: ModelArrays, image: int, points: Array) -> tuple[float, f
         ])  # fmt: skip
         normal = np.einsum("ain,ajn,n->ij", J, J, weight)
         if not np.isfinite(normal).all() or np.linalg.cond(normal) > 1e14:
-            return unknown
+            return np.nan, np.nan
         step = np.linalg.solve(normal, np.einsum("ain,na,n->i", J, residual, weight))
-        moved = Rotation.from_rotvec(step[:3]).apply(moved) + step[3:6]
+        rotation = Rotation.from_rotvec(step[:3]).as_matrix()
+        turn = rotation @ turn
+        shift = rotation @ shift + step[3:6]
         log = float(np.clip(log + step[6], -1, 1))
     variance = np.average((residual**2).sum(1), weights=weight) / 2
     return log, float(np.sqrt(np.linalg.inv(normal)[6, 6] * variance))
