@@ -30,10 +30,11 @@ def table(rows: Iterable[tuple[str, ...]]) -> str:
 
 
 def formats_table(formats: Sequence[Format[Any]]) -> str:
-    """Format the formats that are read."""
+    """Format the formats that are read, without the columns that are empty for all."""
     rows = [("format", "written by", "frames", "units", "not read")]
     rows += [(f"`{f.name}`", f.title, f.frames, f.units, f.unread) for f in formats]
-    return table(rows)
+    used = [k for k in range(len(rows[0])) if any(row[k] for row in rows[1:])]
+    return table(tuple(row[k] for k in used) for row in rows)
 
 
 def layouts_table() -> str:
@@ -47,7 +48,7 @@ def layouts_table() -> str:
 
 TABLES = {
     "detections": formats_table(DETECTIONS.formats),
-    "ground truth": formats_table(TRUTH.formats),
+    "ground truth": f"Formats: {', '.join(f'`{f.name}`' for f in TRUTH.formats)}.\n",
     "poses": formats_table(POSES.formats),
     "cameras": formats_table(CAMERAS.formats),
     "layouts": layouts_table(),
