@@ -12,7 +12,7 @@ import quadrics
 import reobj_track as rt
 from reobj.cameras import distort_boxes
 from reobj.objects import association, likelihood
-from reobj.objects.association import Association, Associator
+from reobj.objects.association import MAX_BOX_GAIN, MISSED, Association, Associator
 from reobj.objects.component import associate_component, propose
 from reobj.objects.config import make_fit
 from reobj.objects.description import (
@@ -426,3 +426,60 @@ def test_frames_are_filled_only_near_observed_viewpoints() -> None:
     assert filled.frame[filled.score == 0].tolist() == [f for f in np.flatnonzero(near) if f != 30]
     never = table[seen & (table.detection_index != 0)]  # no detection, nothing to fill from
     assert len(fill_from_objects(never, poses, np.array([1]), solids[:1], ["box"])) == len(never)
+
+
+def test_greedy_selection_adds_the_largest_marginal_gain() -> None:
+    """Equals re-evaluating every object in every round; ties go to the first."""
+    three = chairs()
+    rng = np.random.default_rng(0)
+    near = three[np.tile(np.arange(3), 8)]
+    off = rng.normal(0, 0.15, near.ellipsoids.center_in_world.shape)
+    moved = dataclasses.replace(
+        near.ellipsoids, center_in_world=near.ellipsoids.center_in_world + off
+    )
+    many = Shapes.concatenate([dataclasses.replace(near, ellipsoids=moved), three[[0]], three[[0]]])
+    made, _ = association_of(three, walk(30))
+    made.size_log_odds = lambda s: 1.25 + np.arange(len(s))
+    of = made._unassigned(many)
+    seen, cost, view = of.evidence, of.costs(), made.detections.view
+    value = np.minimum(seen.assignment, seen.existence + MAX_BOX_GAIN)
+    explained, expected = np.zeros(len(view)), list[int]()
+    while True:
+        gain, tops = -cost, np.zeros((len(many), len(seen.expected)))
+        np.maximum.at(tops, (seen.obj, view[seen.row]), value - explained[seen.row])
+        gain += (tops + MISSED * (seen.expected.T & (tops > 0))).sum(1)
+        gain[expected] = -np.inf
+        if gain.max() <= 0:
+            break
+        expected.append(int(gain.argmax()))
+        own = (seen.obj == expected[-1]) & (value > 0)
+        np.maximum.at(explained, seen.row[own], value[own])
+    assert len(expected) > 1 and made._select_greedily(of).tolist() == expected
+
+
+def test_the_gain_of_a_merge_uses_all_rows_of_both() -> None:
+    """Computed by loops: each object's summed log odds, with one hit per frame at its best row."""
+    three = chairs()
+    made, found = association_of(three, walk(12))
+    rng = np.random.default_rng(1)
+    label = found.label.copy()
+    label[rng.random(len(label)) < 0.3] = 0  # several rows of an object in one frame
+    strong = np.array([0, 1])
+    weak = np.array([2, 0])
+    fitted = three[[0, 1]]
+    seen = made._unassigned(fitted).evidence
+    view = made.detections.view
+    expected = -made._unassigned(fitted).costs()
+    for k in range(2):
+        best: dict[int, tuple[float, int]] = {}
+        rows = [n for n in range(len(seen.row)) if seen.obj[n] == k]
+        rows = [n for n in rows if label[seen.row[n]] in (strong[k], weak[k])]
+        for n in rows:
+            frame = int(view[seen.row[n]])
+            best[frame] = max(best.get(frame, (-np.inf, -n)), (float(seen.existence[n]), -n))
+        for n in rows:
+            frame = int(view[seen.row[n]])
+            hit = MISSED * seen.expected[frame, k] * (best[frame][1] == -n)
+            expected[k] += max(seen.existence[n] + hit, 0.0)
+    assert any(np.bincount(view[label == 0]) > 1)
+    np.testing.assert_allclose(made._joint_gains(label, strong, weak, fitted), expected)

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+import quadrics
 from reobj.maps.compare import Decision, FoundObject, PointMotion, compare
 from reobj.maps.fusion import ObjectState
-from reobj.maps.visibility import Visibility
+from reobj.maps.visibility import Visibility, _points_around
 
 SIZES = {
     "chair": (0.25, 0.25, 0.45),
@@ -354,3 +355,26 @@ def test_random_rooms_steal_no_number() -> None:
         stayed += int((~hidden & (fate == "stayed")).sum())
         kept += sum(d.kind == "stayed" and fate[d.map_id - 1] == "stayed" for d in decisions)
     assert kept >= 0.98 * stayed
+
+
+@pytest.mark.parametrize(
+    ("depths", "is_occluded", "behind"),
+    [
+        ([8] * 6, False, True),  # seen through
+        ([3] * 6, True, False),  # hidden
+        ([4.5] * 3 + [8] * 3, False, False),  # as many on its front
+        ([8] * 4 + [3] * 2, False, True),
+        ([8] * 2 + [3] * 4, False, False),  # fewer than five points
+    ],
+)
+def test_points_on_rays_through_a_ball_say_what_is_seen(
+    depths: list[float], is_occluded: bool, behind: bool
+) -> None:
+    """A ball of radius .5 at depth 5, and points on rays close to its middle."""
+    ball = quadrics.Ellipsoids(np.array([[0.0, 0, 5]]), np.full((1, 3), 0.5), np.eye(3)[None])
+    xy = np.random.default_rng(0).uniform(-0.02, 0.02, (len(depths), 2))
+    points = np.column_stack([xy, np.ones(len(depths))]) * np.array(depths)[:, None]
+    box = np.array([[-0.1, -0.1, 0.1, 0.1]])
+    occluded, _, beyond = _points_around(ball, box, points, np.eye(3, 4), np.zeros(3))
+    assert occluded.tolist() == [is_occluded]
+    assert beyond[0].tolist() == [behind and depth > 5.5 for depth in depths]

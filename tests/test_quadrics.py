@@ -7,6 +7,7 @@ truth, and the LfD authors' published demo (../shared/data/lfd_aldoma).
 
 from __future__ import annotations
 
+import itertools
 import json
 from pathlib import Path
 
@@ -994,3 +995,146 @@ def test_user_priors_from_a_table(tmp_path: Path) -> None:
     table.write_text("category,w,d,h\n" + "".join(f"stool,{w},{d},{h}\n" for w, d, h in sizes))
     assert own_priors.main([str(table), "-o", str(out), "--support", "cylinder"]) == 0
     assert np.allclose(q.load_priors(out).log_mean[0], np.log(sizes).mean(0), atol=1e-3)
+
+
+def plain_lfd(boxes: np.ndarray, cams: np.ndarray, passes: int = 2) -> np.ndarray:
+    """LfD as published, one object at a time: the stand-in for the official code.
+
+    boxes (V, 4), cams (V, 3, 4) -> dual quadric (4, 4). For each view beta C* = P Q* P' with P and
+    C* in the frame where the ellipse is centred and of unit size; null vector by SVD; each further
+    pass has its origin at the centre found before. Ref: Rubino et al., PAMI 2018.
+    """
+    i, j = np.triu_indices(4)
+    r, s = np.triu_indices(3)
+    expand = np.zeros((16, 10))  # vec Q = expand @ vech Q
+    for k, (a, b) in enumerate(zip(i, j, strict=True)):
+        expand[4 * a + b, k] = expand[4 * b + a, k] = 1.0
+    origin = np.zeros(3)
+    dual_q = np.zeros((4, 4))
+    for _ in range(passes):
+        shift = np.eye(4)
+        shift[:3, 3] = origin
+        rows = np.zeros((6 * len(boxes), 10 + len(boxes)))
+        for v, (x1, y1, x2, y2) in enumerate(boxes):
+            half = 0.5 * np.array([x2 - x1, y2 - y1])
+            scale = np.linalg.norm(half)
+            frame = np.array([[scale, 0, (x1 + x2) / 2], [0, scale, (y1 + y2) / 2], [0, 0, 1]])
+            cam = np.linalg.inv(frame) @ cams[v] @ shift
+            kron = (np.kron(cam, cam) @ expand).reshape(3, 3, 10)
+            rows[6 * v : 6 * v + 6, :10] = kron[r, s]
+            conic = np.diag([*(half / scale) ** 2, -1.0])
+            rows[6 * v : 6 * v + 6, 10 + v] = -conic[r, s]
+        null = np.linalg.svd(rows)[2][-1, :10]
+        local = (expand @ null).reshape(4, 4)
+        local = -local / local[3, 3]
+        dual_q = shift @ local @ shift.T
+        origin = -dual_q[:3, 3]
+    return dual_q
+
+
+def test_plain_lfd_agrees_with_the_batched_one() -> None:
+    """Independent per-object version (`plain_lfd`), same equations, world at the object."""
+    rng = np.random.default_rng(7)
+    solids = random_solids(6, rng)
+    solids = q.Ellipsoids(0.1 * solids.center_in_world, solids.half_axes, solids.world_from_obj)
+    cams = syn.arc_cameras(12, 170, rng)
+    boxes = syn.noisy(q.solid_boxes(solids, "ellipsoid", cams), 0.01, rng)
+    ours, real = q.fit_lfd(boxes, cams)
+    plain = np.array([plain_lfd(boxes[:, k], cams) for k in range(6)])
+    assert real.all()
+    overlap = q.volume_overlap(*(q.Ellipsoids.from_dual_quadrics(x)[0] for x in (ours, plain)))
+    assert overlap.min() > 0.99
+
+
+def spheres(center: np.ndarray, radius: np.ndarray) -> q.Ellipsoids:
+    return q.Ellipsoids(
+        center, np.repeat(radius[:, None], 3, 1), np.tile(np.eye(3), (len(radius), 1, 1))
+    )
+
+
+def test_volume_overlap_of_spheres_is_the_lens() -> None:
+    rng = np.random.default_rng(20)
+    r1, r2, d = rng.uniform(0.2, 1, 200), rng.uniform(0.2, 1, 200), rng.uniform(0, 2.2, 200)
+    direction = rng.normal(0, 1, (200, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    lens = np.pi * (r1 + r2 - d) ** 2 * (d**2 + 2 * d * (r1 + r2) - 3 * (r1 - r2) ** 2) / (12 * d)
+    lens = np.where(
+        d >= r1 + r2, 0, np.where(d <= abs(r1 - r2), 4 / 3 * np.pi * np.minimum(r1, r2) ** 3, lens)
+    )
+    expected = lens / (4 / 3 * np.pi * (r1**3 + r2**3) - lens)
+    measured = q.volume_overlap(
+        spheres(np.zeros((200, 3)), r1), spheres(direction * d[:, None], r2)
+    )
+    assert np.abs(measured - expected).max() < 1e-3
+
+
+def plain_psfmo(
+    rows: np.ndarray, cams: np.ndarray, center: np.ndarray, rot: np.ndarray,
+    mean_log: np.ndarray, cov_log: np.ndarray,
+) -> tuple[float, np.ndarray, float]:  # fmt: skip
+    """PSfMO of one object by loops, as the paper states it: log likelihood, half axes, noise.
+
+    rows (F, 3): entries 11, 12, 22 of the centred ellipses; rot: the ellipsoid's axes; the prior is
+    on log(w/h), log(d/h) of these axes. EM in the gain form of the Gaussian posterior.
+    """
+    columns = []
+    for axis in range(3):  # what a squared half axis of 1 adds to each row
+        column = []
+        for cam in cams:
+            jacobian = np.zeros((2, 3))  # of the projection at the centre
+            for i, d in enumerate(1e-5 * np.eye(3)):
+                jacobian[:, i] = (pixels(center[None] + d, cam) - pixels(center[None] - d, cam))[0]
+            image = jacobian @ rot[:, axis] / 2e-5
+            column += [image[0] ** 2, image[0] * image[1], image[1] ** 2]
+        columns.append(column)
+    unit = np.abs(rows).mean()
+    system, target = np.array(columns).T / unit, rows.ravel() / unit
+    node, weight = np.polynomial.hermite.hermgauss(20)
+    spread = np.sqrt(2) * np.linalg.cholesky(cov_log)
+    draws = [mean_log + spread @ [x, y] for x in node for y in node]
+    square = np.exp(2 * np.column_stack([draws, np.zeros(400)]))
+    u = square / square.sum(1, keepdims=True)  # squared half axes, their sum 1
+    mass = np.outer(weight, weight).ravel() / np.pi
+    mu = mass @ u
+    cov = (mass[:, None] * (u - mu)).T @ (u - mu)
+    x, noise2 = mu, 0.01
+    for _ in range(200):
+        scale = (system @ x) @ target / np.sum((system @ x) ** 2)
+        loading, rest = scale * system, target - scale * system @ mu
+        total = loading @ cov @ loading.T + noise2 * np.eye(len(target))
+        gain = cov @ loading.T @ np.linalg.inv(total)
+        likelihood = -0.5 * (rest @ np.linalg.solve(total, rest) + np.linalg.slogdet(total)[1])
+        x, left = mu + gain @ rest, cov - gain @ loading @ cov
+        noise2 = np.mean((target - loading @ x) ** 2)
+        noise2 += np.trace(loading @ left @ loading.T) / len(target)
+    likelihood -= 0.5 * len(target) * np.log(2 * np.pi)
+    return float(likelihood), np.sqrt(scale * x), float(np.sqrt(noise2))
+
+
+def test_psfmo_agrees_with_the_plain_one() -> None:
+    """Prior of a^2, its axes' order, EM until it converges, noise with the posterior's trace."""
+    _, cams, dual_c, priors = ratio_scene(4, 40, 0.1, seed=0)
+    ours = q.fit_psfmo(None, priors, priors.names, cams, dual_c)
+    center = -dual_c[..., :2, 2] / -dual_c[..., 2:, 2]
+    conic = -dual_c / dual_c[..., 2:, 2:]
+    agree = []
+    for k in range(10):
+        solid = ours.ellipsoids[k]
+        block = conic[:, k, :2, :2] + center[:, k, :, None] * center[:, k, None]
+        rows = block.reshape(4, 4)[:, [0, 1, 3]]
+        given = (rows, cams, solid.center_in_world[0], solid.world_from_obj[0])
+        size_cov = np.zeros((3, 3))
+        size_cov[:2, :2] = priors.ratio_cov[k]
+        found = {}
+        for order in itertools.permutations(range(3)):
+            difference = np.eye(3)[list(order[:2])] - np.eye(3)[order[2]]
+            size = np.append(priors.ratio_mean[k], 0.0)
+            prior = (difference @ size, difference @ size_cov @ difference.T)
+            found[order] = plain_psfmo(*given, *prior)
+        order = max(found, key=lambda x: found[x][0])
+        likelihood, half, noise = found[order]
+        assert tuple(ours.permutation[k]) == order
+        assert ours.log_likelihood[k] == pytest.approx(likelihood, abs=0.5)
+        values = [*solid.half_axes[0], ours.noise[k]]
+        agree.append(np.allclose(values, [*half, noise], rtol=2e-3))
+    assert np.mean(agree) >= 0.8  # its number of steps does not converge for all
