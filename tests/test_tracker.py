@@ -28,6 +28,10 @@ def rows(*boxes: tuple[float, ...], score: float = 0.9, class_id: int = CHAIR) -
     return rt.Detections.from_array(table)
 
 
+LARGE = rows((100, 100, 200, 200))
+TALL = rows((100, 100, 110, 350))
+
+
 def unit(rng: np.random.Generator, n: int, dim: int = 64) -> np.ndarray:
     vectors = rng.normal(size=(n, dim))
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
@@ -736,3 +740,171 @@ def test_a_restored_tracker_continues_identically(tmp_path: Path) -> None:
     tracker.reset()
     for given, true in zip(inputs, expected, strict=True):
         np.testing.assert_array_equal(update(tracker, **given).to_array(), true)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_duplicate_box_does_not_take_the_identity(seed: int) -> None:
+    """The track of the second box has no embedding yet, which is no evidence."""
+    rng, tracker = np.random.default_rng(seed), rt.Tracker()
+    own, beside, second = (100, 100, 140, 200), (300, 100, 340, 200), (105, 100, 145, 200)
+    common, seen = unit(rng, 2), []
+    for step in range(30):
+        boxes = [own if step <= 24 else second, beside] + [second] * (step == 24)
+        view = common[[0, 1, 0][: len(boxes)]] + 0.9 * unit(rng, len(boxes))  # cosine .55
+        seen.append(tracker.update(rows(*boxes), embeddings=view).track_id.tolist())
+    assert seen[23] == [1, 2]
+    assert seen[25:] == [[1, 2]] * 5
+
+
+def test_another_class_never_takes_over_an_identity() -> None:
+    view = unit(np.random.default_rng(8), 1)
+    tracker = rt.Tracker()
+    repeat(5, tracker, CORNER, embeddings=view)
+    repeat(60, tracker, NOTHING)
+    tracks = repeat(5, tracker, rows((300, 0, 350, 50), class_id=CUP), embeddings=view)
+    assert tracks.track_id.tolist() == [2]
+
+
+def test_with_poses_an_identical_object_elsewhere_is_new() -> None:
+    """All balls look the same. The third appears while the others are out of view."""
+    tracker, view = rt.Tracker(), unit(np.random.default_rng(15), 1)
+    ids: dict[int, set[int]] = {}
+    for pose in (
+        PAST + [pose_at(0.5, t) for t in range(60)] + [pose_at(0.5, 60 - t) for t in range(61)]
+    ):
+        found, which = balls_seen(pose)
+        tracks = tracker.update(
+            found, embeddings=view.repeat(len(found), 0), cam_from_world=pose, camera=CAMERA
+        )
+        for ball, track in zip(which[tracks.detection_index], tracks.track_id, strict=True):
+            ids.setdefault(int(ball), set()).add(int(track))
+    assert [len(ids[k]) for k in range(3)] == [1, 1, 1]
+    assert len(set.union(*ids.values())) == 3
+
+
+@pytest.mark.parametrize(
+    ("box", "same"),
+    [
+        ((103, 100, 113, 350), True),
+        ((72, 170, 138, 280), False),  # at the same position, but of another shape
+    ],
+)
+def test_without_appearance_boxes_must_be_similar(box: tuple[float, ...], same: bool) -> None:
+    tracker = rt.Tracker()
+    repeat(5, tracker, TALL)
+    assert (update(tracker, rows(box)).tracklet_id == 1).tolist() == [same]
+
+
+@pytest.mark.parametrize(("left", "same"), [(103, True), (111, False)])
+def test_without_appearance_boxes_must_overlap(left: int, same: bool) -> None:
+    """After some missed frames, a position beside so tall a box is well within the gate."""
+    tracker = rt.Tracker()
+    repeat(5, tracker, TALL)
+    repeat(12, tracker, NOTHING)
+    found = update(tracker, rows((left, 100, left + 10, 350)))
+    assert (found.tracklet_id == 1).tolist() == [same]
+
+
+def test_confirmed_tracks_are_matched_first() -> None:
+    """One detection between two tracks, a little nearer to the tentative one."""
+    tracker = rt.Tracker()
+    known, tentative = (100, 100, 200, 200), (110, 100, 210, 200)
+    repeat(8, tracker, rows(known))
+    for _ in range(2):
+        tracks = update(tracker, rows(known, tentative, score=0.6))
+    assert tracks.track_id.tolist() == [1, 0]
+    assert tracker.update(rows((107, 100, 207, 200))).track_id.tolist() == [1]
+
+
+@pytest.mark.parametrize(("score", "found"), [(0.09, []), (0.11, [1])])
+def test_scores_below_the_low_one_continue_nothing(score: float, found: list[int]) -> None:
+    tracker = rt.Tracker()
+    tracker.update(BOX)
+    assert tracker.update(rows((101, 100, 151, 150), score=score)).track_id.tolist() == found
+
+
+def test_low_scores_are_matched_after_high_ones() -> None:
+    """A low score exactly on the track, a high one beside it: the high one continues it."""
+    tracker = rt.Tracker()
+    repeat(5, tracker, LARGE)
+    tracks = tracker.update(rows((100, 100, 200, 200, 0.3), (115, 100, 215, 200, 0.9)))
+    assert tracks.detection_index.tolist() == [1]
+
+
+def gone(tracker: rt.Tracker, view: np.ndarray, frames: int = 60) -> None:
+    """Show one chair of this appearance on the left for 12 frames, then nothing."""
+    repeat(12, tracker, CORNER, embeddings=view)
+    repeat(frames, tracker, NOTHING)
+
+
+def test_an_identity_goes_to_one_of_two_newcomers() -> None:
+    """Both look like the absent object; even with a low threshold one gets a new identity."""
+    view = unit(np.random.default_rng(23), 1)
+    tracker = rt.Tracker(rt.TrackerConfig(return_probability=0.01))
+    gone(tracker, view)
+    for _ in range(5):
+        both = rows((300, 0, 350, 50), (500, 0, 550, 50))
+        tracks = tracker.update(both, embeddings=view.repeat(2, 0))
+    assert sorted(tracks.track_id.tolist()) == [1, 2]
+
+
+def test_simultaneous_objects_are_different() -> None:
+    """The new object appears in the last frame of an identical one, and is missed once; a third
+    one appears a frame later, so that both are confirmed simultaneously.
+    """
+    views = unit(np.random.default_rng(24), 2)
+    old, new, third = (0, 0, 50, 50), (300, 0, 350, 50), (600, 0, 650, 50)
+    tracker = rt.Tracker()
+    repeat(12, tracker, rows(old), embeddings=views[:1])
+    tracker.update(rows(old, new), embeddings=views[[0, 0]])
+    tracker.update(rows(third), embeddings=views[1:])
+    tracks = repeat(3, tracker, rows(new, third), embeddings=views)
+    assert sorted(tracks.track_id.tolist()) == [2, 3]
+
+
+def test_a_return_ends_the_track_that_still_coasts() -> None:
+    """Its object is elsewhere: a detection at the old position is another one."""
+    views = unit(np.random.default_rng(25), 2)
+    old, new = (0, 0, 50, 50), (400, 0, 450, 50)
+    tracker = rt.Tracker()
+    gone(tracker, views[:1], frames=5)
+    tracks = repeat(4, tracker, rows(new), embeddings=views[:1])
+    assert tracks.track_id.tolist() == [1] and tracker.state.tracks.identity.tolist() == [0]
+    tracks = repeat(4, tracker, rows(new, old), embeddings=views)
+    assert tracks.track_id.tolist() == [1, 2]
+
+
+def test_a_track_votes_for_its_class() -> None:
+    """Most of its score is a cup's: it may match the lost cup, although it last was a chair."""
+    view = unit(np.random.default_rng(26), 1)
+    tracker = rt.Tracker()
+    repeat(12, tracker, rows((0, 0, 50, 50), class_id=CUP), embeddings=view)
+    repeat(60, tracker, NOTHING)
+    for kind, score in ((CUP, 0.9), (CHAIR, 0.6)):
+        found = rows((300, 0, 350, 50), score=score, class_id=kind)
+        tracks = tracker.update(found, embeddings=view)
+    assert tracks.track_id.tolist() == [1]
+
+
+def test_tracks_follow_their_positions_under_camera_jerks() -> None:
+    """The camera jumps to and fro by more than a ball's width; no track is lost for a frame."""
+    tracker = rt.Tracker()
+    walk(tracker, PAST)
+    assert tracker.ellipsoid_map.known.sum() == 2
+    tracklets = tracker.latest.tracklet_id.tolist()
+    for i in range(12):
+        pose = pose_at(0.5 - 0.5 * (i % 2))
+        found, _ = balls_seen(pose)
+        tracks = tracker.update(found, cam_from_world=pose, camera=CAMERA)
+        assert sorted(tracks.tracklet_id.tolist()) == sorted(tracklets)
+        assert tracks.track_id.tolist() == [1, 2]
+
+
+def test_embedding_of_a_track_is_a_running_mean() -> None:
+    """A fifth of the new one, four fifths of the old mean."""
+    first, second = np.eye(2, 8)
+    tracker = rt.Tracker(rt.TrackerConfig(embed_every=1))
+    for view in (first, second):
+        tracker.update(CORNER, embeddings=view[None])
+    expected = (0.8 * first + 0.2 * second) / np.hypot(0.8, 0.2)
+    np.testing.assert_allclose(tracker.state.tracks.embedding[0], expected, atol=1e-6)
