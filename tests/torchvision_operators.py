@@ -8,6 +8,7 @@ A torchvision that matches PyTorch is used as it is.
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import sys
 from typing import Any
@@ -20,7 +21,7 @@ def declare_nms() -> None:
     import torch
 
     try:
-        pass
+        importlib.import_module("torchvision")
     except RuntimeError:
         for name in [name for name in sys.modules if name.partition(".")[0] == "torchvision"]:
             del sys.modules[name]
