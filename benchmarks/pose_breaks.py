@@ -354,7 +354,8 @@ def mirrored(clip: Clip, rows: IntArray) -> Clip:
 
     x_cam = R X + t becomes F x_cam = (F R F) (F X) + F t with F the flip of x.
     """
-    truth, world = clip.truth.copy(), clip.world.copy()
+    truth = clip.truth.copy()
+    world = clip.world.copy()
     truth[rows] = FLIP @ truth[rows]
     truth[rows, :, :3] = truth[rows, :, :3] @ FLIP
     world[rows] = -1 - world[rows]

@@ -309,7 +309,8 @@ class HeadTrainer(te.Trainer):
         import onnx
 
         fed = tuple(part[:2] for part in self.inputs(self.pool.rooms[:1]))
-        net, args = self.net.cpu().eval(), self.args
+        net = self.net.cpu().eval()
+        args = self.args
         name = f"{'crops_' if args.crops else ''}{Path(args.backbone).stem}_head.onnx"
         path = args.out / name
         if args.crops:

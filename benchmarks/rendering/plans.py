@@ -274,7 +274,7 @@ def wall_objects(rng: Rng, size: Size) -> list[list[Part]]:
 
 
 def turned_furniture(size: Size, quarter: int) -> list[Part]:
-    """Fixed furniture of a room that is turned by so many right angles."""
+    """Fixed furniture of a room that is turned by a number of right angles."""
     own = (size[1], size[0], size[2]) if quarter % 2 else size
     return placed(fixed_furniture(own), rotation_z(quarter * np.pi / 2))
 
