@@ -245,7 +245,7 @@ class TrackState:
     uncertainty: Array  # (T, 2) px, of the projected position
 
     def select(self, keep: npt.NDArray[Any]) -> TrackState:
-        """Return the tracks of these rows."""
+        """Return the tracks of some rows."""
         return TrackState(*(getattr(self, name)[keep] for name in self.__slots__))
 
     def append(self, other: TrackState) -> TrackState:

@@ -239,7 +239,8 @@ def stream_of(seq: Sequence, embedded: list[Array] | None) -> Stream:
 
 def ours(seq: Sequence) -> IntArray:
     """Our tracker alone, frame by frame, with its own embedder where there are images."""
-    tracker, identity = rt.Tracker(None, rt.Embedder() if seq.images is not None else None), []
+    tracker = rt.Tracker(None, rt.Embedder() if seq.images is not None else None)
+    identity = []
     frames = iter(seq.video()) if seq.images is not None else None
     for found in seq.detections:
         tracks = tracker.update(found, None if frames is None else next(frames).image)

@@ -770,11 +770,14 @@ def prepare(
         clip = Clip(NO_IMAGES, truth, np.zeros(len(truth), np.int64), focal, recording.noise)
         return video, clip, rt.PosesConfig(), "as it is"
     if kind == "good":
-        clip, what, config = job.shelf.clip(tail), "as it is", rt.PosesConfig()
+        clip = job.shelf.clip(tail)
+        what = "as it is"
+        config = rt.PosesConfig()
     else:
         rng = np.random.default_rng([job.seed, list(KINDS).index(kind), int(tail)])
         clip, what = KINDS[kind](job.shelf, job.names, rng)
-        config, (height, width) = SHORT, clip.images.shape[1:3]
+        config = SHORT
+        height, width = clip.images.shape[1:3]
         if rng.random() < KNOWN_CAMERA:
             focal = clip.focal * width
             config = replace(config, camera=f"{focal:.3f},{focal:.3f},{width / 2},{height / 2}")

@@ -134,7 +134,8 @@ def room_path(seed: int, cache: Path) -> Path:
 def render_to(path: Path, seed: int) -> None:
     """Render a room into a cache file: small, in coarse light, its own lens and eye height."""
     rng = np.random.default_rng([seed, 8])
-    lens, eye = float(rng.uniform(52, 76)), float(rng.uniform(1.15, 1.75))
+    lens = float(rng.uniform(52, 76))
+    eye = float(rng.uniform(1.15, 1.75))
     config = RoomConfig(
         seed=seed, frames=FRAMES, width=SIZE_WH[0], height=SIZE_WH[1], texels_per_m=200.0,
         light_rays=4, shutter=0.0, noise=0.0, exposure=0.1, plan="varied", path="tour",

@@ -109,7 +109,8 @@ class Frozen:
         """Augment, look, write. Odd copies have masks, even ones ellipses, as a video has."""
         rng = np.random.default_rng([copy, len(clip.images), sum(map(len, clip.identity))])
         tone, flip = (te.photo_tone(rng, 1.0) if copy else None), bool(copy and rng.random() < 0.5)
-        everything, seen = np.unique(np.concatenate(clip.identity)), []
+        everything = np.unique(np.concatenate(clip.identity))
+        seen = []
         count = min(SEEN_FRAMES, len(clip.images))
         shift = rng.uniform(0, 1) if copy else 0.5
         for frame in ((np.arange(count) + shift) * len(clip.images) / count).astype(int):

@@ -31,7 +31,9 @@ def write_model(
     inputs = [helper.make_tensor_value_info("images", 1, shape)]
     if "boxes" in outputs:
         inputs.append(helper.make_tensor_value_info("orig_target_sizes", 7, ["n", 2]))
-    nodes, made, constants = [], [], dict[str, Any]()
+    nodes = []
+    made = []
+    constants = dict[str, Any]()
     for name, value in outputs.items():
         array = np.asarray(value)
         array = array.astype(np.float32) if array.dtype == np.float64 else array

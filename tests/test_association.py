@@ -441,11 +441,15 @@ def test_greedy_selection_adds_the_largest_marginal_gain() -> None:
     made, _ = association_of(three, walk(30))
     made.size_log_odds = lambda s: 1.25 + np.arange(len(s))
     of = made._unassigned(many)
-    seen, cost, view = of.evidence, of.costs(), made.detections.view
+    seen = of.evidence
+    cost = of.costs()
+    view = made.detections.view
     value = np.minimum(seen.assignment, seen.existence + MAX_BOX_GAIN)
-    explained, expected = np.zeros(len(view)), list[int]()
+    explained = np.zeros(len(view))
+    expected = list[int]()
     while True:
-        gain, tops = -cost, np.zeros((len(many), len(seen.expected)))
+        gain = -cost
+        tops = np.zeros((len(many), len(seen.expected)))
         np.maximum.at(tops, (seen.obj, view[seen.row]), value - explained[seen.row])
         gain += (tops + MISSED * (seen.expected.T & (tops > 0))).sum(1)
         gain[expected] = -np.inf

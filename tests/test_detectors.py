@@ -293,7 +293,8 @@ def test_a_cache_survives_a_kill_and_a_damaged_file(
     assert caplog.text.count("removed and computed again") == 1 and first.name in caplog.text
     assert again.get(0) is None and again.get(98) is None
     for index in (*range(64, stored), 99):
-        found, true = again.get(index), some(index, masks)
+        found = again.get(index)
+        true = some(index, masks)
         assert found is not None
         for key in ("xyxy", "score", "class_id", "masks"):
             np.testing.assert_array_equal(getattr(found, key), getattr(true, key))

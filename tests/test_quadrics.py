@@ -846,7 +846,8 @@ def test_covariance_follows_the_axes_of_a_lying_object() -> None:
     ],
 )
 def test_empty_input(shape: tuple[int, int], reason: str | None) -> None:
-    boxes, cams = np.full((*shape, 4), np.nan), np.full((shape[0], 3, 4), np.nan)
+    boxes = np.full((*shape, 4), np.nan)
+    cams = np.full((shape[0], 3, 4), np.nan)
     fits = q.fit_objects(boxes, cams, (640, 480))
     assert len(fits) == shape[1] and (fits.status == "rejected").all()
     assert fits.inlier.shape == shape and fits.cov.shape == (shape[1], 9, 9)
@@ -944,7 +945,8 @@ def ratio_scene(views: int, arc: float, size_error: float, seed: int):
 
 def test_psfmo_finds_the_axes_with_a_prior_on_their_ratios() -> None:
     """Better than with the ratios of other objects; exact ellipses give the exact axes."""
-    own, other = [], []
+    own = []
+    other = []
     for seed in range(4):
         truth, cams, dual_c, priors = ratio_scene(4, 40, 0.1, seed)
         for names, errors in ((priors.names, own), (priors.names[::-1], other)):
@@ -1054,7 +1056,9 @@ def spheres(center: np.ndarray, radius: np.ndarray) -> q.Ellipsoids:
 
 def test_volume_overlap_of_spheres_is_the_lens() -> None:
     rng = np.random.default_rng(20)
-    r1, r2, d = rng.uniform(0.2, 1, 200), rng.uniform(0.2, 1, 200), rng.uniform(0, 2.2, 200)
+    r1 = rng.uniform(0.2, 1, 200)
+    r2 = rng.uniform(0.2, 1, 200)
+    d = rng.uniform(0, 2.2, 200)
     direction = rng.normal(0, 1, (200, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     lens = np.pi * (r1 + r2 - d) ** 2 * (d**2 + 2 * d * (r1 + r2) - 3 * (r1 - r2) ** 2) / (12 * d)

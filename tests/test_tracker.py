@@ -745,9 +745,13 @@ def test_a_restored_tracker_continues_identically(tmp_path: Path) -> None:
 @pytest.mark.parametrize("seed", range(2))
 def test_a_duplicate_box_does_not_take_the_identity(seed: int) -> None:
     """The track of the second box has no embedding yet, which is no evidence."""
-    rng, tracker = np.random.default_rng(seed), rt.Tracker()
-    own, beside, second = (100, 100, 140, 200), (300, 100, 340, 200), (105, 100, 145, 200)
-    common, seen = unit(rng, 2), []
+    rng = np.random.default_rng(seed)
+    tracker = rt.Tracker()
+    own = (100, 100, 140, 200)
+    beside = (300, 100, 340, 200)
+    second = (105, 100, 145, 200)
+    common = unit(rng, 2)
+    seen = []
     for step in range(30):
         boxes = [own if step <= 24 else second, beside] + [second] * (step == 24)
         view = common[[0, 1, 0][: len(boxes)]] + 0.9 * unit(rng, len(boxes))  # cosine .55
@@ -767,7 +771,8 @@ def test_another_class_never_takes_over_an_identity() -> None:
 
 def test_with_poses_an_identical_object_elsewhere_is_new() -> None:
     """All balls look the same. The third appears while the others are out of view."""
-    tracker, view = rt.Tracker(), unit(np.random.default_rng(15), 1)
+    tracker = rt.Tracker()
+    view = unit(np.random.default_rng(15), 1)
     ids: dict[int, set[int]] = {}
     for pose in (
         PAST + [pose_at(0.5, t) for t in range(60)] + [pose_at(0.5, 60 - t) for t in range(61)]
@@ -808,7 +813,8 @@ def test_without_appearance_boxes_must_overlap(left: int, same: bool) -> None:
 def test_confirmed_tracks_are_matched_first() -> None:
     """One detection between two tracks, a little nearer to the tentative one."""
     tracker = rt.Tracker()
-    known, tentative = (100, 100, 200, 200), (110, 100, 210, 200)
+    known = (100, 100, 200, 200)
+    tentative = (110, 100, 210, 200)
     repeat(8, tracker, rows(known))
     for _ in range(2):
         tracks = update(tracker, rows(known, tentative, score=0.6))

@@ -413,14 +413,16 @@ def _outline(shape: ET.Element) -> Array:
         return np.array([floats("left top"), floats("left top") + floats("width height")])
     angle = np.radians(_angle(shape))
     if shape.tag == "ellipse":
-        center, half = floats("cx cy"), floats("rx ry")
+        center = floats("cx cy")
+        half = floats("rx ry")
         around = np.radians(np.arange(360))
         unit = np.stack([np.cos(around), np.sin(around)], 1)
     else:
         box = floats("xtl ytl xbr ybr").reshape(2, 2)
         if not angle:
             return box
-        center, half = box.mean(0), np.ptp(box, 0) / 2
+        center = box.mean(0)
+        half = np.ptp(box, 0) / 2
         unit = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
     return np.asarray(center + unit * half @ turn)

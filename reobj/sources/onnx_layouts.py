@@ -171,7 +171,8 @@ def fit_image(image: Image, size: tuple[int, int], fit: str) -> tuple[Image, Geo
     w, h = size
     if fit != "stretch":
         ratio = min(w / width, h / height)
-        w, h = max(round(width * ratio), 1), max(round(height * ratio), 1)
+        w = max(round(width * ratio), 1)
+        h = max(round(height * ratio), 1)
     left, top = ((size[0] - w) // 2, (size[1] - h) // 2) if fit == "centre" else (0, 0)
     canvas = np.full((size[1], size[0], 3), 114, np.uint8)
     canvas[top : top + h, left : left + w] = cv2.resize(image, (w, h))
@@ -249,7 +250,8 @@ def _decode_yolo(
     cells = outs[0][0] if rows else outs[0][0].T  # (A, values)
     if offsets and not model.in_px:
         corner, stride = _grid(geometry.input_size, 3)
-        center, size = (cells[:, :2] + corner) * stride, np.exp(cells[:, 2:4]) * stride
+        center = (cells[:, :2] + corner) * stride
+        size = np.exp(cells[:, 2:4]) * stride
         cells = np.hstack([center, size, cells[:, 4:]])
     if rotated:
         cos, sin = np.abs([np.cos(cells[:, -1:]), np.sin(cells[:, -1:])])

@@ -587,7 +587,8 @@ def read_npz(
     count = len(frame)
     offsets = np.zeros(count + 1, np.int64)
     data = {"mask_counts": NO_RUNS, "mask_offsets": offsets} | data
-    runs, offsets = take("mask_counts", np.int64), take("mask_offsets", np.int64, count + 1)
+    runs = take("mask_counts", np.int64)
+    offsets = take("mask_offsets", np.int64, count + 1)
     if (np.diff(offsets, prepend=0) < 0).any() or offsets[-1] > len(runs) or (runs < 0).any():
         raise ReobjError(f"{path}: mask_counts and mask_offsets are inconsistent")
     width, height = take("image_size", np.int64, 2).tolist()

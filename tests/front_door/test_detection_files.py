@@ -606,7 +606,8 @@ class Results:
     """As of ultralytics: a model with classes of its own."""
 
     def __init__(self, xyxy: Any) -> None:
-        self.orig_shape, self.names = (240, 320), {0: "red mug"}
+        self.orig_shape = (240, 320)
+        self.names = {0: "red mug"}
         cells = {"xyxy": [xyxy], "conf": [0.9], "cls": [0]}
         self.boxes = SimpleNamespace(**{key: np.array(v, float) for key, v in cells.items()})
 

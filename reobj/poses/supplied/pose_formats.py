@@ -180,7 +180,7 @@ CV_FROM_LLFF = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]])  # LLFF: x down, y
 
 
 def _file(path: Path, *names: str) -> Path:
-    """Return a file, or the first of these in a folder."""
+    """Return a file, or the first one in a folder that has one of the names."""
     return next((path / name for name in names if (path / name).is_file()), path)
 
 
