@@ -90,12 +90,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name, choices in (("path", PATHS), ("plan", PLANS)):
         text = "; ".join(f"{choice}: {about}" for choice, about in choices.items())
         add(f"--{name}", choices=choices, default=getattr(RoomConfig(), name), help=text)
+    sway = "amplitude of the translation of the hand, m (default %(default)s; 0: only rotation)"
+    add("--sway", type=float, default=RoomConfig().shake_m, help=sway)
     add("--own-world", action="store_true", help="poses in a world that begins at the first camera")
     args = parser.parse_args(argv)
     return report(
         lambda: write_clip(
             args.out,
-            room_config(args, path=args.path, plan=args.plan),
+            room_config(args, path=args.path, plan=args.plan, shake_m=args.sway),
             args.png,
             args.crf,
             args.own_world,

@@ -40,6 +40,23 @@ def tour_keys(room: Room, seed: int) -> Keys:
 TURNS_FROM_TO = (0.3, 0.7)  # of the frames of the path "turn"
 
 
+def spot_keys(room: Room) -> Keys:
+    """Twice round on the free spot that is farthest from walls and objects, looking up and down."""
+    limit = np.array(room.size_m[:2]) / 2
+    grid = np.meshgrid(*(np.arange(-x + 0.4, x - 0.4, 0.1) for x in limit))
+    spots = np.stack(grid, -1).reshape(-1, 2)
+    free = (limit - np.abs(spots)).min(1)
+    for o in room.objects:
+        away = np.linalg.norm(spots - o.center_in_world[:2], axis=1)
+        free = np.minimum(free, away - np.linalg.norm(o.size_m[:2]) / 2)
+    x, y = spots[free.argmax()].tolist()
+    steps = np.linspace(0, 1, 25)
+    yaw = 4 * np.pi * steps
+    down = np.radians(14 + 8 * np.sin(2.7 * yaw))
+    aims = np.column_stack([x + np.cos(yaw), y + np.sin(yaw), RoomConfig().eye_m - np.tan(down)])
+    return [(t, (x, y), aim) for t, aim in zip(steps.tolist(), aims, strict=True)]
+
+
 def path_keys(room: Room, kind: str, seed: int) -> tuple[Array, Array, Array]:
     """Where the walk passes: time (K,) in 0..1, camera x, y (K, 2), what it looks at (K, 3)."""
     w, d, _ = room.size_m
@@ -74,6 +91,7 @@ def path_keys(room: Room, kind: str, seed: int) -> tuple[Array, Array, Array]:
         "orbit": orbit,
         "tour": tour_keys(room, seed),
         "turn": turn,
+        "spot": spot_keys(room),
         "corridor": [(t, (x, -0.3), (x + 1.2, d / 2, 1.0)) for t, x in ends],
     }
     if kind not in paths:

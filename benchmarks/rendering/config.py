@@ -40,6 +40,7 @@ PATHS = {
     "tour": "twice past every table and couch, another way for every seed",
     "table": "photos STEP_M apart, taken standing still, once round a table, weaving up and down",
     "turn": "a walk that stops for two fifths of the frames, where the camera only turns",
+    "spot": "twice round on one free spot, see --sway",
     "corridor": "straight on along x, looking to one side",
 }
 PLANS = {
