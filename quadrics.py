@@ -76,7 +76,7 @@ SUPPORTS = tuple(shape.name.lower() for shape in Shape if shape >= 0)  # names, 
 # h = sum over groups of sqrt(sum a_k^2 m_k^2)
 AXIS_GROUPS: Array = np.array(
     [np.ones((3, 3)), np.eye(3), [[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]]
-)  # (3 supports, 3, 3)
+)  # (3 shapes, 3, 3)
 AXIS_ORDERS: IntArray = np.array(list(itertools.permutations(range(3))))  # (6, 3)
 
 
@@ -313,7 +313,7 @@ def fit_objects(
     cameras = np.asarray(img_from_world, np.float64)
     sparse = np.zeros((boxes.shape[1], 0, 3)) if points is None else np.asarray(points, np.float64)
     _check_input(boxes, cameras, image_size, categories, sparse)
-    codes = _support_codes(support, boxes.shape[1])
+    codes = _shape_codes(support, boxes.shape[1])
     cams = _cameras(cameras)
     usable = _usable_boxes(boxes, cams)
     quality = np.nan_to_num(np.asarray(1.0 if score is None else score, np.float64))
@@ -356,9 +356,9 @@ def _check_input(
             raise QuadricsError(f"{name} has shape {shape}, expected {expected}")
 
 
-def _support_codes(support: str | Sequence[str | None] | None, n: int) -> IntArray:
+def _shape_codes(shape: str | Sequence[str | None] | None, n: int) -> IntArray:
     """Convert shape names to codes (n,); None: by category, "evidence": by evidence."""
-    names = [support] * n if support is None or isinstance(support, str) else list(support)
+    names = [shape] * n if shape is None or isinstance(shape, str) else list(shape)
     codes = {None: Shape.BY_CATEGORY, "evidence": Shape.BY_EVIDENCE}
     codes |= {name: Shape(code) for code, name in enumerate(SUPPORTS)}
     unknown = {str(name) for name in names if name not in codes}
@@ -845,8 +845,8 @@ def _prior_row(entry: Mapping[str, Any]) -> list[Any]:
     finite = all(np.isfinite(x).all() for x in values)
     if not finite or min(np.linalg.eigvalsh(cov)[0] for cov in (log_cov, ratio_cov)) <= 0:
         raise ValueError("sizes and variances must be finite and positive")
-    support = entry.get("support", "ellipsoid")
-    code = Shape.BY_EVIDENCE if support == "auto" else SUPPORTS.index(support)
+    shape = entry.get("support", "ellipsoid")
+    code = Shape.BY_EVIDENCE if shape == "auto" else SUPPORTS.index(shape)
     round_ = bool(entry.get("yaw_symmetric", False))
     upright = bool(entry.get("upright", True))
     return [*values, int(code), round_, upright, entry.get("stands_on") == "floor"]
@@ -2193,7 +2193,7 @@ def solid_boxes(
     Returns:
         (F, O, 4) xyxy in pixels, not clipped; NaN where no part is in front of the camera.
     """
-    codes = _support_codes(support, len(solids))
+    codes = _shape_codes(support, len(solids))
     if (codes < 0).any():
         raise QuadricsError(f"support: a shape is missing; name one of {SUPPORTS} for each solid")
     cams = _with_positive_depth(np.asarray(img_from_world, np.float64))  # (F, 3, 4)

@@ -235,7 +235,7 @@ class TrackState:
     cov: Array  # (T, 4, 3)
     tracklet: IntArray  # (T,)
     identity: IntArray  # (T,) index of the identity, -1 while tentative
-    missed: IntArray  # (T,) frames looked at since the last detection
+    missed: IntArray  # (T,) frames on which the detector ran since the last detection
     first: IntArray  # (T,) frame of birth
     embedded: IntArray  # (T,) frame of the last embedding, -1: never
     votes: Array  # (T, C) score sums of the classes
@@ -598,7 +598,7 @@ class Tracker:
         if len(detections):
             state.intervals.add(state.frame_number)
         elif run and looked is None:
-            run = state.intervals.looked_at(state.frame_number)
+            run = state.intervals.detector_ran(state.frame_number)
         state.detector_runs += run
         weight = self.config.foreground_weight
         lazy = LazyEmbeddings(given, self.embedder, image, detections, weight)
@@ -1177,10 +1177,10 @@ def track(
     source = open_detections(video, DetectConfig(), detector)
     tracker = tracker or Tracker(embedder=Embedder())
     cameras = camera_inputs(poses, video.scale)
-    looked = True if source.always_looks else None
+    detector_ran = True if source.always_looks else None
     for frames in in_batches(video, 1 if video.is_live else source.batch):
         for frame, found in zip(frames, source.detect(frames), strict=True):
-            tracks = tracker.update(found, frame.image, looked=looked, **cameras(frame.index))
+            tracks = tracker.update(found, frame.image, looked=detector_ran, **cameras(frame.index))
             yield frame, dataclasses.replace(tracks, frame=np.full(len(tracks), frame.index))
 
 

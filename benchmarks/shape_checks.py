@@ -74,10 +74,10 @@ ORDERS = np.array(list(itertools.permutations(range(3))))  # (6, 3) of axes
 def depth_ratios(result: Result) -> dict[int, float]:
     """Return the depth of each listed object over that of the points in its boxes, NaN unknown."""
     return {
-        o.id: _depth_ratio(o, part.tracks[part.tracks.track_id == o.id], part.poses)
-        for part in result.parts()
-        if part.poses is not None
-        for o in part.located
+        o.id: _depth_ratio(o, component.tracks[component.tracks.track_id == o.id], component.poses)
+        for component in result.parts()
+        if component.poses is not None
+        for o in component.located
     }
 
 
@@ -196,9 +196,9 @@ def matched(
         a, b: (O, T) boxes of each object in each track.
     """
     shared = np.minimum(a[:, None], b).sum(2)  # (A, B)
-    part = [np.array([o.part for o in objects], np.int64) for objects in (first, second)]
+    component = [np.array([o.part for o in objects], np.int64) for objects in (first, second)]
     enough = 2 * shared >= np.minimum(a.sum(1)[:, None], b.sum(1))
-    allowed = enough & (shared > 0) & (part[0][:, None] == part[1])
+    allowed = enough & (shared > 0) & (component[0][:, None] == component[1])
     rows, columns = linear_sum_assignment(np.where(allowed, shared, 0), maximize=True)
     return [(i, j) for i, j in zip(rows, columns, strict=True) if allowed[i, j]]
 

@@ -76,20 +76,20 @@ def noisy(boxes: Array, sigma: float, rng: np.random.Generator) -> Array:
     return boxes + rng.normal(0, sigma, boxes.shape) * side
 
 
-def individual_priors(log_size: Array, sigma: float, support: str) -> tuple[Priors, list[str]]:
+def individual_priors(log_size: Array, sigma: float, shape: str) -> tuple[Priors, list[str]]:
     """Priors with one category an object: mean log full size (O, 3), isotropic log sigma."""
     n = len(log_size)
     names = [f"object {k}" for k in range(n)]
     cov = np.tile(np.eye(3) * sigma**2, (n, 1, 1))
     diff = np.array([[1.0, 0.0, -1.0], [0.0, 1.0, -1.0]])
-    code = np.full(n, quadrics.SUPPORTS.index(support))
+    code = np.full(n, quadrics.SUPPORTS.index(shape))
     flags = np.zeros(n, bool)
     ratio = (log_size @ diff.T, diff @ cov @ diff.T)
     return Priors(tuple(names), {}, log_size, cov, *ratio, code, flags, ~flags, flags), names
 
 
 def scenes(
-    n_trials: int, n_views: int, arc_deg: float, noise: float, support: str,
+    n_trials: int, n_views: int, arc_deg: float, noise: float, shape: str,
     rng: np.random.Generator,
     sizes: tuple[float, float, float] | None = None, spread: float = 0.25, tilt_deg: float = 0.0,
 ) -> tuple[Array, Array, Ellipsoids, Priors, list[str]]:  # fmt: skip
@@ -107,9 +107,9 @@ def scenes(
     truth = Ellipsoids(rng.normal(0, 0.05, (n_trials, 3)), 0.5 * np.exp(log_size), rot)
     cams = np.stack([arc_cameras(n_views, arc_deg, rng) for _ in range(n_trials)])
     boxes = np.stack(
-        [quadrics.solid_boxes(truth[k : k + 1], support, cams[k]) for k in range(n_trials)]
+        [quadrics.solid_boxes(truth[k : k + 1], shape, cams[k]) for k in range(n_trials)]
     )  # (T, V, 1, 4)
-    return noisy(boxes, noise, rng), cams, truth, *individual_priors(mean, spread, support)
+    return noisy(boxes, noise, rng), cams, truth, *individual_priors(mean, spread, shape)
 
 
 def as_one(boxes: Array, cams: Array) -> tuple[Array, Array]:
@@ -248,7 +248,7 @@ def region_error(fits: quadrics.ObjectFits, truth: Ellipsoids) -> tuple[Array, A
 
 
 def coverage(
-    n: int, views: int, arc_deg: float, noise: float, support: str, rng: np.random.Generator,
+    n: int, views: int, arc_deg: float, noise: float, shape: str, rng: np.random.Generator,
     config: FitConfig | None = None,
 ) -> dict[str, float]:  # fmt: skip
     """Rate of trials with the truth in the 95 % region: all nine, and each block of three.
@@ -256,7 +256,7 @@ def coverage(
     The truth is drawn from the prior, tilt included, so that the region is calibrated.
     """
     boxes, cams, truth, priors, names = scenes(
-        n, views, arc_deg, noise, support, rng, tilt_deg=TILT_DEG
+        n, views, arc_deg, noise, shape, rng, tilt_deg=TILT_DEG
     )
     fits = solve(boxes, cams, priors, names, config)
     errors, square = region_error(fits, truth)

@@ -284,7 +284,7 @@ def score_solids(
     output: Output,
     truth_from_ours: tuple[float, Array, Array],
 ) -> Solids:
-    """Match solids (of the largest part) with true boxes of their class, in reach, one to one.
+    """Match solids (of the largest component) with true boxes of their class, in reach, one to one.
 
     Args:
         true: each `class`, `center` (3,) m, `size_m` (3,), `world_from_obj` (3, 3).

@@ -187,20 +187,21 @@ def usable(camera: Camera) -> bool:
 
 
 def checked_pose(
-    cam_from_world: Any, camera: Camera | None, points: Any = None, part: Any = 0
+    cam_from_world: Any, camera: Camera | None, points: Any = None, component: Any = 0
 ) -> Array | None:
     """Validate and return the pose (3, 4) of one frame; None for None or NaN.
 
     Args:
-        points: (N, 3) in world, or None. part: component of the trajectory, with its own world.
+        points: (N, 3) in world, or None. component: number of the one that the pose is in.
     Raises:
-        ReobjError: the pose is not rigid, or its camera, the points or `part` are invalid.
+        ReobjError: the pose is not rigid, or its camera, the points or the component are invalid.
     """
 
     if points is not None and (np.shape(points)[1:] != (3,) or not np.isfinite(points).all()):
         raise ReobjError(f"points of shape {np.shape(points)}, expected (N, 3), finite, in world")
-    if not isinstance(part, int | np.integer) or not 0 <= part <= 1000:  # an hour's walk has a few
-        raise ReobjError(f"part {part!r}, expected the number of a component, from 0")
+    # an hour's walk has a few components
+    if not isinstance(component, int | np.integer) or not 0 <= component <= 1000:
+        raise ReobjError(f"part {component!r}, expected the number of a component, from 0")
     if cam_from_world is None:
         return None
     pose = as_numbers(cam_from_world, "cam_from_world").astype(np.float64)

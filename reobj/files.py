@@ -145,17 +145,17 @@ def check_places(folder: Path, names: Iterable[str | Path]) -> None:
             raise ReobjError(f"{(*blocked, path)[0]}: results go here, but {what}; move it away")
 
 
-def part_path(path: Path, part: int) -> Path:
+def component_path(path: Path, component: int) -> Path:
     """Name the file or folder of one component of the trajectory; that of component 0 is `path`.
 
-    >>> part_path(Path("poses.txt"), 2).name
+    >>> component_path(Path("poses.txt"), 2).name
     'poses_part2.txt'
     """
-    return path.with_name(f"{path.stem}_part{part}{path.suffix}") if part else path
+    return path.with_name(f"{path.stem}_part{component}{path.suffix}") if component else path
 
 
-def part_paths(path: Path) -> list[Path]:
-    """List the existing files or folders of `part_path`, without that of component 0."""
+def component_paths(path: Path) -> list[Path]:
+    """List the existing files or folders of `component_path`, without that of component 0."""
     return sorted(path.parent.glob(f"{path.stem}_part[0-9]*{path.suffix}"))
 
 

@@ -23,7 +23,7 @@ import quadrics
 from reobj.cameras import Poses, without_copies
 from reobj.config import Config, changed_options, read_config, write_config
 from reobj.export.registry import Viewer
-from reobj.files import Progress, part_path, shortened
+from reobj.files import Progress, component_path, shortened
 from reobj.maps.stage import (
     OpenMap,
     Placed,
@@ -261,7 +261,7 @@ def place(
         size_px = job.config.poses.size_px
         placed = place_recording(room, poses, job.video, size_px, job.progress)
         folder = job.workspace.path("placed", job.video.fingerprint).with_suffix(".sparse")
-        models = move_models(models, poses, placed, lambda k: part_path(folder, k))
+        models = move_models(models, poses, placed, lambda k: component_path(folder, k))
     return placed.poses, models, placed
 
 

@@ -552,17 +552,17 @@ def frame_step(frame: IntArray) -> int:
     return int(np.gcd.reduce(np.diff(frames))) if len(frames) > 1 else 1
 
 
-def looks(table: Tracks, looked: IntArray | None) -> tuple[IntArray, int]:
+def detector_run_numbers(table: Tracks, detector_ran: IntArray | None) -> tuple[IntArray, int]:
     """Number the frames on which the detector was run.
 
     Args:
-        looked: (F,) their frame numbers, ascending; None: all that were read, `frame_step` apart.
+        detector_ran: (F,) their numbers, ascending; None: all that were read, `frame_step` apart.
     Returns:
         (N,) number of the frame of each row, and the difference between consecutive frames.
     """
-    if looked is None:
+    if detector_ran is None:
         return table.frame, frame_step(table.frame)
-    return np.searchsorted(looked, table.frame), 1
+    return np.searchsorted(detector_ran, table.frame), 1
 
 
 def object_classes(table: Tracks) -> dict[int, int]:

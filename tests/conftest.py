@@ -89,15 +89,15 @@ def chairs() -> rt.Result:
 
 
 @pytest.fixture(scope="session")
-def parted() -> rt.Result:
+def broken_walk() -> rt.Result:
     """The chairs with a trajectory in two components; not saved. Copy it before you change it."""
     return finished(unlinked())
 
 
 @pytest.fixture(scope="session")
-def parted_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def broken_walk_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Output folder of the two components with all its files, as `objects` writes them."""
-    top = tmp_path_factory.mktemp("parts")
+    top = tmp_path_factory.mktemp("components")
     (top / "frames").mkdir()
     for i in range(64):
         image = np.full((SIZE[1], SIZE[0], 3), (60, 60 + 2 * i, 60), np.uint8)

@@ -86,29 +86,31 @@ def with_columns(tracks: rt.Tracks, **columns: object) -> rt.Tracks:
     return dataclasses.replace(tracks, **arrays)  # type: ignore[arg-type]
 
 
-BREAK = 40  # first frame of the second component in `two_parts`
-PARTS = (  # scale, rotation vector, shift: x_in_part = scale * R @ x_in_true + shift
+BREAK = 40  # first frame of the second component in `two_components`
+COMPONENTS = (  # scale, rotation vector, shift: x_in_component = scale * R @ x_in_true + shift
     (0.5, (0.2, 0.1, -0.3), (1.0, 2.0, -1.0)),
     (3.0, (-1.0, 0.7, 0.4), (-5.0, 0.5, 4.0)),
 )
 
 
-def into_part(part: int, points: np.ndarray) -> np.ndarray:
+def into_component(component: int, points: np.ndarray) -> np.ndarray:
     """Transform points (N, 3) from the true world to that of a component."""
-    scale, turn, shift = PARTS[part]
+    scale, turn, shift = COMPONENTS[component]
     return scale * points @ Rotation.from_rotvec(turn).as_matrix().T + shift
 
 
-def two_parts(frames: int = 64) -> rt.Poses:
+def two_components(frames: int = 64) -> rt.Poses:
     """A walk around the chairs that breaks at frame 40: two components; 38 to 40 have no pose.
 
     Every chair's centre is a sparse point that all frames of its component observe.
     """
     true = walk(frames, 200.0)
-    part = (np.arange(frames) >= BREAK).astype(np.int64)
+    component = (np.arange(frames) >= BREAK).astype(np.int64)
     cams = true.cam_from_world.copy()
-    for k, (scale, turn, shift) in enumerate(PARTS):
-        rows = part == k  # X_cam = R_c X + t_c; times the scale, with X = R' (X_part - shift) / s
+    for k, (scale, turn, shift) in enumerate(COMPONENTS):
+        rows = (
+            component == k
+        )  # X_cam = R_c X + t_c; times the scale, with X = R' (X_own - shift) / s
         rotation = cams[rows, :, :3] @ Rotation.from_rotvec(turn).as_matrix().T
         cams[rows, :, 3] = scale * cams[rows, :, 3] - rotation @ np.array(shift)
         cams[rows, :, :3] = rotation
@@ -118,14 +120,14 @@ def two_parts(frames: int = 64) -> rt.Poses:
     row, point = np.divmod(np.arange(frames * 3), 3)
     return dataclasses.replace(
         true, cam_from_world=cams, status=status, source="pycolmap", metric=False,
-        up_in_world=None, points=np.concatenate([into_part(k, centers) for k in (0, 1)]),
+        up_in_world=None, points=np.concatenate([into_component(k, centers) for k in (0, 1)]),
         colors=np.repeat(np.array([[0], [9]], np.uint8), 3, 0) * np.ones(3, np.uint8),
-        visibility=np.column_stack([row, point + 3 * part[row]]), part=part,
+        visibility=np.column_stack([row, point + 3 * component[row]]), part=component,
     )  # fmt: skip
 
 
-def tracks_in_two_parts(poses: rt.Poses) -> rt.Tracks:
-    """Boxes of the chairs in `two_parts`: all three tracks continue over the break."""
+def tracks_in_two_components(poses: rt.Poses) -> rt.Tracks:
+    """Boxes of the chairs in `two_components`: all three tracks continue over the break."""
     true = dataclasses.replace(walk(len(poses.frame), 200.0), frame=poses.frame)
     return tracks_of(true, 0.5)
 
@@ -144,8 +146,8 @@ def with_fitted_covariance(result: rt.Result, variance: float) -> rt.Result:
 
 def unlinked(poses: rt.Poses | None = None, tracks: rt.Tracks | None = None) -> rt.Result:
     """Output of tracker and reconstruction, before linking: by default two components."""
-    poses = two_parts() if poses is None else poses
-    tracks = tracks_in_two_parts(poses) if tracks is None else tracks
+    poses = two_components() if poses is None else poses
+    tracks = tracks_in_two_components(poses) if tracks is None else tracks
     return rt.Result(tracks, rt.COCO_NAMES, VideoInfo("walk.mp4", *SIZE, 30.0), poses=poses)
 
 

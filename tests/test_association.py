@@ -145,7 +145,7 @@ def test_a_single_view_proposes_the_true_position(floor: quadrics.Floor | None) 
         off = np.linalg.norm(centre - chair, axis=1)
         assert off.min() < 0.25
     if floor is not None:
-        rays = found.support == "cylinder"
+        rays = found.shape == "cylinder"
         np.testing.assert_allclose(centre[rays, 2], half[rays, 2], atol=0.02)  # they stand on it
 
 

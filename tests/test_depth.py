@@ -196,12 +196,12 @@ def test_a_reconstruction_becomes_metric(tmp_path, walk, unit_m, noise):
 def test_every_component_has_its_own_scale(tmp_path, walk):
     folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS)
     one, other = with_points(walk, 0.5), with_points(walk, 4.0)
-    part = (np.arange(FRAMES) >= 6).astype(int)
+    component = (np.arange(FRAMES) >= 6).astype(int)
     of_second = np.zeros((len(one.points), 1), bool)
     of_second[one.visibility[one.visibility[:, 0] >= 6, 1]] = True
     given = dataclasses.replace(
-        one, part=part, points=np.where(of_second, other.points, one.points),
-        cam_from_world=np.where(part[:, None, None], other.cam_from_world, one.cam_from_world),
+        one, part=component, points=np.where(of_second, other.points, one.points),
+        cam_from_world=np.where(component[:, None, None], other.cam_from_world, one.cam_from_world),
     )  # fmt: skip
     poses = add(given, folder)
     assert poses.metric

@@ -174,8 +174,8 @@ def test_a_bad_file_is_one_line(tmp_path: Path, text: Any, said: str) -> None:
 
 
 @pytest.fixture
-def folder(parted_folder: Path, tmp_path: Path) -> Path:
-    return shutil.copytree(parted_folder, tmp_path / "out")
+def folder(broken_walk_folder: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(broken_walk_folder, tmp_path / "out")
 
 
 def refit(out: Path, *words: str | Path) -> int:

@@ -117,7 +117,7 @@ def test_empty_video_and_live_camera_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "parts, steps",
+    "components, steps",
     [
         ([[0, 30, 60, 90, 120, 150]], []),  # nothing broke
         ([[0, 30, 60], [90, 120, 150]], [1, 2, 3]),  # between, and one on each side
@@ -126,15 +126,17 @@ def test_empty_video_and_live_camera_are_refused(tmp_path):
         ([[0, 30, 60, 90, 120]], [3, 4]),  # the last
     ],
 )
-def test_more_keyframes_around_breaks(parts, steps):
+def test_more_keyframes_around_breaks(components, steps):
     """At most eight in each step, evenly spread."""
-    found = rows_around_breaks([0, 30, 60, 90, 120, 150], [np.array(part) for part in parts])
+    found = rows_around_breaks(
+        [0, 30, 60, 90, 120, 150], [np.array(component) for component in components]
+    )
     assert found == [30 * k + row for k in steps for row in (3, 7, 10, 13, 17, 20, 23, 27)]
 
 
 def test_no_keyframes_between_adjacent_rows():
-    parts = [np.array([0, 1, 2]), np.array([5, 6])]
-    assert rows_around_breaks([0, 1, 2, 5, 6], parts) == [3, 4]
+    components = [np.array([0, 1, 2]), np.array([5, 6])]
+    assert rows_around_breaks([0, 1, 2, 5, 6], components) == [3, 4]
 
 
 def test_a_broken_reconstruction_is_repeated_with_more_keyframes(walk, tmp_path, monkeypatch):

@@ -151,7 +151,7 @@ def test_points_that_only_two_frames_observed_do_not_count():
     assert floor is not None and abs(floor.middle[2]) < 0.03
 
 
-def poses_in_two_parts():
+def poses_in_two_components():
     """The same room again in the component of frames 15-29, 5 m higher."""
     poses = poses_in_room(part=np.repeat([0, 1], 15))
     count = len(poses.points)
@@ -168,15 +168,15 @@ def poses_in_two_parts():
 def test_every_component_has_its_own_floor():
     scale = quadrics.Scale(1.0, 0.05, "priors")
     fit = SimpleNamespace(scale=scale, up=UP, up_source="cameras")  # the used attributes of a fit
-    world = describe_world(poses_in_two_parts(), [fit, fit], [])
-    for part, height in zip(world.parts, (0, 5 * HIGHER @ UP), strict=True):
-        assert part.floor is not None and part.floor_reason == ""
-        assert abs(part.floor.middle @ UP - height) < 0.03
+    world = describe_world(poses_in_two_components(), [fit, fit], [])
+    for component, height in zip(world.parts, (0, 5 * HIGHER @ UP), strict=True):
+        assert component.floor is not None and component.floor_reason == ""
+        assert abs(component.floor.middle @ UP - height) < 0.03
     assert world.floor is world.parts[0].floor
     back = decode(rt.World, json.loads(json.dumps(world.to_json())))
     assert back.to_json() == world.to_json()
     np.testing.assert_array_equal(back.parts[1].floor.middle, world.parts[1].floor.middle)
-    assert describe_world(poses_in_two_parts(), [fit, None], []).parts[1].floor is None
+    assert describe_world(poses_in_two_components(), [fit, None], []).parts[1].floor is None
 
 
 def test_the_reason_for_a_missing_floor_is_saved():

@@ -142,7 +142,7 @@ def test_an_object_lists_its_two_most_probable_classes() -> None:
     assert list(once) == ["chair"] and 0.1 < once["chair"] < 0.3  # one box is weak evidence
 
 
-def test_support_and_up_reach_the_fit() -> None:
+def test_shape_and_up_reach_the_fit() -> None:
     poses = dataclasses.replace(walk(20), up_in_world=None)
     tracks = tracks_of(poses)
     tilted = np.array([0, 0.1, 1]) / np.hypot(0.1, 1)

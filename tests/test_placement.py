@@ -52,7 +52,7 @@ def project(points, cam_from_map):
     return xy, (in_cam[:, 2] > 0.1) & ((xy > 0) & (xy < (640, 480))).all(1)
 
 
-def recording(rng, points, cam_from_map, noise_px=0.5, outliers=100, parts=None):
+def recording(rng, points, cam_from_map, noise_px=0.5, outliers=100, components=None):
     """Poses in a session's own world, and features of every image with wrong ones among them."""
     to_session = Similarity(SCALE, TURN.T, -SCALE * TURN.T @ SHIFT)  # of map_from_session
     count = len(cam_from_map)
@@ -75,7 +75,7 @@ def recording(rng, points, cam_from_map, noise_px=0.5, outliers=100, parts=None)
         CAMERA, np.arange(count), np.arange(count) / 10.0, session, np.full(count, "keyframe"),
         "pycolmap", points=to_session.apply(points.xyz), visibility=np.array(visibility),
         colors=np.zeros((len(points), 3), np.uint8),
-        part=np.zeros(count, np.int64) if parts is None else parts,
+        part=np.zeros(count, np.int64) if components is None else components,
     )  # fmt: skip
     return poses, features
 
@@ -142,8 +142,8 @@ def test_components_are_placed_one_by_one_and_become_one():
     rng = np.random.default_rng(5)
     points = room(rng)
     truth = walk(21)
-    parts = np.repeat([0, 1, 2], 7)
-    poses, features = recording(rng, points, truth, parts=parts)
+    components = np.repeat([0, 1, 2], 7)
+    poses, features = recording(rng, points, truth, components=components)
     other = Similarity(3.0, TURN, SHIFT)
     cam = poses.cam_from_world.copy()
     cam[7:14] = other.poses(cam[7:14])

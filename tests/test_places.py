@@ -168,10 +168,10 @@ def test_an_uncertain_box_overlaps_within_its_uncertainty() -> None:
 def test_a_frame_has_the_points_of_neighbours_in_its_component() -> None:
     poses = walk(6)
     seen = np.array([[0, 0], [0, 1], [3, 1], [3, 2], [5, 3]])
-    points, part = np.arange(12.0).reshape(4, 3), np.array([0, 0, 0, 0, 1, 1])
+    points, component = np.arange(12.0).reshape(4, 3), np.array([0, 0, 0, 0, 1, 1])
     visible = VisiblePoints(rt.Poses(
         poses.camera, poses.frame, poses.time_s, poses.cam_from_world, poses.status, "user",
-        points=points, visibility=seen, part=part,
+        points=points, visibility=seen, part=component,
     ))  # fmt: skip
     assert [visible.nearby(row).tolist() for row in range(6)] == [
         [0, 1], [0, 1, 2], [0, 1, 2], [1, 2], [3], [3],

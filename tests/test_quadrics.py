@@ -31,13 +31,13 @@ def random_solids(n: int, rng: np.random.Generator, upright: bool = False) -> q.
     return q.Ellipsoids(rng.normal(0, 0.4, (n, 3)), half, q.rotations(turn))
 
 
-def surface(solids: q.Ellipsoids, k: int, support: str, n: int = 90) -> np.ndarray:
+def surface(solids: q.Ellipsoids, k: int, shape: str, n: int = 90) -> np.ndarray:
     """Dense points on the surface of one shape."""
     a, b = np.meshgrid(np.linspace(0, 2 * np.pi, 4 * n), np.sin(np.linspace(-0.5, 0.5, n) * np.pi))
-    if support == "ellipsoid":
+    if shape == "ellipsoid":
         r = np.sqrt(1 - b**2)
         unit = np.stack([r * np.cos(a), r * np.sin(a), b], -1).reshape(-1, 3)
-    elif support == "cylinder":
+    elif shape == "cylinder":
         unit = np.stack([np.cos(a), np.sin(a), np.sign(b)], -1).reshape(-1, 3)
     else:
         unit = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8).T
@@ -61,14 +61,14 @@ def fitted(n: int, views: int, arc: float, noise: float, shape: str, seed: int =
 # ---- Projection ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("support", q.SUPPORTS)
-def test_solid_boxes_match_sampled_surfaces(support: str) -> None:
+@pytest.mark.parametrize("shape", q.SUPPORTS)
+def test_solid_boxes_match_sampled_surfaces(shape: str) -> None:
     rng = np.random.default_rng(0)
     solids, cams = random_solids(12, rng), syn.arc_cameras(4, 200, rng)
-    boxes = q.solid_boxes(solids, support, cams)
+    boxes = q.solid_boxes(solids, shape, cams)
     for k in range(12):
         for f in range(4):
-            uv = pixels(surface(solids, k, support), cams[f])
+            uv = pixels(surface(solids, k, shape), cams[f])
             expected = np.concatenate([uv.min(0), uv.max(0)])
             assert np.abs(boxes[f, k] - expected).max() < 0.5, (k, f)
 
@@ -264,16 +264,16 @@ def test_published_lfd_demo(demo) -> None:
 # ---- fit_objects: accuracy -----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("support", q.SUPPORTS)
-def test_clean_boxes_give_the_truth(support: str) -> None:
-    fits, truth, *_ = fitted(40, 8, 100, 1e-4, support)
+@pytest.mark.parametrize("shape", q.SUPPORTS)
+def test_clean_boxes_give_the_truth(shape: str) -> None:
+    fits, truth, *_ = fitted(40, 8, 100, 1e-4, shape)
     assert (fits.status == "ok").all()
     assert (
         np.linalg.norm(fits.ellipsoids.center_in_world - truth.center_in_world, axis=1).max() < 0.01
     )
-    overlap = syn.box_overlap if support == "box" else q.volume_overlap
+    overlap = syn.box_overlap if shape == "box" else q.volume_overlap
     assert np.median(overlap(fits.ellipsoids, truth)) > 0.98
-    assert (fits.support == support).all() and fits.inlier.sum() == 40 * 8
+    assert (fits.support == shape).all() and fits.inlier.sum() == 40 * 8
 
 
 @pytest.mark.parametrize(
@@ -364,7 +364,7 @@ def test_few_boxes_of_a_part_do_not_make_an_object_implausible() -> None:
 
 
 def cost_terms(
-    solid: tuple[np.ndarray, ...], delta: np.ndarray, support: str, boxes: np.ndarray,
+    solid: tuple[np.ndarray, ...], delta: np.ndarray, shape: str, boxes: np.ndarray,
     cams: np.ndarray, sigma_px: float, prior: tuple[np.ndarray, float],
 ) -> np.ndarray:  # fmt: skip
     """Whitened terms of one object's cost, written from docs/quadrics.md, edge by edge.
@@ -384,7 +384,7 @@ def cost_terms(
                 "ellipsoid": np.sqrt(np.full(3, square.sum())),
                 "box": np.sqrt(square),
                 "cylinder": np.sqrt([square[:2].sum(), square[:2].sum(), square[2]]),
-            }[support]
+            }[shape]
             excess = line @ cam @ np.append(center, 1.0) + (square / root).sum()
             contact = center + rot @ (half**2 * m / root)  # where the solid is tangent to the plane
             terms.append(excess / (cam[2] @ np.append(contact, 1.0)) / sigma_px)
@@ -418,7 +418,7 @@ def newton_step(terms_at, views: int, last: tuple[float, ...]) -> tuple:
     return terms, weight, step
 
 
-@pytest.mark.parametrize("support", q.SUPPORTS)
+@pytest.mark.parametrize("shape", q.SUPPORTS)
 @pytest.mark.parametrize(
     ("views", "noise_px", "noise", "surprise", "shift"),
     [
@@ -427,7 +427,7 @@ def newton_step(terms_at, views: int, last: tuple[float, ...]) -> tuple:
     ],
 )
 def test_fits_are_minima_of_the_documented_cost(
-    support: str, views: int, noise_px: float, noise: float, surprise: float, shift: float
+    shape: str, views: int, noise_px: float, noise: float, surprise: float, shift: float
 ) -> None:
     """A Gauss-Newton step on the cost above, by finite differences, does not improve it.
 
@@ -435,18 +435,18 @@ def test_fits_are_minima_of_the_documented_cost(
     """
     rng = np.random.default_rng(31)
     sigma = 0.05 * noise_px
-    boxes, cams, _, priors, names = syn.scenes(160, views, 60, noise, support, rng)
+    boxes, cams, _, priors, names = syn.scenes(160, views, 60, noise, shape, rng)
     boxes[::16, 3, 0, 2] += shift * sigma
     boxes[8::16, 3, 0, 2] -= shift * sigma
     log_size = priors.log_mean + rng.normal(0, surprise, (160, 3))
-    priors, names = syn.individual_priors(log_size, 0.25, support)
+    priors, names = syn.individual_priors(log_size, 0.25, shape)
     config = q.FitConfig(
         edge_noise_px=noise_px, edge_noise_rel=0, correlation_deg=0, iterations=200
     )
     fits = syn.solve(boxes, cams, priors, names, config)
     steps, linear, walls = [], set(), 0
     for k in range(0, 160, 8):
-        given = (support, boxes[k, :, 0], cams[k], sigma, (log_size[k], 0.25))
+        given = (shape, boxes[k, :, 0], cams[k], sigma, (log_size[k], 0.25))
         solid = solid_of(fits, k)
         terms, weight, step = newton_step(
             lambda d, solid=solid, given=given: cost_terms(solid, d, *given), views, ()
@@ -620,12 +620,12 @@ def test_of_many_views_the_best_of_each_interval_are_used(way: str) -> None:
 # ---- fit_objects: uncertainty, scale, gravity ----------------------------------------------
 
 
-@pytest.mark.parametrize("support", q.SUPPORTS)
-def test_covariance_is_calibrated(support: str) -> None:
+@pytest.mark.parametrize("shape", q.SUPPORTS)
+def test_covariance_is_calibrated(shape: str) -> None:
     """True parameters lie inside the 95 % region about as often as they should (400 trials)."""
     rng = np.random.default_rng(14)
     config = q.FitConfig(correlation_deg=0.0)  # the noise of these boxes is independent
-    inside = syn.coverage(400, 6, 90, 0.02, support, rng, config)
+    inside = syn.coverage(400, 6, 90, 0.02, shape, rng, config)
     assert 0.90 <= inside["all"] <= 0.985
     assert 0.92 <= inside["center"] <= 0.99 and 0.92 <= inside["size"] <= 0.99
 
@@ -806,7 +806,7 @@ def test_gravity_is_given_or_from_level_cameras(room) -> None:
         assert off_deg < (10.0 if up is None else 1e-3)
 
 
-def test_support_may_differ_by_object(room) -> None:
+def test_shape_may_differ_by_object(room) -> None:
     boxes, cams, _, names = room
     wanted = [None, "ellipsoid", "evidence"] + [None] * (len(names) - 3)
     fits = q.fit_objects(boxes, cams, syn.IMAGE, names, q.load_priors(), up=UP, support=wanted)

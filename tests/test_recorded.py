@@ -33,8 +33,8 @@ def test_round_trip(tmp_path: Path) -> None:
     found = recorded.read_npz(path, SIZE, SIZE)
     assert found.class_names == ("cup", "box") and len(found) == 7
     assert found.frame.tolist() == [3, 3, 3, 6, 8, 8, 8]
-    assert found.looked is not None
-    assert found.looked.tolist() == [3, 5, 6, 8]  # also the one without a box
+    assert found.detector_ran is not None
+    assert found.detector_ran.tolist() == [3, 5, 6, 8]  # also the one without a box
     for index, expected in frames:
         got = found.at(index)
         np.testing.assert_array_equal(got.xyxy, expected.xyxy)
@@ -84,7 +84,7 @@ def test_wrong_arrays_are_named(tmp_path: Path, change: dict[str, Any], expected
     np.savez(path, **{key: value for key, value in arrays.items() if key not in optional})
     found = recorded.read_npz(path, SIZE, SIZE)
     assert found.at(0).masks is None and found.at(0).xyxy.tolist() == BOXES.tolist()
-    assert found.looked is None
+    assert found.detector_ran is None
 
 
 # ---- Masks ---------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from browser import Browser
 from scipy.spatial.transform import Rotation
-from simulated import fitted, into_part
+from simulated import fitted, into_component
 
 import quadrics
 import reobj.viewer.scene as scene
@@ -353,10 +353,10 @@ def test_the_list_is_searched_sorted_and_filtered(browser: Browser, page: Path) 
 
 
 def test_corrections_made_in_the_viewer_are_applied(
-    browser: Browser, parted_folder: Path, tmp_path: Path
+    browser: Browser, broken_walk_folder: Path, tmp_path: Path
 ) -> None:
     """Merge, rename, delete, undo; the saved file gives the same objects in Python."""
-    out = shutil.copytree(parted_folder, tmp_path / "out")
+    out = shutil.copytree(broken_walk_folder, tmp_path / "out")
     browser.open(out / "scene.html")
     browser.eval("select(here[0])")
     browser.eval("[...document.querySelectorAll('#panel button')]"
@@ -378,7 +378,7 @@ def test_corrections_made_in_the_viewer_are_applied(
         browser.eval("$('save').click()")
     download.value.save_as(tmp_path / "edits.json")
     command = browser.eval("$('saved').querySelector('code').innerText")
-    assert command == f"python -m reobj_track objects {parted_folder} --edits edits.json"
+    assert command == f"python -m reobj_track objects {broken_walk_folder} --edits edits.json"
     assert rt.main(["objects", str(out), "--edits", str(tmp_path / "edits.json")]) == 0
     assert [[o.id, o.class_name] for o in rt.Result.load(out).objects] == shown
     browser.open(out / "scene.html")
@@ -397,10 +397,10 @@ def test_corrections_made_in_the_viewer_are_applied(
 
 
 def test_a_visit_is_split_at_the_slider(
-    browser: Browser, parted_folder: Path, tmp_path: Path
+    browser: Browser, broken_walk_folder: Path, tmp_path: Path
 ) -> None:
     """The preview has the frames that the split gives in Python, also after a second split."""
-    out = shutil.copytree(parted_folder, tmp_path / "out")
+    out = shutil.copytree(broken_walk_folder, tmp_path / "out")
     browser.open(out / "scene.html")
     browser.eval("select(here[1]); goTo(13); $('cut').querySelector('button').click()")
     assert browser.eval("pending.map(said)") == ["split frames 13\u201339 off 2"]
@@ -525,14 +525,16 @@ def test_menus_and_targets_fit_a_phone(browser: Browser, page: Path) -> None:
     assert browser.errors == []
 
 
-def test_selecting_a_component_updates_everything(browser: Browser, parted_folder: Path) -> None:
-    browser.open(parted_folder / "scene.html")
+def test_selecting_a_component_updates_everything(
+    browser: Browser, broken_walk_folder: Path
+) -> None:
+    browser.open(broken_walk_folder / "scene.html")
     rows = "[...document.querySelectorAll('.row b')].map(b => +b.textContent.split(' ').at(-1))"
     shown = (
         "[solid.map(o => o.id), steps.length, posed.length, +$('slider').max, "
         "cloud.geometry.attributes.position.count]"
     )
-    name = parted_folder.parent.name
+    name = broken_walk_folder.parent.name
     assert browser.eval("document.title") == f"{name}: 6 objects with a shape in 2 components"
     assert browser.eval(rows) == [1, 2, 3]
     assert browser.eval(shown) == [[1, 2, 3], 40, 38, 39, 3]
@@ -547,7 +549,7 @@ def test_selecting_a_component_updates_everything(browser: Browser, parted_folde
     assert 4 < before[0] / after[0] < 9  # 3 units a metre instead of .5
     assert 0.4 < before[1] / after[1] < 2.5  # metres both
     solid = browser.eval("solid[1].center")
-    np.testing.assert_allclose(solid, into_part(1, np.array([[0, 0.1, 0.41]]))[0], atol=0.1)
+    np.testing.assert_allclose(solid, into_component(1, np.array([[0, 0.1, 0.41]]))[0], atol=0.1)
     browser.eval("$('slider').value = 23; $('slider').oninput()")
     assert browser.eval("[state.step, $('clock').textContent]") == [63, "frame 63"]
     browser.eval("goTo(3)")  # of the other component

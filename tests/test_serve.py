@@ -117,9 +117,9 @@ def serving(out: Path, *words: str, **environment: str) -> Iterator[Client]:
 
 
 @pytest.fixture
-def out(parted_folder: Path, tmp_path: Path) -> Path:
+def out(broken_walk_folder: Path, tmp_path: Path) -> Path:
     """An output folder of an image folder, with six objects in two components."""
-    return shutil.copytree(parted_folder, tmp_path / "out")
+    return shutil.copytree(broken_walk_folder, tmp_path / "out")
 
 
 @pytest.fixture(scope="module")

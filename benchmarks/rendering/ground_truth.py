@@ -63,9 +63,9 @@ def solid_outline(truth: RoomObject, center_in_world: Array) -> Array:
     frame = np.concatenate(
         [truth.world_from_obj * half, truth.center_in_world[:, None]], 1
     )  # (3, 4)
-    if truth.support == "ellipsoid":
+    if truth.shape == "ellipsoid":
         return sphere_rim(frame, center_in_world)
-    if truth.support == "box":
+    if truth.shape == "box":
         signs = np.stack(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0]), -1).reshape(8, 3)
         return apply(frame, signs)
     turn = np.arange(96) * 2 * np.pi / 96

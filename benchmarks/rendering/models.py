@@ -37,7 +37,7 @@ class Model:
     """A piece of furniture in its own frame: footprint around the origin, floor at z = 0."""
 
     class_name: str
-    support: str  # the solid that describes it: box | cylinder | ellipsoid
+    shape: str  # the solid that describes it: box | cylinder | ellipsoid
     parts: Sequence[Part]
 
 

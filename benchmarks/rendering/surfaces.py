@@ -43,7 +43,7 @@ class RoomObject:
     class_name: str
     class_id: int  # COCO-80
     twin_group: int  # objects of one model share it: they look the same
-    support: str  # box | cylinder | ellipsoid
+    shape: str  # box | cylinder | ellipsoid
     center_in_world: Array  # (3,) m
     size_m: Array  # (3,) full width, depth, height
     yaw_rad: float
@@ -242,7 +242,7 @@ def place_object(
         class_name=model.class_name,
         class_id=COCO_NAMES.index(model.class_name),
         twin_group=twin_group,
-        support=model.support,
+        shape=model.shape,
         center_in_world=rotation @ ((low + high) / 2) + placement.position,
         size_m=high - low,
         yaw_rad=float((placement.yaw_rad + np.pi) % (2 * np.pi) - np.pi),

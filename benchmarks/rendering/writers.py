@@ -82,7 +82,7 @@ def objects_json(room: Room, config: RoomConfig) -> dict[str, Any]:
             "class": item.class_name,
             "class_id": item.class_id,
             "twin_group": item.twin_group,
-            "support": item.support,
+            "support": item.shape,
             "center": item.center_in_world.round(6).tolist(),
             "size_m": item.size_m.round(6).tolist(),
             "half_axes": (item.size_m / 2).round(6).tolist(),

@@ -197,24 +197,24 @@ def _ellipsoids_in_truth(
     solids: list[quadrics.Ellipsoids] = []
     scale_errors: list[float | None] = []
     faults: dict[int, ReobjError] = {}
-    for k, part in enumerate(result.parts()):
+    for k, component in enumerate(result.parts()):
         scale_errors.append(None)
         try:
-            scale, turn, shift = align_with_truth(part, truth_poses)
+            scale, turn, shift = align_with_truth(component, truth_poses)
         except ReobjError as error:
             faults[k] = error
             continue
-        ours = part.ellipsoids()
-        objects += part.located
+        ours = component.ellipsoids()
+        objects += component.located
         center = ours.center_in_world @ (scale * turn).T + shift
         axes = turn @ ours.world_from_obj
         solids.append(quadrics.Ellipsoids(center, scale * ours.half_axes, axes))
-        if part.world.scale is not None and part.world.scale.value:
-            scale_errors[k] = abs(part.world.scale.value / scale - 1)
+        if component.world.scale is not None and component.world.scale.value:
+            scale_errors[k] = abs(component.world.scale.value / scale - 1)
     if not solids:
         raise faults[0]
     for k, fault in faults.items():
         log.warning("component %d of the trajectory is not evaluated in 3D: %s", k, fault)
     columns = ("center_in_world", "half_axes", "world_from_obj")
-    joined = (np.concatenate([getattr(part, name) for part in solids]) for name in columns)
+    joined = (np.concatenate([getattr(own, name) for own in solids]) for name in columns)
     return objects, quadrics.Ellipsoids(*joined), scale_errors

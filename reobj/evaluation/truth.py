@@ -129,7 +129,7 @@ def _read_labelled(entry: Format[Reader], source: Source, _: float) -> LabelledB
         names[recorded.ignored] = ""
         source.say("KITTI's labels: frames from 0; boxes on DontCare do not count; KITTI's rules "
                    "of distractors, occlusion and height are not applied")  # fmt: skip
-    listed = None if recorded.looked is None else recorded.looked + 1
+    listed = None if recorded.detector_ran is None else recorded.detector_ran + 1
     ids = recorded.identity
     return LabelledBoxes(recorded.frame + 1, ids, recorded.xyxy, names, role, listed)
 

@@ -44,7 +44,7 @@ def export_coco_vid(result: Result, path: Path) -> None:
     ]  # fmt: skip
     warn_of_components(result, path)
     several = len(result.world.parts) > 1
-    part_of = {o.id: {"part": o.part} for o in result.objects if several}
+    component_of = {o.id: {"part": o.part} for o in result.objects if several}
     low, high = np.hsplit(tracks.xyxy.round(2), 2)  # (N, 2) each
     boxes = np.hstack([low, high - low]).round(2).tolist()
     columns = (tracks.frame, tracks.track_id, tracks.class_id, tracks.score)
@@ -53,7 +53,7 @@ def export_coco_vid(result: Result, path: Path) -> None:
         {"id": i, "image_id": image_id[frame], "video_id": 1, "category_id": kind + 1,
          "instance_id": identity, "track_id": identity, "bbox": box,
          "area": round(box[2] * box[3], 2), "iscrowd": 0, "score": score,
-         **part_of.get(identity, {})}
+         **component_of.get(identity, {})}
         for i, (box, frame, identity, kind, score) in enumerate(rows, 1)
     ]  # fmt: skip
     data = {

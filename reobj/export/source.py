@@ -32,8 +32,8 @@ from reobj.types import Array, ReobjError, log
 
 def largest_component(result: Result, path: Path) -> Result:
     """Return the objects and cameras of component 0; warn if there are others."""
-    if len(parts := result.world.parts) > 1:
-        exported = f"component 0 of {len(parts)} ({parts[0].span_text})"
+    if len(components := result.world.parts) > 1:
+        exported = f"component 0 of {len(components)} ({components[0].span_text})"
         log.warning("%s contains %s: the others have other frames and scales", path, exported)
     return result.of_part(0)
 
@@ -41,8 +41,11 @@ def largest_component(result: Result, path: Path) -> Result:
 def warn_of_components(result: Result, path: Path) -> None:
     """Warn that objects are not joined across components, and list those of each."""
     if len(result.world.parts) > 1:
-        ids = [spans(o.id for o in part.objects) or "none" for part in result.parts()]
-        lists = [f"{part.span_text}: {i}" for part, i in zip(result.world.parts, ids, strict=True)]
+        ids = [spans(o.id for o in component.objects) or "none" for component in result.parts()]
+        lists = [
+            f"{component.span_text}: {i}"
+            for component, i in zip(result.world.parts, ids, strict=True)
+        ]
         text = "; ".join(lists)
         log.warning("%s: objects are not joined across components; objects of %s", path, text)
 
@@ -74,27 +77,29 @@ def shifted(poses: Poses, origin: Array) -> Poses:
     return dataclasses.replace(poses, cam_from_world=cams, points=poses.points - origin)
 
 
-def centred(part: Result) -> tuple[Result, Array]:
+def centred(component: Result) -> tuple[Result, Array]:
     """Shift the world of a component (`Result.of_part`) if its origin is far away.
 
     Returns:
         the component, then without fits, and the position (3,) of the new origin in the old world.
     """
-    centers = np.array([o.center for o in part.located], np.float64).reshape(-1, 3)
-    origin = far_origin(part.poses, centers)
-    if part.poses is None or not origin.any():
-        return part, origin
-    floor = part.world.floor
+    centers = np.array([o.center for o in component.located], np.float64).reshape(-1, 3)
+    origin = far_origin(component.poses, centers)
+    if component.poses is None or not origin.any():
+        return component, origin
+    floor = component.world.floor
     if floor is not None:
         offset = floor.offset - float(floor.normal @ origin)
         floor = dataclasses.replace(floor, offset=offset, middle=floor.middle - origin)
     objects = [
         o if o.center is None else dataclasses.replace(o, center=o.center - origin)
-        for o in part.objects
+        for o in component.objects
     ]
-    world = dataclasses.replace(part.world, floor=floor)
-    poses = shifted(part.poses, origin)
-    return dataclasses.replace(part, objects=objects, world=world, poses=poses, fits=None), origin
+    world = dataclasses.replace(component.world, floor=floor)
+    poses = shifted(component.poses, origin)
+    return dataclasses.replace(
+        component, objects=objects, world=world, poses=poses, fits=None
+    ), origin
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,19 +141,19 @@ def upright_world(
     Raises:
         ReobjError: no objects with a shape and no cameras, unless the world `may_be_empty`.
     """
-    part = largest_component(result, path)
+    component = largest_component(result, path)
     origin = np.zeros(3)
     if float32:
-        part, origin = centred(part)
+        component, origin = centred(component)
     if origin.any():
         point = ", ".join(f"{value:.12g}" for value in origin)
         log.warning("%s: its origin is %s of the world: the format has float32", path, point)
-    poses = part.poses
-    scale = part.world.scale
-    up = part.world.up_in_world
+    poses = component.poses
+    scale = component.world.scale
+    up = component.world.up_in_world
     metric = scale is not None and scale.source != "none"
     metres = scale.value if scale is not None and metric else 1.0
-    if part.located:
+    if component.located:
         if not metric:
             log.warning("the scale is unknown: %s is not in metres; give --known-size", path)
         if up is None:
@@ -157,7 +162,7 @@ def upright_world(
         raise ReobjError(f"{path}: nothing to export: the result has no solids and no cameras, see "
                          "`run`")  # fmt: skip
     rotation = rotation_to_up(up)
-    ellipsoids = part.ellipsoids()
+    ellipsoids = component.ellipsoids()
     turned = quadrics.Ellipsoids(
         metres * ellipsoids.center_in_world @ rotation.T,
         metres * ellipsoids.half_axes,
@@ -171,7 +176,7 @@ def upright_world(
         points = metres * poses.points @ rotation.T
         poses = dataclasses.replace(poses, cam_from_world=cams, points=points)
     return UprightWorld(
-        part.located, turned, poses, metres, metric, up is not None, rotation, origin
+        component.located, turned, poses, metres, metric, up is not None, rotation, origin
     )
 
 

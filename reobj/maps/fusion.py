@@ -234,9 +234,9 @@ def _fused(detected: Sequence[Observation], room: RoomMap) -> tuple[str, Shapes]
     """
     starts = [k for k, o in enumerate(detected) if o.status in ("new", "moved")] or [0]
     here = np.arange(len(detected)) >= starts[-1]
-    support = max(detected[starts[-1] :], key=lambda o: o.views).support
-    same = np.array([o.support == support for o in detected])
-    is_round = support == "cylinder"
+    kind = max(detected[starts[-1] :], key=lambda o: o.views).support
+    same = np.array([o.support == kind for o in detected])
+    is_round = kind == "cylinder"
     upright = room.up is not None or is_round  # the third axis stays the third one
     shapes = observed_shapes(detected, room)
     turning = np.einsum("kii->k", shapes.cov[:, 6:, 6:])
@@ -251,7 +251,7 @@ def _fused(detected: Sequence[Observation], room: RoomMap) -> tuple[str, Shapes]
     info = np.where(both, np.linalg.inv(np.where(both, cov, np.eye(9))), 0.0)
     fused_cov = np.linalg.inv(info.sum(0))
     step = fused_cov @ np.einsum("kij,kj->i", info, delta)
-    return support, Shapes(
+    return kind, Shapes(
         shapes.center[[ref]] + step[:3],
         shapes.log_half[[ref]] + step[3:6],
         shapes.rot[[ref]] @ Rotation.from_rotvec(step[6:]).as_matrix(),

@@ -550,9 +550,9 @@ def joined(poses: Poses, components: Sequence[ComponentPlacement], placed: Seque
     """Move the placed components into the world of the map, as one component, the first."""
     cam_from_world = poses.cam_from_world.copy()
     points = poses.points.copy()
-    part = np.zeros_like(poses.part)
+    component = np.zeros_like(poses.part)
     for number, k in enumerate(sorted({*range(poses.part_count)} - {*placed}), 1):
-        part[poses.part == k] = number
+        component[poses.part == k] = number
     observer, point = poses.visibility.T
     for k in placed:
         similarity = components[k].similarity
@@ -561,4 +561,4 @@ def joined(poses: Poses, components: Sequence[ComponentPlacement], placed: Seque
         # unobserved points belong to the only component
         seen = point[rows[observer]] if poses.part_count > 1 else np.arange(len(points))
         points[seen] = similarity.apply(points[seen])
-    return dataclasses.replace(poses, cam_from_world=cam_from_world, points=points, part=part)
+    return dataclasses.replace(poses, cam_from_world=cam_from_world, points=points, part=component)

@@ -30,7 +30,7 @@ from reobj.types import Array, BoolArray, IntArray
 # Log odds unless a unit is given; measured on hololens_kitchen and redkitchen
 # (benchmarks/RESULTS.md).
 MISSED = 0.5  # against an object, for each frame in which it is expected and not detected
-NEW_OBJECT = 10.0  # against each object: at least three frames must support it
+NEW_OBJECT = 10.0  # against each object: needs agreeing detections in at least three frames
 SAME_TRACKLET = 2.5  # for the object of the previous or next detection of the tracklet
 # Of a pair of an object and a detection that is kept: below it the detection is not assigned, even
 # if both of its neighbours in the tracklet are

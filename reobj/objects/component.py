@@ -83,19 +83,19 @@ def associate_component(
     fit: Fit,
     priors: quadrics.Priors,
     moving: Collection[str] = (),
-    looked: IntArray | None = None,
+    detector_ran: IntArray | None = None,
 ) -> ComponentObjects:
     """Associate the detections of a component with 3D objects.
 
     Args:
         rows: all detections by frame; tracklet 0: untracked. moving: names of classes that move.
-        looked: frames that the detector was run on, the only ones in which a detection can be
+        detector_ran: frames that the detector was run on, the only ones in which a detection can be
             missed; None: all.
     """
     names = np.array([*class_names, ""])
     processed = poses.frame[poses.known]
-    if looked is not None:
-        processed = processed[np.isin(processed, looked)]
+    if detector_ran is not None:
+        processed = processed[np.isin(processed, detector_ran)]
     moves = _moves(rows, names, moving)
     used = np.flatnonzero(~moves & np.isin(rows.frame, processed) & ~_duplicates(rows))
     table = rows[used]
@@ -106,7 +106,7 @@ def associate_component(
     if not len(tracked):
         return ComponentObjects(label, iou, [], None, unknown)
     frames, informative = informative_frames(tracked, poses, processed)
-    fragment = cut_at_gaps(tracked, looked)
+    fragment = cut_at_gaps(tracked, detector_ran)
     # Skip fragments without new viewpoints: earlier fragments already produced these hypotheses
     chosen = np.isin(tracked.frame, frames) & np.isin(fragment, fragment[informative])
     tracked = tracked[chosen]
@@ -238,7 +238,7 @@ def _depths_in(box: Array, view: IntArray, row: IntArray, poses: Poses) -> Array
 
 def _project(shapes: Shapes, cams: Array, image_size: tuple[int, int]) -> Array:
     """Return the boxes (V, O, 4) of shapes in the images, NaN where they are out of view."""
-    boxes = quadrics.solid_boxes(shapes.ellipsoids, list(shapes.support), cams)
+    boxes = quadrics.solid_boxes(shapes.ellipsoids, list(shapes.shape), cams)
     return quadrics.clip_boxes(boxes, image_size)
 
 

@@ -101,7 +101,7 @@ def make_fit(config: ObjectsConfig, poses: Poses, class_names: Sequence[str]) ->
         expected = f"{default} or {', '.join(published)}"
         raise ReobjError(f"--solver {config.solver}: expected {expected}")
     up = parse_up(config.up) if config.up else poses.up_in_world
-    support = None if config.support == "auto" else config.support
+    shape = None if config.support == "auto" else config.support
     given = by_depth = None
     if poses.scale is not None and poses.metric and not poses.map_id:
         by_depth = quadrics.Scale(*poses.scale, "depth_maps")
@@ -114,7 +114,7 @@ def make_fit(config: ObjectsConfig, poses: Poses, class_names: Sequence[str]) ->
         scale = scene.scale or given
         fits = quadrics.fit_objects(
             views.boxes, views.img_from_world, views.image_size, names, priors,
-            up=scene.up if up is None else up, support=support, score=views.score,
+            up=scene.up if up is None else up, support=shape, score=views.score,
             hidden=views.occluded, metric=poses.metric if scale is None else scale,
             known_size=known_size, floor=scene.floor, points=views.points,
             config=dataclasses.replace(plain, wrong_class=0) if scene.trusts_classes else plain,

@@ -133,11 +133,11 @@ def _fit_fields(
         view_count = int(seen.sum())
     elif seen.any():
         dropped = round(dropped * view_count / int(seen.sum()))
-    status, reason, support = _verdict(fits, i, moves, view_count, min_views)
+    status, reason, shape = _verdict(fits, i, moves, view_count, min_views)
     fields = {
         "status": status,
         "reason": reason,
-        "support": support,
+        "support": shape,
         "views": view_count,
         "dropped_boxes": dropped,
         "parallax_deg": rounded(fits.parallax_deg[i], 2),

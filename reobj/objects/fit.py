@@ -43,7 +43,7 @@ from reobj.types import (
     LinkEvent,
     ReobjError,
     Tracks,
-    looks,
+    detector_run_numbers,
     nearest_of,
     object_classes,
     rows_by,
@@ -263,7 +263,7 @@ def _link_component(
             tracks, result.class_names, *_select_embeddings(result, source),
             None if objects is None else poses, moving=config.moving_classes,
             label=None if objects is None else label,
-            iou=None if objects is None else objects.iou[keep], looked=result.looked,
+            iou=None if objects is None else objects.iou[keep], detector_ran=result.looked,
         )  # fmt: skip
     else:
         tracks = tracks.with_identities(tracks.track_id)
@@ -308,14 +308,14 @@ def _with_untracked(tracks: Tracks, untracked: Tracks) -> tuple[Tracks, IntArray
     return Tracks.joined([tracks, untracked]), source[order]
 
 
-def _with_tracklets(table: Tracks, label: IntArray, looked: IntArray | None = None) -> Tracks:
+def _with_tracklets(table: Tracks, label: IntArray, detector_ran: IntArray | None = None) -> Tracks:
     """Give untracked rows the tracklet of the previous row of their object, or a new one.
 
     A tracklet ends at a gap of more than FRAGMENT_GAP frames in which the detector was run.
     """
     tracklet = table.tracklet_id.copy()
     unused = int(tracklet.max(initial=0)) + 1
-    number, unit = looks(table, looked)
+    number, unit = detector_run_numbers(table, detector_ran)
     taken = set(zip(table.frame.tolist(), tracklet.tolist(), strict=True))
     for rows in rows_by(label):
         if label[rows[0]] < 0:
@@ -571,11 +571,11 @@ def fill(result: Result, image_size: tuple[int, int], max_gap: int) -> Tracks:
     for component in result.parts() if max_gap else ():
         if component.poses is not None and (located := component.located):
             identity = np.array([o.id for o in located])
-            support = [str(o.support) for o in located]
+            shapes = [str(o.support) for o in located]
             poses = component.poses
             frames, _ = informative_frames(result.tracks, poses, poses.frame[poses.known])
             tracks = fill_from_objects(
-                tracks, poses, identity, component.ellipsoids(), support, sources=frames
+                tracks, poses, identity, component.ellipsoids(), shapes, sources=frames
             )
     if result.looked is not None:
         tracks = tracks[np.isin(tracks.frame, result.looked)]

@@ -75,12 +75,12 @@ class Shapes(quadrics.Rows):
     """Shapes of O objects, each with a class.
 
     Attributes:
-        ellipsoids: centres, half extents, rotations. support: (O,) names of the kind of shape.
+        ellipsoids: centres, half extents, rotations. shape: (O,) names of the kind of shape.
         class_id: (O,).
     """
 
     ellipsoids: quadrics.Ellipsoids
-    support: npt.NDArray[np.str_]
+    shape: npt.NDArray[np.str_]
     class_id: IntArray
 
 
@@ -120,7 +120,7 @@ def gather_evidence(shapes: Shapes, detections: PosedDetections, min_log_odds: f
     chunk = 1 + 30_000 // (1 + len(shapes))  # frames that are compared together, bounds the memory
     for first in range(0, len(expected), chunk):
         cams = detections.img_from_world[first : first + chunk]
-        whole = quadrics.solid_boxes(shapes.ellipsoids, list(shapes.support), cams)  # (v, O, 4)
+        whole = quadrics.solid_boxes(shapes.ellipsoids, list(shapes.shape), cams)  # (v, O, 4)
         clipped = quadrics.clip_boxes(whole, size)
         visible = np.nan_to_num(box_area(clipped) / box_area(whole))  # (v, O)
         expected[first : first + chunk] = visible > EXPECTED

@@ -300,7 +300,7 @@ def _occluded_by_nearer(
     """Mark box edges (V, G, 4) with a nearer object just outside and none just inside.
 
     A nearer object is there if it covers half of the points beside the edge or more. One that is
-    behind the object at the points inside supports it, and hides nothing, unless the object stands
+    behind the object at the points inside carries it, and hides nothing, unless the object stands
     on the floor.
     """
     occluded = np.zeros(views.boxes.shape, bool)
@@ -322,8 +322,8 @@ def _occluded_by_nearer(
         itself = candidates == column[groups, None]  # (D, N)
         entry = np.where(itself[:, None, None], np.inf, entry)
         outside, inside = entry < depth[column[groups], None, None, None]  # (D, 4, P, N)
-        supports = np.isfinite(entry[1]) & ~inside & ~standing[groups, None, None, None]
-        outside &= ~supports
+        carries = np.isfinite(entry[1]) & ~inside & ~standing[groups, None, None, None]
+        outside &= ~carries
         covered = [hit.any(3).mean(2) >= 0.5 for hit in (outside, inside)]  # (D, 4)
         occluded[v, groups] = covered[0] & ~covered[1]
     return occluded

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from reobj.cameras import Camera, Poses, SparseModel, import_pycolmap, read_sparse_model
-from reobj.files import Progress, part_path, spans
+from reobj.files import Progress, component_path, spans
 from reobj.poses.intrinsics import parse_camera
 from reobj.poses.keyframes import (
     MAX_FLOW,
@@ -117,7 +117,7 @@ def estimate_poses(
             second = made.attempt(sorted([*keys, *extra]), best.mapped.view_of)
             best = second if second.pairs > best.pairs else best
     for k, model in enumerate(best.mapped.models):
-        model.replace(part_path(work_dir / "sparse", k))
+        model.replace(component_path(work_dir / "sparse", k))
     shutil.rmtree(folder, ignore_errors=True)
     poses = best.poses
     messages = best.mapped.messages

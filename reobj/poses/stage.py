@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from reobj.cameras import Poses, import_pycolmap, load_poses, save_poses, write_colmap
-from reobj.files import Progress, load_cached, load_npz, part_path
+from reobj.files import Progress, component_path, load_cached, load_npz
 from reobj.poses.estimate import PosesConfig, estimate_poses
 from reobj.poses.intrinsics import camera_line, parse_camera
 from reobj.poses.sfm import CheckMatches, MakeProgress, triangulate
@@ -146,11 +146,11 @@ def reconstruct_cached(
         boxes_of = (lambda frame: boxes[boxes[:, 0] == frame, 1:]) if len(boxes) else None
         poses = estimate_poses(video, config, work_dir, progress=progress, boxes_to_mask=boxes_of)
         for k in range(poses.part_count if poses.known.any() else 0):
-            shutil.rmtree(part_path(model, k), ignore_errors=True)
-            part_path(work_dir / "sparse", k).replace(part_path(model, k))
+            shutil.rmtree(component_path(model, k), ignore_errors=True)
+            component_path(work_dir / "sparse", k).replace(component_path(model, k))
         if poses.known.any():
             save_poses(path, poses, models=_digest_of(model, poses.part_count))
-    models = [part_path(model, k) for k in range(poses.part_count)]
+    models = [component_path(model, k) for k in range(poses.part_count)]
     return _with_depth(poses, models, video, config, workspace, progress)
 
 
@@ -166,7 +166,7 @@ def _load_reconstruction(path: Path) -> Poses:
 def _digest_of(model: Path, components: int) -> str:
     """Hash the files of the COLMAP models of all components."""
     digest = hashlib.sha256()
-    for folder in (part_path(model, k) for k in range(components)):
+    for folder in (component_path(model, k) for k in range(components)):
         for file in sorted(folder.glob("*")):
             digest.update(f"{folder.name}/{file.name} {file.stat().st_size} ".encode())
             digest.update(file.read_bytes())
@@ -199,7 +199,7 @@ def _with_depth(
         return scaled, models
     pc = import_pycolmap()
     path = _points_path(poses, video, config, workspace).with_suffix(".sparse")
-    folders = [part_path(path, k) for k in range(len(models))]
+    folders = [component_path(path, k) for k in range(len(models))]
     for k, (model, folder) in enumerate(zip(models, folders, strict=True)):
         rows = poses.known & (poses.part == k)
         lengths = [np.linalg.norm(p.cam_from_world[rows, :, 3]) for p in (scaled, poses)]
@@ -214,7 +214,7 @@ def _with_depth(
 def write_supplied_model(poses: Poses | None, video: Video, out: Path) -> None:
     """Write sparse/ of supplied poses, and mark it, or a reconstruction's, as of upright photos."""
     for k in range(0 if poses is None else poses.part_count):
-        folder = part_path(out / "sparse", k)
+        folder = component_path(out / "sparse", k)
         if poses is not None and poses.source == "user" and poses.known.any():
             component = poses.of_part(k)
             names = [video.name(int(f)) or f"{f:06d}" for f in component.frame]

@@ -29,11 +29,11 @@ from reobj.cameras import Poses, load_poses, write_tum
 from reobj.files import (
     atomic,
     check_places,
+    component_path,
+    component_paths,
     cut,
     load_json,
     numbers,
-    part_path,
-    part_paths,
     rounded,
     shortened,
     staged,
@@ -520,7 +520,7 @@ def remove_stale(
     """
     kept = {out / path for path in made}
     for name in stale:
-        for found in (out / name, *part_paths(out / name)):
+        for found in (out / name, *component_paths(out / name)):
             found.with_name(f".part-{found.name}").unlink(missing_ok=True)  # of a killed run
             if name == OutputFile.MODEL and found.is_dir() and not found.is_symlink():
                 for old in set(found.iterdir()) - kept:
@@ -535,17 +535,17 @@ def copy_models(models: Sequence[Path], folder: Path) -> None:
     """Copy the existing COLMAP models, one a component, to sparse/, sparse_part1/, ..."""
     for k, model in enumerate(models):
         if model.is_dir():
-            shutil.copytree(model, part_path(folder / OutputFile.MODEL, k))
+            shutil.copytree(model, component_path(folder / OutputFile.MODEL, k))
 
 
 def write_trajectories(out: Path, poses: Poses) -> None:
     """Write poses.txt, and poses_part1.txt, ... of further components: a TUM file has one world."""
     if not poses.known.any():
         return
-    for old in part_paths(out / OutputFile.POSES):
+    for old in component_paths(out / OutputFile.POSES):
         old.unlink()
     for k in range(poses.part_count):
-        write_tum(part_path(out / OutputFile.POSES, k), poses.of_part(k))
+        write_tum(component_path(out / OutputFile.POSES, k), poses.of_part(k))
 
 
 def write_mot(path: Path, tracks: Tracks) -> None:

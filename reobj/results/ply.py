@@ -23,16 +23,16 @@ def write_ply(
     path: Path,
     ellipsoids: quadrics.Ellipsoids,
     object_id: Sequence[int],
-    support: Sequence[str | None] | None = None,
+    shapes: Sequence[str | None] | None = None,
 ) -> None:
     """Write solids as one coloured triangle mesh (PLY, binary little endian), in world.
 
     Each solid is closed, its triangles face outwards, and it shares no vertex with others.
 
     Args:
-        support: shape of each, "box", "cylinder" or "ellipsoid"; None: all are ellipsoids.
+        shapes: kind of each, "box", "cylinder" or "ellipsoid"; None: all are ellipsoids.
     """
-    meshes = [unit_mesh(shape) for shape in support or [None] * len(ellipsoids)]
+    meshes = [unit_mesh(shape) for shape in shapes or [None] * len(ellipsoids)]
     points = [
         half_axes * unit @ axes.T + center
         for (unit, _), half_axes, axes, center in zip(
@@ -45,7 +45,7 @@ def write_ply(
     rgb = np.repeat(np.array(colors, np.uint8).reshape(-1, 3), np.diff(start), axis=0)
     corners = [triangles + first for (_, triangles), first in zip(meshes, start, strict=False)]
     faces = np.concatenate([np.empty((0, 3), np.int64), *corners])
-    content = "ellipsoids" if support is None else "solids"
+    content = "ellipsoids" if shapes is None else "solids"
     xyz = np.concatenate([np.empty((0, 3)), *points])
     write_point_ply(path, xyz, rgb, f"comment reobj_track {content}\n", faces)
 

@@ -23,10 +23,10 @@ from reobj import __version__
 from reobj.cameras import Poses, save_poses
 from reobj.files import (
     columns_of,
+    component_path,
     cut,
     from_columns,
     load_npz,
-    part_path,
     save_npz,
     texts_with_sigma,
     wrapped,
@@ -261,7 +261,7 @@ class Result:
             if self.fits is not None or self.located:
                 for k, component in enumerate(self.parts()):
                     ids = [o.id for o in component.located]
-                    write_ply(part_path(new / OutputFile.MESH, k), component.ellipsoids(), ids)
+                    write_ply(component_path(new / OutputFile.MESH, k), component.ellipsoids(), ids)
             if more is not None:
                 more(new)
         return dataclasses.replace(self, out=out)

@@ -178,13 +178,14 @@ def read_coco_results(source: Source) -> RecordedDetections:
 def _read(source: Source, entries: list[Annotation], dataset: Dataset | None) -> RecordedDetections:
     """Convert COCO annotations."""
     classes = _categories(source, entries, dataset)
-    frame, size, looked = _images(source, entries, dataset)
+    frame, size, detector_ran = _images(source, entries, dataset)
     scale = source.scale(size, frame >= 0)
     masks = [_mask(entry.segmentation, source.video.size, ratio)
              for entry, ratio in zip(entries, scale[:, :2], strict=True)]  # fmt: skip
     form = CORNERS if any(entry.bbox_mode == 0 for entry in entries) else SIZES
     return source.recorded(
-        frame, [entry.bbox for entry in entries], classes, form, scale, looked=looked, runs=masks,
+        frame, [entry.bbox for entry in entries], classes, form, scale, runs=masks,
+        detector_ran=detector_ran,
         score=np.array([entry.score for entry in entries], np.float64),
         identity=np.array([entry.identity for entry in entries], np.int64),
         ignored=np.array([bool(entry.iscrowd or entry.ignore) for entry in entries], bool),
@@ -357,7 +358,7 @@ def read_cvat(source: Source) -> RecordedDetections:
         begin = int(source.first == "1")
         numbers = np.array([int(shape.attrib["frame"]) for _, shape in shapes], np.int64)
         frame = numbers - begin
-        columns["looked"] = _listed_frames(root, numbers, begin)
+        columns["detector_ran"] = _listed_frames(root, numbers, begin)
         columns["identity"] = np.array([int(track.attrib["id"]) + 1 for track, _ in shapes])
     else:
         frame = frames_of_names([image.attrib["name"] for image, _ in shapes], source)

@@ -27,8 +27,8 @@ from reobj.sources.recorded import (
     NORMALISED_MAX,
     RecordedDetections,
     Source,
-    frames_looked_at,
-    looked_message,
+    detector_ran_message,
+    infer_detector_ran,
     other_form,
     read_npz,
 )
@@ -221,13 +221,13 @@ def read_detections(
     path = Path(path)
     config = config or DetectConfig()
     recorded = _read(path, video, config, poses)
-    listed = recorded.looked is not None
-    if recorded.looked is None:
-        recorded.looked = frames_looked_at(recorded.frame, video.frame_count)
-    elif not 0 < len(recorded.looked) < (video.frame_count or sys.maxsize):
-        recorded.looked = None
-    if recorded.looked is not None:
-        recorded.messages.append(looked_message(recorded.looked, listed))
+    listed = recorded.detector_ran is not None
+    if recorded.detector_ran is None:
+        recorded.detector_ran = infer_detector_ran(recorded.frame, video.frame_count)
+    elif not 0 < len(recorded.detector_ran) < (video.frame_count or sys.maxsize):
+        recorded.detector_ran = None
+    if recorded.detector_ran is not None:
+        recorded.messages.append(detector_ran_message(recorded.detector_ran, listed))
     _check_scores(recorded, config.score_max, path)
     _check(recorded, path, config, video.frame_count)
     return recorded

@@ -66,8 +66,8 @@ class DetectionCache:
         """Add the frames of a file, with packed masks; a damaged one is removed."""
         size = self.image_size
         chunk = load_cached(path, lambda path: read_npz(path, size, size, sealed=True))
-        if chunk is not None and chunk.looked is not None:
-            self._stored |= dict.fromkeys(chunk.looked.tolist(), chunk)
+        if chunk is not None and chunk.detector_ran is not None:
+            self._stored |= dict.fromkeys(chunk.detector_ran.tolist(), chunk)
 
     def __contains__(self, index: int) -> bool:
         """Test whether `put` was called for a frame."""
@@ -273,11 +273,13 @@ def as_source(detector: Any, class_names: Sequence[str] = ()) -> DetectionSource
     if isinstance(detector, DetectionSource):
         return detector
     if isinstance(detector, RecordedDetections):
-        looked = None if detector.looked is None else set(detector.looked.tolist())
+        detector_ran = (
+            None if detector.detector_ran is None else set(detector.detector_ran.tolist())
+        )
 
         def run(frames: Sequence[Frame]) -> Iterator[Detections | None]:
             for frame in frames:
-                ran = looked is None or frame.index in looked
+                ran = detector_ran is None or frame.index in detector_ran
                 yield detector.at(frame.index) if ran else None
 
         return DetectionSource(

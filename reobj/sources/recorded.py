@@ -132,7 +132,7 @@ class RecordedDetections:
         messages: about dropped rows and assumptions, for the user.
         identity: (N,) as in the file, -1: none.
         ignored: (N,) regions that do not count, as the file marks them.
-        looked: frames on which the detector was run, ascending; None: all.
+        detector_ran: frames on which the detector was run, ascending; None: all.
         boxes_3d: (N, 15) of `tables.Boxes3D`; None: the detector gives none.
         form: of the boxes in the file.
     """
@@ -150,7 +150,7 @@ class RecordedDetections:
     messages: list[str]
     identity: IntArray
     ignored: BoolArray
-    looked: IntArray | None = None
+    detector_ran: IntArray | None = None
     boxes_3d: Array | None = None
     form: str = CORNERS
 
@@ -392,7 +392,7 @@ class Intervals:
         self.last = frame
         self.count = self.count + 1
 
-    def looked_at(self, frame: int) -> bool:
+    def detector_ran(self, frame: int) -> bool:
         """Return whether the detector was run on a frame without boxes."""
         return self.count < 3 or self.step < 2 or (frame - self.first) % self.step == 0
 
@@ -402,7 +402,7 @@ def _usual_step(frames: IntArray) -> int:
     return int(np.gcd.reduce(np.diff(frames))) if len(frames) > 2 else 1
 
 
-def frames_looked_at(frame: IntArray, frame_count: int) -> IntArray | None:
+def infer_detector_ran(frame: IntArray, frame_count: int) -> IntArray | None:
     """Return the frames on which a detector was run: every n-th if all boxes are in such frames.
 
     Tracks must not count frames that the detector skipped as missed detections.
@@ -418,16 +418,17 @@ def frames_looked_at(frame: IntArray, frame_count: int) -> IntArray | None:
     return np.arange(seen[0] % step, end, step) if step > 1 else None
 
 
-def looked_message(looked: IntArray, listed: bool) -> str:
+def detector_ran_message(detector_ran: IntArray, listed: bool) -> str:
     """Return the message about the frames on which the detector was run.
 
     Args:
-        looked: frame numbers, ascending. listed: in the file; else inferred from its boxes.
+        detector_ran: frame numbers, ascending. listed: in the file; else inferred from its boxes.
     """
-    step = _usual_step(looked)
-    which = f"1 frame in {step}" if step > 1 else f"{len(looked)} frames only"
+    step = _usual_step(detector_ran)
+    which = f"1 frame in {step}" if step > 1 else f"{len(detector_ran)} frames only"
+    verb = "lists" if listed else "has boxes in"
     return (
-        f"{'lists' if listed else 'has boxes in'} {which} ({shortened(looked.tolist())}): the "
+        f"{verb} {which} ({shortened(detector_ran.tolist())}): the "
         "detector was not run on the others, which do not count as empty frames"
     )
 
@@ -565,7 +566,7 @@ def read_npz(
 ) -> RecordedDetections:
     """Read the format of `pack_detections` for a video of (w, h) `size`, (0, 0): any.
 
-    The detections are not validated; `looked` has the frames that were `done`, None: not stated.
+    The detections are not validated. `detector_ran`: the frames in `done`; None: not stated.
 
     Args:
         sealed: as in `load_npz`.
@@ -599,6 +600,6 @@ def read_npz(
     classes = (take("class_id", np.int64, count), take("class_names", np.str_).tolist())
     return source.recorded(
         frame, take("xyxy", np.float64, count, 4), classes, unit="row",
-        score=take("score", np.float64, count), looked=np.unique(take("done", np.int64))
+        score=take("score", np.float64, count), detector_ran=np.unique(take("done", np.int64))
         if "done" in data else None, runs=np.split(runs.astype(np.uint32), offsets[1:])[:count],
     )  # fmt: skip

@@ -35,8 +35,8 @@ from reobj.types import (
     box_iou,
     class_shares,
     cxcywh_from_xyxy,
+    detector_run_numbers,
     frame_step,
-    looks,
     nearest_of,
     rows_by,
     unit_rows,
@@ -184,7 +184,7 @@ def link(
     moving: Collection[str] = (),
     label: IntArray | None = None,
     iou: Array | None = None,
-    looked: IntArray | None = None,
+    detector_ran: IntArray | None = None,
 ) -> tuple[Tracks, list[LinkEvent]]:
     """Decide over the whole video which tracklets belong to one object.
 
@@ -195,13 +195,13 @@ def link(
         moving: names of the classes that move; they keep the tracker's identities.
         label, iou: (N,) 3D object that each row is assigned to, or -1 (`associate_component`), and
             the IoU of its projection with the box. None: appearance decides.
-        looked: frames that the detector was run on; None: all that were read.
+        detector_ran: frames that the detector was run on; None: all that were read.
     Returns:
         the rows with the objects' identities, and every join and split with its evidence.
     """
     if not len(tracks):
         return tracks, []
-    linker = Linker(tracks, class_names, embeddings, embedding_row, poses, moving, looked)
+    linker = Linker(tracks, class_names, embeddings, embedding_row, poses, moving, detector_ran)
     identity = linker.by_appearance()
     if label is not None:
         label = propagate_labels(tracks, label, linker.fragment)
@@ -256,10 +256,10 @@ class Linker:
         embedding_row: IntArray,
         poses: Poses | None,
         moving: Collection[str],
-        looked: IntArray | None,
+        detector_ran: IntArray | None,
     ) -> None:
         self.tracks = tracks
-        self.fragment = cut_at_gaps(tracks, looked)
+        self.fragment = cut_at_gaps(tracks, detector_ran)
         count = int(self.fragment.max()) + 1
         self.classes = class_shares(tracks, self.fragment, count).argmax(1)
         moves = among([*class_names, ""], moving)  # (C + 1,), the last: unknown
@@ -370,16 +370,16 @@ def _agglomerate(log_odds: Array, banned: BoolArray, distinct: BoolArray) -> Int
     return np.unique(group, return_inverse=True)[1]
 
 
-def cut_at_gaps(tracks: Tracks, looked: IntArray | None = None) -> IntArray:
+def cut_at_gaps(tracks: Tracks, detector_ran: IntArray | None = None) -> IntArray:
     """Cut tracklets at gaps of more than FRAGMENT_GAP frames in which the detector was run.
 
     Args:
-        looked: frames that the detector was run on; None: all that were read.
+        detector_ran: frames that the detector was run on; None: all that were read.
     Returns:
         fragment of each row (N,), numbered from 0.
     """
     order = np.lexsort((tracks.frame, tracks.tracklet_id))
-    number, unit = looks(tracks, looked)
+    number, unit = detector_run_numbers(tracks, detector_ran)
     tracklet = tracks.tracklet_id[order]
     number = number[order]
     gone = np.diff(number) > FRAGMENT_GAP * unit
@@ -405,20 +405,20 @@ MIN_INSIDE = 0.8
 
 
 def fill_gaps(
-    tracks: Tracks, image_size: tuple[int, int], max_gap: int, looked: IntArray | None = None
+    tracks: Tracks, image_size: tuple[int, int], max_gap: int, detector_ran: IntArray | None = None
 ) -> Tracks:
     """Interpolate gaps of at most `max_gap` frames between two detections of an identity.
 
     Args:
         tracks: of a video, in frames that were all read. image_size: (w, h) that boxes stay in.
-        looked: frames that the detector was run on, the only ones that count and are filled;
+        detector_ran: frames that the detector was run on, the only ones that count and are filled;
             None: all that were read.
     Returns:
         the tracks with rows of score 0 and detection index -1 in the gaps, ordered by frame.
     """
     tables = [tracks]
-    step = frame_step(tracks.frame if looked is None else looked)
-    number, unit = looks(tracks, looked)
+    step = frame_step(tracks.frame if detector_ran is None else detector_ran)
+    number, unit = detector_run_numbers(tracks, detector_ran)
     for of_identity in rows_by(tracks.track_id):
         rows = tracks[of_identity]
         between = np.diff(rows.frame) // step - 1  # (n - 1,) frames after each row
@@ -431,7 +431,7 @@ def fill_gaps(
             at = (window.frame - window.frame[0]) // step
             box = smooth_boxes(at, window.xyxy)  # (F, 4) of every frame of the window
             frame = rows.frame[i] + step * np.arange(1, between[i] + 1)
-            frame = frame if looked is None else np.intersect1d(frame, looked)
+            frame = frame if detector_ran is None else np.intersect1d(frame, detector_ran)
             filled = box[(frame - window.frame[0]) // step].clip(0, np.tile(image_size, 2))
             tables.append(_filled(rows[np.full(len(frame), i)], frame, filled))
     return Tracks.joined(tables)
@@ -450,7 +450,7 @@ def fill_from_objects(
     poses: Poses,
     identity: IntArray,
     ellipsoids: quadrics.Ellipsoids,
-    support: list[str],
+    shapes: list[str],
     sources: IntArray | None = None,
 ) -> Tracks:
     """Add projected boxes in frames without a detection if a nearby view has one.
@@ -460,6 +460,7 @@ def fill_from_objects(
 
     Args:
         poses: of one component. identity: (O,) of the objects, which lie in that component.
+        shapes: (O,) their kinds.
         sources: (K,) frames whose detections are tried; None: all.
     Returns:
         the tracks with rows of score 0 and detection index -1, ordered by frame.
@@ -471,7 +472,7 @@ def fill_from_objects(
     center = -np.einsum("vij,vi->vj", cam_from_world[:, :, :3], cam_from_world[:, :, 3])
     tables = [tracks]
     for o, track_id in enumerate(identity.tolist()):
-        whole = quadrics.solid_boxes(ellipsoids[[o]], [support[o]], cams)[:, 0]
+        whole = quadrics.solid_boxes(ellipsoids[[o]], [shapes[o]], cams)[:, 0]
         inside = box_area(quadrics.clip_boxes(whole, size))
         box = np.full_like(whole, np.nan)  # (V, 4)
         shown = inside > 0

@@ -113,9 +113,9 @@ class DenseFrames:
         """Keep an undistorted frame."""
         self.images[number] = shrunk(image, SIZE_PX)
 
-    def cloud(self, part: int) -> Cloud | None:
+    def cloud(self, component: int) -> Cloud | None:
         """Return the cloud of a component; None: no frame of it gives points."""
-        rows = [row for row in self.rows if self.poses.part[row] == part]
+        rows = [row for row in self.rows if self.poses.part[row] == component]
         found = [self._points(row) for row in rows if int(self.poses.frame[row]) in self.images]
         xyz, rgb, seen_from = (
             np.concatenate(column) for column in zip(_NO_POINTS, *found, strict=True)

@@ -234,16 +234,16 @@ class Wireframes:
         return ends, edge, np.asarray(facing[edge].any(1), bool)
 
 
-def wireframes(ellipsoids: quadrics.Ellipsoids, support: Sequence[str | None]) -> Wireframes:
+def wireframes(ellipsoids: quadrics.Ellipsoids, shapes: Sequence[str | None]) -> Wireframes:
     """Make the edges of the solids in which ellipsoids are inscribed.
 
     Args:
-        support: (S,) "box" or "cylinder"; other shapes have no edges.
+        shapes: (S,) "box" or "cylinder"; other shapes have no edges.
     """
     columns = [(np.empty((0, 2, 3)), np.empty((0, 2, 4)), np.empty(0, bool), np.empty(0, int),
                 np.empty(0))]  # fmt: skip
     rows = zip(ellipsoids.half_axes, ellipsoids.world_from_obj, ellipsoids.center_in_world,
-               support, strict=True)  # fmt: skip
+               shapes, strict=True)  # fmt: skip
     for k, (half, turn, center, shape) in enumerate(rows):
         if shape not in EDGED:
             continue
@@ -326,15 +326,15 @@ def _fits(pixels: Array, image: Image) -> bool:
 
 
 def surface_points(
-    center: Array, half_axes: Array, world_from_obj: Array, support: str | None
+    center: Array, half_axes: Array, world_from_obj: Array, shape: str | None
 ) -> Array:
     """Return points (P, 3) of a solid whose projections have its outline as convex hull."""
-    if support in EDGED:  # lens distortion bends edges: 8 segments look smooth
-        ends = _unit_edges(support)[0]
+    if shape in EDGED:  # lens distortion bends edges: 8 segments look smooth
+        ends = _unit_edges(shape)[0]
         fraction = np.linspace(0, 1, 9)[:, None, None]
         unit = (ends[:, 0] + fraction * (ends[:, 1] - ends[:, 0])).reshape(-1, 3)
     else:
-        unit = unit_mesh(support, 4)[0]
+        unit = unit_mesh(shape, 4)[0]
     return np.asarray(unit * half_axes @ world_from_obj.T + center)
 
 
@@ -379,29 +379,29 @@ class _Component:
     outlined: dict[int, Array]
 
 
-def _component(result: Result, number: int, part: Result) -> _Component | None:
+def _component(result: Result, number: int, component: Result) -> _Component | None:
     """Collect what is drawn in a component; None: it has no cameras."""
-    shifted, origin = centred(part)
+    shifted, origin = centred(component)
     poses = shifted.poses
     if poses is None:
         return None
     solids = shifted.ellipsoids()
-    support = [o.support for o in part.located]
-    ids = [o.id for o in part.located]
+    shapes = [o.support for o in component.located]
+    ids = [o.id for o in component.located]
     outlined = {
         i: surface_points(solids.center_in_world[k], solids.half_axes[k], solids.world_from_obj[k],
                           shape)
-        for k, (i, shape) in enumerate(zip(ids, support, strict=True)) if shape not in EDGED
+        for k, (i, shape) in enumerate(zip(ids, shapes, strict=True)) if shape not in EDGED
     }  # fmt: skip
     changes = result.changes
     if changes is not None and number in changes.components:
-        here = {o.id for o in part.objects}
+        here = {o.id for o in component.objects}
         for change in (*(c for c in changes.moved if c.id in here), *changes.gone):
             if (shape := change.before_shape) is not None and change.before is not None:
                 turn = Rotation.from_quat(shape.quat_wxyz[[1, 2, 3, 0]]).as_matrix()
                 place = change.before - origin
                 outlined[-change.id] = surface_points(place, shape.half_axes, turn, shape.support)
-    return _Component(poses, ids, wireframes(solids, support), outlined)
+    return _Component(poses, ids, wireframes(solids, shapes), outlined)
 
 
 # ---- The video ---------------------------------------------------------------------------------

@@ -80,7 +80,7 @@ class Pictures:
         self.best: dict[int, int] = {}
         self.time_s: dict[int, float] = {}
         self.dense = dense
-        poses = [part.poses for part in result.parts()]
+        poses = [component.poses for component in result.parts()]
         chosen: list[int] = []
         ranked = sorted(result.objects, key=lambda o: -o.frames_seen)
         for doubtful in (False, True):  # low-confidence objects get the remaining crops
@@ -279,10 +279,10 @@ def write_scene(
     seconds = video.config.every / (video.fps or IMAGE_FPS) * count / max(1, len(steps))
     is_file = video.has_images and not video.is_live and not video.files  # it can be played
     fps = result.video.fps or IMAGE_FPS  # for frames that were not read
-    of_part = np.zeros(len(steps), int) if poses is None else poses.part_of(steps)  # (S,)
+    component = np.zeros(len(steps), int) if poses is None else poses.part_of(steps)  # (S,)
     # every n-th point: 20,000 are .4 MB of the page
     thin = math.ceil(0 if poses is None else len(poses.points) / 20_000) or 1
-    parts, origins = zip(*(centred(part) for part in result.parts()), strict=True)
+    components, origins = zip(*(centred(own) for own in result.parts()), strict=True)
     data = {
         "version": PAGE_VERSION,
         "title": recording_name(str(video.source)),
@@ -308,19 +308,19 @@ def write_scene(
             "time": [round(pictures.time_s.get(at, at / fps), 4) for at in steps.tolist()],
             "frame_s": 1 / (video.fps or IMAGE_FPS),
             "seconds": seconds,
-            "part": of_part.tolist(),
+            "part": component.tolist(),
         },
         **_scene_cameras(result, steps, np.array(origins)),
         "parts": [
-            _scene_component(k, part, thin) | {"origin": origin.tolist()}
-            for k, (part, origin) in enumerate(zip(parts, origins, strict=True))
+            _scene_component(k, own, thin) | {"origin": origin.tolist()}
+            for k, (own, origin) in enumerate(zip(components, origins, strict=True))
         ],
     }
     if (changes := result.changes) is not None:
         marked = dataclasses.replace(changes, new=()) if changes.made_the_map else changes
         data["changes"] = marked.to_json() | {"summary": changes.summary()}
     if pictures.dense is not None:
-        clouds = [pictures.dense.cloud(k) for k in range(len(parts))]
+        clouds = [pictures.dense.cloud(k) for k in range(len(components))]
         for entry, origin, cloud in zip(data["parts"], origins, clouds, strict=True):
             entry |= {} if cloud is None else {"dense": _dense_points(cloud, origin)}
         if not any(clouds):
@@ -404,22 +404,22 @@ def _scene_cameras(result: Result, steps: IntArray, origins: Array) -> dict[str,
     }
 
 
-def _scene_component(number: int, part: Result, thin: int) -> dict[str, Any]:
+def _scene_component(number: int, component: Result, thin: int) -> dict[str, Any]:
     """Collect name, scale, floor, up, every `thin`-th point and their sigma of a component."""
-    poses = part.poses
-    up = part.world.up_in_world
-    count = counted(len(part.objects), "object", "objects")
-    spans = ", ".join(p.span_text for p in part.world.parts)
+    poses = component.poses
+    up = component.world.up_in_world
+    count = counted(len(component.objects), "object", "objects")
+    spans = ", ".join(p.span_text for p in component.world.parts)
     facts = {
         "name": f"component {number}: {spans}; {count}",
-        "facts": _scene_facts(part.world),
-        "scale": part.world.to_json()["scale"],
+        "facts": _scene_facts(component.world),
+        "scale": component.world.to_json()["scale"],
     }
     if poses is None or not poses.known.any():
         return facts | {"points": "", "colors": "", "up": [0, 0, 1]}
     if up is None:
         up = quadrics.camera_up(poses.camera.K @ poses.cam_from_world[poses.known])[0]
-    if (floor := part.world.floor) is not None:
+    if (floor := component.world.floor) is not None:
         facts["floor"] = {"normal": floor.normal.tolist(), "offset": floor.offset}
     eye = invert_rigid(poses.cam_from_world[poses.known])[:, :, 3]
     points = poses.points[:: len(poses.points) // 500 + 1]

@@ -13,7 +13,7 @@ from simulated import unlinked, walk
 
 import reobj_track as rt
 from reobj.objects.fit import link_and_fit
-from reobj.sources.recorded import frames_looked_at
+from reobj.sources.recorded import infer_detector_ran
 
 TABLE, CHAIR = 60, 56
 FRAMES = 60
@@ -42,11 +42,11 @@ def test_a_new_track_is_confirmed_at_its_third_detection(name: str, unseen: obje
         return
     tracker, chair = rt.Tracker(), []
     for frame in range(300):
-        looked = frame in WHEN[name]
-        found = tracker.update(scene(frame) if looked else unseen)
-        if looked and frame >= 10:
+        detector_ran = frame in WHEN[name]
+        found = tracker.update(scene(frame) if detector_ran else unseen)
+        if detector_ran and frame >= 10:
             chair.append(dict(zip(found.class_id.tolist(), found.track_id.tolist(), strict=True)))
-        if not looked:
+        if not detector_ran:
             assert len(found) == 0 and len(tracker.latest) == 0
     assert [ids.get(CHAIR) for ids in chair[2:]] == [2] * (len(chair) - 2)
     assert {ids[TABLE] for ids in chair} == {1}
@@ -68,7 +68,7 @@ def test_a_track_missed_in_processed_frames_ends() -> None:
 
 
 @pytest.mark.parametrize(
-    ("frames", "boxes", "looked"),
+    ("frames", "boxes", "detector_ran"),
     [
         (range(60), 3, None),  # dense
         ([f for f in range(60) if f % 7], 3, None),  # some are empty
@@ -81,9 +81,9 @@ def test_a_track_missed_in_processed_frames_ends() -> None:
         ([], 1, None),
     ],
 )
-def test_processed_frames_are_inferred(frames: object, boxes: int, looked: object) -> None:
-    found = frames_looked_at(np.repeat(np.array(frames, np.int64), boxes), 60)
-    assert (None if found is None else found.tolist()) == (looked and list(looked))
+def test_processed_frames_are_inferred(frames: object, boxes: int, detector_ran: object) -> None:
+    found = infer_detector_ran(np.repeat(np.array(frames, np.int64), boxes), 60)
+    assert (None if found is None else found.tolist()) == (detector_ran and list(detector_ran))
 
 
 @pytest.fixture(scope="module")
@@ -181,8 +181,10 @@ def test_unprocessed_frames_do_not_lower_the_confidence() -> None:
     given = dataclasses.replace(given, tracks=given.tracks[given.tracks.frame % 4 == 0])
     given.tracks.score[:] = 0.35
     confidences = []
-    for looked in (np.arange(0, 40, 4), None):
-        found = link_and_fit(dataclasses.replace(given, looked=looked), rt.ObjectsConfig()).objects
+    for detector_ran in (np.arange(0, 40, 4), None):
+        found = link_and_fit(
+            dataclasses.replace(given, looked=detector_ran), rt.ObjectsConfig()
+        ).objects
         confidences.append([o.confidence or 0.0 for o in found])
     assert len(confidences[0]) == 3
     assert min(confidences[0]) > max(confidences[1] or [0.0]) + 0.1

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from simulated import (
     BREAK,
-    PARTS,
+    COMPONENTS,
     chair_solids,
     finished,
-    into_part,
-    tracks_in_two_parts,
+    into_component,
+    tracks_in_two_components,
     tracks_of,
-    two_parts,
+    two_components,
     unlinked,
     walk,
 )
@@ -32,25 +32,25 @@ CENTERS = chair_solids().center_in_world
 # ---- Linked and fitted ----
 
 
-def test_every_component_has_its_own_identities(parted: rt.Result) -> None:
+def test_every_component_has_its_own_identities(broken_walk: rt.Result) -> None:
     """Tracks continue over the break, but their positions after it are unrelated."""
-    assert [(o.id, o.part) for o in parted.objects] == [
+    assert [(o.id, o.part) for o in broken_walk.objects] == [
         (1, 0), (2, 0), (3, 0), (4, 1), (5, 1), (6, 1),
     ]  # fmt: skip
-    tracks = parted.tracks
+    tracks = broken_walk.tracks
     assert set(tracks.track_id[tracks.frame < BREAK]) == {1, 2, 3}
     assert set(tracks.track_id[tracks.frame >= BREAK]) == {4, 5, 6}
     np.testing.assert_array_equal(tracks.track_id % 3, (tracks.detection_index + 1) % 3)
-    assert [o.visits for o in parted.objects] == [[[0, 39]]] * 3 + [[[40, 63]]] * 3
-    assert len({t for o in parted.objects for t in o.tracklet_ids}) == 6
+    assert [o.visits for o in broken_walk.objects] == [[[0, 39]]] * 3 + [[[40, 63]]] * 3
+    assert len({t for o in broken_walk.objects for t in o.tracklet_ids}) == 6
 
 
-def test_a_component_equals_the_result_of_a_separate_video(parted: rt.Result) -> None:
-    for part in (0, 1):
-        poses = parted.poses.of_part(part)
-        tracks = tracks_in_two_parts(parted.poses)
+def test_a_component_equals_the_result_of_a_separate_video(broken_walk: rt.Result) -> None:
+    for component in (0, 1):
+        poses = broken_walk.poses.of_part(component)
+        tracks = tracks_in_two_components(broken_walk.poses)
         alone = finished(unlinked(poses, tracks[np.isin(tracks.frame, poses.frame)]))
-        own = [o for o in parted.objects if o.part == part]
+        own = [o for o in broken_walk.objects if o.part == component]
         assert len(alone.objects) == len(own) == 3
         for a, b in zip(alone.objects, own, strict=True):
             a, b = a.to_json(), b.to_json()
@@ -58,19 +58,19 @@ def test_a_component_equals_the_result_of_a_separate_video(parted: rt.Result) ->
                 del a[key], b[key]
             assert a == b
         (facts,) = alone.world.to_json()["parts"]
-        assert facts == parted.world.to_json()["parts"][part]
+        assert facts == broken_walk.world.to_json()["parts"][component]
 
 
-def test_the_world_describes_its_components(parted: rt.Result) -> None:
-    world = parted.world
+def test_the_world_describes_its_components(broken_walk: rt.Result) -> None:
+    world = broken_walk.world
     assert [(p.spans, p.frames, p.registered_frames) for p in world.parts] == [
         ([[0, 39]], 40, 38), ([[40, 63]], 24, 23),
     ]  # fmt: skip
-    for part, (scale, turn, _) in zip(world.parts, PARTS, strict=True):
-        assert part.scale.source == "priors"
-        np.testing.assert_allclose(part.scale.value, 1 / scale, rtol=0.2)
-        up = into_part(PARTS.index((scale, turn, _)), np.array([[0, 0, 1.0], [0, 0, 0]]))
-        np.testing.assert_allclose(part.up_in_world, (up[0] - up[1]) / scale, atol=0.03)
+    for component, (scale, turn, _) in zip(world.parts, COMPONENTS, strict=True):
+        assert component.scale.source == "priors"
+        np.testing.assert_allclose(component.scale.value, 1 / scale, rtol=0.2)
+        up = into_component(COMPONENTS.index((scale, turn, _)), np.array([[0, 0, 1.0], [0, 0, 0]]))
+        np.testing.assert_allclose(component.up_in_world, (up[0] - up[1]) / scale, atol=0.03)
     largest = world.parts[0]  # the fields that predate components
     assert world.registered_frames == 38 and world.frames == 64
     assert world.scale == largest.scale and world.up_source == largest.up_source
@@ -80,23 +80,25 @@ def test_the_world_describes_its_components(parted: rt.Result) -> None:
 # ---- Files ----
 
 
-def test_each_component_has_its_own_files(parted_folder: Path) -> None:
-    poses = two_parts()
-    for part, name in enumerate(("poses.txt", "poses_part1.txt")):
-        own = poses.of_part(part)
-        table = np.loadtxt(parted_folder / name)
+def test_each_component_has_its_own_files(broken_walk_folder: Path) -> None:
+    poses = two_components()
+    for component, name in enumerate(("poses.txt", "poses_part1.txt")):
+        own = poses.of_part(component)
+        table = np.loadtxt(broken_walk_folder / name)
         np.testing.assert_allclose(table[:, 0], own.time_s[own.known], atol=1e-6)
         centers = invert_rigid(own.cam_from_world[own.known])[:, :, 3]
         np.testing.assert_allclose(table[:, 1:4], centers, atol=1e-6)
     trimesh = pytest.importorskip("trimesh", reason="pip install trimesh (dev extra)")
-    for part, name in enumerate(("objects.ply", "objects_part1.ply")):
-        mesh = trimesh.load(parted_folder / name)
-        middle = into_part(part, CENTERS).mean(0)
-        np.testing.assert_allclose(mesh.vertices.mean(0), middle, atol=0.02 * PARTS[part][0])
+    for component, name in enumerate(("objects.ply", "objects_part1.ply")):
+        mesh = trimesh.load(broken_walk_folder / name)
+        middle = into_component(component, CENTERS).mean(0)
+        np.testing.assert_allclose(
+            mesh.vertices.mean(0), middle, atol=0.02 * COMPONENTS[component][0]
+        )
 
 
-def test_the_summary_has_a_line_for_each_component(parted: rt.Result) -> None:
-    lines = parted.summary().splitlines()
+def test_the_summary_has_a_line_for_each_component(broken_walk: rt.Result) -> None:
+    lines = broken_walk.summary().splitlines()
     cameras = "cameras: 61 of 64 frames (pycolmap) in 2 components"
     assert f"{cameras}, each with its own frame and scale" in lines
     first, second = (line for line in lines if re.match(r"component \d: ", line))
@@ -107,7 +109,9 @@ def test_the_summary_has_a_line_for_each_component(parted: rt.Result) -> None:
     assert ["measured" in line for line in lines[groups[1] + 1 : groups[1] + 4]] == [True] * 3
     assert groups[1] - groups[0] == 4
     assert not [line for line in lines if line.startswith("scale")]
-    mixed = dataclasses.replace(parted, objects=sorted(parted.objects, key=lambda o: o.id % 3))
+    mixed = dataclasses.replace(
+        broken_walk, objects=sorted(broken_walk.objects, key=lambda o: o.id % 3)
+    )
     lines = mixed.summary().splitlines()
     assert [k for k, line in enumerate(lines) if line in ("component 0", "component 1")] == groups
 
@@ -134,15 +138,17 @@ def true_eyes() -> np.ndarray:
     return invert_rigid(walk(64, 200.0).cam_from_world)[:, :, 3]
 
 
-def test_each_component_is_aligned_and_scored_separately(parted: rt.Result, tmp_path: Path) -> None:
+def test_each_component_is_aligned_and_scored_separately(
+    broken_walk: rt.Result, tmp_path: Path
+) -> None:
     pairs: dict[int, int | None] = {1: 1, 2: 5, 3: 6}  # one of component 0, two of component 1
-    found = score_objects(parted, *truth(tmp_path), pairs)
+    found = score_objects(broken_walk, *truth(tmp_path), pairs)
     assert (found["true"], found["found"]) == (3, 3)
     assert found["o3d_all"] > 0.9 and found["center_error_median"] < 0.02
     errors = found["part_scale_errors"]
     assert found["scale_error"] == errors[0] and len(errors) == 2 and max(errors) < 0.2
-    scales = [part.scale.value * scale for part, (scale, *_) in zip(
-        parted.world.parts, PARTS, strict=True)]  # fmt: skip
+    scales = [component.scale.value * scale for component, (scale, *_) in zip(
+        broken_walk.world.parts, COMPONENTS, strict=True)]  # fmt: skip
     np.testing.assert_allclose(errors, np.abs(np.array(scales) - 1), atol=5e-3)
 
 
@@ -171,7 +177,9 @@ def test_a_scale_of_depth_maps_is_one_statement_with_a_sigma() -> None:
     for ours, theirs in zip(result.objects, supplied.objects, strict=True):
         more = np.square(ours.size_rel_sigma) - np.square(theirs.size_rel_sigma)
         np.testing.assert_allclose(more, 0.03**2, rtol=0.05)
-    parts = finished(unlinked(dataclasses.replace(two_parts(), metric=True, scale=(1.0, 0.03))))
-    assert [p.scale.source for p in parts.world.parts] == ["depth_maps"] * 2
+    components = finished(
+        unlinked(dataclasses.replace(two_components(), metric=True, scale=(1.0, 0.03)))
+    )
+    assert [p.scale.source for p in components.world.parts] == ["depth_maps"] * 2
     known = finished(unlinked(metric, tracks_of(metric)), known_size="chair=.8m")
     assert known.world.scale.source == "known_size"
