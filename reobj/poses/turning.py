@@ -38,6 +38,7 @@ RADIUS = 2.5
 # Fraction of the motion in the image that rotations may leave unexplained
 MAX_UNEXPLAINED = 0.1
 MAX_SPREAD_DEG = 3.0  # of directions, and error of the rotations between the images of a pair
+WIDEST = (0.2, 10.0)  # of a focal length over the longer side, beyond which it diverges
 FOCAL_SIGMA = 0.3  # of the log of a guessed focal length
 RADIAL_SIGMA = 0.1  # of the first coefficient of distortion
 
@@ -108,8 +109,11 @@ def estimate_turn(pairs: MatchedPairs, camera: Any, is_given: bool) -> Turn | No
     rotation = _chained(matches, turn, tree, order, parent)
     inside = np.isin(matches.ends, order).all(1)  # (P,)
     matches = matches.of_pairs(np.flatnonzero(inside))
-    rotation, focal_sigma = _adjust(matches, rotation, order, camera, free)
-    return _measure(pairs, matches, rotation, np.sort(order), camera, turn[inside], focal_sigma)
+    found = _adjust(matches, rotation, order, camera, free)
+    if found is None:
+        return None
+    rotation, focal_sigma = found
+    return _measure(pairs, matches, rotation, np.sort(order), camera, focal_sigma)
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,19 +217,18 @@ def _chained(
 
 def _adjust(
     matches: _Matches, rotation: Array, order: IntArray, camera: Any, free: list[int]
-) -> tuple[Array, float]:
+) -> tuple[Array, float] | None:
     """Adjust rotations, and `free` parameters of the camera, to all matches (Gauss-Newton).
 
     The camera is changed in place. Residuals are the differences of the directions in world of the
-    two ends of each match.
+    two ends of each match, in px.
 
     Returns:
-        cam_from_world (K, 3, 3); sigma of the log focal length.
+        cam_from_world (K, 3, 3); sigma of the log focal length. None: it diverges.
     """
     count = len(matches.ids)
     a, b = matches.ends[matches.pair].T
     focal = camera.mean_focal_length()
-    scale = SCALE_PX / focal
     start = np.array(camera.params)
     prior = np.array([FOCAL_SIGMA * focal, RADIAL_SIGMA])[: len(free)]
     size = 3 * count + len(free)
@@ -236,8 +239,10 @@ def _adjust(
     def world_rays(params: Array) -> tuple[Array, Array]:
         camera.params = params
         rays = matches.rays(camera)
+        f = camera.mean_focal_length()  # in pixels: in rad a longer focal length would fit better
         one, other = (
-            np.einsum("mji,mj->mi", rotation[end], ray) for end, ray in zip((a, b), rays, strict=True)
+            f * np.einsum("mji,mj->mi", rotation[end], ray)
+            for end, ray in zip((a, b), rays, strict=True)
         )
         return one, other
 
@@ -246,7 +251,7 @@ def _adjust(
         params = np.array(camera.params)
         one, other = world_rays(params)
         off = one - other  # (M, 3)
-        weight = 1 / (1 + (off**2).sum(1) / scale**2)
+        weight = 1 / (1 + (off**2).sum(1) / SCALE_PX**2)
         columns = [_cross_matrix(one), _cross_matrix(-other)]
         entries = np.concatenate([block.reshape(-1) for block in columns])
         rows = np.tile(np.repeat(row.ravel(), 3), 2)
@@ -265,14 +270,16 @@ def _adjust(
         W = sparse.diags(np.repeat(weight, 3))
         normal = (J.T @ W @ J).tolil()
         gradient = J.T @ (np.repeat(weight, 3) * off.ravel())
-        variance = max(float(np.average((off**2).sum(1), weights=weight) / 2), 1e-10)
+        variance = max(float(np.average((off**2).sum(1), weights=weight) / 2), 1e-4)
         for n, k in enumerate(free):
             normal[3 * count + n, 3 * count + n] += variance / prior[n] ** 2
             gradient[3 * count + n] += variance * (params[k] - start[k]) / prior[n] ** 2
         keep = np.flatnonzero(~fixed)
         system = normal.tocsc()[keep][:, keep]
         delta = np.zeros(size)
-        delta[keep] = -spsolve(system, gradient[keep])
+        ridge = 1e-6 * sparse.diags(system.diagonal() + 1.0)
+        delta[keep] = -spsolve(system + ridge, gradient[keep])
+        delta[3 * count :] = delta[3 * count :].clip(-0.2 * focal, 0.2 * focal)
         turned = Rotation.from_rotvec(delta[: 3 * count].reshape(-1, 3)).as_matrix()
         rotation = rotation @ np.swapaxes(turned, 1, 2)
         for n, k in enumerate(free):
@@ -285,6 +292,8 @@ def _adjust(
             # matches of a pair err alike: each pair counts once
             per_pair = len(a) / len(matches.ends)
             sigma = float(np.sqrt(inverse * variance * per_pair) / params[free[0]])
+        if not np.isfinite(delta).all() or camera.has_bogus_params(*WIDEST, 1.0):
+            return None
         if np.abs(delta[: 3 * count]).max() < 1e-5:
             break
     return rotation, sigma
@@ -299,7 +308,7 @@ def _cross_matrix(v: Array) -> Array:
 
 def _measure(
     pairs: MatchedPairs, matches: _Matches, rotation: Array, rows: IntArray, camera: Any,
-    pair_turn: Array, focal_sigma: float,
+    focal_sigma: float,
 ) -> Turn:  # fmt: skip
     """Measure how well rotations explain all matches, and collect points."""
     a, b = matches.ends.T
