@@ -1,6 +1,6 @@
 """Place a recording in a map: match features to the map's points, PnP, one similarity a component.
 
-Each chosen image is matched to the points of the map (one descriptor a point) and located by PnP.
+Each selected image is matched to the points of the map (one descriptor a point) and located by PnP.
 The images of a component of the trajectory must agree on one similarity transform from its world
 to that of the map; the component is then moved as a whole. Its cameras relative to each other stay
 as they are. Axes: N points of the map, L located images, H hypotheses.

@@ -409,8 +409,8 @@ def triangulate(
 ) -> Poses:
     """Triangulate sparse points of the images from known poses.
 
-    Keyframes and the pairs to match are chosen by their poses. The fraction of the matched features
-    that triangulate shows whether the poses explain the images.
+    Keyframes and the pairs to match are selected by their poses. The fraction of the matched
+    features that triangulate shows whether the poses explain the images.
 
     Args:
         video: a `Video`, iterated once. size_px: longer side to which its images are shrunk.
@@ -449,7 +449,7 @@ def triangulate(
         return _without_points(poses, f"no features of {count} images could be matched")
     if not triangulated or triangulated < MIN_TRIANGULATED * matched:
         cause = "are the poses of this video, in this order, with this camera?"
-        if explained > 0.5:  # chosen; of right poses .6 and more
+        if explained > 0.5:  # of the matches; right poses: .6 and more
             cause = "the poses agree with the matches: too few views, or too little parallax"
         return _without_points(
             poses,
