@@ -180,7 +180,7 @@ class _Reconstruction:
         return keys
 
     def add_keyframes(self, rows: Sequence[int]) -> list[int]:
-        """Read the images of more keyframes; return the rows of those with texture."""
+        """Read the images of more keyframes; return the rows of images with texture."""
         added = list[int]()
         if rows:
             line = self.progress("more keyframes", len(self.resized.frames))

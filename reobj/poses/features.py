@@ -394,7 +394,7 @@ MAP_MORE_TO = 300
 REPEATED_FLOW = 0.06
 REPEATED_MATCHES = 3 * MIN_MATCHES  # verified ones, which register a keyframe with certainty
 CANDIDATES = 4  # mapped keyframes with which one is compared; time grows with it
-BLOCK = 32  # keyframes that are compared at once with those mapped before them
+BLOCK = 32  # keyframes that are compared at once with mapped ones
 
 
 def find_repeated(
@@ -448,7 +448,7 @@ def find_repeated(
 
 
 class _ViewSearch:
-    """Compare keyframes with those that are to be mapped.
+    """Compare keyframes with the ones that will be mapped.
 
     Attributes:
         words: (W, 128) of `visual_words`. view_of: as of `find_repeated`, is extended.

@@ -140,7 +140,7 @@ def _fault(
     low, high = CAMERA_HEIGHT_M
     if len(across) < max(30, 0.015 * len(local)):
         return f"only {len(across)} points lie on the lowest plane"
-    # rms extent less than .3 of that of all points
+    # rms extent below .3 of the extent of all points
     if np.var(across, axis=0).sum() < 0.3**2 * np.var(local[:, :2], axis=0).sum():
         return "the lowest plane with points is small"
     if floor.sigma > 3 * noise:  # 11 cm at 3 m
@@ -169,7 +169,7 @@ def _one_per_voxel(points: Array, size: float) -> Array:
 
 
 def _best_level(local: Array, noise: float) -> Array | None:
-    """Find the plane with the most points on it minus those shortly above it, and few below.
+    """Find the plane with the most points on it minus the ones shortly above it, and few below.
 
     The search is to three sigmas of `up`, in steps of a degree: it is refined later.
 

@@ -43,8 +43,8 @@ from reobj.types import Array, BoolArray, IntArray
 # ---- Consistency ---------------------------------------------------------------------------------
 
 
-# What connects the images of a model; connections with less, or with fewer points or matches of one
-# pair than MIN_MATCHES, are cut.
+# Minimum connection between the images of a model. Connections that are weaker, or have fewer
+# points or matches of one pair than MIN_MATCHES, are cut.
 # Fraction of the matches of two consecutive images that must be one point of the model (measured:
 # right .38-.98, wrong 0)
 MIN_SUPPORTED = 0.1
