@@ -486,7 +486,7 @@ def _count_matched(pairs: MatchedPairs) -> int:
 # Fraction of their matches that must be one point (measured, least of a recording: rendered .71,
 # studio_room .42, hololens_kitchen .14; redkitchen .09, and .003 where its Kinect lost track; ends
 # of stretches that were moved 0 and .04)
-MIN_TIED_SUPPLIED = 0.05
+MIN_TRIANGULATED_PAIR = 0.05
 
 
 def _inconsistent(counts: IntArray, frame: IntArray) -> list[str]:
@@ -496,7 +496,9 @@ def _inconsistent(counts: IntArray, frame: IntArray) -> list[str]:
         counts: (K - 1, 2) of `_count_triangulated_matches`. frame: (K,).
     """
     matches, triangulated = counts.T
-    breaks = np.flatnonzero((matches >= MIN_MATCHES) & (triangulated < MIN_TIED_SUPPLIED * matches))
+    breaks = np.flatnonzero(
+        (matches >= MIN_MATCHES) & (triangulated < MIN_TRIANGULATED_PAIR * matches)
+    )
     if not len(breaks):
         return []
     runs = np.split(breaks, np.flatnonzero(np.diff(breaks) > 1) + 1)
