@@ -615,7 +615,7 @@ def _select_views(
     """Choose up to `max_views` frames an object, spread evenly along the camera's path.
 
     Args:
-        usable, quality: (F, O); in each segment of the path the frame of best quality is chosen.
+        usable, quality: (F, O); in each segment of the path the frame of best quality is taken.
         path_where_seen: as in `FitConfig`.
     Returns:
         (O, V) frame numbers, -1 where an object has fewer; V = the most any object has.

@@ -16,7 +16,7 @@ MARK = " (choosing)"  # of what is not held out
 
 
 def held_out(kind: str, name: str) -> bool:
-    """Return whether a sequence is for reporting: nothing was chosen on it.
+    """Return whether a sequence is for reporting: nothing was tuned on it.
 
     Args:
         kind: rooms, recordings or pedestrians.

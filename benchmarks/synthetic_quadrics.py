@@ -304,11 +304,11 @@ def cuboids_table(trials: int) -> str:
         rng = np.random.default_rng(2)
         boxes, cams, truth, priors, names = scenes(trials, 10, 120, 0.02, "box", rng, size)
         row: list[object] = [" x ".join(f"{x:.2f}" for x in size)]
-        for support in ("ellipsoid", "box", "evidence"):
-            fits = solve(boxes, cams, priors, names, support=support)
+        for shape in ("ellipsoid", "box", "evidence"):
+            fits = solve(boxes, cams, priors, names, support=shape)
             iou = box_overlap(fits.ellipsoids, truth).mean()
             cuboids = (fits.support == "box").mean()
-            row.append(f"{iou:.3f}" + (f" ({cuboids:.0%} boxes)" if support == "evidence" else ""))
+            row.append(f"{iou:.3f}" + (f" ({cuboids:.0%} boxes)" if shape == "evidence" else ""))
         rows.append(row)
     return table(["size m", "ellipsoid", "box", "evidence"], rows)
 

@@ -106,12 +106,12 @@ def write_depth(folder: Path, spoiled: int = -1) -> Path:
 def dense_of(page: Path) -> tuple[np.ndarray, np.ndarray]:
     """The dense points of a page in world, and their colours."""
     text = page.read_text().split('id="data">')[1].split("</script>")[0]
-    part = json.loads(text)["parts"][0]
-    dense = part["dense"]
+    component = json.loads(text)["parts"][0]
+    dense = component["dense"]
     n = dense["count"]
     data = base64.b64decode(dense["data"])
     place = np.frombuffer(data[: 6 * n], "<u2").reshape(-1, 3) * dense["step"] + dense["low"]
-    return place + part["origin"], np.frombuffer(data[6 * n : 9 * n], np.uint8).reshape(-1, 3)
+    return place + component["origin"], np.frombuffer(data[6 * n : 9 * n], np.uint8).reshape(-1, 3)
 
 
 def with_depth(folder: Path, out: Path, depth: Path | str, poses: rt.Poses) -> Path:

@@ -194,7 +194,7 @@ def fuzz(n: int, rng: np.random.Generator) -> dict[str, int]:
         boxes, cams = ugly_scene(f, o, rng)
         names = [str(x) for x in rng.choice(priors.names, o)] if rng.random() < 0.7 else None
         up = (None, UP, (0.0, -1.0, 0.0))[rng.integers(3)]
-        support = (None, "evidence", *q.SUPPORTS)[rng.integers(5)]
+        shape = (None, "evidence", *q.SUPPORTS)[rng.integers(5)]
         fits = q.fit_objects(
             boxes,
             cams,
@@ -202,7 +202,7 @@ def fuzz(n: int, rng: np.random.Generator) -> dict[str, int]:
             names,
             priors,
             up=up,
-            support=support,
+            support=shape,
             metric=bool(rng.integers(2)),
         )
         q.fit_lfd(boxes, cams)
@@ -525,15 +525,15 @@ def test_points_improve_the_depth_despite_background_points() -> None:
 def test_evidence_is_robust_to_occluded_edges() -> None:
     """An occluder covers a fifth of every box from one side."""
     right = []
-    for support in q.SUPPORTS:
+    for shape in q.SUPPORTS:
         rng = np.random.default_rng(1)
-        boxes, cams, _, priors, names = syn.scenes(80, 5, 120, 0.02, support, rng)
+        boxes, cams, _, priors, names = syn.scenes(80, 5, 120, 0.02, shape, rng)
         for box in boxes.reshape(-1, 4):
             side = rng.integers(4)
             box[side] += (0.2 if side < 2 else -0.2) * (box[2:] - box[:2])[side % 2]
         config = q.FitConfig(correlation_deg=0)
         fits = syn.solve(boxes, cams, priors, names, config, support="evidence")
-        right.append(np.mean(fits.support == support))
+        right.append(np.mean(fits.support == shape))
     assert np.mean(right) > 0.74  # .75 over five seeds
 
 

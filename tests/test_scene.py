@@ -781,14 +781,14 @@ def test_the_page_contains_the_scene(page: Path) -> None:
     data, poses = data_of(page), poses_of_walk()
     found = np.frombuffer(base64.b64decode(data["poses"]), "<f4").reshape(-1, 3, 4)
     np.testing.assert_allclose(found, invert_rigid(poses.cam_from_world), atol=1e-6)
-    (part,) = data["parts"]
-    points = np.frombuffer(base64.b64decode(part["points"]), "<f4").reshape(-1, 3)
+    (component,) = data["parts"]
+    points = np.frombuffer(base64.b64decode(component["points"]), "<f4").reshape(-1, 3)
     np.testing.assert_allclose(points, poses.points, atol=1e-6)
-    assert data["objects"][1]["seen"] == [0, 8, 15, 23] and part["up"] == [0, 0, 1]
+    assert data["objects"][1]["seen"] == [0, 8, 15, 23] and component["up"] == [0, 0, 1]
     assert [tuple(o["color"]) for o in data["objects"]] == [
         object_color(i)[::-1] for i in (1, 2, 3, 4)
     ]
-    assert part["facts"] == "cameras of 23 of 24 frames · scale from poses, ± 0 %"
+    assert component["facts"] == "cameras of 23 of 24 frames · scale from poses, ± 0 %"
     assert data["steps"] == {
         "frame": list(range(24)), "seconds": pytest.approx(1 / 30), "part": [0] * 24,
         "time": pytest.approx(np.arange(24) / 30, abs=1e-4), "frame_s": pytest.approx(1 / 30),
@@ -797,7 +797,8 @@ def test_the_page_contains_the_scene(page: Path) -> None:
     assert (np.diag(cov) > 0).all() and data["objects"][3]["cov"] == data["why_flat"] == ""
     assert data["camera"] == {"width": 320, "height": 240, "fx": 250, "fy": 250,
                               "cx": 170, "cy": 112, "lens": None}  # fmt: skip
-    assert 0.02 < part["point_sigma"] < 0.1 and "floor" not in part  # too few points for a floor
+    assert 0.02 < component["point_sigma"] < 0.1
+    assert "floor" not in component  # too few points for a floor
 
 
 def test_crops_show_the_object(tmp_path: Path) -> None:

@@ -43,7 +43,7 @@ FATE_OF = {name: fate for fate, names in FATES.items() for name in names}
 USUAL_FATE = (0.75, 0.15, 0.10)  # of all other classes, also of unknown ones
 # Of an object that was gone: it is back in its place, it is elsewhere in the room, it is still gone
 ABSENT_FATE = (0.10, 0.20, 0.70)
-NEW_OBJECTS = 1.0  # expected ones, besides those that replace what was taken away
+NEW_OBJECTS = 1.0  # expected number, besides replacements of removed objects
 DETECTED = 0.9  # probability that an object in a part of the room that was seen is found
 MISSED_FLOOR = 1e-3  # least probability that an object is missed, whatever the number of views
 POSITION_FLOOR_M = (

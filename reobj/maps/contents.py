@@ -67,7 +67,7 @@ def find_session(room: RoomMap, session: int | str) -> Session:
 
 
 def forget(room: RoomMap, session: int | str) -> RoomMap:
-    """Remove what a session added: its observations and points.
+    """Remove the observations and points that a session added.
 
     An object that no other session detected is removed; its number is not used again. The world
     stays the same, also without the first session.
@@ -113,7 +113,7 @@ def _without_session(rows: Sequence[Observation], session: int) -> tuple[Observa
 
 
 def merge(room: RoomMap, keep: int, drop: int) -> RoomMap:
-    """Join two objects that are one; the number `drop` then means `keep`.
+    """Merge two objects that are one; the number `drop` then refers to `keep`.
 
     Where a session detected both, the observation of more views is kept. The object counts as moved
     where the places of its consecutive observations differ by more than 3 sigma.
@@ -145,7 +145,7 @@ def _joined(a: MapObject, b: MapObject, room: RoomMap) -> tuple[Observation, ...
     for session in sorted({o.session for o, _ in both}):
         here = [(o, source) for o, source in both if o.session == session]
         seen = [(o, source) for o, source in here if o.detected]
-        if not seen:  # what it says is of the place of the object that was detected last
+        if not seen:  # the status is about the place of the last detection
             rows += [o for o, source in here if last is not None and source == last[1]]
             continue
         best, source = max(seen, key=lambda entry: entry[0].views)
@@ -182,7 +182,7 @@ def rename(room: RoomMap, number: int, name: str) -> RoomMap:
 
 
 def delete(room: RoomMap, number: int, deleted: bool = True) -> RoomMap:
-    """Mark an object as none: it is matched in later sessions and left out of results.
+    """Mark an object as deleted: it is matched in later sessions and left out of results.
 
     Args:
         deleted: False undoes it.
@@ -317,7 +317,7 @@ def _states(room: RoomMap) -> list[ObjectState]:
 
 
 def _sessions(found: MapObject, status: str = "") -> list[int]:
-    """Return the sessions that detected an object, or those of a status."""
+    """Return the sessions that detected an object, or only the ones with a status."""
     rows = found.observations
     return sorted(o.session for o in rows if (o.status == status if status else o.detected))
 
@@ -421,7 +421,7 @@ MAP_EXPORTS: dict[str, Callable[[RoomMap, Path], None]] = {
 
 
 def earlier_sessions(room: RoomMap, path: Path, fingerprint: str) -> tuple[EarlierSession, ...]:
-    """List the sessions of a map other than that of one video, in their order.
+    """List the sessions of a map without the one of a video, in their order.
 
     Objects that the user deleted are left out. Classes are those that the map has now.
 
@@ -542,7 +542,7 @@ class FolderMap:
         return put_back
 
     def _add(self, copy: Path, *rooms: RoomMap) -> None:
-        """Add digests of maps to those of a copy."""
+        """Add digests of maps to the digests of a copy."""
         found = [*_digests(copy), *map(self._digest, rooms)]
         _write(copy.with_suffix(".digests"), "\n".join(found).encode())
 

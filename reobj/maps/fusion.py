@@ -46,7 +46,7 @@ class Described:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObjectState(Described):
-    """What the map knows of an object after its last session: where it was last seen.
+    """State of an object of the map after its last session, at the place where it was last seen.
 
     The covariance includes the uncertainty of the alignment of the sessions.
 

@@ -77,8 +77,8 @@ AGREEING = 2  # least images that agree
 TRIALS = 2000  # of RANSAC; enough for 15 % of inliers: (1 - .15^3)^2000 = .1 %
 TILT_DEG = 25.0  # an object that is turned over more than this needs TILTED points
 TILTED = 12
-# Share of the height over the lower end of the object, below which its points may belong to what
-# it stands on
+# Share of the height over the lower end of the object, below which its points may belong to the
+# surface that it stands on
 BOTTOM = 0.15
 
 

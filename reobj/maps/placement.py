@@ -1,6 +1,6 @@
 """Place a recording in a map: match features to the map's points, PnP, one similarity a component.
 
-Each chosen image is matched to the points of the map (one descriptor a point) and located by PnP.
+Each selected image is matched to the points of the map (one descriptor a point) and located by PnP.
 The images of a component of the trajectory must agree on one similarity transform from its world
 to that of the map; the component is then moved as a whole. Its cameras relative to each other stay
 as they are. Axes: N points of the map, L located images, H hypotheses.
@@ -33,10 +33,10 @@ from reobj.types import Array, BoolArray, Floats, Frame, IntArray
 
 T = TypeVar("T")
 
-COMPARED = 40  # images of a component that are matched to the map; more take longer
-MORE = 200  # images that are compared where fewer do not place a recording; more take longer
-DESCRIBED_POINTS = 20_000  # of a recording, those in most images
-MATCHED_POINTS = 15_000  # of the map, first those on no object; more take longer
+COMPARED = 40  # images of a component that are matched to the map; time grows with it
+MORE = 200  # images that are compared where fewer do not place a recording
+DESCRIBED_POINTS = 20_000  # of a recording, the ones in most images
+MATCHED_POINTS = 15_000  # of the map, first points on no object; time grows with it
 RATIO = 0.8  # of angles to the best point and to the best one elsewhere (Lowe, IJCV 2004)
 ELSEWHERE = 0.03  # distance of such a point, over that of the best one from the camera
 # Largest error of an inlier of PnP, px of an image of 640 px (COLMAP: 4; 12 for localisation: two
@@ -539,7 +539,7 @@ def spread_over(rows: IntArray, most: int) -> IntArray:
 
 
 def _matched(points: MapPoints) -> MapPoints:
-    """Choose MATCHED_POINTS spread over the map: those on no object, then the others."""
+    """Choose MATCHED_POINTS spread over the map: points on no object, then others."""
     others = spread_over(np.flatnonzero(points.object_id <= 0), MATCHED_POINTS)
     on_objects = np.flatnonzero(points.object_id > 0)
     chosen = [others, spread_over(on_objects, MATCHED_POINTS - len(others))]

@@ -64,7 +64,7 @@ Number = Annotated[int, msgspec.Meta(ge=1, lt=2**31)]  # of an object or a sessi
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation:
-    """What a session says about an object, in the world of the map.
+    """Observation of an object in one session, in the world of the map.
 
     Attributes:
         session: number of the session. status: "new" (first seen), "stayed", "moved", "gone" or
@@ -238,7 +238,7 @@ class RoomMap:
     def save(self, path: str | Path) -> None:
         """Write the file, atomically; the same map gives the same bytes."""
         arrays, facts = encoded(self)
-        _decoded(arrays, facts)  # what could not be read again is not written
+        _decoded(arrays, facts)  # refuses a map that could not be read again
         save_npz(Path(path), arrays, **facts)
 
     @staticmethod
@@ -278,7 +278,7 @@ ANOTHER_FILE = "not a map of reobj_track; another file was given"
 
 
 def _check_kind(path: Path) -> None:
-    """Refuse what is no zip file by its first bytes; npz files are."""
+    """Refuse a file whose first bytes show that it is no zip file, as npz files are."""
     with path.open("rb") as file:
         if file.read(2) != b"PK":
             raise ReobjError(f"{path}: {ANOTHER_FILE}")

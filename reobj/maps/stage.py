@@ -266,7 +266,7 @@ def finish_map(
 
 
 def _refusal(opened: OpenMap, result: Result, video: Video, placed: Placed | None) -> str:
-    """Say why a recording is not in the world of the map; "" if it is."""
+    """Explain why a recording is not in the world of the map; "" if it is."""
     if placed is not None and placed.placement is not None and placed.placement.refused:
         return (
             f"this is not the room of {opened.path.name}, or nothing in view matches it: "
@@ -303,7 +303,7 @@ def _recording(
     placed: Placed | None,
     before: Changes | None,
 ) -> Recording:
-    """Collect the facts of a recording; those of a refitted one are in the map.
+    """Collect the facts of a recording; a refitted one has its facts in the map.
 
     Args:
         before: of the last run; of the covariance of the placement it has that of the shift.

@@ -271,7 +271,7 @@ def _renumbered(
     decisions: Sequence[Decision],
     changes: Changes,
 ) -> Result:
-    """Give tracks and objects the numbers of the map; leave out what the user deleted there."""
+    """Give tracks and objects the numbers of the map; leave out objects deleted there."""
     found = {d.map_id for d in decisions if d.found_id}
     matched = {s.id: s for s in states if s.id in found}
     deleted = [s.id for s in matched.values() if s.deleted]
@@ -320,7 +320,7 @@ def _observation(
     expected: int,
     pictures: Mapping[int, bytes],
 ) -> Observation:
-    """Return what a session says about an object; found: None: it was not detected."""
+    """Make the observation of an object in a session; found: None: it was not detected."""
     if found is None:
         return Observation(session, kind, expected=expected, missed=expected)
     confidence = float(np.clip(found.confidence, 0.01, 0.99))
@@ -343,10 +343,10 @@ def _with_observations(
     observations: Mapping[int, Observation],
     own: Mapping[int, Observation],
 ) -> tuple[MapObject, ...]:
-    """Return the objects with the observations of a session instead of those that it had.
+    """Replace the observations of a session by new ones; return the objects.
 
     Args:
-        observations: by number. own: that it had. They are kept for deleted objects that are not
+        observations: by number. own: the former ones, kept for deleted objects that are not
             detected, as corrections of the recording delete their tracks.
     """
     objects = {o.id: o for o in room.objects}

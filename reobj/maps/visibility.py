@@ -138,7 +138,7 @@ def visibility_of(
                 left &= ~near
         return total
 
-    # one view of its surroundings may show them beside what stands before the object
+    # one view of the surroundings may show them beside an occluder
     seen_through = np.maximum(independent(through, through), independent(around, around) - 1)
     return Visibility(
         independent(expected, expected),

@@ -150,7 +150,7 @@ class Associator:
         return Association(shapes, label, evidence, self.size_log_odds(shapes))
 
     def _select_greedily(self, hypotheses: Association) -> IntArray:
-        """Select hypotheses one by one: each adds most to those before.
+        """Select hypotheses greedily: each gains most beside the ones selected before.
 
         Returns:
             the selected hypotheses, the best first.
@@ -264,7 +264,7 @@ class Associator:
         hit = MISSED * missed[view[row], obj]
 
         def best_of_others(value: Array) -> Array:
-            """Return what the best others would gain by the detections of each object, (O,)."""
+            """Return the gain (O,) if the best other objects take over the detections of each."""
             best = np.zeros(len(label))
             np.maximum.at(best, row, value[other] + hit)
             gain = np.bincount(label[assigned], best[assigned], len(current.shapes))

@@ -84,7 +84,7 @@ class ObjectsConfig:
         return tuple(filter(None, (name.strip() for name in self.moving.split(","))))
 
     def size_priors(self) -> quadrics.Priors:
-        """Load the size priors, with those of `prior`."""
+        """Load the size priors, and add the ones of `prior`."""
         return load_size_priors(self.priors, self.prior)
 
 
@@ -130,7 +130,7 @@ def make_fit(config: ObjectsConfig, poses: Poses, class_names: Sequence[str]) ->
 # ---- Boxes in 3D of a detector ----
 
 OUTLIER = 3.0  # robust sigmas; a box beyond is not used
-BOXES_PER_ERROR = 10.0  # errors of ten boxes count as one: those of neighbouring frames are alike
+BOXES_PER_ERROR = 10.0  # errors of ten boxes count as one: neighbouring frames have similar errors
 FLOOR = 0.05  # sigma common to all boxes, relative to the size, and in rad: their bias is unknown
 
 

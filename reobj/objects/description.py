@@ -164,7 +164,7 @@ def _verdict(
 
 
 MOST_DISTANCES = 10.0  # sigma of a centre, in distances of the object: beyond it none is known
-# of a rotation about an axis: that of a uniform distribution over the full turn
+# sigma of a rotation about an axis: uniform over the full turn
 MOST_TURN = np.pi / np.sqrt(3)
 MOST_LOG_SIZE = quadrics.UNKNOWN_SCALE_LOG
 
@@ -345,7 +345,7 @@ def log_best_odds(score: Array, group: IntArray, count: int) -> Array:
 
 
 def scores_far_off(result: Result) -> list[str]:
-    """Return a warning if the scores are far from those that the confidence was fitted to."""
+    """Return a warning if the scores are far from the ones that the confidence was fitted to."""
     tracks = result.tracks
     score = np.append(tracks.score[tracks.detection_index >= 0], result.untracked.score)
     if not len(score) or all(o.confidence is None for o in result.objects):
@@ -412,14 +412,14 @@ def with_low_confidence(status: str, reason: str, confidence: float) -> tuple[st
         return status, reason
     why = f"{100 * confidence:.0f} % likely to exist"
     if isinstance(confidence, Existence):
-        why += f": {_weightiest(confidence)}"
+        why += f": {_strongest_doubt(confidence)}"
     if status == "rejected":
         why += f"; {reason}"
     return "doubtful", why
 
 
-def _weightiest(found: Existence) -> str:
-    """Say which evidence lowers a confidence most, compared with objects that exist."""
+def _strongest_doubt(found: Existence) -> str:
+    """Name the evidence that lowers a confidence most, compared with objects that exist."""
     if np.isnan(found.hit_rate):
         return "its detections agree with no object in 3D"
     _, of_score, of_hit_rate, of_see_through = CONFIDENCE

@@ -72,7 +72,8 @@ def link_and_fit(result: Result, config: ObjectsConfig, last: Links | None = Non
     components = _split_trajectory(poses, config, result.class_names)
 
     links = _link(result, config, last)
-    linked = links if _same(links, config, OPTIONS_OF_SHAPES) else _without_shapes(links)
+    keeps_shapes = _options_unchanged(links, config, OPTIONS_OF_SHAPES)
+    linked = links if keeps_shapes else _without_shapes(links)
     edited = _Edited(linked, result.class_names, [], None)
     if result.edits is not None:
         edited = _edit(linked, result, result.edits, priors, _last_numbers(links, last))
@@ -158,21 +159,21 @@ OPTIONS_OF_LINKS = ("link", "moving")
 OPTIONS_OF_SHAPES = (*OPTIONS_OF_LINKS, "priors", "prior", "known_size", "up")
 
 
-def _same(links: Links, config: ObjectsConfig, names: Sequence[str]) -> bool:
-    """Test whether some options are those of the links."""
+def _options_unchanged(links: Links, config: ObjectsConfig, names: Sequence[str]) -> bool:
+    """Test whether some options have the values that the links were made with."""
     options = dataclasses.asdict(config)
     return all(links.options.get(name) == options[name] for name in names)
 
 
 def _link(result: Result, config: ObjectsConfig, last: Links | None) -> Links:
-    """Return the identities of all components: those of the last result, or linked again.
+    """Return the identities of all components: from the last result, or linked again.
 
     Without a change of the options of linking, detections are linked as in the last run: known
-    sizes and priors of this one concern the fit.
+    sizes and priors given now concern the fit only.
     """
     key = tracked_key((result.tracks, result.untracked), result.poses)
     linking = config
-    if last is not None and _same(last, config, OPTIONS_OF_LINKS):
+    if last is not None and _options_unchanged(last, config, OPTIONS_OF_LINKS):
         if last.key == key:
             return last
         known = {f.name for f in dataclasses.fields(ObjectsConfig)}
@@ -279,7 +280,7 @@ def _link_component(
 
 
 def _joined(components: Iterable[Links]) -> Links:
-    """Join the linked components; identities are numbered after those of the components before."""
+    """Join the linked components; identities continue the numbers of the component before."""
     linked = list(components)
     highest = [int(c.tracks.track_id.max(initial=0)) for c in linked]
     pairs = list(zip(linked, itertools.accumulate([0, *highest[:-1]]), strict=True))
@@ -504,7 +505,7 @@ def _fit_component(
             occluded=occluded_edges(views, ellipsoids, standing, floor is not None),
             points=points_on(views, poses, ellipsoids),
         )
-        # repeated views are more numerous than those of other sides: the fit takes new ones only
+        # repeated views outnumber views of other sides: the fit takes new ones only
         new = np.zeros(views.boxes.shape[:2], bool)
         rows = np.flatnonzero(usable)[informative]
         new[np.searchsorted(views.frame, tracks.frame[rows]), group[rows]] = True
@@ -523,7 +524,7 @@ def _fit_component(
 
 
 def _frames_of_fit(tracks: Tracks, poses: Poses) -> tuple[IntArray, BoolArray]:
-    """Choose the frames of a fit: informative ones, and those with observations of points.
+    """Choose the frames of a fit: informative ones, and frames that observe points.
 
     Returns:
         (K,) frames; (N,) informative rows.
@@ -537,7 +538,7 @@ def _frames_of_fit(tracks: Tracks, poses: Poses) -> tuple[IntArray, BoolArray]:
 def join_fits(
     fits: Sequence[quadrics.ObjectFits | None], component_of_object: IntArray, poses: Poses
 ) -> quadrics.ObjectFits | None:
-    """Join the fits of all components; scale and up are those of component 0.
+    """Join the fits of all components; scale and up are from component 0.
 
     Args:
         fits: of the objects of each component, in their order; None for one without objects.

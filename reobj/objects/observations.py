@@ -174,9 +174,9 @@ class FrameOptions:
     Attributes:
         all_of: videos of at most this number of frames are used whole; of longer ones at least it.
         same_direction_deg: viewing rays of an object within this angle see it from one side.
-        identity_frames: least number of chosen frames of each identity of the tracker, so that an
+        identity_frames: least number of selected frames of each identity of the tracker, so that an
             object that is seen briefly has enough views.
-        longest_step: frames from one chosen frame to the next: where nothing is detected, missing
+        longest_step: frames from one selected frame to the next: where nothing is detected, missing
             detections are evidence too.
     """
 
@@ -195,17 +195,17 @@ def informative_frames(
     in the same way. Objects of a long video are therefore associated on frames that differ in their
     view of the objects; the detections of the other frames are assigned to the objects found.
 
-    A frame is chosen if at least half of the identities detected in it were not seen from their
-    direction in any frame chosen before, or if one of them has too few chosen frames. If these are
-    few, further frames are chosen at even steps.
+    A frame is selected if at least half of the identities detected in it were not seen from their
+    direction in any frame selected before, or if one of them has too few selected frames. If few
+    are selected, further frames follow at even steps.
 
     Args:
         tracks: N rows with identities of the tracker, by frame. poses: of one component.
         frames: (F,) numbers to choose from, ascending, with a pose and a detector output.
     Returns:
-        (K,) the chosen numbers, ascending; (N,) rows in them that show an identity from a new
-        direction, or one that has too few chosen frames. If all frames are chosen, these are all
-        rows of the frames.
+        (K,) the selected numbers, ascending; (N,) rows in them that show an identity from a new
+        direction, or one with too few selected frames. If all frames are selected: all rows of the
+        frames.
     """
     options = options or FrameOptions()
     in_frames = np.flatnonzero(np.isin(tracks.frame, frames))
@@ -221,7 +221,8 @@ def informative_frames(
     start = np.searchsorted(tracks.frame, frames)
     end = np.searchsorted(tracks.frame, frames, side="right")
     same = np.cos(np.radians(options.same_direction_deg))
-    seen = np.full((int(identity.max(initial=-1)) + 1, 16, 3), np.nan)  # chosen rays of identities
+    # rays of identities in selected frames
+    seen = np.full((int(identity.max(initial=-1)) + 1, 16, 3), np.nan)
     count = np.zeros(len(seen), np.int64)
     chosen = np.zeros(len(frames), bool)
     last = -options.longest_step

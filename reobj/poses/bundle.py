@@ -20,7 +20,7 @@ from reobj.types import Array, BoolArray, IntArray
 
 MIN_TRI_ANGLE_DEG = 1.5  # between rays that triangulate a point (COLMAP's min_tri_angle)
 INLIER_PX = 4.0  # largest error of an inlier, resized images (COLMAP's filter_max_reproj_error)
-FOCAL_RANGE = (0.4, 2.0)  # plausible focal length over the longer side (chosen: 28-103 deg wide)
+FOCAL_RANGE = (0.4, 2.0)  # plausible focal length over the longer side: 103 to 28 deg wide
 
 
 def triangulates(count: Array, squared_sum: Array) -> BoolArray:

@@ -1,7 +1,7 @@
 """Reconstruct the poses of all frames of a video.
 
-Keyframes are chosen (`keyframes`) and mapped (`sfm`); the frames between them are located by PnP or
-interpolated (`localize`). Where the trajectory broke, this is repeated once with more keyframes.
+Keyframes are selected (`keyframes`) and mapped (`sfm`); the frames between them are located by PnP
+or interpolated (`localize`). Where the trajectory broke, this is repeated once with more keyframes.
 """
 
 from __future__ import annotations
@@ -180,7 +180,7 @@ class _Reconstruction:
         return keys
 
     def add_keyframes(self, rows: Sequence[int]) -> list[int]:
-        """Read the images of more keyframes; return the rows of those with texture."""
+        """Read the images of more keyframes; return the rows of images with texture."""
         added = list[int]()
         if rows:
             line = self.progress("more keyframes", len(self.resized.frames))
@@ -306,14 +306,14 @@ class _Attempt:
 # ---- More keyframes ------------------------------------------------------------------------------
 
 
-MAX_EXTRA = 8  # keyframes added between two at a break (chosen; more take longer)
+MAX_EXTRA = 8  # keyframes added between two at a break; matching them takes time
 
 
 def rows_around_breaks(key_rows: list[int], component_rows: list[IntArray]) -> list[int]:
     """Choose frames for more keyframes where the trajectory broke.
 
     A break is between two keyframes of different components, or without one; more keyframes are
-    also chosen in the steps before and after it.
+    also selected in the steps before and after it.
 
     Args:
         key_rows: rows of all keyframes, ascending. component_rows: of those of each component.

@@ -99,7 +99,7 @@ def root_sift(bgr: Image, boxes: Array) -> tuple[npt.NDArray[np.float32], Image]
 
 
 MAX_RATIO = 0.8  # of angles or distances to the best and the second best (Lowe, IJCV 2004; COLMAP)
-RETRIEVED = 6  # most similar keyframes with which one is matched (chosen; more take longer)
+RETRIEVED = 6  # most similar keyframes with which one is matched; time grows with it
 UNORDERED = 20  # the same of photos whose order says nothing (usual: 20 to 50)
 ALL_PAIRS = 30  # keyframes of which all pairs are matched: 435 pairs
 MIN_MATCHES = 30  # verified matches of a pair that count as evidence (COLMAP registers from 30 on)
@@ -366,7 +366,7 @@ def focal_from_pairs(pairs: MatchedPairs, size: tuple[int, int]) -> float | None
     """
     used = pairs.enough & np.isfinite(pairs.fundamental[:, 0, 0])
     F = pairs.fundamental[used]  # (P, 3, 3)
-    if len(F) < 10:  # chosen; lower: a few wrong pairs decide
+    if len(F) < 10:  # among fewer, some wrong pairs decide
         return None
     tried = np.geomspace(*FOCAL_RANGE, 161)  # (S,) 1 % apart
     K = np.zeros((len(tried), 3, 3))
@@ -386,15 +386,15 @@ def focal_from_pairs(pairs: MatchedPairs, size: tuple[int, int]) -> float | None
 # ---- Repeated views ------------------------------------------------------------------------------
 
 
-MAP_ALL_OF = 100  # keyframes up to which all are mapped (chosen: it takes a minute)
+MAP_ALL_OF = 100  # keyframes up to which all are mapped, in about a minute
 # Keyframes added in a second attempt are all mapped, but only registered where more than this
-# number are mapped already (chosen: it takes minutes)
+# number are mapped already: mapping takes minutes
 MAP_MORE_TO = 300
 # Median displacement of the matches, over the width: half of that between consecutive keyframes
 REPEATED_FLOW = 0.06
 REPEATED_MATCHES = 3 * MIN_MATCHES  # verified ones, which register a keyframe with certainty
-CANDIDATES = 4  # mapped keyframes with which one is compared (chosen; more take longer)
-BLOCK = 32  # keyframes that are compared at once with those mapped before them
+CANDIDATES = 4  # mapped keyframes with which one is compared; time grows with it
+BLOCK = 32  # keyframes that are compared at once with mapped ones
 
 
 def find_repeated(
@@ -448,7 +448,7 @@ def find_repeated(
 
 
 class _ViewSearch:
-    """Compare keyframes with those that are to be mapped.
+    """Compare keyframes with the ones that will be mapped.
 
     Attributes:
         words: (W, 128) of `visual_words`. view_of: as of `find_repeated`, is extended.

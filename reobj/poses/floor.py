@@ -35,27 +35,27 @@ class Floor:
     inliers: NonNegativeInt
 
 
-NOISE = 0.012  # of points along the height, over their distance (chosen: 4 cm at 3 m)
+NOISE = 0.012  # of points along the height, over their distance: 4 cm at 3 m
 
 
-# Points of a component, and of it below the cameras (chosen; lower: chance planes of few points)
+# Points of a component, and of it below the cameras; fewer lie on a plane by chance
 MIN_POINTS = 100
-UP_SIGMA_DEG = 2.0  # prior of `up` (chosen: errors of an estimated direction)
+UP_SIGMA_DEG = 2.0  # prior of `up`: error of an estimated direction
 # Fraction of the points below the floor, outliers (measured: at .05 redkitchen gets a floor that
 # lies .08 m high)
 MAX_BELOW = 0.03
-# Heights in NOISE, whole numbers: points between them count against a plane (chosen: beyond the
-# noise of the floor itself)
+# Heights in NOISE, whole numbers, beyond the noise of the floor itself: points between them count
+# against a plane
 ABOVE = (4, 10)
-# Density of points on the plane over that shortly above it (chosen; higher: floors with much on
-# them are refused)
+# Density of points on the plane over that shortly above it: a higher limit refuses floors with
+# much on them
 MIN_EDGE = 1.5
 # Sigmas of the height, over the distance, and of the tilt that are common to all half samples:
-# drift of the cameras, gravity (chosen: 9 mm at 3 m; hololens_kitchen's floor lies .5 deg off its
-# gravity)
+# drift of the cameras, gravity (9 mm at 3 m; the floor of hololens_kitchen lies .5 deg off its
+# gravity: benchmarks/RESULTS.md)
 COMMON_SIGMA = 0.003
 COMMON_TILT_DEG = 0.3
-CAMERA_HEIGHT_M = (0.3, 2.5)  # of a hand-held camera above a floor (chosen: wide)
+CAMERA_HEIGHT_M = (0.3, 2.5)  # lowest and highest hand-held camera above a floor
 
 
 def floor_of(
@@ -140,7 +140,7 @@ def _fault(
     low, high = CAMERA_HEIGHT_M
     if len(across) < max(30, 0.015 * len(local)):
         return f"only {len(across)} points lie on the lowest plane"
-    # rms extent less than .3 of that of all points
+    # rms extent below .3 of the extent of all points
     if np.var(across, axis=0).sum() < 0.3**2 * np.var(local[:, :2], axis=0).sum():
         return "the lowest plane with points is small"
     if floor.sigma > 3 * noise:  # 11 cm at 3 m
@@ -169,7 +169,7 @@ def _one_per_voxel(points: Array, size: float) -> Array:
 
 
 def _best_level(local: Array, noise: float) -> Array | None:
-    """Find the plane with the most points on it minus those shortly above it, and few below.
+    """Find the plane with the most points on it minus the ones shortly above it, and few below.
 
     The search is to three sigmas of `up`, in steps of a degree: it is refined later.
 

@@ -193,13 +193,14 @@ class _KeyframeFlow:
         return float(np.median(flow)) / frame.gray.shape[1] if kept.any() else 0.0, left
 
 
-MIN_KEYFRAMES = 40  # with fewer the steps are halved (chosen; lower: too wide to be matched)
-MAX_FLOW = 0.12  # median since the last keyframe, over the width (chosen; lower: more keyframes)
-MIN_FLOW = 0.015  # that counts as motion, over the width (chosen: 10 px of 640)
-# Fraction of the last keyframe's corners that can still be tracked (chosen; higher: more keyframes
-# where the scene changes quickly)
+MIN_KEYFRAMES = 40  # with fewer the steps are halved: wider ones may not be matched
+# Median flow since the last keyframe, over the width; a lower limit gives more keyframes
+MAX_FLOW = 0.12
+MIN_FLOW = 0.015  # that counts as motion, over the width: 10 px of 640
+# Fraction of the last keyframe's corners that can still be tracked: a higher limit gives more
+# keyframes where the scene changes quickly
 MIN_LEFT = 0.55
-MAX_INTERVAL = 60  # frames after which any motion makes a keyframe (chosen: 2 s at 30 Hz)
+MAX_INTERVAL = 60  # frames after which any motion makes a keyframe: 2 s at 30 Hz
 
 
 def pick_keyframes(
@@ -215,7 +216,7 @@ def pick_keyframes(
     nothing in it can be matched.
 
     Args:
-        max_flow: threshold, as MAX_FLOW. keep: stores the image of each chosen frame.
+        max_flow: threshold, as MAX_FLOW. keep: stores the image of each selected frame.
     Returns:
         rows of the keyframes, ascending.
     """
@@ -239,7 +240,7 @@ def pick_keyframes(
             continue
         last = frame
         flow, left = update
-        if flow >= 0.7 * wider * max_flow:  # near the threshold: the sharpest is chosen
+        if flow >= 0.7 * wider * max_flow:  # near the threshold: the sharpest is kept
             window.append(frame)
         late = frame.row - track.row >= wider * MAX_INTERVAL and flow > MIN_FLOW
         if late or flow > wider * max_flow or left < MIN_LEFT**wider:
@@ -262,8 +263,8 @@ def pick_keyframes(
 # ---- Keyframes of supplied poses -----------------------------------------------------------------
 
 
-TURN_DEG = 8.0  # rotation between keyframes (chosen: an eighth of a usual field of view)
-SPREAD_STEP = 1 / 8  # translation between them, over the spread (chosen: 7 deg of an orbit)
+TURN_DEG = 8.0  # rotation between keyframes: an eighth of a usual field of view
+SPREAD_STEP = 1 / 8  # translation between them, over the spread: 7 deg of an orbit
 
 
 def path_steps(poses: Poses) -> Array:
@@ -301,7 +302,7 @@ def choose_posed_keyframes(steps: Array) -> IntArray:
 
 
 def _rows_apart(steps: Array, rows: IntArray, length: float) -> IntArray:
-    """Choose rows at least `length` from the last one chosen."""
+    """Choose rows at least `length` from the last one selected."""
     chosen = rows[:1].tolist()
     for row in rows[1:].tolist():
         if np.linalg.norm(steps[row] - steps[chosen[-1]]) >= length:

@@ -159,8 +159,8 @@ def _track_model_points(
     return tracked
 
 
-MIN_INLIERS = 15  # of an accepted pose (chosen; COLMAP registers images from 30 on)
-MIN_RATIO = 0.5  # of inliers among the tracked points (chosen; COLMAP: .25 of raw matches)
+MIN_INLIERS = 15  # of an accepted pose; half of COLMAP's abs_pose_min_num_inliers
+MIN_RATIO = 0.5  # of inliers among the tracked points (COLMAP: .25 of raw matches)
 
 
 def absolute_pose(
@@ -190,7 +190,7 @@ def absolute_pose(
     return pose if np.isfinite(pose).all() and (depth > 0).all() else None
 
 
-MAX_DETOUR = 5.0  # units (chosen; lower: frames of a shaking camera are lost)
+MAX_DETOUR = 5.0  # in the unit of `_detours`; a lower limit drops frames of a shaking camera
 
 
 def _detours(cam_from_world: Array) -> BoolArray:
@@ -211,7 +211,7 @@ def _detours(cam_from_world: Array) -> BoolArray:
 
 
 MAX_GAP = 15  # consecutive lost frames that are interpolated: half a second at 30 Hz
-# Gap lengths, before and after it, in which the error is measured (chosen; higher: other motion)
+# Gap lengths, before and after it, in which the error is measured: farther motion may differ
 NEAR_GAPS = 2.0
 
 

@@ -97,13 +97,15 @@ def without_poses(problem: str, advice: str = ADVICE) -> str:
 
 
 # Fraction of the keyframes and of the verified matches in sound components that ends the search
-# (matches, measured: right .91-1, wrong up to .89; keyframes: chosen)
+# (matches, measured: right .91-1, wrong up to .89; the same limit for keyframes)
 NEARLY_ALL = 0.9
 # Largest centre_sigma of a component of the incremental mapper that needs no second mapper, where a
-# focal length that does not come from the model agrees: it is evidence of its own (chosen: time)
+# focal length that does not come from the model agrees: it is evidence of its own. A
+# higher limit saves the time of second mappers (wrong models: from .0011 on,
+# benchmarks/RESULTS.md)
 ACCEPTED_SIGMA = 0.0012
-# Weight of the verified matches that the global mapper explains (chosen: it is right more often
-# where the parallax is weak; higher: it is kept with fewer matches)
+# Weight of the verified matches that the global mapper explains: it is right more often where
+# the parallax is weak. A higher weight prefers it with fewer matches
 PREFERRED = 1.1
 
 
@@ -394,7 +396,7 @@ def _run_mapper(
         options["mapper"] = {"bundle_adjustment": kept}
         return list(pc.global_mapping(*paths, options=options).values())
     options |= {"multiple_models": True, "min_model_size": 3, "extract_colors": False}
-    # global adjustment more rarely and less exactly than by default (chosen: time; one follows)
+    # cheaper global adjustment while mapping (COLMAP's ratios: 1.1); a full one follows
     options |= {"ba_global_frames_ratio": 2.0, "ba_global_points_ratio": 2.0}
     options |= {"ba_global_function_tolerance": 1e-5, "ba_global_max_refinements": 1}
     options |= {"ba_local_max_refinements": 1}
@@ -412,13 +414,13 @@ def _run_mapper(
 # ---- Windows -------------------------------------------------------------------------------------
 
 
-WINDOW = 200  # keyframes of a window (chosen: a mapper needs a minute for them)
+WINDOW = 200  # keyframes of a window, for which a mapper needs a minute
 OVERLAP = 40  # keyframes that two consecutive windows share
 # Largest reprojection error in the other model of a point that joins two models (COLMAP's
 # abs_pose_max_error: windows are not adjusted together yet)
 JOINT_PX = 3 * INLIER_PX
 # Distance of joined points over their depth, median of two models, above which the other joins
-# contradict theirs (chosen: drift of a window stays below)
+# contradict theirs: the drift of a window stays below
 CONTRADICTION = 0.1
 
 

@@ -335,8 +335,8 @@ class PointsJob:
         """Triangulate in the folder (child process).
 
         Returns:
-            points, colors and visibility as of `Poses`, by rows of the keyframes, and `ties`
-            (`_count_ties`); the verified matches; their rays.
+            points, colors and visibility as of `Poses`, by rows of the keyframes, and `counts`
+            (`_count_triangulated_matches`); the verified matches; their rays.
         """
         pc = import_pycolmap()
         database = folder / "database.db"
@@ -370,25 +370,25 @@ class PointsJob:
             "points": np.array([point.xyz for _, point in points]).reshape(-1, 3),
             "colors": np.array([color_of[i] for i, _ in points], np.uint8).reshape(-1, 3),
             "visibility": np.array(seen, np.int64).reshape(-1, 2),
-            "ties": _count_ties(pairs, model, count),
+            "counts": _count_triangulated_matches(pairs, model, count),
         }
         rays = {i: np.asarray(camera.cam_ray_from_img(xy)) for i, xy in pairs.keypoints.items()}
         return arrays, pairs, rays
 
 
-def _count_ties(pairs: MatchedPairs, model: Any, count: int) -> IntArray:
-    """Count (K - 1, 2) the matches of consecutive keyframes, and those that are one point."""
+def _count_triangulated_matches(pairs: MatchedPairs, model: Any, count: int) -> IntArray:
+    """Count (K - 1, 2) the matches of consecutive keyframes, and how many are triangulated."""
     point_of = {
         i: np.array([p.point3D_id if p.has_point3D() else -1 for p in model.image(i).points2D])
         for i in range(1, count + 1)
     }
-    ties = np.zeros((count - 1, 2), np.int64)
+    counts = np.zeros((count - 1, 2), np.int64)
     for (i, j), matches in zip(pairs.image_ids.tolist(), pairs.inliers, strict=True):
         if j == i + 1:
             points = point_of[i][matches[:, 0]]
             same = (points == point_of[j][matches[:, 1]]) & (points >= 0)
-            ties[i - 1] = len(matches), same.sum()
-    return ties
+            counts[i - 1] = len(matches), same.sum()
+    return counts
 
 
 # Fraction of the matched features that must be points of three images and more. Measured:
@@ -409,8 +409,8 @@ def triangulate(
 ) -> Poses:
     """Triangulate sparse points of the images from known poses.
 
-    Keyframes and the pairs to match are chosen by their poses. The fraction of the matched features
-    that triangulate shows whether the poses explain the images.
+    Keyframes and the pairs to match are selected by their poses. The fraction of the matched
+    features that triangulate shows whether the poses explain the images.
 
     Args:
         video: a `Video`, iterated once. size_px: longer side to which its images are shrunk.
@@ -449,7 +449,7 @@ def triangulate(
         return _without_points(poses, f"no features of {count} images could be matched")
     if not triangulated or triangulated < MIN_TRIANGULATED * matched:
         cause = "are the poses of this video, in this order, with this camera?"
-        if explained > 0.5:  # chosen; of right poses .6 and more
+        if explained > 0.5:  # of the matches; right poses: .6 and more
             cause = "the poses agree with the matches: too few views, or too little parallax"
         return _without_points(
             poses,
@@ -457,7 +457,7 @@ def triangulate(
             f"{count} images triangulate (usual: half of them); {cause}",
         )
     arrays["visibility"] = np.column_stack([rows[image], point])
-    messages = (*poses.messages, *_inconsistent(arrays.pop("ties"), poses.frame[rows]))
+    messages = (*poses.messages, *_inconsistent(arrays.pop("counts"), poses.frame[rows]))
     return dataclasses.replace(poses, **arrays, messages=messages)
 
 
@@ -486,17 +486,19 @@ def _count_matched(pairs: MatchedPairs) -> int:
 # Fraction of their matches that must be one point (measured, least of a recording: rendered .71,
 # studio_room .42, hololens_kitchen .14; redkitchen .09, and .003 where its Kinect lost track; ends
 # of stretches that were moved 0 and .04)
-MIN_TIED_SUPPLIED = 0.05
+MIN_TRIANGULATED_PAIR = 0.05
 
 
-def _inconsistent(ties: IntArray, frame: IntArray) -> list[str]:
+def _inconsistent(counts: IntArray, frame: IntArray) -> list[str]:
     """Report where matches of consecutive keyframes (K,) do not triangulate with supplied poses.
 
     Args:
-        ties: (K - 1, 2) of `_count_ties`. frame: (K,).
+        counts: (K - 1, 2) of `_count_triangulated_matches`. frame: (K,).
     """
-    matches, tied = ties.T
-    breaks = np.flatnonzero((matches >= MIN_MATCHES) & (tied < MIN_TIED_SUPPLIED * matches))
+    matches, triangulated = counts.T
+    breaks = np.flatnonzero(
+        (matches >= MIN_MATCHES) & (triangulated < MIN_TRIANGULATED_PAIR * matches)
+    )
     if not len(breaks):
         return []
     runs = np.split(breaks, np.flatnonzero(np.diff(breaks) > 1) + 1)
@@ -508,7 +510,7 @@ def _inconsistent(ties: IntArray, frame: IntArray) -> list[str]:
 
 
 def listed(names: Sequence[str], most: int = 5) -> str:
-    """Join names for a message; of those beyond `most` only the number."""
+    """Join at most `most` names for a message, and count the others."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more
 

@@ -155,7 +155,7 @@ def reconstruct_cached(
 
 
 def _load_reconstruction(path: Path) -> Poses:
-    """Read cached poses; the models beside them must be those that were written with them."""
+    """Read cached poses; the models beside them must have been written with them."""
     poses = load_poses(path)
     model = path.with_suffix(".sparse")
     if load_npz(path)[1].get("models") != _digest_of(model, poses.part_count):

@@ -43,8 +43,8 @@ from reobj.types import Array, BoolArray, IntArray
 # ---- Consistency ---------------------------------------------------------------------------------
 
 
-# What connects the images of a model; connections with less, or with fewer points or matches of one
-# pair than MIN_MATCHES, are cut.
+# Minimum connection between the images of a model. Connections that are weaker, or have fewer
+# points or matches of one pair than MIN_MATCHES, are cut.
 # Fraction of the matches of two consecutive images that must be one point of the model (measured:
 # right .38-.98, wrong 0)
 MIN_SUPPORTED = 0.1
@@ -391,9 +391,9 @@ class FocalSource(enum.Enum):
 # Minimum requirements for accepting a model
 MIN_IMAGES = 10  # (COLMAP's min_model_size), or MIN_REGISTERED
 MIN_REGISTERED = 0.5  # fraction of the keyframes of a short video
-MIN_POINTS = 100  # of a model (chosen; higher: short walks are refused)
-# Parallax that rotations of the camera alone cannot explain; walks have more than 4 (chosen; lower:
-# rotation alone at a wrong focal length is accepted)
+MIN_POINTS = 100  # of a model; a higher limit refuses short walks
+# Parallax that rotations of the camera alone cannot explain; walks have more than 4. A lower limit
+# accepts a rotation alone with a wrong focal length
 MIN_PARALLAX_PX = 3.0
 
 # `Component.centre_sigma` up to which all centres are certain. Above, the model may be one of many
@@ -408,8 +408,8 @@ GUESS_SIGMA = 0.004
 # orientation: half of what the benchmark of broken trajectories calls wrong
 SAME_CENTRE = 0.05
 SAME_TURN_DEG = 5.0
-# Fraction of the component that the other mapper must have (chosen; lower: components are kept of
-# which most images are not confirmed)
+# Fraction of the component that the other mapper must have: a lower limit keeps components
+# of which most images are not confirmed
 CONFIRMED = 0.75
 # Points that each of two pieces triangulates and that prove how they are joined: they fix rotation,
 # shift and scale (measured: right joins 191 to 386, a mirrored stretch 24, a free scale 0 to 3)
@@ -602,7 +602,7 @@ def _parallax_px(arrays: ModelArrays) -> float:
 
 
 # When the focal length changes between two consecutive images
-ZOOM_WINDOW = 10  # images on one side whose points are used (chosen: a zoom bends farther ones)
+ZOOM_WINDOW = 10  # images on one side whose points are used: a zoom bends the path of more
 RESECTED = 2  # images next to a gap whose focal length is measured, on each side
 # Least log of the change (measured, mean of both sides: zoomed by 1.25 to 1.5 .15-.30, right models
 # below .03)
@@ -610,7 +610,7 @@ ZOOM_LOG = 0.12
 # The same where only one side can be measured: the noise of its depths biases it (measured: zooms
 # .34-.39, right models up to .12)
 ZOOM_LOG_ONE_SIDE = 0.24
-ZOOM_SIGMAS = 5.0  # of that change (chosen; lower: noise of few points counts as a zoom)
+ZOOM_SIGMAS = 5.0  # of that change; with a lower limit noise of few points counts as a zoom
 
 
 def constant_focal(

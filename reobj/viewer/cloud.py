@@ -155,7 +155,8 @@ class DenseFrames:
         others = [r for r in self.rows if r != row and self.poses.part[r] == self.poses.part[row]]
         axis = self.poses.cam_from_world[:, 2, :3]
         base = np.linalg.norm(self.centers[others] - self.centers[row], axis=1)
-        cost = base / self._median_depth(row) + 4 * (1 - axis[others] @ axis[row])  # chosen
+        # a turn of 60 deg weighs as much as a baseline of twice the depth
+        cost = base / self._median_depth(row) + 4 * (1 - axis[others] @ axis[row])
         return [others[k] for k in np.argsort(cost, kind="stable")[:NEIGHBOURS]]
 
 

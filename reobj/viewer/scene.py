@@ -198,7 +198,7 @@ def best_pictures(result: Result, video: Video, line: Progress) -> dict[int, byt
 def diverse_rows(tracks: Tracks, obj: Object, poses: Poses | None, count: int) -> IntArray:
     """Choose diverse views of one object: (n,) rows of the tracks, n <= count.
 
-    First the best box (large, high score), then repeatedly the box farthest from the chosen ones in
+    First the best box (large, high score), then repeatedly the box farthest from the ones taken in
     time and, where there are cameras, in viewing direction.
 
     Args:

@@ -304,7 +304,7 @@ def test_coordinates_of_a_map_projection_keep_their_millimetres(tmp_path: Path) 
     np.testing.assert_allclose(table, expected, rtol=0, atol=1e-3)
     for name in ("objects.ply", "solids.ply"):
         mesh = trimesh.load(far / name)
-        middles = np.array([part.bounds.mean(0) for part in mesh.split()])
+        middles = np.array([solid.bounds.mean(0) for solid in mesh.split()])
         gap = np.linalg.norm(middles[:, None] - expected, axis=2).min(0)
         assert gap.max() < 2e-3, name
     scene_glb = trimesh.load(far / "objects.glb")
@@ -317,8 +317,8 @@ def test_coordinates_of_a_map_projection_keep_their_millimetres(tmp_path: Path) 
     np.testing.assert_allclose(poses[:, 1:4], eyes + UTM, rtol=0, atol=1e-4)
     page = (far / "scene.html").read_text()
     data = json.loads(page.split('id="data">')[1].split("</script>")[0])
-    (part,) = data["parts"]
+    (component,) = data["parts"]
     shown = np.array([o["center"] for o in data["objects"]])
-    np.testing.assert_allclose(shown + part["origin"], expected, rtol=0, atol=1e-3)
+    np.testing.assert_allclose(shown + component["origin"], expected, rtol=0, atol=1e-3)
     cams = np.frombuffer(base64.b64decode(data["poses"]), "<f4").reshape(-1, 3, 4)[:, :, 3]
-    np.testing.assert_allclose(cams + part["origin"], eyes + UTM, rtol=0, atol=1e-3)
+    np.testing.assert_allclose(cams + component["origin"], eyes + UTM, rtol=0, atol=1e-3)

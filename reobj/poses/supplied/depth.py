@@ -134,7 +134,7 @@ def _last_number(text: str) -> str:
 
 
 def _depth_camera(folder: Path, size: Size, color: Camera) -> tuple[Camera, Array]:
-    """Find the intrinsics of the maps: in a file beside them, else those of the colour images.
+    """Find the intrinsics of the maps: in a file beside them, else of the colour images.
 
     Returns:
         camera, and color_from_depth (3, 4).
@@ -195,7 +195,7 @@ SENSOR_SIGMA = 0.02
 
 
 def depth_scale(poses: Poses, maps: DepthMaps, max_spread: float = 0.2) -> tuple[Array, Array, int]:
-    """Estimate metres per unit of each component: depth of the maps over that of sparse points.
+    """Estimate metres per unit of each component: the ratio of map depths to point depths.
 
     Args:
         max_spread: relative, between maps; more contradicts the poses.
@@ -267,7 +267,7 @@ def look_up_depth(depth: Floats, K: Array, in_depth: Array) -> Array:
 
 
 def _scaled(poses: Poses, scale: Array, sigma: Array) -> Poses:
-    """Scale the components of the trajectory to metres; the largest sigma is that of all."""
+    """Scale the components of the trajectory to metres; the poses get the largest sigma."""
     cam_from_world = poses.cam_from_world.copy()
     cam_from_world[:, :, 3] *= scale[poses.part][:, None]
     component = np.zeros(len(poses.points), np.int64)

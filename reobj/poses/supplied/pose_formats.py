@@ -476,7 +476,7 @@ def read_splatting(path: Path, size: Size) -> PoseFile:
 
 # ---- COLMAP models -------------------------------------------------------------------------------
 
-UPRIGHT = "upright.txt"  # file in our models: their cameras are those of upright photos
+UPRIGHT = "upright.txt"  # file in our models: their cameras describe upright photos
 MODEL_FOLDERS = ([""], ["sparse/", "sparse/[0-9]*/"], ["[0-9]*/"],
                  ["colmap/sparse/", "colmap/sparse/[0-9]*/"])  # fmt: skip
 

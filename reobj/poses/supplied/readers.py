@@ -77,7 +77,7 @@ def read_poses(
 
 
 def read_supplied(video: Any, config: PosesConfig) -> Supplied:
-    """Read poses as `read_poses` does, with what `check` needs to name a mistake."""
+    """Read poses as `read_poses` does, and keep what `check` needs to name a mistake."""
     path = Path(config.mode)
     size = (int(video.size[0]), int(video.size[1]))
     file = read_pose_file(path, config.fmt, size)
