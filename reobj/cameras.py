@@ -247,6 +247,8 @@ class Poses:
         part: (F,) connected component of the trajectory of each frame, 0 the largest. Each has its
             own world frame and scale; the transform between two of them is unknown. A frame without
             a pose belongs to the component of the nearest frame with one.
+        direction_sigma: (C,) of each component: 0 where its camera positions are sound; else only
+            the directions of objects are known, and this is their sigma, rad.
         messages: warnings (frames without poses, and what to do about them).
         reading: how supplied poses were read: format, and the rule that matched their frames.
         scale: metres per world unit and its relative standard deviation, given by a map, or by
@@ -266,6 +268,7 @@ class Poses:
     colors: npt.NDArray[np.uint8] = field(default_factory=lambda: np.empty((0, 3), np.uint8))
     visibility: IntArray = field(default_factory=lambda: np.empty((0, 2), np.int64))
     part: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+    direction_sigma: Array = field(default_factory=lambda: np.empty(0))
     messages: tuple[str, ...] = ()
     reading: str = ""
     scale: tuple[float, float] | None = None
@@ -274,6 +277,8 @@ class Poses:
     def __post_init__(self) -> None:
         if len(self.part) != len(self.frame):
             object.__setattr__(self, "part", np.zeros(len(self.frame), np.int64))
+        if len(self.direction_sigma) != self.part_count:
+            object.__setattr__(self, "direction_sigma", np.zeros(self.part_count))
 
     def __repr__(self) -> str:
         """Describe the poses in one line."""
@@ -296,6 +301,13 @@ class Poses:
         origin = f"{self.source}: {self.reading}" if self.reading else self.source
         text = f"cameras: {known} of {len(self.frame)} frames ({origin})"
         return f"{text}, {interpolated} interpolated" if interpolated else text
+
+    @property
+    def is_spot(self) -> bool:
+        """Whether all cameras have one position, as of a turn: objects have no parallax."""
+        known = self.cam_from_world[self.known]
+        centre = -np.einsum("fij,fi->fj", known[:, :, :3], known[:, :, 3])
+        return len(centre) > 1 and bool((np.ptp(centre, axis=0) == 0).all())
 
     @property
     def part_count(self) -> int:
@@ -323,6 +335,7 @@ class Poses:
             colors=self.colors[kept],
             visibility=np.column_stack([row_of[seen[:, 0]], np.searchsorted(kept, seen[:, 1])]),
             part=np.zeros(len(rows), np.int64),
+            direction_sigma=self.direction_sigma[part : part + 1],
             messages=(),
         )
 
@@ -352,7 +365,8 @@ def without_copies(poses: Poses, copies: Mapping[int, int]) -> Poses:
     )
 
 
-_ARRAYS = ("frame", "time_s", "cam_from_world", "status", "points", "colors", "visibility", "part")
+_ARRAYS = ("frame", "time_s", "cam_from_world", "status", "points", "colors", "visibility", "part",
+           "direction_sigma")  # fmt: skip
 _FACTS = ("source", "metric", "messages", "reading", "scale", "map_id")
 
 

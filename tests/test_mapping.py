@@ -198,7 +198,7 @@ def zoomed_walk(first, last, ratio=1.4, count=40):
 @pytest.mark.slow
 def test_a_zoom_leaves_the_images_of_one_focal_length_and_is_reported(tmp_path):
     focal = Focal(430 / 480, FocalSource.MATCHES)
-    models, messages, _ = map_keyframes(search_of(tmp_path, zoomed_walk(29, 40), focal))
+    models, messages, *_ = map_keyframes(search_of(tmp_path, zoomed_walk(29, 40), focal))
     assert models and max(i for model in models for i in model.reg_image_ids()) <= 29
     assert any("the focal length changed between frames" in text for text in messages)
     assert models[0].camera(1).mean_focal_length() == pytest.approx(430, rel=0.03)
@@ -210,7 +210,7 @@ def test_an_undetermined_focal_length_is_kept_and_reported(tmp_path):
     cams[:, 0, 3] = -0.35 * np.arange(12)
     world = PointWorld(cams, wall(4.2, per_metre=60))
     search = search_of(tmp_path, world, Focal(0.8, FocalSource.GUESS))
-    _, messages, _ = map_keyframes(search)
+    _, messages, *_ = map_keyframes(search)
     assert any("do not determine the focal length" in text and "--camera" in text
                for text in messages)  # fmt: skip
 

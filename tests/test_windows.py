@@ -187,7 +187,7 @@ def test_a_walk_mapped_in_windows_is_that_mapped_at_once(tmp_path, size, windows
     focal = Focal(430 / 480, FocalSource.GIVEN)
     frames = {i: 10 * i for i in ids}
     search = MapperSearch(database, frames, read_pairs(database), focal, 0.9, 0)
-    (model,), messages, weak = map_keyframes(search, size, 4)
+    (model,), messages, weak, _ = map_keyframes(search, size, 4)
     assert messages == [] and weak == [] and sorted(model.reg_image_ids()) == ids
     assert error_percent(model, world) < 0.3
     assert sorted(path.name for path in tmp_path.glob("window*")) == windows

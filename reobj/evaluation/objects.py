@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 import quadrics
 from reobj.cameras import Poses, import_pycolmap, invert_rigid
@@ -74,6 +75,9 @@ def align_with_truth(result: Result, truth_poses: Path | None) -> tuple[float, A
     use = poses.known & np.isfinite(truth[:, :, 3]).all(1)
     estimated = invert_rigid(poses.cam_from_world[use])  # (f, 3, 4)
     truth = truth[use]
+    if poses.is_spot and len(truth):  # only directions, in metres by the usual sizes
+        turn = Rotation.from_matrix(truth[:, :, :3] @ estimated[:, :, :3].swapaxes(1, 2)).mean()
+        return 1.0, turn.as_matrix(), np.median(truth[:, :, 3], axis=0)
     similarity = _similarity(estimated[:, :, 3], truth[:, :, 3]) if use.sum() >= 3 else None
     if similarity is None:
         raise ReobjError(f"{truth_poses}: {use.sum()} poses in common; 3 or more are needed")

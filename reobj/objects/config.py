@@ -107,6 +107,9 @@ def make_fit(config: ObjectsConfig, poses: Poses, class_names: Sequence[str]) ->
         by_depth = quadrics.Scale(*poses.scale, "depth_maps")
     elif poses.scale is not None:
         given = quadrics.Scale(*poses.scale, "map")
+    elif poses.is_spot and not poses.metric:  # any scale explains the boxes: metres by the category
+        given = quadrics.Scale(1.0, SPOT_SCALE_SIGMA, "priors")
+    directions_only = bool(poses.direction_sigma.any())
     plain = quadrics.FitConfig(path_where_seen=int(poses.known.sum()) > FrameOptions().all_of)
 
     def fit(views: Views, classes: list[int], scene: Scene) -> quadrics.ObjectFits:
@@ -121,10 +124,25 @@ def make_fit(config: ObjectsConfig, poses: Poses, class_names: Sequence[str]) ->
         )  # fmt: skip
         if by_depth is not None and fits.scale.source == "poses":
             fits = dataclasses.replace(fits, scale=by_depth)
+        if directions_only:
+            fits = _guessed(fits)
         up_is_given = up is not None or scene.up is None
         return fits if up_is_given else dataclasses.replace(fits, up_source="floor")
 
     return fit
+
+
+SPOT_SCALE_SIGMA = 0.15  # of the usual sizes of one room (benchmarks/RESULTS.md: .07 to .22)
+
+
+def _guessed(fits: quadrics.ObjectFits) -> quadrics.ObjectFits:
+    """Mark all sizes and distances as guessed: the camera positions do not determine them."""
+    ok = fits.status == "ok"
+    why = "size and distance guessed from the category: the cameras have directions only"
+    reason = [why if good else text for good, text in zip(ok, fits.reason, strict=True)]
+    return dataclasses.replace(
+        fits, status=np.where(ok, "prior_dominated", fits.status), reason=reason
+    )
 
 
 # ---- Boxes in 3D of a detector ----

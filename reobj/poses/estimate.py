@@ -215,7 +215,9 @@ class _Reconstruction:
         row_of = {name: row for row, name in enumerate(names)}
         rows = [np.array([row_of[name] for name in model.names]) for model in models]
         key_rows = np.array([row for row in keys if row + 1 not in mapped.unmatched], np.int64)
-        return _Attempt(self._locate(models, rows, key_rows), rows, key_rows, mapped)
+        poses = self._locate(models, rows, key_rows)
+        poses = dataclasses.replace(poses, direction_sigma=np.array(mapped.direction_sigma))
+        return _Attempt(poses, rows, key_rows, mapped)
 
     def _locate(
         self, models: list[SparseModel], component_rows: list[IntArray], key_rows: IntArray
@@ -238,20 +240,32 @@ class _Reconstruction:
             camera = self.camera or Camera("SIMPLE_PINHOLE", *self.size, guess)
             return Poses(camera, frame, time_s, cam_from_world, status, "none")
         visibility = []
+        points = []
+        colors = []
         first_point = 0
         for number, (model, rows) in enumerate(zip(models, component_rows, strict=True)):
             unmapped = np.setdiff1d(key_rows, rows)
             located = locate_between(model, rows, unmapped, video, self.config.seed, line)
             shrink = min(1.0, self.config.size_px / max(self.size))
             filled, how = fill_gaps(located, frame, time_s, shrink, unmapped)
+            is_turn = not model.cam_from_world[:, :, 3].any()
+            if is_turn:
+                filled[:, :, 3] *= 0  # keeps NaN
             own = (how != "none") & (component < 0)
             own[rows] = True  # keyframes of the model
             cam_from_world[own] = filled[own]
             status[own] = how[own]
             component[own] = number
+            if is_turn:  # its points are directions, without depth
+                model = dataclasses.replace(
+                    model, points=model.points[:0], colors=model.colors[:0],
+                    obs_image=model.obs_image[:0], obs_point=model.obs_point[:0],
+                )  # fmt: skip
             visibility.append(
                 np.column_stack([rows[model.obs_image], first_point + model.obs_point])
             )
+            points.append(model.points)
+            colors.append(model.colors)
             first_point += len(model.points)
         line.close()
         known = np.flatnonzero(component >= 0)
@@ -262,8 +276,8 @@ class _Reconstruction:
             cam_from_world,
             status,
             "pycolmap",
-            points=np.concatenate([model.points for model in models]),
-            colors=np.concatenate([model.colors for model in models]),
+            points=np.concatenate(points),
+            colors=np.concatenate(colors),
             visibility=np.concatenate(visibility),
             part=component[known[nearest_of(np.arange(len(frame)), known)]],
         )

@@ -96,6 +96,15 @@ def without_poses(problem: str, advice: str = ADVICE) -> str:
     return f"no camera poses: {problem}; {advice}; or give --poses; 2D identities need no poses"
 
 
+def directions_only(frames: str, problem: str) -> str:
+    """Report that frames have rotations but no sound positions, and what that means."""
+    return (
+        f"frames {frames} have directions only: {problem}. Identities rest on directions, sizes "
+        "and distances on usual sizes of the categories; one step to the side, with the objects in "
+        "view, measures them"
+    )
+
+
 # Fraction of the keyframes and of the verified matches in sound components that ends the search
 # (matches, measured: right .91-1, wrong up to .89; the same limit for keyframes)
 NEARLY_ALL = 0.9
@@ -139,14 +148,15 @@ class MapperSearch:
         self.seed = seed
         self.show = show
 
-    def run(self) -> tuple[list[Any], list[str], list[str]]:
+    def run(self) -> tuple[list[Any], list[str], list[str], list[float]]:
         """Try mappers until sound components contain nearly all keyframes.
 
         Images of another focal length are left out of `ids` as soon as they are found.
 
         Returns:
-            models of the components, the largest first ([]: none is sound); messages about the
-            focal length; messages about keyframes without poses.
+            models of the components ([]: none is sound), those of sound positions first, then the
+            largest; messages about the focal length; messages about keyframes without poses;
+            `direction_sigma` of each model.
         """
         zooms = list[tuple[int, int, float]]()
         for _ in range(3):  # each without the images of other focal lengths found before
@@ -162,22 +172,33 @@ class MapperSearch:
                 camera = best[0].arrays.camera
                 self.focal = estimate_focal(self.pairs, (camera.width, camera.height), self.guess)
         else:
-            best = [replace(c, problem="the focal length keeps changing") for c in best]
+            changing = "the focal length keeps changing"
+            best = [replace(c, problem=changing, direction_sigma=0.0) for c in best]
         if self.focal.source is FocalSource.GIVEN and zooms:  # which of them is the camera's?
             why = "its images were taken at another focal length than that of the given camera"
-            best = [c if self._has_its_focal(c) else replace(c, problem=why) for c in best]
+            best = [
+                c if self._has_its_focal(c) else replace(c, problem=why, direction_sigma=0.0)
+                for c in best
+            ]
         sound = [component for component in best if not component.problem]
-        if not sound:
+        turning = [c for c in best if c.problem and c.direction_sigma]
+        if not sound and not turning:
             problem = best[0].problem if best else "no pair of keyframes initialises a model"
             advice = (best[0].advice if best else "") or ADVICE
-            return [], [], [without_poses(f"{problem}; {self._match_counts()}", advice)]
+            return [], [], [without_poses(f"{problem}; {self._match_counts()}", advice)], []
         messages = [
             f"the focal length changed between frames {self.frames[a]} and {self.frames[b]} "
             f"(x {ratio:.2f}): only the frames of one focal length have poses; do not zoom"
             for a, b, ratio in zooms
         ] + messages
+        sigma = [0.0] * len(sound) + [component.direction_sigma for component in turning]
+        lost = self._lost(best, sound + turning)
+        return models_of_one_camera(sound + turning), messages, lost, sigma
+
+    def _lost(self, components: list[Component], kept: list[Component]) -> list[str]:
+        """Report the keyframes without poses, and those with directions only."""
         lost = list[str]()
-        for component in sound:
+        for component in kept:
             uncertain = np.setdiff1d(component.arrays.ids, component.kept)
             if len(uncertain):
                 frames = spans([self.frames[i] for i in uncertain.tolist()])
@@ -185,11 +206,13 @@ class MapperSearch:
                     f"keyframes {frames} are left out: their poses are uncertain, and a second "
                     "mapper does not reproduce them"
                 )
-        for component in best:
+        for component in components:
             ids = component.arrays.ids.tolist()
-            if component.problem and len(ids) >= MIN_IMAGES:
+            if component.direction_sigma:
+                lost.append(directions_only(self._range(ids), component.problem))
+            elif component.problem and len(ids) >= MIN_IMAGES:
                 lost.append(f"frames {self._range(ids)} have no poses: {component.problem}")
-        return models_of_one_camera(sound), messages, lost
+        return lost
 
     def _other_focal(
         self, components: list[Component]
@@ -245,8 +268,10 @@ class MapperSearch:
             else:
                 by_incremental = confirmed(best, other, source)
                 by_global = confirmed(other, best, source)
-                weighted = PREFERRED * _explained(by_global)
-                best = by_global if weighted >= _explained(by_incremental) else by_incremental
+                weighted = PREFERRED * np.array(_explained(by_global))
+                best = by_incremental
+                if tuple(weighted) >= _explained(by_incremental):
+                    best = by_global
         given = source is FocalSource.GIVEN
         if given or not best or best[0].problem or best[0].focal_source is FocalSource.MODEL:
             return best, []
@@ -275,7 +300,7 @@ class MapperSearch:
                 accepted.append(component)
         registered = sum(component.registered for component in accepted)
         matched = sum(map(len, self.pairs.inliers))
-        return registered >= NEARLY_ALL and _explained(accepted) >= NEARLY_ALL * matched
+        return registered >= NEARLY_ALL and _explained(accepted)[0] >= NEARLY_ALL * matched
 
     def _components(self, mapper: str, keep_intrinsics: bool) -> list[Component]:
         """Run a mapper and measure the consistent components of its models, largest first.
@@ -354,9 +379,10 @@ def models_of_one_camera(sound: list[Component]) -> list[Any]:
     return models
 
 
-def _explained(components: list[Component]) -> int:
-    """Count the verified matches that sound components explain."""
-    return sum(component.explained for component in components if not component.problem)
+def _explained(components: list[Component]) -> tuple[int, int]:
+    """Count the verified matches that sound components explain, and those of directions only."""
+    sound = sum(c.explained for c in components if not c.problem)
+    return sound, sum(c.explained for c in components if c.problem and c.direction_sigma)
 
 
 # ---- Mappers of pycolmap -------------------------------------------------------------------------
@@ -449,7 +475,7 @@ def split(ids: Sequence[int], size: int = WINDOW, overlap: int = OVERLAP) -> lis
 
 def map_keyframes(
     search: MapperSearch, size: int = WINDOW, overlap: int = OVERLAP
-) -> tuple[list[Any], list[str], list[int]]:
+) -> tuple[list[Any], list[str], list[int], list[float]]:
     """Map keyframes: at once, or in windows whose models are joined.
 
     Args:
@@ -457,22 +483,24 @@ def map_keyframes(
         size, overlap: keyframes, as of `split`.
     Returns:
         models of the components, the largest first ([]: none is sound); messages; keyframes whose
-        windows alone do not determine their poses, to be registered in the joined models.
+        windows alone do not determine their poses, to be registered in the joined models;
+        `direction_sigma` of each model.
     """
     windows = split(_path(search.ids, search.pairs), size, overlap)
     if len(windows) == 1:
-        models, messages, lost = search.run()
-        return models, [*messages, *lost], []
+        models, messages, lost, sigma = search.run()
+        return models, [*messages, *lost], [], sigma
     models, messages, tried = _map_windows(windows, search)
     if not models:
-        return [], messages, []
+        return [], messages, [], []
     posed = [_merged_poses(models, place) for place in aligned(models, search.pairs)]
     del models  # memory
     sound, problem = _joined(posed, search)
     if problem:
-        return [], [*messages, without_poses(problem)], []
+        return [], [*messages, without_poses(problem)], [], []
     mapped = {number for component in sound for number in component.kept.tolist()}
-    return models_of_one_camera(sound), messages, sorted(tried - mapped)
+    models = models_of_one_camera(sound)
+    return models, messages, sorted(tried - mapped), [0.0] * len(models)
 
 
 def _map_windows(
@@ -496,9 +524,10 @@ def _map_windows(
         search = MapperSearch(path, frames, whole.pairs.only(ids), *known)
         with lock:
             copy_database(whole.database, path, ids)
-        found = search.run()
+        found, messages, lost, sigma = search.run()
         path.unlink()
-        return *found, search.ids
+        sound = [model for model, value in zip(found, sigma, strict=True) if not value]
+        return sound, messages, lost, search.ids
 
     results = []
     send_progress("mapping", 0, len(windows))
@@ -762,16 +791,14 @@ def _merged_poses(models: Sequence[Any], place: dict[int, Any]) -> tuple[dict[in
     return pose, copy.copy(models[largest].camera(1))
 
 
-def triangulated(pose: dict[int, Array], camera: Any, database: Path, seed: int) -> Any:
-    """Triangulate the verified matches of images with poses.
+def posed(pose: dict[int, Array], camera: Any, database: Path, path: Path) -> Any:
+    """Make a `pycolmap.Reconstruction` of images with poses, without points.
 
     Args:
         pose: cam_from_world (3, 4) by the id of the image. camera: `pycolmap.Camera` of all.
-    Returns:
-        `pycolmap.Reconstruction`.
+        path: of the database of these images, which is made.
     """
     pc = import_pycolmap()
-    path = database.with_name("joined.db")
     copy_database(database, path, sorted(pose), camera)
     with open_database(path) as db:
         cache = pc.DatabaseCache.create(db, pc.DatabaseCacheOptions())
@@ -781,10 +808,17 @@ def triangulated(pose: dict[int, Array], camera: Any, database: Path, seed: int)
         frame_id = model.image(number).frame_id
         model.frame(frame_id).rig_from_world = pc.Rigid3d(cam_from_world)
         model.register_frame(frame_id)
+    return model
+
+
+def triangulated(pose: dict[int, Array], camera: Any, database: Path, seed: int) -> Any:
+    """Triangulate the verified matches of images with poses, as of `posed`."""
+    path = database.with_name("joined.db")
+    model = posed(pose, camera, database, path)
     options: dict[str, Any] = {"num_threads": 1, "random_seed": seed, "extract_colors": False}
     options["triangulation"] = {"min_angle": 0.5}
     options["mapper"] = {"filter_min_tri_angle": 0.5}
     out = database.parent / "joined"
     out.mkdir(exist_ok=True)
     folders = str(path), str(out), str(out)
-    return pc.triangulate_points(model, *folders, options=options)
+    return import_pycolmap().triangulate_points(model, *folders, options=options)

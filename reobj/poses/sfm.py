@@ -46,7 +46,15 @@ from reobj.poses.features import (
     vlad_vectors,
 )
 from reobj.poses.keyframes import ImageFile, choose_posed_keyframes, path_steps, sharpest_images
-from reobj.poses.mapping import Focal, MapperSearch, estimate_focal, map_keyframes, without_poses
+from reobj.poses.mapping import (
+    Focal,
+    MapperSearch,
+    directions_only,
+    estimate_focal,
+    map_keyframes,
+    without_poses,
+)
+from reobj.poses.turning import estimate_turn, pin, turning_model
 from reobj.poses.verification import FocalSource
 from reobj.types import Array, IntArray
 
@@ -199,12 +207,14 @@ class Mapped:
     Attributes:
         models: folders of COLMAP models, one for each component of the trajectory, the largest
             first; in native pixels, with the given image names. messages: for the user.
+        direction_sigma: of each model, as of `Poses`.
         unmatched: ids of keyframes without a verified match with another one.
         view_of: as of `find_repeated`.
     """
 
     models: list[Path]
     messages: list[str]
+    direction_sigma: Sequence[float] = ()
     unmatched: frozenset[int] = frozenset()
     view_of: Mapping[int, int] = dataclasses.field(default_factory=dict)
 
@@ -273,19 +283,30 @@ class MappingJob:
             focal = estimate_focal(pairs, size, guess)
         frames = {number: self.frame_of[number] for number in mapped}
         search = MapperSearch(database, frames, pairs, focal, guess, self.seed)
-        models, messages, weak = map_keyframes(search)
+        models, messages, weak, sigma = map_keyframes(search)
+        turn = None
+        if not models:
+            turn = estimate_turn(pairs, camera, self.camera is not None)
+        if turn is not None and not turn.problem:
+            models = [turning_model(turn, database)]
+            sigma = [turn.spread_rad]
+            turned = [self.frame_of[number] for number in turn.ids.tolist()]
+            cause = f"the camera turns on one spot ({turn.quality})"
+            messages = [directions_only(f"{min(turned)}-{max(turned)}", cause)]
         for model in models:
             inside = set(model.reg_image_ids())
             repeated = [i for i in ids if view_of[i] in inside and view_of[i] != i]
             added = register(model, database, [*repeated, *weak], self.seed)
             weak = [number for number in weak if number not in added]
+            if turn is not None:
+                pin(model)
         new = Path(tempfile.mkdtemp(dir=folder))
         paths = [new / str(k) for k in range(len(models))]
         for model, out in zip(models, paths, strict=True):
             self._write(model, out)
         matched = every_pair.image_ids[every_pair.enough]
         unmatched = frozenset(set(ids) - set(matched.ravel().tolist()))
-        return Mapped(paths, messages, unmatched, view_of)
+        return Mapped(paths, messages, sigma, unmatched, view_of)
 
     def _write(self, model: Any, folder: Path) -> None:
         """Write a model in native pixels with the frames' names and coloured points."""

@@ -408,6 +408,8 @@ GUESS_SIGMA = 0.004
 # orientation: half of what the benchmark of broken trajectories calls wrong
 SAME_CENTRE = 0.05
 SAME_TURN_DEG = 5.0
+# Largest difference of two mappers in the orientation of a camera whose directions are used
+DIRECTION_DEG = 3.0
 # Fraction of the component that the other mapper must have: a lower limit keeps components
 # of which most images are not confirmed
 CONFIRMED = 0.75
@@ -431,6 +433,8 @@ class Component:
     problem: str  # "" if it is sound
     kept: IntArray  # ids of the images with certain poses
     advice: str = ""  # for the user, where the cause is established
+    is_weak: bool = False  # the problem is too little parallax: rotations may be right
+    direction_sigma: float = 0.0  # rad, of the rotations, where another mapper has the same
 
     @property
     def focal(self) -> float:
@@ -472,9 +476,9 @@ def measured(
         (points < MIN_POINTS, f"only {points} points could be triangulated", ""),
         (seen < MIN_MATCHES,
          f"half of the keyframes see {seen:.0f} points or fewer", ""),
-        (parallax_px < MIN_PARALLAX_PX,
+        (is_still := parallax_px < MIN_PARALLAX_PX,
          f"the camera only rotates (to {parallax_px:.1f} px), {no_depth}", advice),
-        (angle_deg < MIN_TRI_ANGLE_DEG,
+        (is_near := angle_deg < MIN_TRI_ANGLE_DEG,
          f"half of the points are seen from directions within {angle_deg:.1f} deg", advice),
         (arrays.camera.has_bogus_params(*FOCAL_RANGE, 1.0),
          f"the estimated focal length is {focal:.2f} x the longer side", lens),
@@ -482,7 +486,7 @@ def measured(
     problem, advice = next(((text, advice) for bad, text, advice in checks if bad), ("", ""))
     return Component(
         model, arrays, focal_source, angle_deg, images / count, parallax_px, centre_sigma,
-        explained, problem, arrays.ids, advice,
+        explained, problem, arrays.ids, advice, bool(advice) and (is_still or is_near),
     )  # fmt: skip
 
 
@@ -493,7 +497,8 @@ def confirmed(
 ) -> list[Component]:
     """Reject components of uncertain cameras unless a second mapper reproduces them.
 
-    Images whose poses differ, or which it lacks, are not kept.
+    Images whose poses differ, or which it lacks, are not kept. Where only the rotations agree,
+    `direction_sigma` is set, and those images are kept.
 
     Args:
         focal_source: of the focal length before mapping.
@@ -513,9 +518,33 @@ def confirmed(
                     f"parallax {component.parallax_px:.0f} px, rays meet at "
                     f"{component.tri_angle_deg:.1f} deg)"
                 )
-                component = replace(component, problem=problem)
+                component = replace(component, problem=problem, is_weak=True)
+        if component.is_weak:
+            rows, sigma = _same_rotations(component.arrays, [other.arrays for other in others])
+            if len(rows) >= CONFIRMED * len(component.arrays.ids):
+                kept = component.arrays.ids[rows]
+                component = replace(component, kept=kept, direction_sigma=sigma)
         checked.append(component)
     return sorted(checked, key=lambda c: (bool(c.problem), -c.registered))
+
+
+def _same_rotations(one: ModelArrays, others: Sequence[ModelArrays]) -> tuple[IntArray, float]:
+    """Return the images (rows of one) that another model turned alike, and the difference, rad."""
+    best = np.empty(0, np.int64)
+    sigma = 0.0
+    for other in others:
+        _, rows, other_rows = np.intersect1d(one.ids, other.ids, return_indices=True)
+        if len(rows) < 3:
+            continue
+        a = one.cam_from_world[rows][:, :, :3]
+        b = other.cam_from_world[other_rows][:, :, :3]
+        relative = Rotation.from_matrix(np.swapaxes(b, 1, 2) @ a)
+        off = (relative.mean().inv() * relative).magnitude()
+        same = off <= np.radians(DIRECTION_DEG)
+        if same.sum() > len(best):
+            best = rows[same]
+            sigma = max(float(np.sqrt((off[same] ** 2).mean())), np.radians(0.1))
+    return best, sigma
 
 
 def _reproduced_by(one: ModelArrays, others: Sequence[ModelArrays]) -> IntArray:
