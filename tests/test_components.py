@@ -45,6 +45,21 @@ def test_every_component_has_its_own_identities(broken_walk: rt.Result) -> None:
     assert len({t for o in broken_walk.objects for t in o.tracklet_ids}) == 6
 
 
+def test_embeddings_stay_with_their_boxes() -> None:
+    """Half of the boxes were embedded, the first of them too; identities are linked again."""
+    poses = walk(24)
+    before = unlinked(poses, tracks_of(poses))
+    row = np.arange(0, len(before.tracks), 2)
+    name = before.tracks.xyxy[row, :1].astype(np.float16)
+    after = finished(
+        dataclasses.replace(before, embeddings=rt.Embeddings(name, -name), embedding_row=row)
+    )
+    for values, sign in ((after.embeddings.foreground, 1), (after.embeddings.background, -1)):
+        found = after.tracks.xyxy[after.embedding_row, :1].astype(np.float16)
+        np.testing.assert_array_equal(found, sign * values)
+    assert len(found) == len(row)
+
+
 def test_a_component_equals_the_result_of_a_separate_video(broken_walk: rt.Result) -> None:
     for component in (0, 1):
         poses = broken_walk.poses.of_part(component)

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from simulated import looking_at
+from simulated import CHAIR, CUP, tracks_of, walk
 
 import quadrics
 import reobj_track as rt
@@ -14,46 +14,10 @@ from reobj.objects.component import associate_component
 from reobj.objects.config import make_fit
 from reobj.tracking.linking import FRAGMENT_GAP, cut_at_gaps, link
 
-SIZE = (640, 480)
-CAMERA = rt.Camera("PINHOLE", *SIZE, (520.0, 520.0, 320.0, 240.0))
 NAMES = rt.COCO_NAMES
 PERSON = 0
 BICYCLE = 1
-CHAIR = 56
-CUP = 41
-
-
-def walk(frames: int = 120, arc_deg: float = 120.0) -> rt.Poses:
-    """An arc around the origin at 3.5 m, z up, metres."""
-    angles = np.radians(np.linspace(-arc_deg / 2, arc_deg / 2, frames))
-    eyes = np.stack([3.5 * np.sin(angles), -3.5 * np.cos(angles), np.full(frames, 1.6)], 1)
-    poses = np.stack([looking_at(eye, np.array([0, 0, 0.4])) for eye in eyes])
-    status, up = np.array(["supplied"] * frames), np.array([0, 0, 1.0])
-    frame = np.arange(frames)
-    return rt.Poses(CAMERA, frame, frame / 30, poses, status, "user", True, up)
-
-
-def chair_solids() -> quadrics.Ellipsoids:
-    """Three equal chairs in a row and nothing else."""
-    centers = np.array([[-1.1, 0, 0.41], [0, 0.1, 0.41], [1.1, 0, 0.41]])
-    cos, sin = np.cos([0.2, 1.1, -0.5]), np.sin([0.2, 1.1, -0.5])
-    turn = np.tile(np.eye(3), (3, 1, 1))
-    turn[:, :2, :2] = np.moveaxis(np.array([[cos, -sin], [sin, cos]]), 2, 0)
-    return quadrics.Ellipsoids(centers, np.tile([0.28, 0.3, 0.41], (3, 1)), turn)
-
-
-def table_of(poses: rt.Poses, solids: quadrics.Ellipsoids | None = None) -> rt.Tracks:
-    """Noisy boxes of the solids (the chairs), one tracklet each; rows ordered by frame.
-
-    `detection_index` is the object of a row.
-    """
-    solids = solids or chair_solids()
-    boxes = quadrics.solid_boxes(solids, "box", poses.camera.K @ poses.cam_from_world)  # (F, O, 4)
-    boxes = boxes + np.random.default_rng(0).normal(0, 1.0, boxes.shape)
-    frame, obj = np.divmod(np.arange(boxes.shape[0] * len(solids)), len(solids))
-    n = len(frame)
-    xyxy, score = boxes.reshape(-1, 4), np.full(n, 0.9)
-    return rt.Tracks(frame, obj + 1, obj + 1, xyxy, score, np.full(n, CHAIR), obj)
+FRAMES = 120
 
 
 def views_of(table: rt.Tracks, chair: np.ndarray, cosine: float) -> np.ndarray:
@@ -105,8 +69,8 @@ def test_a_chair_that_came_back_under_a_new_identity_is_joined() -> None:
     """Each chair's track is cut in two with a gap; the halves are joined, identical chairs stay
     separate.
     """
-    poses = walk()
-    table = table_of(poses)
+    poses = walk(FRAMES)
+    table = tracks_of(poses)
     table = table[(table.frame < 40) | (table.frame >= 80)]
     ids = table.track_id + 3 * (table.frame >= 80)
     found, events = linked(dataclasses.replace(table, track_id=ids, tracklet_id=ids), poses)
@@ -118,8 +82,8 @@ def test_a_chair_that_came_back_under_a_new_identity_is_joined() -> None:
 
 def test_a_wrong_return_is_split_by_its_position() -> None:
     """The tracker re-identified the third chair as the first one: two positions."""
-    poses = walk()
-    table, chair = table_of(poses), table_of(poses).detection_index
+    poses = walk(FRAMES)
+    table, chair = tracks_of(poses), tracks_of(poses).detection_index
     table = table[((chair == 0) & (table.frame < 50)) | ((chair == 2) & (table.frame > 70))]
     one = np.ones(len(table), np.int64)
     found, events = linked(dataclasses.replace(table, track_id=one), poses)
@@ -130,8 +94,8 @@ def test_a_wrong_return_is_split_by_its_position() -> None:
 @pytest.mark.parametrize("slips", [[60], [40, 80], []])
 def test_a_tracklet_with_an_identity_switch_is_cut_by_position(slips: list[int]) -> None:
     """The tracklet switches to another chair without a missed frame; nothing else is cut."""
-    poses = walk()
-    table = table_of(poses)
+    poses = walk(FRAMES)
+    table = tracks_of(poses)
     table = table[table.detection_index == np.searchsorted(slips, table.frame, "right")]
     one = np.ones(len(table), np.int64)
     found, events = linked(dataclasses.replace(table, track_id=one, tracklet_id=one), poses)
@@ -144,8 +108,8 @@ def test_a_tracklet_with_an_identity_switch_is_cut_by_position(slips: list[int])
 @pytest.mark.parametrize(("gap", "cut"), [(7, True), (4, False)])
 def test_a_tracklet_may_be_another_object_after_a_gap(gap: int, cut: bool) -> None:
     """Its last five frames, too few to be localised, show another chair."""
-    poses = walk()
-    table, last = table_of(poses), 70 + gap
+    poses = walk(FRAMES)
+    table, last = tracks_of(poses), 70 + gap
     first = (table.detection_index == 0) & (table.frame < 70)
     after = (table.detection_index == 2) & (table.frame >= last) & (table.frame < last + 5)
     table = table[first | after]
@@ -158,8 +122,8 @@ def test_objects_seen_together_are_never_joined() -> None:
     """Two tracks of one chair in the same frames (duplicate detections) stay separate by the
     evidence of position and of appearance.
     """
-    poses = walk()
-    table = table_of(poses)
+    poses = walk(FRAMES)
+    table = tracks_of(poses)
     half = table[table.detection_index == 0]
     order = np.argsort(np.tile(half.frame, 2), kind="stable")
     ids = np.repeat([1, 2], len(half))[order]
@@ -175,8 +139,8 @@ def test_moving_classes_keep_the_identities_of_the_tracker() -> None:
 
     Static and moving classes are not joined either.
     """
-    poses = walk()
-    table = table_of(poses)
+    poses = walk(FRAMES)
+    table = tracks_of(poses)
     table = table[(table.detection_index == 0) & ((table.frame < 40) | (table.frame >= 80))]
     ids = 1 + (table.frame >= 80)
     for known in ((poses, None), (None, views_of(table, 0 * ids, 0.5))):
@@ -191,7 +155,7 @@ def test_moving_objects_do_not_take_identities_of_equal_number() -> None:
     """Two chairs that move, and later a person that looks like the first: its tracklet has the
     number of the identity of that chair, and its class is number 0.
     """
-    table = table_of(walk())
+    table = tracks_of(walk(FRAMES))
     table = table[(table.detection_index == 1) | ((table.detection_index == 0) & (
         (table.frame < 40) | (table.frame >= 80)))]  # fmt: skip
     piece = np.where(table.detection_index == 1, 1, 2 * (table.frame >= 80))
@@ -235,7 +199,7 @@ def test_appearance_alone_decides_without_poses(
     tracker: list[int], cosine: float, objects: int, expected: set[str]
 ) -> None:
     """Three chairs, each seen before frame 40 and after frame 80; identities of the tracker."""
-    table = table_of(walk())
+    table = tracks_of(walk(FRAMES))
     table = table[(table.frame < 40) | (table.frame >= 80)]
     chair = table.detection_index
     piece = chair + 3 * (table.frame >= 80)
@@ -297,7 +261,7 @@ def test_similarity_is_calibrated_on_the_video(
     """The returns have a cosine of .8: enough if simultaneous chairs are dissimilar, too little if
     their cosine is .7 or they have different classes, which do not calibrate.
     """
-    table = table_of(walk())
+    table = tracks_of(walk(FRAMES))
     table = table[(table.frame < 40) | (table.frame >= 80)]
     chair = table.detection_index
     ids = 1 + chair + 3 * (table.frame >= 80)

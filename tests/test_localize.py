@@ -173,6 +173,15 @@ def test_gaps_of_an_even_motion_are_filled_and_never_beyond():
         assert np.isnan(refused[0][15:18]).all() and np.isin(refused[1][15:18], "none").all()
 
 
+@pytest.mark.parametrize("count, status", [(15, "interpolated"), (16, "none")])
+def test_up_to_fifteen_frames_are_filled(count, status):
+    """Lost frames, and frames that were not read and a lost one."""
+    lost = np.arange(20, 20 + count)
+    assert (filled(sideways(60), lost)[1][lost] == status).all()
+    frame = np.arange(60) + (count - 1) * (np.arange(60) > 30)
+    assert filled(sideways(60), [30], frame=frame, time_s=np.arange(60) / 30)[1][30] == status
+
+
 def test_a_gap_is_filled_by_time():
     """At an uneven rate: the lost frame comes just after the one before it."""
     moment = 10 * np.arange(40)

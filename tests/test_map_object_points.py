@@ -185,6 +185,39 @@ def test_points_of_a_moved_object_give_its_motion_and_those_of_another_that_it_s
     assert 0.005 < np.sqrt(lamp[2].cov[0, 0]) < 0.02  # 3 px at 3 m: 1.8 cm, uniform
 
 
+def still_lamp(world: World, views: Sequence[ObjectView], scale: int) -> PointMotion:
+    """The motion of the lamp in images that are `scale` times as large."""
+    world.poses.camera = CAMERA.resized((640 * scale, 480 * scale))
+    found = point_motions(world.points, world.states, world.found, views, world.poses, UP)
+    return found[1][2]
+
+
+def test_pixels_of_large_images_are_finer() -> None:
+    """The same noise, relative to the image: the limits of the errors grow with its size."""
+    world = moved_world()
+    views = world.views()
+    fine = [dataclasses.replace(v, xy=4 * v.xy) for v in views]
+    usual = still_lamp(world, views, 1)
+    large = still_lamp(world, fine, 4)
+    assert large.inliers == usual.inliers >= 15
+    np.testing.assert_allclose(large.cov, usual.cov)
+
+
+def test_sigma_of_a_motion_includes_the_errors_of_the_points_of_the_map() -> None:
+    """They are 5 mm, .8 px, in each of the three axes, and common to all images."""
+    squares = []
+    for seed in range(5):
+        world = World(seed)
+        points, code = world.add("radio", PLACE)
+        world.xyz[-1] += world.rng.normal(0, 0.005, points.shape)
+        world.put(points, code, ELSEWHERE)
+        world.find("radio", ELSEWHERE)
+        motion = world.motions()[0][1]
+        error = motion.shift - (ELSEWHERE - PLACE)
+        squares.append(error @ np.linalg.solve(motion.cov, error) / 3)
+    assert 0.12 < np.mean(squares) < 1.5
+
+
 def test_a_few_points_do_not_turn_an_object_over() -> None:
     """Eight of its points are seen as those of an object that lies on its side."""
     turned = Rotation.from_euler("xz", [80, 35], degrees=True).as_matrix()
@@ -271,9 +304,11 @@ def test_features_that_views_have_in_common_become_points_of_the_object() -> Non
     cosine = (found.descriptor * of_true).sum(1)
     cosine /= np.linalg.norm(found.descriptor, axis=1) * np.linalg.norm(of_true, axis=1)
     assert cosine.min() > 0.95
-    middle = invert_rigid(poses().cam_from_world)[:, :, 3].mean(0)
-    ray = found.xyz - middle
+    at = invert_rigid(poses().cam_from_world)[:, :, 3]
+    ray = found.xyz - at.mean(0)
     assert ((ray * found.viewing_ray).sum(1) > 0.95 * np.linalg.norm(ray, axis=1)).all()
+    distance = np.linalg.norm(found.xyz[:, None] - at, axis=2)  # (n, 8)
+    np.testing.assert_allclose(found.distance, np.median(distance, axis=1), rtol=0.02)
     # they need views, and a place inside the object
     assert len(points_of(xyz, code, slice(3))) > 10
     assert len(points_of(xyz, code, slice(2))) == 0

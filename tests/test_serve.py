@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 import pytest
 from browser import Browser
-from front_door.room import ROOM
+from front_door.room import ROOM, SMALL
 from simulated import SIZE, tracks_of, unlinked, walk
 
 import reobj_track as rt
@@ -223,7 +223,7 @@ def two_sessions(tmp_path_factory: pytest.TempPathFactory) -> Path:
         words += ["--start", str(start), "--stop", str(start + 80), "--every", "8"]
         words += ["--detections", str(ROOM / "detections.npz"), "--poses", str(ROOM / "poses.txt")]
         words += ["--camera", "492.7568,492.7568,320,240"]
-        assert rt.main(["run", *words, "--set", "embed.model=none", *WITHOUT_FILM]) == 0
+        assert rt.main(["run", *words, "--set", "embed.model=none", *SMALL, *WITHOUT_FILM]) == 0
     return top
 
 
