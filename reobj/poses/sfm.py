@@ -54,7 +54,7 @@ from reobj.poses.mapping import (
     map_keyframes,
     without_poses,
 )
-from reobj.poses.turning import estimate_turn, pin, turning_model
+from reobj.poses.turning import Turn, estimate_turn, pin, turning_model
 from reobj.poses.verification import FocalSource
 from reobj.types import Array, IntArray
 
@@ -284,10 +284,8 @@ class MappingJob:
         frames = {number: self.frame_of[number] for number in mapped}
         search = MapperSearch(database, frames, pairs, focal, guess, self.seed)
         models, messages, weak, sigma = map_keyframes(search)
-        turn = None
-        if not models:
-            turn = estimate_turn(pairs, camera, self.camera is not None)
-        if turn is not None and not turn.problem:
+        turn = self._turn(models, pairs, camera)
+        if turn is not None:
             models = [turning_model(turn, database)]
             sigma = [turn.spread_rad]
             turned = [self.frame_of[number] for number in turn.ids.tolist()]
@@ -307,6 +305,20 @@ class MappingJob:
         matched = every_pair.image_ids[every_pair.enough]
         unmatched = frozenset(set(ids) - set(matched.ravel().tolist()))
         return Mapped(paths, messages, sigma, unmatched, view_of)
+
+    def _turn(self, models: list[Any], pairs: MatchedPairs, camera: Any) -> Turn | None:
+        """Estimate a turn where the models connect less than half as many pairs of keyframes.
+
+        Args:
+            models: of the mapper. pairs: verified matches of all keyframes. camera: before mapping.
+        """
+        connected = sum(model.num_reg_images() ** 2 for model in models)
+        if 2 * connected >= len(pairs.keypoints) ** 2:
+            return None
+        turn = estimate_turn(pairs, camera, self.camera is not None)
+        if turn is None or turn.problem or 2 * connected >= len(turn.ids) ** 2:
+            return None
+        return turn
 
     def _write(self, model: Any, folder: Path) -> None:
         """Write a model in native pixels with the frames' names and coloured points."""

@@ -291,6 +291,9 @@ class Linker:
         whole = tracklet[np.unique(self.fragment, return_index=True)[1]]  # (L,) of each fragment
         joined = np.zeros(len(first), np.int64)  # (T,)
         for tracklets in rows_by(kind):  # others are never joined
+            if kind[tracklets[0]] < 0:
+                joined[tracklets] = joined.max() + 1
+                continue
             members = np.flatnonzero(np.isin(whole, tracklets))
             of_kind = np.searchsorted(tracklets, whole[members])
             square = np.ix_(members, members)
