@@ -69,6 +69,8 @@ def floor_of(
     largest = poses.of_part(0)
     if up is None:
         return None, "gravity is unknown"
+    if largest.direction_sigma.any():
+        return None, "the cameras have directions only"
     views = np.bincount(largest.visibility[:, 1], minlength=len(largest.points))
     often = views >= 3  # two views may be a false match
     points = largest.points[often] if often.sum() >= MIN_POINTS else largest.points

@@ -96,6 +96,11 @@ def without_poses(problem: str, advice: str = ADVICE) -> str:
     return f"no camera poses: {problem}; {advice}; or give --poses; 2D identities need no poses"
 
 
+# Size of a component with directions only over the largest: it measures nothing, and identities end
+# where it begins; frames of a smaller one join the tracks of their neighbours
+LEAST_TURNING = 0.25
+
+
 def directions_only(frames: str, problem: str) -> str:
     """Report that frames have rotations but no sound positions, and what that means."""
     return (
@@ -181,7 +186,12 @@ class MapperSearch:
                 for c in best
             ]
         sound = [component for component in best if not component.problem]
-        turning = [c for c in best if c.problem and c.direction_sigma]
+        largest = max((c.registered for c in best if not c.problem or c.direction_sigma), default=0)
+        turning = [
+            c
+            for c in best
+            if c.problem and c.direction_sigma and c.registered >= LEAST_TURNING * largest
+        ]
         if not sound and not turning:
             problem = best[0].problem if best else "no pair of keyframes initialises a model"
             advice = (best[0].advice if best else "") or ADVICE
@@ -208,7 +218,7 @@ class MapperSearch:
                 )
         for component in components:
             ids = component.arrays.ids.tolist()
-            if component.direction_sigma:
+            if component.problem and any(component is other for other in kept):
                 lost.append(directions_only(self._range(ids), component.problem))
             elif component.problem and len(ids) >= MIN_IMAGES:
                 lost.append(f"frames {self._range(ids)} have no poses: {component.problem}")
