@@ -140,11 +140,6 @@ def noise(count):
         (lambda walk: walk[:2], "only 2 different views"),
         (lambda walk: noise(6), "no pair of keyframes|keyframes connect"),
         (lambda walk: walk + noise(10), "of 18 keyframes connect"),
-        pytest.param(
-            lambda walk: textured_room(8, 0.005, 4, size=(320, 240))[0],  # turns, hardly moves
-            "camera only rotates|initialises a model|keyframes connect",
-            marks=pytest.mark.slow,
-        ),
     ],
 )
 def test_scenes_without_depth_are_refused_with_a_remedy(walk, tmp_path, images, message):

@@ -180,6 +180,29 @@ def test_pieces_of_another_mapper_count_if_points_connect_them(ends, count, soun
         assert set(found.kept) == {i for end in ends for i in range(*end)}
 
 
+@pytest.mark.parametrize("turn_deg, images", [(0.0, 12), (2.0, 12), (6.0, 11)])
+def test_rotations_of_two_mappers_that_agree_give_directions(turn_deg, images):
+    """The other mapper has one camera elsewhere, turned by an angle."""
+    weak = component(Scene().model(), 0.02)
+    (found,) = confirmed([weak], [component(moved(3.0, turn_deg), 0.02)], FocalSource.MATCHES)
+    assert found.problem and found.is_weak and len(found.kept) == images
+    assert np.radians(0.05) < found.direction_sigma < np.radians(1)
+
+
+def test_rotations_that_differ_give_nothing():
+    weak = component(Scene().model(), 0.02)
+    other = moved(3.0)
+    for number in range(1, 13, 2):
+        image = other.image(number)
+        turned = pycolmap.Rigid3d(pycolmap.Rotation3d([0.2, 0, 0]), np.zeros(3))
+        pose = turned * image.cam_from_world()
+        other.frame(image.frame_id).rig_from_world = pose
+    (found,) = confirmed([weak], [component(other, 0.02)], FocalSource.MATCHES)
+    assert found.problem and found.direction_sigma == 0
+    (sound,) = confirmed([component(Scene().model(), 0.0005)], [], FocalSource.MATCHES)
+    assert not sound.problem and sound.direction_sigma == 0
+
+
 def test_images_missing_in_the_other_mapper_are_dropped():
     weak = component(Scene().model(), 0.002)
     (found,) = confirmed([weak], [piece(1, 11)], FocalSource.MATCHES)
