@@ -167,6 +167,16 @@ def test_moving_objects_do_not_take_identities_of_equal_number() -> None:
     assert objects_of(found, piece) == [[0], [1], [2]]
 
 
+def test_a_moving_tracklet_keeps_two_identities() -> None:
+    table = tracks_of(walk(FRAMES))
+    table = table[table.detection_index == 0]
+    ids = 1 + (table.frame >= 60)
+    kind = np.full(len(table), PERSON)
+    rows = dataclasses.replace(table, track_id=ids, tracklet_id=0 * ids + 1, class_id=kind)
+    found, _ = linked(rows, None, views_of(table, 0 * ids, 0.5), moving=("person",))
+    assert objects_of(found, ids) == [[1], [2]]
+
+
 def test_labels_are_propagated_within_fragments() -> None:
     """From the nearest labelled row of the fragment, unless that frame has the object already."""
     frame = np.array([0, 0, 1, 1, 2, 2, 3, 12, 13])

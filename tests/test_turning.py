@@ -95,7 +95,9 @@ def test_points_are_directions_that_all_their_images_agree_on() -> None:
     local = np.einsum("mij,mj->mi", turn.cam_from_world[turn.image], turn.direction[turn.point])
     xy = turn.camera.img_from_cam(local)
     pairs = matched(truth, np.zeros((36, 3)))
-    measured = [pairs.keypoints[int(turn.ids[i])][k] for i, k in zip(turn.image, turn.keypoint)]
+    measured = [
+        pairs.keypoints[int(turn.ids[i])][k] for i, k in zip(turn.image, turn.keypoint, strict=True)
+    ]
     assert np.median(np.linalg.norm(xy - measured, axis=1)) < 1.0
 
 
