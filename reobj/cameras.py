@@ -301,7 +301,8 @@ class Poses:
         origin = f"{self.source}: {self.reading}" if self.reading else self.source
         turning = int((self.known & (self.direction_sigma[self.part] > 0)).sum())
         if turning:
-            origin += f"; {turning} with directions only" if turning < known else "; directions only"
+            few = f"{turning} with " if turning < known else ""
+            origin += f"; {few}directions only"
         text = f"cameras: {known} of {len(self.frame)} frames ({origin})"
         return f"{text}, {interpolated} interpolated" if interpolated else text
 

@@ -101,7 +101,7 @@ def describe_objects(
 
 
 BORDER_PX = 2  # a box this near to the border is truncated
-GUESSED = "size and distance guessed from the category: the cameras have directions only"
+GUESSED = "distance guessed from the category: the cameras have directions only"
 
 
 def with_directions(objects: Sequence[Object], tracks: Tracks, poses: Poses) -> list[Object]:
@@ -126,7 +126,8 @@ def _direction_fields(found: Object, tracks: Tracks, poses: Poses) -> dict[str, 
     """Return the fields of an object that directions determine, from its own rows of the tracks."""
     fields: dict[str, Any] = {}
     if found.located and "distance guessed" not in found.reason:
-        reason = "; ".join(filter(None, [GUESSED, found.reason]))
+        size = "size and " if found.status == "ok" else ""
+        reason = "; ".join(filter(None, [found.reason, size + GUESSED]))
         fields = {"status": "prior_dominated", "reason": reason}
     row, known = place_of(poses, tracks.frame)
     if not known.any():

@@ -143,8 +143,8 @@ function facts(o) {
   if (second && second[1] >= 0.05) rows.push(["class", Object.entries(o.classes)
     .map(([name, p]) => `${name} ${percent(p)}`).join(", ")]);
   rows.push(["seen", `frames: ${o.frames_seen}, visits: ${o.visits.length}`], ["score", o.score]);
-  if (o.direction && posed.length) rows.push(...directionFacts(o));
   if (o.angular_size_deg) rows.push(["angular size", `${o.angular_size_deg}°`]);
+  if (o.direction && posed.length) rows.push(...directionFacts(o));
   if (o.parallax_deg !== null) rows.push(["parallax", `${o.parallax_deg}°`]);
   if (o.reprojection_iou_median !== null) rows.push(["box overlap", o.reprojection_iou_median]);
   if (o.dropped_boxes) rows.push(["boxes left out", o.dropped_boxes]);
