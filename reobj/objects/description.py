@@ -101,7 +101,7 @@ def describe_objects(
 
 
 BORDER_PX = 2  # a box this near to the border is truncated
-GUESSED = "distance guessed from the category: the cameras have directions only"
+NOT_MEASURED = "distance not measured: the cameras have directions only"
 
 
 def with_directions(objects: Sequence[Object], tracks: Tracks, poses: Poses) -> list[Object]:
@@ -127,7 +127,7 @@ def _direction_fields(found: Object, tracks: Tracks, poses: Poses) -> dict[str, 
     fields: dict[str, Any] = {}
     if found.located and "distance guessed" not in found.reason:
         size = "size and " if found.status == "ok" else ""
-        reason = "; ".join(filter(None, [found.reason, size + GUESSED]))
+        reason = "; ".join(filter(None, [found.reason, size + NOT_MEASURED]))
         fields = {"status": "prior_dominated", "reason": reason}
     row, known = place_of(poses, tracks.frame)
     if not known.any():
