@@ -1294,7 +1294,8 @@ def refit(
         else:
             links = workspace.last_links()
         result = dataclasses.replace(result, edits=corrections)
-        with opened_map(config.map, must_exist=True) as room:
+        placed = last.poses is not None and bool(last.poses.map_id)
+        with opened_map(config.map, must_exist=placed) as room:
             return pipeline.finish(dataclasses.replace(job, room=room), result, links=links)
 
 

@@ -295,10 +295,14 @@ class Poses:
 
     @property
     def cameras_text(self) -> str:
-        """Summarise the number of frames with a pose, its source, and how many are interpolated."""
+        """Summarise the frames with a pose: number, source, grade, how many are interpolated."""
         known = int(self.known.sum())
         interpolated = int((self.known & ~self.measured).sum())
         origin = f"{self.source}: {self.reading}" if self.reading else self.source
+        turning = int((self.known & (self.direction_sigma[self.part] > 0)).sum())
+        if turning:
+            few = f"{turning} with " if turning < known else ""
+            origin += f"; {few}directions only"
         text = f"cameras: {known} of {len(self.frame)} frames ({origin})"
         return f"{text}, {interpolated} interpolated" if interpolated else text
 

@@ -41,6 +41,24 @@ def walk(frames: int = 40, arc_deg: float = 120.0, camera: rt.Camera = CAMERA) -
     return rt.Poses(camera, number, number / 30, poses, status, "user", True, up)
 
 
+def turn(frames: int = 40) -> tuple[rt.Poses, rt.Tracks]:
+    """A camera that turns on one spot past the chairs, twice: directions only; tracks of them.
+
+    The world of the poses has its axes and its origin on the spot, at `SPOT` of the chairs' world.
+    """
+    x = 0.6 * np.sin(np.linspace(0, 4 * np.pi, frames))
+    cams = np.stack([looking_at(SPOT, np.array([to, 0, 0.4])) for to in x])
+    true = dataclasses.replace(walk(frames), cam_from_world=cams)
+    ours = dataclasses.replace(
+        true, cam_from_world=cams * [1, 1, 1, 0], source="pycolmap", metric=False,
+        up_in_world=None, direction_sigma=np.array([0.01]),
+    )  # fmt: skip
+    return ours, tracks_of(true)
+
+
+SPOT = np.array([0, -3.5, 1.6])
+
+
 def chair_solids() -> quadrics.Ellipsoids:
     """Three chairs of .56 x .6 x .82 m in a row."""
     centers = np.array([[-1.1, 0, 0.41], [0, 0.1, 0.41], [1.1, 0, 0.41]])

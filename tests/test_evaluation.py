@@ -11,9 +11,11 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from simulated import SPOT, finished, turn, unlinked
 
 import quadrics
 import reobj_track as rt
+from reobj.cameras import invert_rigid
 from reobj.evaluation.objects import read_true_objects, score_objects
 from reobj.evaluation.tracks import (
     return_ranks,
@@ -316,6 +318,27 @@ def straight(tmp_path: Path, turned: np.ndarray) -> float:
     xyzw = Rotation.from_matrix(turn @ turned).as_quat()
     np.savetxt(path, np.c_[np.arange(12) / 10, centers, xyzw])
     return float(score_objects(result, solids, path, {4: 9})["center_error_median"])
+
+
+def test_a_turn_is_aligned_by_its_rotations(tmp_path: Path) -> None:
+    poses, tracks = turn()
+    result = finished(unlinked(poses, tracks))
+    c2w = np.tile(np.eye(4), (len(poses.frame), 1, 1))  # true world: turned, at SPOT
+    c2w[:, :3] = invert_rigid(poses.cam_from_world)
+    c2w[:, :3, :3] = TURN.T @ c2w[:, :3, :3]
+    c2w[:, :3, 3] = TURN.T @ SPOT
+    np.savetxt(tmp_path / "poses_c2w.txt", c2w.reshape(-1, 16))
+    true = [
+        {"id": o.id, "center": (TURN.T @ (SPOT + o.center)).tolist(), "half_axes": [0.3] * 3,
+         "world_from_obj": np.eye(3).tolist()} for o in result.objects
+    ]  # fmt: skip
+    (tmp_path / "gt_objects.json").write_text(json.dumps({"objects": true}))
+    files = tmp_path / "gt_objects.json", tmp_path / "poses_c2w.txt"
+    found = score_objects(result, *files, {o.id: o.id for o in result.objects})
+    assert found["found"] == 3 and found["scale_error"] is None
+    assert found["center_error_median"] == pytest.approx(0, abs=1e-5)
+    with pytest.raises(rt.ReobjError, match="give --gt-poses"):
+        score_objects(result, files[0], None, {1: 1})
 
 
 def test_3d_needs_cameras(tmp_path: Path) -> None:

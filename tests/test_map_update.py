@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,12 @@ import pytest
 from simulated import (
     CUP,
     chair_solids,
+    finished,
     fitted,
     tracks_of,
+    turn,
+    two_components,
+    unlinked,
     walk,
     with_columns,
 )
@@ -23,7 +28,9 @@ from reobj.maps import update
 from reobj.maps.compare import PointMotion
 from reobj.maps.contents import delete, earlier_sessions, forget
 from reobj.maps.fusion import object_state
+from reobj.maps.placement import DIRECTIONS_ONLY, ComponentPlacement, joined, place
 from reobj.maps.room_map import MapPoints, RoomMap, Session
+from reobj.maps.stage import OpenMap, finish_map, place_recording
 from reobj.maps.update import Recording, add_recording
 from reobj.maps.visibility import visibility_of
 
@@ -278,6 +285,29 @@ def test_the_viewer_gets_the_objects_of_other_recordings(monday, recognised):
     (_, _, third) = earlier_sessions(delete(room, 2), path, "")
     assert [o.id for o in third.objects] == [3] and [c.id for c in third.changes.gone] == [1]
     assert len(earlier_sessions(forget(room, "monday"), path, "content of friday")) == 1
+
+
+def test_a_map_needs_positions(monday, tmp_path):
+    poses, tracks = turn()
+    result = finished(unlinked(poses, tracks))
+    video: Any = SimpleNamespace(source="turn.mp4", has_images=True, config=rt.InputConfig())
+    for room, said in (RoomMap(), "not made: its cameras"), (monday, "the map is unchanged"):
+        opened = OpenMap(tmp_path / "flat.map", room, False)
+        for placed in place_recording(opened, poses, video), None:  # None: a refit
+            found = finish_map(opened, result, video, "reobj", placed)
+            (warning,) = found.warnings
+            assert said in warning and "steps to the side" in warning
+            assert "directions only" in found.changes.refused
+            assert [o.id for o in found.objects] == [o.id for o in result.objects]
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_component_with_directions_only_is_not_placed(monday):
+    poses = dataclasses.replace(two_components(), direction_sigma=np.array([0, 0.02]))
+    components = place(poses, [], monday.points).components
+    assert components[1].refused == DIRECTIONS_ONLY != components[0].refused
+    placed = joined(poses, [ComponentPlacement(5), components[1]], [0])
+    np.testing.assert_array_equal(placed.direction_sigma, [0, 0.02])
 
 
 def test_known_points_are_not_added_again():

@@ -3,18 +3,34 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from simulated import SIZE, chair_solids, fitted, tracks_of, walk, with_columns
+from simulated import (
+    SIZE,
+    SPOT,
+    chair_solids,
+    finished,
+    fitted,
+    tracks_of,
+    turn,
+    two_components,
+    unlinked,
+    walk,
+    with_columns,
+)
 
 import quadrics
 import reobj_track as rt
-from reobj.objects.config import make_fit, mean_box
+from reobj.objects.config import make_fit, mean_box, solve_again
 from reobj.objects.description import describe_objects, describe_world, scores_far_off
+from reobj.objects.fit import link_and_fit
 from reobj.objects.observations import Scene, Views, gather_views
+from reobj.results.entries import validate_objects
 from reobj.types import Existence
 from reobj.words import parse_known_size, parse_up
 
@@ -341,6 +357,56 @@ def test_scores_unlike_those_of_the_confidence_are_reported(
     assert len(texts) == said and all(f"is {score:.2g}, that of" in text for text in texts)
     unsure = [dataclasses.replace(o, confidence=None) for o in chairs.objects]
     assert scores_far_off(dataclasses.replace(result, objects=unsure)) == []
+
+
+# ---- Cameras with directions only ----
+
+
+@pytest.mark.parametrize("solver", ["solids", "lfd"])
+def test_directions_measure_no_object(tmp_path: Path, solver: str) -> None:
+    poses, tracks = turn()
+    config = rt.ObjectsConfig(solver=solver)
+    result = solve_again(link_and_fit(unlinked(poses, tracks), config), config)
+    (part,) = result.world.parts
+    assert part.grade == "directions" and part.direction_sigma_deg == pytest.approx(0.573)
+    assert "40 of 40 frames (pycolmap; directions only)" in result.summary()
+    assert not any(o.status == "ok" for o in result.objects) and len(result.objects) == 3
+    for o, true in zip(result.objects, chair_solids().center_in_world, strict=True):
+        box = tracks.xyxy[tracks.track_id == o.id]
+        longer_px = np.median((box[:, 2:] - box[:, :2]).max(1))
+        assert o.angular_size_deg == pytest.approx(np.degrees(longer_px / 520), rel=0.1)
+        if solver == "solids":
+            away = (true - SPOT) / np.linalg.norm(true - SPOT)
+            assert "distance guessed" in o.reason and o.direction @ away > np.cos(np.radians(1.5))
+        elif o.located:
+            assert o.reason == "size and distance not measured: the cameras have directions only"
+    result.save(tmp_path)
+    assert validate_objects(tmp_path) == []
+    read = rt.Result.load(tmp_path)
+    assert [o.to_json() for o in read.objects] == [o.to_json() for o in result.objects]
+    assert read.world.to_json() == result.world.to_json()
+
+
+def test_files_without_grades_are_read(tmp_path: Path) -> None:
+    finished(unlinked()).save(tmp_path)
+    path = tmp_path / "objects.json"
+    data = json.loads(path.read_text())
+    assert all(o.pop("direction") is o.pop("angular_size_deg") is None for o in data["objects"])
+    for part in data["world"]["parts"]:
+        assert (part.pop("grade"), part.pop("direction_sigma_deg")) == ("positions", 0)
+    path.write_text(json.dumps(data))
+    assert [part.grade for part in rt.Result.load(tmp_path).world.parts] == ["positions"] * 2
+
+
+def test_each_component_has_a_grade() -> None:
+    poses = dataclasses.replace(two_components(), direction_sigma=np.array([0, 0.02]))
+    result = finished(unlinked(poses))
+    assert [part.grade for part in result.world.parts] == ["positions", "directions"]
+    assert {(o.part, o.direction is None, o.status) for o in result.objects} == {
+        (0, True, "ok"), (1, False, "prior_dominated"),
+    }  # fmt: skip
+    assert "(pycolmap; 23 with directions only) in 2 components" in result.summary()
+    assert result.summary().count("frames; directions only") == 1
 
 
 # ---- Boxes in 3D of a detector ----

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from browser import Browser
 from scipy.spatial.transform import Rotation
-from simulated import fitted, into_component
+from simulated import finished, fitted, into_component, turn, unlinked
 
 import quadrics
 import reobj.viewer.scene as scene
@@ -554,6 +554,19 @@ def test_selecting_a_component_updates_everything(
     assert browser.eval("[state.step, $('clock').textContent]") == [63, "frame 63"]
     browser.eval("goTo(3)")  # of the other component
     assert browser.eval(f"[+$('part').value, +$('slider').value, {rows}]") == [0, 3, [1, 2, 3]]
+    assert browser.errors == []
+
+
+def test_a_turn_shows_directions_on_a_phone(browser: Browser, tmp_path: Path) -> None:
+    result = finished(unlinked(*turn()))
+    scene.write_scene(result, Pictures(result, VIDEO), tmp_path / "scene.html", VIDEO)
+    browser.open(tmp_path / "scene.html", 390, 844, phone=True)
+    assert 10 < browser.eval("$('grade').getBoundingClientRect().height") < 20  # one line
+    assert browser.eval("$('grade').innerText").startswith("directions only: sizes and distances")
+    browser.eval("select(here[0])")
+    text = " ".join(browser.eval("$('panel').innerText").split())
+    assert re.search(r"angular size 1[\d.]+° direction 1\d° left of the first view, \d+° down", text)
+    assert re.search(r"distance ≈ [34][.\d]+ m, guessed from the category", text)
     assert browser.errors == []
 
 

@@ -213,6 +213,9 @@ def _ellipsoids_in_truth(
         center = ours.center_in_world @ (scale * turn).T + shift
         axes = turn @ ours.world_from_obj
         solids.append(quadrics.Ellipsoids(center, scale * ours.half_axes, axes))
+        poses = component.poses
+        if poses is not None and poses.is_spot and not poses.metric:
+            continue  # its cameras measure no scale
         if component.world.scale is not None and component.world.scale.value:
             scale_errors[k] = abs(component.world.scale.value / scale - 1)
     if not solids:

@@ -331,6 +331,7 @@ class Similarity:
         return np.concatenate([rotation, moved[:, :, None]], 2)
 
 
+DIRECTIONS_ONLY = "its cameras have directions only, and a map needs their positions"
 NOT_MOVED = Similarity(1.0, np.eye(3), np.zeros(3))
 
 
@@ -521,6 +522,9 @@ def place(
     matcher = PointMatcher(_matched(points), camera, error_px)
     components = list[ComponentPlacement]()
     for k in range(poses.part_count):
+        if poses.direction_sigma[k]:
+            components.append(ComponentPlacement(0, DIRECTIONS_ONLY))
+            continue
         usable = [im for im in features if poses.part[im.row] == k and poses.known[im.row]]
         tried = usable[:: max(1, -(-len(usable) // most))]
         components.append(place_component(poses, tried, matcher))
@@ -551,7 +555,8 @@ def joined(poses: Poses, components: Sequence[ComponentPlacement], placed: Seque
     cam_from_world = poses.cam_from_world.copy()
     points = poses.points.copy()
     component = np.zeros_like(poses.part)
-    for number, k in enumerate(sorted({*range(poses.part_count)} - {*placed}), 1):
+    others = sorted({*range(poses.part_count)} - {*placed})
+    for number, k in enumerate(others, 1):
         component[poses.part == k] = number
     observer, point = poses.visibility.T
     for k in placed:
@@ -561,4 +566,10 @@ def joined(poses: Poses, components: Sequence[ComponentPlacement], placed: Seque
         # unobserved points belong to the only component
         seen = point[rows[observer]] if poses.part_count > 1 else np.arange(len(points))
         points[seen] = similarity.apply(points[seen])
-    return dataclasses.replace(poses, cam_from_world=cam_from_world, points=points, part=component)
+    return dataclasses.replace(
+        poses,
+        cam_from_world=cam_from_world,
+        points=points,
+        part=component,
+        direction_sigma=np.append(0.0, poses.direction_sigma[others]),
+    )

@@ -20,6 +20,7 @@ from reobj.maps.fusion import scale_of
 from reobj.maps.object_points import object_views, triangulated
 from reobj.maps.placement import (
     COMPARED,
+    DIRECTIONS_ONLY,
     MORE,
     ImageFeatures,
     Placement,
@@ -133,7 +134,7 @@ def place_recording(
         size_px: longer side of the images for features.
     """
     room = opened.room
-    if not video.has_images:
+    if not video.has_images or poses.direction_sigma.all():
         return Placed(poses, (), None)
     keyframes = keyframe_rows(poses)
     known = np.flatnonzero(poses.known)
@@ -274,6 +275,8 @@ def _refusal(opened: OpenMap, result: Result, video: Video, placed: Placed | Non
         )
     if result.poses is None or not result.poses.known.any():
         return "the recording has no camera poses"
+    if result.poses.direction_sigma.all():
+        return f"{DIRECTIONS_ONLY}: film again with steps to the side, the objects in view"
     if not video.has_images and placed is not None:
         return "a recording without images cannot be placed in a map"
     if result.poses.map_id != opened.room.map_id:

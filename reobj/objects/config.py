@@ -16,7 +16,7 @@ import numpy as np
 
 import quadrics
 from reobj.cameras import Poses, import_pycolmap
-from reobj.objects.description import describe_objects
+from reobj.objects.description import describe_objects, with_directions
 from reobj.objects.likelihood import name_of
 from reobj.objects.observations import MIN_SCORE, Fit, FrameOptions, Scene, Views, gather_views
 from reobj.results.result import Object, Result
@@ -109,7 +109,6 @@ def make_fit(config: ObjectsConfig, poses: Poses, class_names: Sequence[str]) ->
         given = quadrics.Scale(*poses.scale, "map")
     elif poses.is_spot and not poses.metric:  # any scale explains the boxes: metres by the category
         given = quadrics.Scale(1.0, SPOT_SCALE_SIGMA, "priors")
-    directions_only = bool(poses.direction_sigma.any())
     plain = quadrics.FitConfig(path_where_seen=int(poses.known.sum()) > FrameOptions().all_of)
 
     def fit(views: Views, classes: list[int], scene: Scene) -> quadrics.ObjectFits:
@@ -124,8 +123,6 @@ def make_fit(config: ObjectsConfig, poses: Poses, class_names: Sequence[str]) ->
         )  # fmt: skip
         if by_depth is not None and fits.scale.source == "poses":
             fits = dataclasses.replace(fits, scale=by_depth)
-        if directions_only:
-            fits = _guessed(fits)
         up_is_given = up is not None or scene.up is None
         return fits if up_is_given else dataclasses.replace(fits, up_source="floor")
 
@@ -133,16 +130,6 @@ def make_fit(config: ObjectsConfig, poses: Poses, class_names: Sequence[str]) ->
 
 
 SPOT_SCALE_SIGMA = 0.15  # of the usual sizes of one room (benchmarks/RESULTS.md: .07 to .22)
-
-
-def _guessed(fits: quadrics.ObjectFits) -> quadrics.ObjectFits:
-    """Mark all sizes and distances as guessed: the camera positions do not determine them."""
-    ok = fits.status == "ok"
-    why = "size and distance guessed from the category: the cameras have directions only"
-    reason = [why if good else text for good, text in zip(ok, fits.reason, strict=True)]
-    return dataclasses.replace(
-        fits, status=np.where(ok, "prior_dominated", fits.status), reason=reason
-    )
 
 
 # ---- Boxes in 3D of a detector ----
@@ -276,10 +263,11 @@ def solve_again(result: Result, config: ObjectsConfig) -> Result:
         parallax = np.array([before[i].parallax_deg for i in classes], np.float64)
         fits = _as_fits(ellipsoids, views, parallax, scale, reason)
         confidence = {i: o.confidence for i, o in before.items() if o.confidence is not None}
-        objects += describe_objects(
+        described = describe_objects(
             rows, result.class_names, fits, views, config.min_views, config.moving_classes,
             confidence, component=k, fps=result.video.fps,
         )  # fmt: skip
+        objects += with_directions(described, rows, poses)
     warning = f"objects.solver={solver}: {LIMITS[solver]}"
     return dataclasses.replace(
         result,

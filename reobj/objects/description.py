@@ -5,13 +5,20 @@ The confidence of an object is the probability that it exists and is not a dupli
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 import quadrics
-from reobj.cameras import Poses, quat_wxyz_from_matrix
+from reobj.cameras import (
+    Poses,
+    invert_rigid,
+    place_of,
+    quat_wxyz_from_matrix,
+    undistort_boxes,
+)
 from reobj.files import numbers, rounded, shortened, significant
 from reobj.objects.association import Association
 from reobj.objects.likelihood import CLASS_KEPT, PosedDetections, logit, name_of
@@ -91,6 +98,58 @@ def describe_objects(
             )
         )
     return objects
+
+
+BORDER_PX = 2  # a box this near to the border is truncated
+NOT_MEASURED = "distance not measured: the cameras have directions only"
+
+
+def with_directions(objects: Sequence[Object], tracks: Tracks, poses: Poses) -> list[Object]:
+    """Add direction and angular size to objects of a component whose cameras have directions only.
+
+    None of them is measured: "ok" becomes "prior_dominated", and the reason names the distance.
+
+    Args:
+        tracks: without interpolated boxes. poses: of the component.
+    Returns:
+        the objects; of another component as they are.
+    """
+    if not poses.direction_sigma.any():
+        return list(objects)
+    return [
+        dataclasses.replace(o, **_direction_fields(o, tracks[tracks.track_id == o.id], poses))
+        for o in objects
+    ]
+
+
+def _direction_fields(found: Object, tracks: Tracks, poses: Poses) -> dict[str, Any]:
+    """Return the fields of an object that directions determine, from its own rows of the tracks."""
+    fields: dict[str, Any] = {}
+    if found.located and "distance guessed" not in found.reason:
+        size = "size and " if found.status == "ok" else ""
+        reason = "; ".join(filter(None, [found.reason, size + NOT_MEASURED]))
+        fields = {"status": "prior_dominated", "reason": reason}
+    row, known = place_of(poses, tracks.frame)
+    if not known.any():
+        return fields
+    if found.center is not None:
+        eye = invert_rigid(poses.cam_from_world[row[known]])[:, :, 3].mean(0)
+        away = found.center - eye
+        fields["direction"] = significant(away / np.linalg.norm(away))
+    xyxy = tracks.xyxy[known]
+    far_border = np.array([poses.camera.width, poses.camera.height]) - BORDER_PX
+    whole = (xyxy[:, :2] > BORDER_PX).all(1) & (xyxy[:, 2:] < far_border).all(1)
+    box = undistort_boxes(xyxy[whole] if whole.any() else xyxy, poses.camera)
+    x1, y1, x2, y2 = box.T
+    x = (x1 + x2) / 2
+    y = (y1 + y2) / 2
+    one = np.ones_like(x)
+    ends = np.array([[x1, y, one], [x, y1, one], [x2, y, one], [x, y2, one]]).swapaxes(1, 2)
+    ray = ends @ np.linalg.inv(poses.camera.K).T  # (4, n, 3) to the middle of the edges
+    ray /= np.linalg.norm(ray, axis=2, keepdims=True)
+    chord = np.linalg.norm(ray[:2] - ray[2:], axis=2).max(0)
+    fields["angular_size_deg"] = rounded(np.degrees(2 * np.arcsin(np.median(chord) / 2)), 2)
+    return fields
 
 
 def _likeliest_classes(
@@ -281,6 +340,8 @@ def _describe_component(poses: Poses, component: int, fits: quadrics.ObjectFits 
         scale=scale,
         floor=floor,
         floor_reason=reason,
+        grade="directions" if poses.direction_sigma.any() else "positions",
+        direction_sigma_deg=round(float(np.degrees(poses.direction_sigma[0])), 3),
     )
 
 

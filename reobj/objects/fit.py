@@ -19,7 +19,12 @@ import quadrics
 from reobj.cameras import Poses, place_of
 from reobj.objects.component import associate_component, find_floor
 from reobj.objects.config import ObjectsConfig, make_fit, with_given_boxes
-from reobj.objects.description import describe_objects, describe_world, identities_confidence
+from reobj.objects.description import (
+    describe_objects,
+    describe_world,
+    identities_confidence,
+    with_directions,
+)
 from reobj.objects.likelihood import name_of, on_floor
 from reobj.objects.observations import (
     MIN_SCORE,
@@ -516,6 +521,8 @@ def _fit_component(
         tracks, class_names, fits, views, config.min_views, config.moving_classes,
         linked.confidence, number, view_count, fps,
     )  # fmt: skip
+    if poses is not None:
+        described = with_directions(described, tracks, poses)
     if fits is not None and views is not None and poses is not None:
         inlier = np.zeros((int(poses.known.sum()), fits.inlier.shape[1]), bool)
         inlier[np.isin(poses.frame[poses.known], views.frame)] = fits.inlier

@@ -101,6 +101,9 @@ class Object:
         tracklet_ids: its unbroken tracks.
         visits: first and last frame of each time in view, by time (`visits_of`).
         part: component of the trajectory (`Poses.part`), whose world and units its lengths are in.
+        direction: (3,) unit vector in world from the mean of the cameras that saw it to its centre;
+            angular_size_deg: of the longer side of its boxes, median. Both only where the grade of
+            the component is "directions".
     """
 
     id: PositiveInt
@@ -128,6 +131,8 @@ class Object:
     part: NonNegativeInt = 0
     confidence: FiniteFloat | None = None
     classes: dict[str, FiniteFloat] = field(default_factory=dict)
+    direction: Vector | None = None
+    angular_size_deg: FiniteFloat | None = None
 
     def __post_init__(self) -> None:
         """Check the shape."""
@@ -236,6 +241,8 @@ class Part:
         spans: first and last frame of each unbroken run of its frames; frames: their number.
         registered_frames, interpolated_frames: frames with an estimated, an interpolated pose.
         up_in_world, up_source, scale, floor, floor_reason: as in `World`.
+        grade: of the cameras: "positions", or "directions": only directions of objects are known,
+            with direction_sigma_deg; sizes and distances rest on the category.
     """
 
     spans: Spans
@@ -247,6 +254,8 @@ class Part:
     scale: quadrics.Scale | None = None
     floor: Floor | None = None
     floor_reason: str = ""
+    grade: Annotated[str, msgspec.Meta(pattern="^(positions|directions)$")] = "positions"
+    direction_sigma_deg: FiniteFloat = 0.0
 
     @property
     def span_text(self) -> str:

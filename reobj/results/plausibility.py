@@ -59,6 +59,8 @@ def _nothing_measured(result: Result, still: Sequence[Object]) -> str:
     measured = any(o.status == "ok" or (o.parallax_deg or 0.0) >= 10.0 for o in still)
     if poses is None or not poses.known.any() or measured or len(still) < 3:
         return ""
+    if poses.direction_sigma.all():  # a message of the poses says why
+        return ""
     cameras = "" if poses.source == "user" else "--camera (intrinsics), --poses, or "
     return (
         f"none of the {len(still)} listed objects is measured (status ok; see their reasons): walk "

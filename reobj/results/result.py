@@ -180,7 +180,8 @@ class Result:
         if self.poses is None or self.poses.part_count == 1:
             return self
         facts = self.world.parts[part]
-        shared = {f.name for f in dataclasses.fields(Part)} - {"spans"}
+        own = {"spans", "grade", "direction_sigma_deg"}
+        shared = {f.name for f in dataclasses.fields(Part)} - own
         component = {name: getattr(facts, name) for name in shared}
         return dataclasses.replace(
             self,
@@ -566,7 +567,8 @@ def _cameras(result: Result) -> list[str]:
         found = found_text(o for o in result.objects if o.part == k)
         frames = f"{component.registered_frames} of {component.frames} frames"
         scale_text = f"; scale {_scale_text(component.scale)}" if component.scale else ""
-        texts.append(f"component {k}: {component.span_text}; {frames}; {found}{scale_text}")
+        grade = "; directions only" * (component.grade == "directions")
+        texts.append(f"component {k}: {component.span_text}; {frames}{grade}; {found}{scale_text}")
     return [f"{result.poses.cameras_text} in {count}", *_lines(texts)]
 
 

@@ -414,6 +414,7 @@ def _scene_component(number: int, component: Result, thin: int) -> dict[str, Any
         "name": f"component {number}: {spans}; {count}",
         "facts": _scene_facts(component.world),
         "scale": component.world.to_json()["scale"],
+        "directions_only": any(p.grade == "directions" for p in component.world.parts),
     }
     if poses is None or not poses.known.any():
         return facts | {"points": "", "colors": "", "up": [0, 0, 1]}

@@ -47,8 +47,9 @@ const hue = (id) => {                            // `object_color` in types.py
   return [5, 3, 1].map((n) => { const k = (n + 6 * (id * 0.381966 % 1)) % 6;
     return Math.round(v - v * s * Math.max(0, Math.min(k, 4 - k, 1))); });
 };
-const sure = (o) => o.status !== "doubtful" ? {} : { status: o.center ? "ok" : "tracked", reason: "" };
-const NO_SOLID = { center: null, half_axes: null, size: null, size_m: null, sides: [],
+const sure = (o) => o.status !== "doubtful" ? {}
+  : { status: o.direction ? "prior_dominated" : o.center ? "ok" : "tracked", reason: "" };
+const NO_SOLID = { center: null, direction: null, half_axes: null, size: null, size_m: null, sides: [],
   status: "tracked", reason: SERVED ? "its shape is fitted by Save" : "its shape is fitted by objects OUT --edits" };
 
 const APPLY = {

@@ -117,6 +117,15 @@ function evidence(link) {
     + (link.kept ? "" : "; undone: one solid does not fit the boxes of both");
 }
 
+function directionFacts(o) {                     // of cameras that turn on one spot
+  const away = level.turn(o.direction), spot = [0, 1, 2].map((i) => quantile(posed.map((c) => c.at[i]), 0.5));
+  const [first, now] = [posed[0].forward, away].map(([x, y]) => Math.atan2(y, x));
+  const turned = (180 / Math.PI * (first - now) + 540) % 360 - 180, up = 180 / Math.PI * Math.asin(away[2]);
+  return [["direction", `${Math.abs(turned).toFixed()}° ${turned < 0 ? "left" : "right"} of the first view, `
+    + `${Math.abs(up).toFixed()}° ${up < 0 ? "down" : "up"}`],
+  ["distance", `≈ ${length(Math.hypot(...add(level.place(o.center), spot, -1)), level.metres)}, guessed from the category`]];
+}
+
 function facts(o) {
   const { scale } = S.parts[o.part], unitName = unitOf(o.size_m), sides = sidesOf(o);
   const rows = o.then ? [["recording", `${o.then.name}, ${dateOf(o.then)} UTC`], ["now", nowOf(o)]]
@@ -134,6 +143,8 @@ function facts(o) {
   if (second && second[1] >= 0.05) rows.push(["class", Object.entries(o.classes)
     .map(([name, p]) => `${name} ${percent(p)}`).join(", ")]);
   rows.push(["seen", `frames: ${o.frames_seen}, visits: ${o.visits.length}`], ["score", o.score]);
+  if (o.angular_size_deg) rows.push(["angular size", `${o.angular_size_deg}°`]);
+  if (o.direction && posed.length) rows.push(...directionFacts(o));
   if (o.parallax_deg !== null) rows.push(["parallax", `${o.parallax_deg}°`]);
   if (o.reprojection_iou_median !== null) rows.push(["box overlap", o.reprojection_iou_median]);
   if (o.dropped_boxes) rows.push(["boxes left out", o.dropped_boxes]);

@@ -25,6 +25,7 @@ function enter(part) {                           // show one part of the cameras
   posed = cams.filter(Boolean);
   $("part").value = part;
   $("facts").textContent = S.parts[part].facts;
+  $("grade").hidden = !S.parts[part].directions_only;
   $("slider").max = Math.max(steps.length - 1, 0);
   $("slider").value = 0;
   $("clock").textContent = "";
