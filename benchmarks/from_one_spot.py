@@ -16,8 +16,8 @@ detector. Clips and results that lie in OUT already (SEED-SWAY/, SEED-SWAY/out/)
     positions, directions   frames of the two grades with a camera, of `frames`
     rotation, max   error of the orientations after the best common rotation, median and maximum,
               deg; as ATE that of the worst component
-    ATE       root mean square error of the centres after a similarity, cm; a component whose cameras
-              have one position is moved only
+    ATE       root mean square error of the centres after a similarity, cm; a component whose
+              cameras have one position is moved only
 """
 
 from __future__ import annotations
