@@ -30,12 +30,15 @@ the truth, at the same scale throughout; it is the similarity with the most inli
 is
     whole     right, in one component with (nearly) every frame
     partly    right, in several components or with frames without a pose
-    refused   without poses
+    refused   without positions
     said      wrong, but messages list all wrong frames by number
     passed    wrong otherwise: some component contains wrong frames, without a message
 A shuffled set that is reconstructed correctly is no failure, and neither is a detected corruption.
 A component whose true cameras do not move is judged by its orientations alone. Interpolated frames,
 which are marked, are not judged.
+Components of which only directions are known (Poses.direction_sigma) do not enter this verdict: an
+orientation is right within 3 deg after the best common rotation, and such a component is wrong if
+half of its orientations are not.
 """
 
 from __future__ import annotations
@@ -64,6 +67,7 @@ from rendering.config import RoomConfig
 from rendering.photograph import render_clip
 from rendering.room import make_room
 from tables import table
+from truth import rotation_errors
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import reobj_track as rt
@@ -88,6 +92,7 @@ LEAST_EXTENT = 0.05  # of that path over all of its world's: below it a componen
 # by no more than .05 of its extent, which MAX_CENTRE lets pass.
 MAX_SCALE_JUMP = 1.35
 MAX_TURN_DEG = 10.0  # error of an orientation; good recordings stay below 3 in the median
+MAX_DIRECTION_DEG = 3.0  # error of an orientation where only directions are known
 STRAY_SHARE = 0.05  # of a component's frames, at least one, may be strays: counted, no break
 WHOLE_SHARE = 0.9  # of the frames in one component: whole
 
@@ -205,11 +210,13 @@ class Verdict:
 
     Attributes:
         outcome: whole, partly, refused, said or passed (head of this file).
-        posed: fraction of the frames that have a pose. right: frames whose pose is right.
-        components: number of those with poses. strays: frames off their component that are too few
-        to be a break. wrong: numbers of frames that do not belong to their component.
+        posed: fraction of the frames that have a pose, be it a direction. right: frames whose pose
+        is right. components: number of those with positions. strays: frames off their component
+        that are too few to be a break. wrong: numbers of frames that do not belong to it.
         centre, turn_deg: their median errors (of all frames, if none is wrong), centres over the
-        extent of the component. look: what to look at.
+        extent of the component. look: what to look at. directions: frames of which only directions
+        are known; directions_off: of them, those that are wrong; directions_deg: the largest median
+        error of the orientations of such a component.
     """
 
     outcome: str
@@ -221,6 +228,9 @@ class Verdict:
     centre: float
     turn_deg: float
     look: str
+    directions: int = 0
+    directions_off: int = 0
+    directions_deg: float = 0.0
 
 
 def judge(poses: rt.Poses, truth: Array, world: IntArray, noise: float = 0.0) -> Verdict:
@@ -234,6 +244,7 @@ def judge(poses: rt.Poses, truth: Array, world: IntArray, noise: float = 0.0) ->
     posed = poses.known & (poses.status != "interpolated")
     wrong, strays, looks, right = list[int](), 0, list[str](), [0]
     errors, bad_errors = list[Array](), list[Array]()
+    directions = list[Array]()  # errors, degrees, by component
     for component in np.unique(poses.part[posed]):
         rows = np.flatnonzero(posed & (poses.part == component))
         rows = rows[np.isfinite(truth[poses.frame[rows]]).all((1, 2))]
@@ -243,6 +254,10 @@ def judge(poses: rt.Poses, truth: Array, world: IntArray, noise: float = 0.0) ->
         at = np.unique(world[frame], return_counts=True)
         own = world[frame] == at[0][at[1].argmax()]
         error, turn = np.full(len(rows), np.inf), np.full(len(rows), 180.0)
+        if poses.direction_sigma[component] > 0:
+            turn[own] = rotation_errors(poses.cam_from_world[rows[own]], truth[frame[own]])
+            directions.append(turn)
+            continue
         pair, scale = (poses.cam_from_world[rows[own]], truth[frame[own]]), np.ones(len(rows))
         of_world = np.isfinite(truth).all((1, 2)) & (world == at[0][at[1].argmax()])
         least = max(LEAST_EXTENT * extent_of(truth[of_world]), noise / MAX_CENTRE, 1e-9)
@@ -259,16 +274,23 @@ def judge(poses: rt.Poses, truth: Array, world: IntArray, noise: float = 0.0) ->
             bad_errors.append(errors[-1][:, ~good])
             looks.append(describe(int(component), frame, own, good, errors[-1]))
     known = np.isfinite(truth).all((1, 2)).sum()
+    turns = np.concatenate([*directions, np.empty(0)])
+    off = int((turns > MAX_DIRECTION_DEG).sum())
+    worst = round(max((float(np.median(turn)) for turn in directions), default=0.0), 2)
+    grade = (len(turns), off, worst)
     if not errors:
-        return Verdict("refused", 0.0, 0, 0, 0, (), 0.0, 0.0, "; ".join(poses.messages)[:200])
+        look = "; ".join(poses.messages)[:200]
+        return Verdict("refused", float(poses.known.mean()), 0, 0, 0, (), 0.0, 0.0, look, *grade)
     middle = np.median(np.concatenate(bad_errors or errors, 1), axis=1)
     outcome = "whole" if max(right) >= WHOLE_SHARE * known else "partly"
     if wrong:
-        outcome = "said" if set(wrong) <= named_frames(poses.messages) else "passed"
+        said = [text for text in poses.messages if "directions only" not in text]
+        outcome = "said" if set(wrong) <= named_frames(said) else "passed"
         looks += [f"messages: {poses.messages}"]
     return Verdict(
         outcome, float(poses.known.mean()), sum(right), len(errors), strays, tuple(wrong),
         round(float(min(middle[0], 999)), 4), round(float(middle[1]), 2), "; ".join(looks),
+        *grade,
     )  # fmt: skip
 
 
@@ -905,9 +927,25 @@ def summary(lines: Sequence[dict[str, Any]]) -> str:
     passed = sum(line["outcome"] == "passed" for line in broken)
     text += ["", f"passed as good though wrong: {passed} of {len(broken)}; good recordings refused "
              f"or torn: {lost} of {len(good)}"]  # fmt: skip
+    text.append(grades(lines))
     for line in (line for line in lines if failed(line)):
         text.append(f"- {line['case']}: {line.get('what', '')}: {line['outcome']}: {line['look']}")
     return "\n".join(text)
+
+
+def grades(lines: Sequence[dict[str, Any]]) -> str:
+    """Say how many cases have frames of each grade, and how many of them are wrong."""
+    judged = [line for line in lines if line["outcome"] != "crashed"]
+    positions = [line for line in judged if line["components"]]
+    wrong = sum(bool(line["wrong"]) for line in positions)
+    turned = [line for line in judged if line["directions"]]
+    off = [line["case"] for line in turned if line["directions_deg"] > MAX_DIRECTION_DEG]
+    frames = [sum(line[key] for line in turned) for key in ("directions_off", "directions")]
+    return (
+        f"cases with positions: {len(positions)}, wrong {wrong}; with directions: {len(turned)}, "
+        f"wrong {len(off)} {off}, {frames[0]} of their {frames[1]} frames by more than "
+        f"{MAX_DIRECTION_DEG:.0f} deg"
+    )
 
 
 if __name__ == "__main__":

@@ -244,6 +244,20 @@ def similarity(points: Array, target: Array) -> tuple[float, Array, Array]:
     return scale, turn, target.mean(0) - scale * turn @ points.mean(0)
 
 
+def rotation_errors(found: Array, truth: Array) -> Array:
+    """Return the errors (n,) of orientations, degrees, after the common rotation of most of them.
+
+    Args:
+        found, truth: cam_from_world (n, 3, 3) or (n, 3, 4), n >= 1.
+    """
+    relative = Rotation.from_matrix(truth[:, :, :3].swapaxes(1, 2) @ found[:, :, :3])
+    turn = relative.as_matrix().reshape(-1, 9)
+    apart = np.arccos(((turn @ turn.T - 1) / 2).clip(-1, 1))  # (n, n) rad
+    middle = apart[np.median(apart, axis=1).argmin()]
+    common = relative[middle <= 2 * np.median(middle) + 1e-6].mean()
+    return np.asarray(np.degrees((common.inv() * relative).magnitude()))
+
+
 @dataclass(frozen=True)
 class Cameras:
     """Camera centres beside the truth: errors in its units, and the similarity to its world."""

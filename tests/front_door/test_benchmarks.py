@@ -1,4 +1,4 @@
-"""benchmarks/truth.py: scores of hand-made results."""
+"""Scores of the benchmarks for hand-made results."""
 
 from __future__ import annotations
 
@@ -7,6 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import truth as scores
+from from_one_spot import score_identities
+from pose_breaks import judge
+from scipy.spatial.transform import Rotation
+
+import reobj_track as rt
 
 
 def output(rows: list[list[float]], names: dict[int, str]) -> scores.Output:
@@ -52,3 +57,34 @@ def test_cameras_and_solids_by_hand() -> None:
     assert scores.score_solids([far], output, cameras.truth_from_ours).found == 0
     late = scores.score_cameras(output, {k + 1: v for k, v in enumerate(true)}, own=True)
     assert late is not None and late.median > 0.3
+
+
+def test_returns_and_the_ceiling_of_idf1_by_hand() -> None:
+    """An object has four visits: found as 7, as 8 and as 7 again; the last has no recorded box."""
+    frames = [0, 1, 2, 15, 16, 17, 30, 31, 43, 44, 45]  # 12 frames between 17 and 30, not 31 and 43
+    ids = [7, 7, 8, 8, 8, 7, 7, 7, 7, 7, 7]
+    box = [10.0, 10, 30, 30]
+    truth = np.array([[f, 1, *box] for f in [*frames, 60]], float)
+    tracks = np.array([[f, i, *box] for f, i in zip(frames, ids, strict=True)], float)
+    boxes = np.array([[f, 0, *box] for f in frames] + [[0, 0, 90, 10, 110, 30]], float)
+    found = score_identities(truth, boxes, tracks)
+    assert found == {"ceiling": 2 * 11 / (12 + 11), "returns": 2, "kept": 1}
+
+
+def test_rotations_of_a_component_of_directions_are_judged_apart_from_positions() -> None:
+    """Eight frames have sound positions; of twelve with directions only, four are 20 deg off."""
+    rng = np.random.default_rng(0)
+    truth = np.zeros((20, 3, 4))
+    truth[:, :, :3] = Rotation.random(20, random_state=1).as_matrix()
+    truth[:, :, 3] = rng.normal(size=(20, 3))
+    cams = truth.copy()
+    cams[8:, :, :3] = truth[8:, :, :3] @ Rotation.random(random_state=2).as_matrix()
+    cams[8:, :, 3] = 0
+    cams[16:, :, :3] = Rotation.from_euler("z", 20, degrees=True).as_matrix() @ cams[16:, :, :3]
+    camera = rt.Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
+    part = np.repeat([0, 1], [8, 12])
+    poses = rt.Poses(camera, np.arange(20), np.arange(20.0), cams, np.full(20, "registered"),
+                     "pycolmap", part=part, direction_sigma=np.array([0, 0.01]))  # fmt: skip
+    found = judge(poses, truth, np.zeros(20, np.int64))
+    assert (found.outcome, found.right, found.wrong, found.components) == ("partly", 8, (), 1)
+    assert (found.directions, found.directions_off, found.directions_deg) == (12, 4, 0)
