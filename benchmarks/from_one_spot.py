@@ -40,7 +40,6 @@ from scipy.spatial.transform import Rotation, Slerp
 from tables import table
 from truth import Array, IntArray, Output, rotation_errors, similarity
 
-sys.path.insert(0, str(ROOT))
 import reobj_track as rt
 from reobj.results.entries import visits_of
 from reobj.types import box_iou
