@@ -12,8 +12,8 @@ detector. Clips and results that lie in OUT already (SEED-SWAY/, SEED-SWAY/out/)
               with perfect identities. Projected objects, which `run` adds where a box is missing,
               can exceed it
     returns   visits of a true object after 12 or more frames out of view; kept: most of the boxes
-              have the identity of most of its first visit; unlisted: one of the two has none. Visits
-              without a recorded box are left out
+              have the identity of most of its first visit; unlisted: one of the two has none.
+              Visits without a recorded box are left out
     positions, directions   frames of the two grades with a camera, of `frames`
     rotation, max   error of the orientations after the best common rotation, median and maximum,
               deg; as ATE that of the worst component
