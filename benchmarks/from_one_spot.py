@@ -12,7 +12,8 @@ detector. Clips and results that lie in OUT already (SEED-SWAY/, SEED-SWAY/out/)
               with perfect identities. Projected objects, which `run` adds where a box is missing,
               can exceed it
     returns   visits of a true object after 12 or more frames out of view; kept: most of the boxes
-              have the identity of most of its first visit. Visits without recorded box are left out
+              have the identity of most of its first visit; unlisted: one of the two has none.
+              Visits without a recorded box are left out
     positions, directions   frames of the two grades with a camera, of `frames`
     rotation, max   error of the orientations after the best common rotation, median and maximum,
               deg; as ATE that of the worst component
@@ -40,7 +41,6 @@ from scipy.spatial.transform import Rotation, Slerp
 from tables import table
 from truth import Array, IntArray, Output, rotation_errors, similarity
 
-sys.path.insert(0, str(ROOT))
 import reobj_track as rt
 from reobj.results.entries import visits_of
 from reobj.types import box_iou
@@ -66,7 +66,7 @@ def score_identities(truth: Array, boxes: Array, tracks: Array) -> Row:
     """Compute the ceiling of IDF1 and the returns; boxes: recorded, all as of `matches`."""
     detected = matches(truth, boxes)[0]
     row, found = matches(truth, tracks)
-    returns = kept = 0
+    returns = kept = unlisted = 0
     for identity in np.unique(truth[:, 1]):
         own = truth[:, 1] == identity
         mains = list[int]()  # main identity of each visit, -1 without
@@ -78,8 +78,9 @@ def score_identities(truth: Array, boxes: Array, tracks: Array) -> Row:
             mains.append(int(np.bincount(ids).argmax()) if len(ids) else -1)
         returns += max(len(mains) - 1, 0)
         kept += sum(main == mains[0] >= 0 for main in mains[1:])
+        unlisted += sum(min(main, mains[0]) < 0 for main in mains[1:])
     ceiling = 2 * len(detected) / (len(truth) + len(detected))
-    return {"ceiling": ceiling, "returns": returns, "kept": kept}
+    return {"ceiling": ceiling, "returns": returns, "kept": kept, "unlisted": unlisted}
 
 
 def parts(poses: rt.Poses, times: Array, truth: Array) -> Iterator[Row]:

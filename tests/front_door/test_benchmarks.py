@@ -68,7 +68,10 @@ def test_returns_and_the_ceiling_of_idf1_by_hand() -> None:
     tracks = np.array([[f, i, *box] for f, i in zip(frames, ids, strict=True)], float)
     boxes = np.array([[f, 0, *box] for f in frames] + [[0, 0, 90, 10, 110, 30]], float)
     found = score_identities(truth, boxes, tracks)
-    assert found == {"ceiling": 2 * 11 / (12 + 11), "returns": 2, "kept": 1}
+    counts = {"returns": 2, "kept": 1, "unlisted": 0}
+    assert found == {"ceiling": 2 * 11 / (12 + 11)} | counts
+    late = score_identities(truth, boxes, tracks[tracks[:, 0] > 2])
+    assert (late["returns"], late["kept"], late["unlisted"]) == (2, 0, 2)
 
 
 def test_rotations_of_a_component_of_directions_are_judged_apart_from_positions() -> None:
