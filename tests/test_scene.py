@@ -565,7 +565,8 @@ def test_a_turn_shows_directions_on_a_phone(browser: Browser, tmp_path: Path) ->
     assert browser.eval("$('grade').innerText").startswith("directions only: sizes and distances")
     browser.eval("select(here[0])")
     text = " ".join(browser.eval("$('panel').innerText").split())
-    assert re.search(r"angular size 1[\d.]+° direction 1\d° left of the first view, \d+° down", text)
+    seen = r"angular size 1[\d.]+° direction 1\d° left of the first view, \d+° down"
+    assert re.search(seen, text)
     assert re.search(r"distance ≈ [34][.\d]+ m, guessed from the category", text)
     assert browser.errors == []
 
