@@ -286,7 +286,8 @@ class MappingJob:
         models, messages, weak, sigma = map_keyframes(search)
         turn = self._turn(models, pairs, camera)
         if turn is not None:
-            models = [turning_model(turn, database)]
+            model, moves = turning_model(turn, database)
+            models = [model]
             sigma = [turn.spread_rad]
             turned = [self.frame_of[number] for number in turn.ids.tolist()]
             cause = f"the camera turns on one spot ({turn.quality})"
@@ -296,7 +297,7 @@ class MappingJob:
             repeated = [i for i in ids if view_of[i] in inside and view_of[i] != i]
             added = register(model, database, [*repeated, *weak], self.seed)
             weak = [number for number in weak if number not in added]
-            if turn is not None:
+            if turn is not None and not moves:
                 pin(model)
         new = Path(tempfile.mkdtemp(dir=folder))
         paths = [new / str(k) for k in range(len(models))]

@@ -25,9 +25,10 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
 from reobj.cameras import import_pycolmap
-from reobj.poses.bundle import FOCAL_RANGE, unit_rows
+from reobj.poses.bundle import FOCAL_RANGE, read_arrays, refine, unit_rows
 from reobj.poses.features import MatchedPairs
 from reobj.poses.mapping import posed
+from reobj.poses.verification import MIN_PARALLAX_PX, measure_parallax_px
 from reobj.types import Array, IntArray, rows_by
 
 PAIR_MATCHES = 60  # of a pair that are used; more change no rotation by .01 deg
@@ -127,8 +128,23 @@ def estimate_turn(pairs: MatchedPairs, camera: Any, is_given: bool) -> Turn | No
     return _measure(pairs, matches, rotation, np.sort(order), camera, focal_sigma)
 
 
-def turning_model(turn: Turn, database: Path) -> Any:
-    """Make a `pycolmap.Reconstruction` of a turn: all cameras at 0, points at RADIUS."""
+def turning_model(turn: Turn, database: Path) -> tuple[Any, bool]:
+    """Make a `pycolmap.Reconstruction` of a turn.
+
+    A bundle adjustment finds the sway of the hand and the depths if it starts at equal depths, with
+    the rotations of the turn. Ref: Yu and Gallup, CVPR 2014.
+
+    Returns:
+        the model; False: without parallax, all cameras are at 0, and points at RADIUS.
+    """
+    model = _at_one_place(turn, database)
+    refine(model)
+    moves = measure_parallax_px(read_arrays(model)) >= MIN_PARALLAX_PX
+    return (model, True) if moves else (_at_one_place(turn, database), False)
+
+
+def _at_one_place(turn: Turn, database: Path) -> Any:
+    """Make a model of a turn with all cameras at 0, and points at RADIUS."""
     pc = import_pycolmap()
     pose = np.concatenate([turn.cam_from_world, np.zeros((len(turn.ids), 3, 1))], 2)
     ids = turn.ids.tolist()
