@@ -25,10 +25,10 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
 from reobj.cameras import import_pycolmap
-from reobj.poses.bundle import FOCAL_RANGE, read_arrays, refine, unit_rows
+from reobj.poses.bundle import FOCAL_RANGE, refine, unit_rows
 from reobj.poses.features import MatchedPairs
 from reobj.poses.mapping import posed
-from reobj.poses.verification import MIN_PARALLAX_PX, measure_parallax_px
+from reobj.poses.verification import MIN_PARALLAX_PX
 from reobj.types import Array, IntArray, rows_by
 
 PAIR_MATCHES = 60  # of a pair that are used; more change no rotation by .01 deg
@@ -138,9 +138,10 @@ def turning_model(turn: Turn, database: Path) -> tuple[Any, bool]:
         the model; False: without parallax, all cameras are at 0, and points at RADIUS.
     """
     model = _at_one_place(turn, database)
-    refine(model)
-    moves = measure_parallax_px(read_arrays(model)) >= MIN_PARALLAX_PX
-    return (model, True) if moves else (_at_one_place(turn, database), False)
+    moves = bool(turn.spread_rad * turn.camera.mean_focal_length() >= MIN_PARALLAX_PX)
+    if moves:
+        refine(model)
+    return model, moves
 
 
 def _at_one_place(turn: Turn, database: Path) -> Any:

@@ -460,7 +460,7 @@ def measured(
     points = len(arrays.xyz)
     seen = np.median(np.bincount(arrays.image, minlength=max(images, 1)))
     angle_deg = _median_tri_angle_deg(arrays)
-    parallax_px = measure_parallax_px(arrays)
+    parallax_px = _parallax_px(arrays)
     focal = arrays.focal_over_size
     # at a wrong focal length a translation along a wall looks like a rotation
     calibrated = focal_source is FocalSource.MODEL
@@ -605,7 +605,7 @@ def _median_tri_angle_deg(arrays: ModelArrays) -> float:
     return float(np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1))))
 
 
-def measure_parallax_px(arrays: ModelArrays) -> float:
+def _parallax_px(arrays: ModelArrays) -> float:
     """Return the parallax that rotations of the camera cannot explain, px.
 
     Of each pair of images the rays of the shared points are aligned by a rotation; the median
