@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import itertools
+from pathlib import Path
 
 import numpy as np
 import pytest
+from point_worlds import PointWorld
 from scipy.spatial.transform import Rotation
 
 from reobj.poses.features import MatchedPairs
-from reobj.poses.turning import Turn, estimate_turn
+from reobj.poses.turning import Turn, estimate_turn, pin, turning_model
 
 pycolmap = pytest.importorskip("pycolmap")
 FOCAL_PX = 500.0
@@ -118,6 +120,31 @@ def test_images_that_do_not_connect_are_left_out() -> None:
     turn = estimate_turn(pairs_of(pairs, both), camera_of(FOCAL_PX), True)
     assert turn is not None and turn.ids.tolist() == list(range(1, 21))
     assert estimate_turn(pairs_of(pairs, both & False), camera_of(FOCAL_PX), True) is None
+
+
+@pytest.mark.parametrize("sway_m", [0.0, 0.03])
+def test_a_bundle_adjustment_from_the_turn_finds_the_sway(sway_m: float, tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    ray = rng.normal(size=(2500, 3))
+    points = ray / np.linalg.norm(ray, axis=1, keepdims=True) * rng.uniform(1.5, 4, (2500, 1))
+    rotation = full_turn()
+    centre = rng.normal(0, sway_m, (36, 3))
+    cams = np.concatenate([rotation, -rotation @ centre[:, :, None]], 2)
+    world = PointWorld(cams, points)
+    pairs = world.pairs(reach=35)
+    world.write(tmp_path / "database.db", range(1, 37), pairs)
+    turn = estimate_turn(pairs, world.camera.to_pycolmap(), True)
+    assert turn is not None
+    model, moves = turning_model(turn, tmp_path / "database.db")
+    assert moves == bool(sway_m) and model.num_reg_images() == 36 and len(model.points3D) > 500
+    found = np.array([model.image(i).projection_center() for i in range(1, 37)])
+    if not sway_m:
+        np.testing.assert_array_equal(found, np.zeros((36, 3)))
+        return
+    similarity = pycolmap.estimate_sim3d(found, centre)
+    assert np.sqrt(((similarity * found - centre) ** 2).sum(1).mean()) < 0.1 * sway_m
+    pin(model)
+    assert not np.array([model.image(i).projection_center() for i in range(1, 37)]).any()
 
 
 def pairs_of(pairs: MatchedPairs, keep: np.ndarray) -> MatchedPairs:
