@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import html
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -77,6 +78,9 @@ from reobj.types import (
 __all__ = ["Object", "Part", "Result", "VideoInfo", "World"]
 
 
+VIEWER_PX = 600  # height of the viewer in a notebook: one on a laptop shows it whole
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Result:
     """Tracks, cameras and objects of a video.
@@ -137,10 +141,17 @@ class Result:
         return f"Result({', '.join(facts)})"
 
     def _repr_html_(self) -> str:
-        """Show the objects and the viewer in a notebook."""
-        from reobj.viewer import scene  # it needs this module
+        """Return the report, and the scene.html of the folder in an iframe, for a notebook.
 
-        return scene.to_html(self)
+        The page is part of the HTML (.7 MB, with pictures up to 10 MB), so that it works where the
+        notebook's server does not serve the folder. Its scripts cannot reach the notebook.
+        """
+        text = f"<pre>{html.escape(self.summary())}</pre>"
+        if self.out is not None and (path := self.out / "scene.html").is_file():
+            page = html.escape(path.read_text(encoding="utf-8"))
+            text += f'<iframe sandbox="allow-scripts allow-downloads" srcdoc="{page}" '
+            text += f'style="width:100%;height:{VIEWER_PX}px;border:0"></iframe>'
+        return text
 
     def object(self, number: int) -> Object:
         """Return the object of a number.

@@ -2,8 +2,7 @@
 
 Its sources are in page/, beside this file; page.html includes the other files.
 
-`write_pictures` reads the video once for the overlay video and the pictures of the viewer;
-`to_html` shows a result in a notebook.
+`write_pictures` reads the video once for the overlay video and the pictures of the viewer.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ from __future__ import annotations
 import base64
 import contextlib
 import dataclasses
-import html
 import json
 import math
 import os
@@ -53,7 +51,6 @@ from reobj.viewer.cloud import Cloud, DenseFrames, dense_frames
 from reobj.viewer.overlay import Overlay
 
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
-VIEWER_PX = 600  # height of the viewer in a notebook: one on a laptop shows it whole
 PAGE_VERSION = 1  # of the page's data: `serve` shows them in the page of this version
 
 
@@ -637,21 +634,3 @@ class _Faults(dict[str, Exception]):
             one_line(FAULTS[name].format(f"{type(error).__name__}: {error}"))
             for name, error in self.items()
         ]
-
-
-# ---- In a notebook -----------------------------------------------------------------------------
-
-
-def to_html(result: Result) -> str:
-    """Return the report of a result, and the scene.html of its folder in an iframe.
-
-    The page is part of the HTML (.7 MB, with pictures up to 10 MB), so that it works where the
-    notebook's server does not serve the folder. The iframe is sandboxed: scripts of the page cannot
-    reach the notebook.
-    """
-    text = f"<pre>{html.escape(result.summary())}</pre>"
-    if result.out is not None and (path := result.out / "scene.html").is_file():
-        page = html.escape(path.read_text(encoding="utf-8"))
-        text += f'<iframe sandbox="allow-scripts allow-downloads" srcdoc="{page}" '
-        text += f'style="width:100%;height:{VIEWER_PX}px;border:0"></iframe>'
-    return text
