@@ -34,8 +34,7 @@ from reobj.types import Array, IntArray, rows_by
 PAIR_MATCHES = 60  # of a pair that are used; more change no rotation by .01 deg
 SCALE_PX = 1.5  # of the Cauchy loss
 ROUNDS = 12  # of reweighted least squares
-# Least distance of the points from the spot, world units: a usual distance of objects in m. Only
-# directions are measured
+# Distance of the points from the spot, world units: a usual one of objects in m; not measured
 RADIUS = 2.5
 # Fraction of the motion in the image that rotations may leave unexplained (measured: turns
 # with 5 cm of sway .016, a turn with 20 cm .037; walks .064 to .8)

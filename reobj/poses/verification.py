@@ -476,17 +476,19 @@ def measured(
         (points < MIN_POINTS, f"only {points} points could be triangulated", ""),
         (seen < MIN_MATCHES,
          f"half of the keyframes see {seen:.0f} points or fewer", ""),
-        (is_still := parallax_px < MIN_PARALLAX_PX,
+        (parallax_px < MIN_PARALLAX_PX,
          f"the camera only rotates (to {parallax_px:.1f} px), {no_depth}", advice),
-        (is_near := angle_deg < MIN_TRI_ANGLE_DEG,
+        (angle_deg < MIN_TRI_ANGLE_DEG,
          f"half of the points are seen from directions within {angle_deg:.1f} deg", advice),
         (arrays.camera.has_bogus_params(*FOCAL_RANGE, 1.0),
          f"the estimated focal length is {focal:.2f} x the longer side", lens),
     )  # fmt: skip
+    too_few, weak, bogus = checks[:3], checks[3:5], checks[5]
     problem, advice = next(((text, advice) for bad, text, advice in checks if bad), ("", ""))
+    is_weak = any(check[0] for check in weak) and not any(c[0] for c in (*too_few, bogus))
     return Component(
         model, arrays, focal_source, angle_deg, images / count, parallax_px, centre_sigma,
-        explained, problem, arrays.ids, advice, bool(advice) and (is_still or is_near),
+        explained, problem, arrays.ids, advice, is_weak,
     )  # fmt: skip
 
 
@@ -519,7 +521,8 @@ def confirmed(
                     f"{component.tri_angle_deg:.1f} deg)"
                 )
                 component = replace(component, problem=problem, is_weak=True)
-        if component.is_weak:
+        # at a wrong focal length both mappers are wrong alike
+        if component.is_weak and component.focal_source is not FocalSource.GUESS:
             rows, sigma = _same_rotations(component.arrays, [other.arrays for other in others])
             if len(rows) >= CONFIRMED * len(component.arrays.ids):
                 kept = component.arrays.ids[rows]
