@@ -278,14 +278,17 @@ class MappingJob:
             match_pairs(database, more, self.seed, "match again")
             every_pair = read_pairs(database)
         pairs = dataclasses.replace(every_pair.only(mapped), is_path=is_path)
-        focal = Focal(guess, FocalSource.GIVEN)
-        if self.camera is None:
-            focal = estimate_focal(pairs, size, guess)
+        focal, turn = self._focal(pairs, camera)
         frames = {number: self.frame_of[number] for number in mapped}
         search = MapperSearch(database, frames, pairs, focal, guess, self.seed)
         models, messages, weak, sigma = map_keyframes(search)
-        turn = self._turn(models, pairs, camera)
-        if turn is not None:
+        connected = sum(model.num_reg_images() ** 2 for model in models)
+        if turn is None and 2 * connected < len(mapped) ** 2:
+            turn = estimate_turn(pairs, camera, self.camera is not None)
+        # models that connect half as many pairs of keyframes are better
+        if turn is None or turn.problem or 2 * connected >= len(turn.ids) ** 2:
+            turn = None
+        else:
             model, moves = turning_model(turn, database)
             models = [model]
             sigma = [turn.spread_rad]
@@ -307,19 +310,22 @@ class MappingJob:
         unmatched = frozenset(set(ids) - set(matched.ravel().tolist()))
         return Mapped(paths, messages, sigma, unmatched, view_of)
 
-    def _turn(self, models: list[Any], pairs: MatchedPairs, camera: Any) -> Turn | None:
-        """Estimate a turn where the models connect less than half as many pairs of keyframes.
+    def _focal(self, pairs: MatchedPairs, camera: Any) -> tuple[Focal, Turn | None]:
+        """Return the focal length before mapping, and the turn if that was tried for it.
 
         Args:
-            models: of the mapper. pairs: verified matches of all keyframes. camera: before mapping.
+            pairs: verified matches of all keyframes. camera: given, or a guess.
         """
-        connected = sum(model.num_reg_images() ** 2 for model in models)
-        if 2 * connected >= len(pairs.keypoints) ** 2:
-            return None
-        turn = estimate_turn(pairs, camera, self.camera is not None)
-        if turn is None or turn.problem or 2 * connected >= len(turn.ids) ** 2:
-            return None
-        return turn
+        size = (int(camera.width), int(camera.height))
+        if self.camera is not None:
+            return Focal(self.focal_guess, FocalSource.GIVEN), None
+        focal = estimate_focal(pairs, size, self.focal_guess)
+        if focal.source is not FocalSource.GUESS:
+            return focal, None
+        turn = estimate_turn(pairs, camera, False)
+        if turn is not None and not turn.problem:
+            focal = Focal(turn.camera.mean_focal_length() / max(size), FocalSource.MATCHES)
+        return focal, turn
 
     def _write(self, model: Any, folder: Path) -> None:
         """Write a model in native pixels with the frames' names and coloured points."""
