@@ -131,7 +131,8 @@ class MapperSearch:
             messages. pairs: their verified matches.
         focal: of all images, as far as it is known before mapping. guess: used in its place where
             the matches no longer determine it.
-        show: as `send_progress`, of registered images.
+        show: as `send_progress`, of registered images. turn_focal: over the longer side, of a
+            camera that turns on one spot (`turning`); NaN: unknown.
     """
 
     def __init__(
@@ -143,6 +144,7 @@ class MapperSearch:
         guess: float,
         seed: int,
         show: Callable[[str, int, int], None] = send_progress,
+        turn_focal: float = np.nan,
     ) -> None:
         self.database = database
         self.ids = list(frames)
@@ -152,6 +154,7 @@ class MapperSearch:
         self.guess = guess
         self.seed = seed
         self.show = show
+        self.turn_focal = turn_focal
 
     def run(self) -> tuple[list[Any], list[str], list[str], list[float]]:
         """Try mappers until sound components contain nearly all keyframes.
@@ -190,7 +193,14 @@ class MapperSearch:
         turning = [
             c
             for c in best
-            if c.problem and c.direction_sigma and c.registered >= LEAST_TURNING * largest
+            if c.problem
+            and c.direction_sigma
+            and c.registered >= LEAST_TURNING * largest
+            # at a wrong guess both mappers turn alike
+            and (
+                c.focal_source is not FocalSource.GUESS
+                or abs(np.log(c.focal / self.turn_focal)) < ZOOM_LOG
+            )
         ]
         if not sound and not turning:
             problem = best[0].problem if best else "no pair of keyframes initialises a model"

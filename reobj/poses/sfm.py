@@ -54,7 +54,7 @@ from reobj.poses.mapping import (
     map_keyframes,
     without_poses,
 )
-from reobj.poses.turning import Turn, estimate_turn, pin, turning_model
+from reobj.poses.turning import estimate_turn, pin, turning_model
 from reobj.poses.verification import FocalSource
 from reobj.types import Array, IntArray
 
@@ -278,9 +278,15 @@ class MappingJob:
             match_pairs(database, more, self.seed, "match again")
             every_pair = read_pairs(database)
         pairs = dataclasses.replace(every_pair.only(mapped), is_path=is_path)
-        focal, turn = self._focal(pairs, camera)
+        focal = Focal(guess, FocalSource.GIVEN)
+        if self.camera is None:
+            focal = estimate_focal(pairs, size, guess)
+        turn = estimate_turn(pairs, camera, False) if focal.source is FocalSource.GUESS else None
+        turns = turn is not None and not turn.problem
+        turn_focal = turn.camera.mean_focal_length() / max(size) if turn and turns else np.nan
         frames = {number: self.frame_of[number] for number in mapped}
-        search = MapperSearch(database, frames, pairs, focal, guess, self.seed)
+        known = (focal, guess, self.seed)
+        search = MapperSearch(database, frames, pairs, *known, turn_focal=turn_focal)
         models, messages, weak, sigma = map_keyframes(search)
         connected = sum(model.num_reg_images() ** 2 for model in models)
         if turn is None and 2 * connected < len(mapped) ** 2:
@@ -309,23 +315,6 @@ class MappingJob:
         matched = every_pair.image_ids[every_pair.enough]
         unmatched = frozenset(set(ids) - set(matched.ravel().tolist()))
         return Mapped(paths, messages, sigma, unmatched, view_of)
-
-    def _focal(self, pairs: MatchedPairs, camera: Any) -> tuple[Focal, Turn | None]:
-        """Return the focal length before mapping, and the turn if that was tried for it.
-
-        Args:
-            pairs: verified matches of all keyframes. camera: given, or a guess.
-        """
-        size = (int(camera.width), int(camera.height))
-        if self.camera is not None:
-            return Focal(self.focal_guess, FocalSource.GIVEN), None
-        focal = estimate_focal(pairs, size, self.focal_guess)
-        if focal.source is not FocalSource.GUESS:
-            return focal, None
-        turn = estimate_turn(pairs, camera, False)
-        if turn is not None and not turn.problem:
-            focal = Focal(turn.camera.mean_focal_length() / max(size), FocalSource.MATCHES)
-        return focal, turn
 
     def _write(self, model: Any, folder: Path) -> None:
         """Write a model in native pixels with the frames' names and coloured points."""

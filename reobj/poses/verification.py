@@ -521,8 +521,7 @@ def confirmed(
                     f"{component.tri_angle_deg:.1f} deg)"
                 )
                 component = replace(component, problem=problem, is_weak=True)
-        # at a wrong focal length both mappers are wrong alike
-        if component.is_weak and component.focal_source is not FocalSource.GUESS:
+        if component.is_weak:
             rows, sigma = _same_rotations(component.arrays, [other.arrays for other in others])
             if len(rows) >= CONFIRMED * len(component.arrays.ids):
                 kept = component.arrays.ids[rows]
