@@ -115,7 +115,7 @@ def estimate_poses(
         best = made.attempt(keys, {})
         if extra := made.add_keyframes(sorted({*best.more_keyframes()} - {*keys})):
             second = made.attempt(sorted([*keys, *extra]), best.mapped.view_of)
-            best = second if second.pairs > best.pairs else best
+            best = second if second.improves(best) else best
     for k, model in enumerate(best.mapped.models):
         model.replace(component_path(work_dir / "sparse", k))
     shutil.rmtree(folder, ignore_errors=True)
@@ -301,6 +301,12 @@ class _Attempt:
     def pairs(self) -> int:
         """Count the pairs of frames with measured poses in one component."""
         return int((np.bincount(self.poses.part[self.poses.measured], minlength=1) ** 2).sum())
+
+    def improves(self, first: _Attempt) -> bool:
+        """Whether it connects more frames; with less certain directions twice as many pairs."""
+        sigma, before = (attempt.poses.direction_sigma.max() for attempt in (self, first))
+        factor = 2 ** np.sign(round(float(sigma - before), 3))
+        return bool(self.pairs > factor * first.pairs)
 
     @property
     def tried(self) -> BoolArray:
