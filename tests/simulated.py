@@ -67,12 +67,15 @@ def chair_solids() -> quadrics.Ellipsoids:
     return quadrics.Ellipsoids(centers, np.tile([0.28, 0.3, 0.41], (3, 1)), np.array(turn))
 
 
-def tracks_of(poses: rt.Poses, noise_px: float = 1.0) -> rt.Tracks:
-    """Noisy boxes of the chairs, one tracklet a chair, by frame; detection_index: the chair."""
+def tracks_of(
+    poses: rt.Poses, noise_px: float = 1.0, solids: quadrics.Ellipsoids | None = None
+) -> rt.Tracks:
+    """Noisy boxes of solids (the chairs), a tracklet each, by frame; detection_index: the solid."""
+    solids = solids or chair_solids()
     img_from_world = poses.camera.K @ poses.cam_from_world
-    boxes = quadrics.solid_boxes(chair_solids(), "box", img_from_world)  # (F, 3, 4)
+    boxes = quadrics.solid_boxes(solids, "box", img_from_world)  # (F, O, 4)
     boxes = boxes + np.random.default_rng(0).normal(0, noise_px, boxes.shape)
-    row, chair = np.divmod(np.arange(boxes.shape[0] * 3), 3)
+    row, chair = np.divmod(np.arange(boxes.shape[0] * len(solids)), len(solids))
     n = len(row)
     columns = (boxes.reshape(-1, 4), np.full(n, 0.9), np.full(n, CHAIR), chair)
     return rt.Tracks(poses.frame[row], chair + 1, chair + 1, *columns)

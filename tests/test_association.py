@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from test_linking import CHAIR, CUP, NAMES, SIZE, chair_solids, table_of, walk
+from simulated import CHAIR, CUP, SIZE, chair_solids, tracks_of, walk
 
 import quadrics
 import reobj_track as rt
@@ -62,7 +62,7 @@ def odds_of(table: rt.Tracks, poses: rt.Poses, solid: int = 0) -> float:
 
 def test_a_box_supports_its_object_and_not_the_neighbour() -> None:
     poses = walk(20)
-    table = table_of(poses)
+    table = tracks_of(poses)
     assert odds_of(table, poses) > 8
     assert odds_of(table, poses, solid=2) == -np.inf
 
@@ -70,7 +70,7 @@ def test_a_box_supports_its_object_and_not_the_neighbour() -> None:
 def test_points_in_a_box_support_the_object_at_their_depth() -> None:
     """Points before the object mean that something else is seen, and so do those behind it."""
     poses = walk(20)
-    table = table_of(poses)
+    table = tracks_of(poses)
     own = table[table.detection_index == 0]
     detections = detected_in(own, poses)
     solid = chairs()[[0]]
@@ -94,14 +94,14 @@ def test_a_box_may_be_half_occluded_but_not_exceed_the_projection(
     inside: list[float], outside: list[float]
 ) -> None:
     poses = walk(20)
-    table = table_of(poses)
+    table = tracks_of(poses)
     occluded, larger = (odds_of(shifted(table, np.array(by)), poses) for by in (inside, outside))
     assert odds_of(table, poses) >= occluded > larger + 1
 
 
 def test_scores_and_classes_change_the_odds() -> None:
     poses = walk(20)
-    table = table_of(poses)
+    table = tracks_of(poses)
     weak = dataclasses.replace(table, score=np.full(len(table), 0.2))
     assert odds_of(weak, poses) < odds_of(table, poses) - 2
     cups = np.where(table.detection_index == 0, CUP, CHAIR)
@@ -115,7 +115,7 @@ def test_a_detection_is_expected_if_most_of_the_object_is_in_the_image() -> None
     whole = quadrics.solid_boxes(chair_solids(), "box", cams)
     cut = quadrics.clip_boxes(whole, SIZE)
     visible = ((cut[..., 2:] - cut[..., :2]) / (whole[..., 2:] - whole[..., :2])).prod(-1)
-    found = gather_evidence(chairs(), detected_in(table_of(poses), poses), 0.0)
+    found = gather_evidence(chairs(), detected_in(tracks_of(poses), poses), 0.0)
     np.testing.assert_array_equal(found.expected, np.nan_to_num(visible) > EXPECTED)
 
 
@@ -126,9 +126,9 @@ def proposed_for(table: rt.Tracks, poses: rt.Poses, floor: quadrics.Floor | None
     group = table.detection_index
     views = gather_views(table, poses, group, 3, 0.0)
     classes = class_shares(table, group, 3).argmax(1)
-    fits = make_fit(rt.ObjectsConfig(), poses, NAMES)(views, classes.tolist(), Scene())
+    fits = make_fit(rt.ObjectsConfig(), poses, rt.COCO_NAMES)(views, classes.tolist(), Scene())
     metres = quadrics.Scale(1.0, 0.0, "poses")
-    categories = Categories(quadrics.load_priors(), np.array([*NAMES, ""]), metres)
+    categories = Categories(quadrics.load_priors(), np.array([*rt.COCO_NAMES, ""]), metres)
     return propose(fits, views, classes, categories, floor)
 
 
@@ -136,7 +136,7 @@ def proposed_for(table: rt.Tracks, poses: rt.Poses, floor: quadrics.Floor | None
 def test_a_single_view_proposes_the_true_position(floor: quadrics.Floor | None) -> None:
     """From the backrests alone, in three frames without parallax."""
     poses = walk(120)
-    table = table_of(poses)
+    table = tracks_of(poses)
     table = table[(table.frame >= 60) & (table.frame < 63)]
     table.xyxy[:, 3] = table.xyxy[:, 1] + 0.5 * (table.xyxy[:, 3] - table.xyxy[:, 1])
     found = proposed_for(table, poses, floor)
@@ -154,14 +154,14 @@ def test_a_single_view_proposes_the_true_position(floor: quadrics.Floor | None) 
 
 def located(table: rt.Tracks, poses: rt.Poses) -> np.ndarray:
     """The object of each row."""
-    fit, priors = make_fit(rt.ObjectsConfig(), poses, NAMES), quadrics.load_priors()
-    return associate_component(table, NAMES, poses, fit, priors).label
+    fit, priors = make_fit(rt.ObjectsConfig(), poses, rt.COCO_NAMES), quadrics.load_priors()
+    return associate_component(table, rt.COCO_NAMES, poses, fit, priors).label
 
 
 def test_weak_detections_that_agree_belong_to_the_object() -> None:
     """Two of three boxes are in no tracklet and have score .2."""
-    poses = walk()
-    table = table_of(poses)
+    poses = walk(120)
+    table = tracks_of(poses)
     weak = table.frame % 3 != 0
     score, tracklet = np.where(weak, 0.2, 0.9), np.where(weak, 0, table.tracklet_id)
     found = located(dataclasses.replace(table, score=score, tracklet_id=tracklet), poses)
@@ -174,7 +174,7 @@ def test_good_detections_in_no_tracklet_make_an_object(score: float, found_at_al
     """Photos with wide baselines: only the 3D position connects the boxes of a chair."""
     poses, solids = walk(12), chair_solids()[[0, 2]]
     solids.half_axes[0] = 0.05  # a cup, which the tracker follows
-    table = table_of(poses, solids)
+    table = tracks_of(poses, solids=solids)
     last = table.detection_index == 1
     class_id = np.where(last, CHAIR, CUP)
     tracklet, scores = np.where(last, 0, table.tracklet_id), np.where(last, score, 0.9)
@@ -186,8 +186,8 @@ def test_good_detections_in_no_tracklet_make_an_object(score: float, found_at_al
 
 
 def test_strong_detections_that_do_not_agree_are_clutter() -> None:
-    poses = walk()
-    table = table_of(poses)
+    poses = walk(120)
+    table = tracks_of(poses)
     rng = np.random.default_rng(0)
     corner = rng.uniform(0, 400, (len(table), 2))
     wild = table.detection_index == 2
@@ -201,15 +201,15 @@ def test_strong_detections_that_do_not_agree_are_clutter() -> None:
 @pytest.mark.parametrize(("off_px", "name"), [(3.0, "chair"), (0.0, "couch")])
 def test_duplicate_detections_give_one_object(off_px: float, name: str) -> None:
     """A second tracklet shows the first chair in every frame: slightly off, or of another class."""
-    poses = walk()
-    table = table_of(poses)
+    poses = walk(120)
+    table = tracks_of(poses)
     again = table[table.detection_index == 0]
     again.xyxy[:] += np.random.default_rng(3).normal(0, off_px, again.xyxy.shape)
     again = dataclasses.replace(
         again,
         tracklet_id=again.tracklet_id + 9,
         score=again.score - 0.3,
-        class_id=np.full(len(again), NAMES.index(name)),
+        class_id=np.full(len(again), rt.COCO_NAMES.index(name)),
     )
     found = located(rt.Tracks.joined([table, again]), poses)
     assert np.unique(found).tolist() == [-1, 0, 1, 2]
@@ -220,10 +220,10 @@ def test_occluded_chairs_get_the_width_of_their_unoccluded_views() -> None:
 
     The floor is known where there are sparse points on it.
     """
-    poses = walk()
+    poses = walk(120)
     ground = np.random.default_rng(0).uniform(-2, 2, (600, 3)) * [1, 1, 0.002]
     observed = np.indices((len(poses.frame), len(ground))).reshape(2, -1).T
-    table = table_of(poses)
+    table = tracks_of(poses)
     back = table.frame % 4 != 0
     x1, y1, x2, y2 = table.xyxy.T
     half = np.stack([0.75 * x1 + 0.25 * x2, y1, 0.25 * x1 + 0.75 * x2, (y1 + y2) / 2], 1)
@@ -232,8 +232,8 @@ def test_occluded_chairs_get_the_width_of_their_unoccluded_views() -> None:
     for points, visibility in ((ground, observed), (ground[:0], observed[:0])):
         colors = np.zeros(points.shape, np.uint8)
         world = dataclasses.replace(poses, points=points, colors=colors, visibility=visibility)
-        fit, priors = make_fit(rt.ObjectsConfig(), world, NAMES), quadrics.load_priors()
-        found = associate_component(seen, NAMES, world, fit, priors)
+        fit, priors = make_fit(rt.ObjectsConfig(), world, rt.COCO_NAMES), quadrics.load_priors()
+        found = associate_component(seen, rt.COCO_NAMES, world, fit, priors)
         assert (found.floor is not None) == bool(len(points))
         assert (found.label >= 0).mean() > 0.9 and len(found.confidence) == 3
         width.append(found.ellipsoids.half_axes[:3, :2].mean())
@@ -241,11 +241,11 @@ def test_occluded_chairs_get_the_width_of_their_unoccluded_views() -> None:
 
 
 def test_adjacent_identical_objects_stay_separate() -> None:
-    poses = walk()
+    poses = walk(120)
     solids = chair_solids()
     solids.center_in_world[1] = solids.center_in_world[0] + [0.35, 0, 0]
     solids.half_axes[:2] = [0.15, 0.15, 0.41]
-    table = table_of(poses, solids)
+    table = tracks_of(poses, solids=solids)
     found = located(dataclasses.replace(table, tracklet_id=np.ones(len(table), np.int64)
                                         + table.detection_index), poses)  # fmt: skip
     assert [len(np.unique(found[table.detection_index == k])) for k in range(3)] == [1, 1, 1]
@@ -254,7 +254,7 @@ def test_adjacent_identical_objects_stay_separate() -> None:
 
 def association_of(solids: Shapes, poses: rt.Poses) -> tuple[Associator, Association]:
     """Association of the chairs' detections with fixed objects."""
-    table = table_of(poses)
+    table = tracks_of(poses)
     detected = detected_in(table, poses)
     made = Associator(
         detected,
@@ -266,8 +266,8 @@ def association_of(solids: Shapes, poses: rt.Poses) -> tuple[Associator, Associa
 
 def test_detections_are_assigned_to_their_objects_one_to_one() -> None:
     _, found = association_of(chairs(), walk(30))
-    np.testing.assert_array_equal(found.label, table_of(walk(30)).detection_index)
-    assert (found.gains(detected_in(table_of(walk(30)), walk(30))) > 50).all()
+    np.testing.assert_array_equal(found.label, tracks_of(walk(30)).detection_index)
+    assert (found.gains(detected_in(tracks_of(walk(30)), walk(30))) > 50).all()
 
 
 def test_ambiguous_detections_are_excluded_from_refits() -> None:
@@ -286,7 +286,7 @@ def test_of_two_duplicates_the_better_fitting_one_stays() -> None:
     )
     four = Shapes.concatenate([three, dataclasses.replace(three, ellipsoids=off)[[0]]])
     made, found = association_of(four, walk(30))
-    own = np.flatnonzero(table_of(walk(30)).detection_index == 0)
+    own = np.flatnonzero(tracks_of(walk(30)).detection_index == 0)
     found.label[own[::2]], found.label[own[1::2]] = 3, 0
     likelier = np.array([-1.0, -1, -1, 0])
     pruned = made._prune(dataclasses.replace(found, size_log_odds=likelier))
@@ -324,7 +324,7 @@ def test_a_part_of_an_object_is_no_separate_object(
 
 def test_a_size_is_compared_with_the_prior_per_axis() -> None:
     """A chair rotated by 90 deg, a flat one of the usual mean size; without a known scale."""
-    priors, names = quadrics.load_priors(), np.array([*NAMES, ""])
+    priors, names = quadrics.load_priors(), np.array([*rt.COCO_NAMES, ""])
     metres = Categories(priors, names, quadrics.Scale(1.0, 0.0, "poses"))
     usual = metres.usual_size(np.array([CHAIR]))[0] / 2
     half = np.stack([usual, usual[[1, 0, 2]], usual * [2, 2, 0.25], usual * 5])
@@ -378,11 +378,11 @@ def test_without_frames_that_should_show_it_the_hit_rate_is_the_usual_one() -> N
 
 def test_floor_standing_objects_extend_to_the_floor() -> None:
     """Only the backrests are visible: with a floor the shapes are complete, without it not."""
-    poses = walk()
-    table = table_of(poses)
+    poses = walk(120)
+    table = tracks_of(poses)
     table.xyxy[:, 3] = table.xyxy[:, 1] + 0.5 * (table.xyxy[:, 3] - table.xyxy[:, 1])
     views = gather_views(table, poses, table.detection_index, 3, 0.0)
-    fit = make_fit(rt.ObjectsConfig(), poses, NAMES)
+    fit = make_fit(rt.ObjectsConfig(), poses, rt.COCO_NAMES)
     floor = quadrics.Floor(np.array([0, 0, 1.0]), 0.0, 0.001)
     low, high = (
         fits.ellipsoids.center_in_world[:, 2] - fits.ellipsoids.half_axes[:, 2]
@@ -398,7 +398,7 @@ def test_filled_boxes_have_the_distortion_of_the_lens() -> None:
     poses = walk(60)
     camera = rt.Camera("OPENCV", *SIZE, (520.0, 520.0, 320.0, 240.0, -0.3, 0.0, 0.0, 0.0))
     bent = dataclasses.replace(poses, camera=camera)
-    table = table_of(poses)
+    table = tracks_of(poses)
     table = dataclasses.replace(table, xyxy=distort_boxes(table.xyxy, camera))
     table = table[np.isfinite(table.xyxy).all(1)]
     seen = (table.detection_index != 0) | (table.frame < 28) | (table.frame >= 33)
@@ -406,14 +406,14 @@ def test_filled_boxes_have_the_distortion_of_the_lens() -> None:
     made = filled[filled.score == 0]
     true = table[~seen].xyxy.clip(0, np.tile(SIZE, 2))
     np.testing.assert_allclose(made.xyxy, true, atol=4)
-    straight = table_of(poses)[~seen].xyxy.clip(0, np.tile(SIZE, 2))
+    straight = tracks_of(poses)[~seen].xyxy.clip(0, np.tile(SIZE, 2))
     assert np.abs(made.xyxy - straight).max() > 10
 
 
 def test_frames_are_filled_only_near_observed_viewpoints() -> None:
     """Detected in one frame: filled if the camera is within 10 deg and 1.25 times the distance."""
     poses = walk(60)
-    table = table_of(poses)
+    table = tracks_of(poses)
     seen = (table.detection_index != 0) | (table.frame == 30)
     solids = chair_solids()
     center = np.array([-m[:, :3].T @ m[:, 3] for m in poses.cam_from_world])

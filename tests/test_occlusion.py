@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from test_linking import CHAIR, NAMES, SIZE, chair_solids, table_of, walk
+from simulated import CHAIR, SIZE, chair_solids, tracks_of, walk
 
 import quadrics
 import reobj_track as rt
@@ -113,14 +113,14 @@ def test_no_edge_is_occluded_below_the_image() -> None:
 @pytest.mark.parametrize("edge", [UPPER, LOWER])
 def test_the_fit_extends_behind_an_occluded_edge(edge: int) -> None:
     """A third of each box is occluded; the size prior of chairs gives the rest."""
-    poses = walk()
-    table = table_of(poses)
+    poses = walk(120)
+    table = tracks_of(poses)
     side = 0.35 * (table.xyxy[:, 3] - table.xyxy[:, 1])
     table.xyxy[:, edge] += side if edge == UPPER else -side
     views = gather_views(table, poses, table.detection_index, 3, 0.0)
     occluded = np.zeros(views.boxes.shape, bool)
     occluded[..., edge] = True
-    fit = make_fit(rt.ObjectsConfig(), poses, NAMES)
+    fit = make_fit(rt.ObjectsConfig(), poses, rt.COCO_NAMES)
     cut, whole = (
         fit(dataclasses.replace(views, occluded=mask), [CHAIR] * 3, Scene())
         for mask in (None, occluded)
