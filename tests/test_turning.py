@@ -34,13 +34,15 @@ def matched(
     xyz = ray / np.linalg.norm(ray, axis=1, keepdims=True) * rng.uniform(1.5, 4, (points, 1))
     camera = camera_of(FOCAL_PX)
     in_cam = np.einsum("kij,knj->kni", rotation, xyz - centre[:, None])
-    seen, keypoints = [], {}
+    seen = []
+    keypoints = {}
     for k, local in enumerate(in_cam):
         xy = camera.img_from_cam(local * np.sign(local[:, 2:]))
         inside = (local[:, 2] > 0.1) & ((xy > 0) & (xy < (640, 480))).all(1)
         seen.append(np.flatnonzero(inside))
         keypoints[k + 1] = xy[inside] + rng.normal(0, 0.5, (inside.sum(), 2))
-    ids, inliers = [], []
+    ids = []
+    inliers = []
     for a, b in itertools.combinations(range(len(rotation)), 2):
         _, one, other = np.intersect1d(seen[a], seen[b], return_indices=True)
         if min(b - a, a + len(rotation) - b) <= 4 and len(one) >= 15:
@@ -85,6 +87,14 @@ def test_the_sway_of_a_hand_is_measured_as_spread() -> None:
     assert turn is not None and turn.problem == ""
     assert 0.003 < turn.spread_rad < 0.03  # 2 cm at 1.5 to 4 m
     assert np.median(errors_deg(turn, truth)) < 1.0
+
+
+def test_part_of_a_turn_gives_the_focal_length() -> None:
+    """Nothing closes: in rad, a longer focal length would have smaller residuals."""
+    truth = full_turn()[:14]
+    sway = np.random.default_rng(1).normal(0, 0.03, (14, 3))
+    turn = estimate_turn(matched(truth, sway), camera_of(620.0), False)
+    assert turn is not None and turn.camera.mean_focal_length() == pytest.approx(FOCAL_PX, rel=0.05)
 
 
 def test_points_are_directions_that_all_their_images_agree_on() -> None:

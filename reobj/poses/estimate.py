@@ -304,8 +304,8 @@ class _Attempt:
 
     def improves(self, first: _Attempt) -> bool:
         """Whether it connects more frames; with less certain directions twice as many pairs."""
-        sigma, before = (attempt.poses.direction_sigma.max() for attempt in (self, first))
-        factor = 2 ** np.sign(round(float(sigma - before), 3))
+        more = self.poses.direction_sigma.max() - first.poses.direction_sigma.max()
+        factor = 2 ** np.sign(round(float(more), 3))
         return bool(self.pairs > factor * first.pairs)
 
     @property

@@ -816,7 +816,7 @@ def posed(pose: dict[int, Array], camera: Any, database: Path, path: Path) -> An
 
     Args:
         pose: cam_from_world (3, 4) by the id of the image. camera: `pycolmap.Camera` of all.
-        path: of the database of these images, which is made.
+        path: of a database of the images alone, which is made.
     """
     pc = import_pycolmap()
     copy_database(database, path, sorted(pose), camera)

@@ -244,8 +244,8 @@ def _pair_rotations(matches: _Matches, rays: Array) -> tuple[Array, Array]:
     for _ in range(ROUNDS):
         product = (weight[:, None] * rays[1])[:, :, None] * rays[0][:, None]  # (M, 3, 3)
         u, _, vt = np.linalg.svd(np.add.reduceat(product, matches.start))
-        sign = np.linalg.det(u @ vt)
-        turn = u * np.stack([sign**2, sign**2, sign], 1)[:, None] @ vt
+        u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]  # no reflection
+        turn = u @ vt
         moved = np.einsum("mij,mj->mi", turn[matches.pair], rays[0])
         off = np.linalg.norm(moved - rays[1], axis=1)
         weight = 1 / np.maximum(off, 1e-4)

@@ -483,9 +483,9 @@ def measured(
         (arrays.camera.has_bogus_params(*FOCAL_RANGE, 1.0),
          f"the estimated focal length is {focal:.2f} x the longer side", lens),
     )  # fmt: skip
-    too_few, weak, bogus = checks[:3], checks[3:5], checks[5]
     problem, advice = next(((text, advice) for bad, text, advice in checks if bad), ("", ""))
-    is_weak = any(check[0] for check in weak) and not any(c[0] for c in (*too_few, bogus))
+    others = (*checks[:3], *checks[5:])  # than those of parallax
+    is_weak = any(check[0] for check in checks[3:5]) and not any(check[0] for check in others)
     return Component(
         model, arrays, focal_source, angle_deg, images / count, parallax_px, centre_sigma,
         explained, problem, arrays.ids, advice, is_weak,
